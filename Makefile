@@ -1,0 +1,40 @@
+# The two commands: `make demo` and `make test`. Both build .venv from the lock when it is missing.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: demo test lint format bench evidence lock clean
+
+demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
+	$(BIN)/python train.py --preset demo
+
+test: $(READY)  ## all tests but the slow evidence
+	$(BIN)/python -m pytest -m "not slow"
+
+evidence: $(READY)  ## the slow evidence: coverage tables, reproduction
+	$(BIN)/python -m pytest -m slow -s
+
+bench: $(READY)  ## timed comparisons
+	$(BIN)/python -m benchmarks
+
+lint: $(READY)  ## style, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+$(READY): requirements.lock pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $(READY)
+
+lock: $(READY)  ## write the versions that are installed now into the lock, keeping its head
+	{ grep '^#' requirements.lock; $(BIN)/pip freeze --exclude-editable | sed 's/+cpu$$//'; } > requirements.lock.tmp
+	mv requirements.lock.tmp requirements.lock
+
+clean:
+	rm -rf .venv build dist
