@@ -1,0 +1,80 @@
+"""Policies by name: whatever chooses the input, with the `predict` of Stable-Baselines3.
+
+`make_policy("silverbox-multisine", env)` makes a policy that fits `env`. To add one, write a
+function of the unwrapped environment (or None) and the seed, and name it in `POLICIES`.
+"""
+
+import difflib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from gymnasium import Env
+from gymnasium.vector import VectorEnv
+from numpy.typing import ArrayLike, NDArray
+
+from agents.policies.signals import make_prbs, make_silverbox, make_uniform
+
+
+class Policy(Protocol):
+    """What a policy is: Stable-Baselines3's `predict`, on one observation or on a batch."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], Any]:
+        """Chooses the action.
+
+        Args:
+            observation: Shape `(n, features)`, or `(features,)` for one environment.
+            state: What the last call returned, or None.
+            episode_start: Shape `(n,)`: which environments begin an episode here.
+            deterministic: Whether to take a stochastic policy's mode instead of a sample.
+
+        Returns:
+            The actions in [-1, 1], float32 of shape `(n, 1)`, or `(1,)` for one environment; and
+            the state for the next call.
+        """
+        ...
+
+
+POLICIES: dict[str, Callable[[Any, int], Policy]] = {
+    "silverbox-multisine": partial(make_silverbox, "multisine"),
+    "silverbox-arrow": partial(make_silverbox, "arrow"),
+    "uniform": make_uniform,
+    "prbs": make_prbs,
+}
+
+
+def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0) -> Policy:
+    """Makes the policy of this name.
+
+    Args:
+        name: A name in `POLICIES`, or the path of a trained policy (`runs/...`).
+        env: The environment it is for, single or vector, wrapped or not: it gives the amplitude
+            limit, the episode's length and, where it replays a record, the recorded input. None:
+            the limit is 0.15 V.
+        seed: The seed of the policy's own randomness; a trained policy takes none.
+
+    Returns:
+        The policy.
+
+    Raises:
+        ValueError: There is neither a policy nor a file of this name, or `env` is not one of
+            duffing_env.
+    """
+    if name in POLICIES:
+        return POLICIES[name](env if env is None else env.unwrapped, seed)
+    if Path(name).exists():
+        from agents.policies.learned import load_policy  # imports torch
+
+        return load_policy(name)
+    nearest = difflib.get_close_matches(name, POLICIES, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+    raise ValueError(
+        f"name must be one of {', '.join(POLICIES)}, or the path of a trained policy, but it is {name!r}{hint}"
+    )

@@ -1,0 +1,35 @@
+"""The twin: the oscillator nearest to the Silverbox circuit, identified from its record.
+
+Run ``python -m duffing_env.twin`` with the record at hand to print the constants of
+`estimator.parameters.SILVERBOX_TWIN`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from duffing_env.silverbox import SilverboxRecord, load_record
+from estimator.parameters import Coefficients, PhysicalParameters, to_physical
+
+
+def identify_twin(record: SilverboxRecord) -> tuple[PhysicalParameters, float]:
+    """Least squares of Eq. (2) with input delay 1 on the record's multisine part.
+
+    Returns:
+        The parameters (m, c, a, b), and the root mean square of the one-step residual [V].
+    """
+    u, y = record.multisine.u, record.multisine.y
+    regressors = np.column_stack([y[1:-1], y[1:-1] ** 3, y[:-2], u[1:-1]])
+    coefficients, squares, *_ = np.linalg.lstsq(regressors, y[2:], rcond=None)
+    return to_physical(Coefficients(*coefficients)), float(np.sqrt(squares[0] / len(regressors)))
+
+
+def main() -> None:
+    """Print the twin."""
+    twin, residual = identify_twin(load_record())
+    print(f"m = {twin.m:.4e} s², c = {twin.c:.4e} s, a = {twin.a:.4f}, b = {twin.b:.4f} V⁻²")
+    print(f"one-step residual {1e3 * residual:.3f} mV root mean square")
+
+
+if __name__ == "__main__":
+    main()

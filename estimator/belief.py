@@ -1,0 +1,325 @@
+"""Prior and belief: the readable faces of the flat record that the kernels update."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.parameters import (
+    SILVERBOX_TWIN,
+    Coefficients,
+    FloatArray,
+    PhysicalParameters,
+    log_uniform_moments,
+    propagate_to_physical,
+)
+from estimator.record import RECORD, RECORD_SIZE
+
+_INDEX = {name: i for i, name in enumerate(RECORD)}
+_MEANS = slice(0, 7)
+_STATES = 3
+
+
+def _covariance_index() -> npt.NDArray[np.intp]:
+    """(7, 7) positions of the covariance's entries in a record."""
+    index = np.empty((7, 7), dtype=np.intp)
+    upper = np.triu_indices(7)
+    index[upper] = index.T[upper] = np.arange(_INDEX["P_x0_x0"], _INDEX["P_e_e"] + 1)
+    return index
+
+
+_COVARIANCE = _covariance_index()
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed before the first sample.
+
+    θ = (θ1, θ2, θ3) and η are Gaussian, γ and ξ are Gamma(shape, rate), the state (x_0, x_{-1}) is Gaussian.
+
+    Attributes:
+        theta_mean: (3,) means of θ1 [1], θ2 [1/V²], θ3 [1].
+        theta_cov: (3, 3) their covariance, positive definite.
+        eta_mean: mean of η [1].
+        eta_var: variance of η, positive.
+        gamma_shape, gamma_rate: of the process precision γ [1/V²]; rate in V², both positive.
+        xi_shape, xi_rate: of the measurement precision ξ [1/V²].
+        state_mean: (2,) means of x_0 and x_{-1} [V].
+        state_cov: (2, 2) their covariance [V²], positive definite.
+        coefficients_cov: (4, 4) joint covariance of (θ, η), whose blocks are ``theta_cov`` and ``eta_var``; without
+            it θ and η are independent. The mean-field factorisation uses the blocks only.
+
+    Raises:
+        ValueError: naming the field, for a wrong shape, a value that is not finite, a covariance that is not
+            symmetric positive definite, or a shape, rate or variance that is not positive.
+    """
+
+    theta_mean: FloatArray
+    theta_cov: FloatArray
+    eta_mean: float
+    eta_var: float
+    gamma_shape: float
+    gamma_rate: float
+    xi_shape: float
+    xi_rate: float
+    state_mean: FloatArray
+    state_cov: FloatArray
+    coefficients_cov: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        for name, shape in (("theta_mean", (3,)), ("eta_mean", ()), ("state_mean", (2,))):
+            self._settle(name, shape)
+        for name in ("eta_var", "gamma_shape", "gamma_rate", "xi_shape", "xi_rate"):
+            value = self._settle(name, ())
+            if value <= 0:
+                raise ValueError(f"{name} must be positive, but is {value}; pass a value above 0")
+        for name, size in (("theta_cov", 3), ("state_cov", 2)):
+            _check_covariance(name, self._settle(name, (size, size)))
+        if self.coefficients_cov is None:
+            joint = np.zeros((4, 4))
+            joint[:3, :3] = self.theta_cov
+            joint[3, 3] = self.eta_var
+            object.__setattr__(self, "coefficients_cov", joint)
+        else:
+            joint = self._settle("coefficients_cov", (4, 4))
+            _check_covariance("coefficients_cov", joint)
+            if not (np.allclose(joint[:3, :3], self.theta_cov) and np.isclose(joint[3, 3], self.eta_var)):
+                raise ValueError(
+                    f"coefficients_cov must contain theta_cov and eta_var as its blocks, but has diagonal "
+                    f"{np.diag(joint)}; pass theta_cov=coefficients_cov[:3, :3] and eta_var=coefficients_cov[3, 3]"
+                )
+
+    def _settle(self, name: str, shape: tuple[int, ...]) -> FloatArray:
+        """Copy a field to float64, check its shape and that it is finite."""
+        value = np.array(getattr(self, name), dtype=np.float64)
+        if value.shape != shape:
+            raise ValueError(f"{name} must have shape {shape}, but has {value.shape}; reshape it")
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite, but is {value}; replace the entries that are not")
+        value.flags.writeable = False
+        object.__setattr__(self, name, value if shape else float(value))
+        return value
+
+    @classmethod
+    def published_run(cls) -> Prior:
+        """The prior that the paper's published numbers were computed with (it differs from the paper's text)."""
+        return cls(np.ones(3), 10 * np.eye(3), 2.0, 1e-2, 1e8, 1e3, 1e8, 1e1, np.zeros(2), 10 * np.eye(2))
+
+    @classmethod
+    def paper_text(cls) -> Prior:
+        """The prior as the paper's section 4 states it; the state's, not given there, is that of the published run."""
+        return cls(np.ones(3), 10 * np.eye(3), 1.0, 10.0, 1e3, 1e1, 1e8, 1e3, np.zeros(2), 10 * np.eye(2))
+
+    @classmethod
+    def silverbox_twin(
+        cls,
+        spread: float = 0.3,
+        process_noise: float = 5e-4,
+        measurement_noise: float = 5e-4,
+        noise_shape: float = 2.0,
+        state_std: float = 1e-3,
+        center: PhysicalParameters = SILVERBOX_TWIN,
+    ) -> Prior:
+        """The prior of the environments: moment-matched to oscillators near the Silverbox circuit.
+
+        Args:
+            spread: m, c, a and b are log-uniform on center * [1 - spread, 1 + spread]; in (0, 1).
+            process_noise: standard deviation of w̃ [V] at which the prior of γ is centred.
+            measurement_noise: standard deviation of v [V] at which the prior of ξ is centred.
+            noise_shape: shape of both Gamma priors: 2 is weak, worth four samples.
+            state_std: standard deviation of x_0 and x_{-1} [V].
+            center: the oscillator in the middle of the range.
+        """
+        for name, value in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
+            if not 0 < value < np.inf:
+                raise ValueError(f"{name} must be positive and finite, but is {value}; pass a standard deviation in V")
+        mean, cov = log_uniform_moments(center, spread)
+        return cls(
+            theta_mean=mean[:3],
+            theta_cov=cov[:3, :3],
+            eta_mean=float(mean[3]),
+            eta_var=float(cov[3, 3]),
+            gamma_shape=noise_shape,
+            gamma_rate=noise_shape * process_noise**2,
+            xi_shape=noise_shape,
+            xi_rate=noise_shape * measurement_noise**2,
+            state_mean=np.zeros(2),
+            state_cov=state_std**2 * np.eye(2),
+            coefficients_cov=cov,
+        )
+
+    def to_record(self, *, factorisation: str = "structured", nonlinear: bool = True) -> FloatArray:
+        """The prior as a flat record (RECORD_SIZE,) that the kernels start from.
+
+        Without the nonlinearity θ2 is known to be 0: mean, variance and covariances are 0, and stay so.
+        """
+        mean = np.zeros(7)
+        mean[:2] = self.state_mean
+        mean[_STATES:] = [*self.theta_mean, self.eta_mean]
+        cov = np.zeros((7, 7))
+        cov[:2, :2] = self.state_cov
+        cov[2, 2] = self.state_cov[1, 1]
+        assert self.coefficients_cov is not None
+        cov[_STATES:, _STATES:] = self.coefficients_cov
+        if factorisation == "mean_field":
+            cov[_STATES:-1, -1] = cov[-1, _STATES:-1] = 0.0
+        if not nonlinear:
+            mean[4] = 0.0
+            cov[4, :] = cov[:, 4] = 0.0
+        record = np.empty(RECORD_SIZE)
+        record[_MEANS] = mean
+        record[_COVARIANCE] = cov
+        record[_INDEX["g_shape"] :] = [self.gamma_shape, self.gamma_rate, self.xi_shape, self.xi_rate]
+        return record
+
+
+@dataclass(frozen=True)
+class Belief:
+    """A posterior: q(x, θ, η) Gaussian, q(γ) and q(ξ) Gamma. A copy; later updates do not change it.
+
+    Attributes:
+        record: (RECORD_SIZE,) the flat record.
+        factorisation: ``structured`` (three lags of the state, jointly with θ and η) or ``mean_field`` (two lags,
+            θ and η independent of them and of each other).
+        nonlinear: False where θ2 is fixed at 0; densities are then over (θ1, θ3, η).
+    """
+
+    record: FloatArray
+    factorisation: str = "structured"
+    nonlinear: bool = True
+
+    def __post_init__(self) -> None:
+        record = np.array(self.record, dtype=np.float64)
+        record.flags.writeable = False
+        object.__setattr__(self, "record", record)
+
+    @property
+    def _lags(self) -> int:
+        return 3 if self.factorisation == "structured" else 2
+
+    @property
+    def _active(self) -> list[int]:
+        return [0, 1, 2, 3] if self.nonlinear else [0, 2, 3]
+
+    @property
+    def state_mean(self) -> FloatArray:
+        """(lags,) means of x_t, x_{t-1}, (x_{t-2})  [V]."""
+        return self.record[: self._lags].copy()
+
+    @property
+    def state_cov(self) -> FloatArray:
+        """(lags, lags) covariance of the lags [V²]."""
+        return self.record[_COVARIANCE[: self._lags, : self._lags]]
+
+    @property
+    def coefficients_mean(self) -> FloatArray:
+        """(4,) means of θ1, θ2, θ3, η."""
+        return self.record[_STATES:7].copy()
+
+    @property
+    def coefficients_cov(self) -> FloatArray:
+        """(4, 4) covariance of θ1, θ2, θ3, η."""
+        return self.record[_COVARIANCE[_STATES:, _STATES:]]
+
+    @property
+    def theta_mean(self) -> FloatArray:
+        """(3,) means of θ1 [1], θ2 [1/V²], θ3 [1]."""
+        return self.coefficients_mean[:3]
+
+    @property
+    def theta_cov(self) -> FloatArray:
+        """(3, 3) covariance of θ."""
+        return self.coefficients_cov[:3, :3]
+
+    @property
+    def eta_mean(self) -> float:
+        """Mean of η [1]."""
+        return float(self.record[_INDEX["e"]])
+
+    @property
+    def eta_var(self) -> float:
+        """Variance of η."""
+        return float(self.record[_INDEX["P_e_e"]])
+
+    @property
+    def gamma_shape(self) -> float:
+        """Shape of q(γ)."""
+        return float(self.record[_INDEX["g_shape"]])
+
+    @property
+    def gamma_rate(self) -> float:
+        """Rate of q(γ) [V²]."""
+        return float(self.record[_INDEX["g_rate"]])
+
+    @property
+    def xi_shape(self) -> float:
+        """Shape of q(ξ)."""
+        return float(self.record[_INDEX["n_shape"]])
+
+    @property
+    def xi_rate(self) -> float:
+        """Rate of q(ξ) [V²]."""
+        return float(self.record[_INDEX["n_rate"]])
+
+    @property
+    def gamma_mean(self) -> float:
+        """E[γ] [1/V²]."""
+        return self.gamma_shape / self.gamma_rate
+
+    @property
+    def xi_mean(self) -> float:
+        """E[ξ] [1/V²]."""
+        return self.xi_shape / self.xi_rate
+
+    def coefficients(self) -> Coefficients:
+        """The posterior means as coefficients."""
+        return Coefficients(*self.coefficients_mean, gamma=self.gamma_mean, xi=self.xi_mean)
+
+    def physical(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (4,) and covariance (4, 4) of (m, c, a, b), first order, Eq. (4)."""
+        return propagate_to_physical(self.coefficients_mean, self.coefficients_cov)
+
+    def entropy(self) -> float:
+        """Entropy of q(θ, η) in nats."""
+        active = self._active
+        sign, log_det = np.linalg.slogdet(self.coefficients_cov[np.ix_(active, active)])
+        return float(0.5 * (len(active) * np.log(2 * np.pi * np.e) + log_det)) if sign > 0 else float("nan")
+
+    def log_prob(self, coefficients: Coefficients | npt.ArrayLike) -> float | FloatArray:
+        """Log density of q(θ, η) at given coefficients.
+
+        Args:
+            coefficients: `Coefficients`, or values (..., 4) of θ1, θ2, θ3, η.
+
+        Returns:
+            Log density in nats, of shape (...): a float for one point.
+
+        Raises:
+            ValueError: for a wrong shape, or values that are not finite.
+        """
+        if isinstance(coefficients, Coefficients):
+            c = coefficients
+            points = np.stack([c.theta1, c.theta2, c.theta3, c.eta], axis=-1)
+        else:
+            points = np.asarray(coefficients, dtype=np.float64)
+        if points.ndim == 0 or points.shape[-1] != 4:
+            raise ValueError(f"coefficients must have shape (..., 4), but has {points.shape}; order θ1, θ2, θ3, η")
+        if not np.isfinite(points).all():
+            raise ValueError("coefficients must be finite, but has entries that are not; remove them")
+        active = self._active
+        deviation = (points - self.coefficients_mean)[..., active]
+        factor = np.linalg.cholesky(self.coefficients_cov[np.ix_(active, active)])
+        whitened = np.linalg.solve(factor, deviation[..., None])[..., 0]
+        log_det = 2 * np.log(np.diag(factor)).sum()
+        value = -0.5 * ((whitened**2).sum(-1) + log_det + len(active) * np.log(2 * np.pi))
+        return float(value) if np.ndim(value) == 0 else value
+
+
+def _check_covariance(name: str, value: FloatArray) -> None:
+    if not np.allclose(value, value.T, rtol=1e-9):
+        raise ValueError(f"{name} must be symmetric, but is {value.tolist()}; pass (C + C.T) / 2")
+    smallest = np.linalg.eigvalsh(value)[0]
+    if smallest <= 0:
+        raise ValueError(f"{name} must be positive definite, but has eigenvalue {smallest}; add variance to it")

@@ -1,0 +1,44 @@
+"""Belief updates: what one sample (u, y) does to a belief, for each recognition factorisation."""
+
+from __future__ import annotations
+
+from estimator.inference import mean_field, structured
+from estimator.lanes import jit
+
+#: Name of a factorisation to the iterations it uses by default: the paper's 10, and 3 where they are scalars.
+DEFAULT_ITERATIONS = {"structured": 3, "mean_field": 10}
+
+
+@jit
+def update(W, is_structured, iterations, as_published, trace):
+    """Update every lane's belief with its row ``u`` and ``y``.
+
+    Args:
+        W: block, (rows * LANES,).
+        is_structured: factorisation; mean field where False.
+        iterations: number of variational iterations, at least 1.
+        as_published: mean field with the two departures of the published run.
+        trace: (iterations,) receives lane 0's free energy after each iteration [nats]; of size 0 to skip it.
+    """
+    if is_structured:
+        structured.predict(W)
+        for i in range(iterations):
+            structured.learn_noise(W)
+            if trace.size:
+                trace[i] = structured.free_energy(W, 0)
+        structured.correct(W)
+    else:
+        mean_field.begin(W)
+        for i in range(iterations):
+            mean_field.iterate(W, as_published)
+            if trace.size:
+                trace[i] = mean_field.free_energy(W, 0)
+        mean_field.end(W)
+
+
+@jit
+def free_energy(W, j, is_structured):
+    """Free energy [nats] that the last update left lane ``j`` with."""
+    if is_structured:
+        return structured.free_energy(W, j)
+    return mean_field.free_energy(W, j)

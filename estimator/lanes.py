@@ -1,0 +1,111 @@
+"""Scalar mathematics, compiled to run across lanes.
+
+The equations of this project are written once, as small scalar functions of named quantities. `lanewise` compiles
+such a function into a loop over `LANES` independent systems, so that the compiler turns every scalar operation into
+a vector operation. All quantities of these systems lie in one flat float64 array, the *block* ``W``: the quantity in
+row r of lane j is ``W[r * LANES + j]``. One array with constant offsets is what makes the loops vectorise: with an
+array per quantity the compiler cannot rule out that two of them overlap, and falls back to scalar code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+
+#: Systems in a block. A multiple of the vector width (8 doubles in AVX-512); 32 lanes of ~120 rows stay within 32 KiB.
+LANES = 32
+
+#: No division checks, fused multiply-adds allowed (nothing else: results must not depend on the order of lanes).
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "nogil": True}
+
+#: Compile a function that other compiled functions call.
+jit = numba.njit(**OPTIONS)
+
+#: Compile a scalar function that is always inlined into its callers, as vectorisation needs.
+inlined = numba.njit(forceinline=True, **OPTIONS)
+
+
+def rows(*groups: str, start: int = 0) -> dict[str, int]:
+    """Number the quantities named in ``groups`` (space-separated names), from row ``start`` on."""
+    names = " ".join(groups).split()
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ValueError(f"groups must name every row once, but {repeated} stand there twice; rename them")
+    return {name: start + i for i, name in enumerate(names)}
+
+
+def lanewise(layout: Mapping[str, int], outputs: str) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a scalar function to run over all lanes of a block.
+
+    Parameters of the function that are rows of ``layout`` are read from the block; its results are written to the
+    rows named in ``outputs``. The remaining parameters are the same for all lanes and become arguments of the loop,
+    after the block: ``f(W, *uniform)``.
+
+    Args:
+        layout: name of a quantity to its row.
+        outputs: the rows that the function returns, in its order, separated by spaces.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        names = list(inspect.signature(function).parameters)
+        uniform = [name for name in names if name not in layout]
+        arguments = ", ".join(f"W[{layout[n] * LANES} + j]" if n in layout else n for n in names)
+        targets = ", ".join(f"W[{layout[n] * LANES} + j]" for n in outputs.split())
+        source = (
+            f"def {function.__name__}({', '.join(['W', *uniform])}):\n"
+            f"    for j in range({LANES}):\n"
+            f"        {targets} = scalar({arguments})\n"
+        )
+        return jit(_define(source, function, scalar=inlined(function)))
+
+    return decorate
+
+
+def at_lane(layout: Mapping[str, int]) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a scalar function to read its parameters from one lane: ``f(W, j)`` returns its value."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        names = inspect.signature(function).parameters
+        arguments = ", ".join(f"W[{layout[name] * LANES} + j]" for name in names)
+        source = f"def {function.__name__}(W, j):\n    return scalar({arguments})\n"
+        return jit(_define(source, function, scalar=jit(function)))
+
+    return decorate
+
+
+def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile an entry point: a function that Python calls, cached on disk.
+
+    Numba's cache knows when the file of the function changed, but not the files of the functions it calls; a stale
+    kernel would give wrong numbers in silence. So the stamp of the cache is a digest of all our sources.
+    """
+    if function is None:
+        return lambda f: kernel(f, **options)
+    dispatcher = numba.njit(cache=True, **OPTIONS, **options)(function)
+    dispatcher._cache._cache_file._source_stamp = _source_digest(Path(function.__code__.co_filename).parent)
+    return dispatcher
+
+
+@cache
+def _source_digest(package: Path) -> str:
+    digest = hashlib.sha256()
+    for folder in sorted({Path(__file__).parent, package}):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _define(source: str, function: Callable[..., Any], **names: Any) -> Callable[..., Any]:
+    """Define the function written in ``source``, filed under the place of ``function``."""
+    namespace: dict[str, Any] = dict(names)
+    exec(compile(source, function.__code__.co_filename, "exec"), namespace)
+    defined: Callable[..., Any] = namespace[function.__name__]
+    defined.__module__ = function.__module__
+    defined.__doc__ = function.__doc__
+    return defined

@@ -1,0 +1,52 @@
+"""The layout of a belief: which quantity lies in which row of a block.
+
+A belief is one flat float64 record of `RECORD_SIZE` numbers: the means of (x_t, x_{t-1}, x_{t-2}, θ1, θ2, θ3, η), the
+upper triangle of their covariance, and the Gamma shapes and rates of γ (process precision) and ξ (measurement
+precision). Both factorisations use the same record; mean field leaves the cross-covariances and the third lag zero.
+
+Names of rows, as they appear as parameters of the scalar functions:
+
+===================  ==================================================================
+``x0 x1 x2``         means of x_t, x_{t-1}, x_{t-2}  [V]
+``t1 t2 t3 e``       means of θ1, θ2 [1/V²], θ3, η
+``P_i_j``            covariance of quantities i and j
+``g_shape g_rate``   γ ~ Gamma(shape, rate), rate in V²
+``n_shape n_rate``   ξ ~ Gamma(shape, rate), rate in V²
+``u y``              the sample: input that acted on x_{t-1}, and output of x_t  [V]
+===================  ==================================================================
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+
+from estimator.lanes import rows
+
+STATES = ("x0", "x1", "x2")
+COEFFICIENTS = ("t1", "t2", "t3", "e")
+QUANTITIES = STATES + COEFFICIENTS
+COVARIANCES = tuple(f"P_{i}_{j}" for i, j in combinations_with_replacement(QUANTITIES, 2))
+NOISES = ("g_shape", "g_rate", "n_shape", "n_rate")
+
+#: The belief itself: 7 means, 28 covariances, 4 noise parameters.
+RECORD = QUANTITIES + COVARIANCES + NOISES
+RECORD_SIZE = len(RECORD)
+
+#: What one structured update keeps between its loops.
+_STRUCTURED = """
+    predicted spread c_x0 c_x1 c_t1 c_t2 c_t3 c_e
+    process_variance measurement_variance next_process_variance next_measurement_variance next_g_rate next_n_rate
+"""
+
+#: What the iterations of one mean-field update share: the prior factors, and the marginals of z_t and z_{t-1}.
+_MEAN_FIELD = """
+    prior_t1 prior_t2 prior_t3 prior_e
+    prior_V_11 prior_V_12 prior_V_13 prior_V_22 prior_V_23 prior_V_33 prior_e_variance
+    prior_L_00 prior_L_01 prior_L_11 prior_h_0 prior_h_1 prior_g_rate prior_n_rate
+    prior_x0 prior_x1 z0 z1 z0_variance q0 q1 Q_00 Q_01 Q_11 gamma xi
+    e_information theta_information theta_shift residual_power error_power g_increment n_increment
+"""
+
+#: Rows of an estimator's block. An environment's block has these first, then its own.
+LAYOUT = rows(" ".join(RECORD), "u y", _STRUCTURED, _MEAN_FIELD)
+N_ROWS = len(LAYOUT)
