@@ -40,25 +40,26 @@ def rows(*groups: str, start: int = 0) -> dict[str, int]:
     return {name: start + i for i, name in enumerate(names)}
 
 
-def lanewise(layout: Mapping[str, int], outputs: str) -> Callable[[Callable[..., Any]], Any]:
+def lanewise(layout: Mapping[str, int], outputs: str, uniform: str = "") -> Callable[[Callable[..., Any]], Any]:
     """Compile a scalar function to run over all lanes of a block.
 
-    Parameters of the function that are rows of ``layout`` are read from the block; its results are written to the
-    rows named in ``outputs``. The remaining parameters are the same for all lanes and become arguments of the loop,
-    after the block: ``f(W, *uniform)``.
+    The function's parameters are read from the rows of their names, its results are written to the rows named in
+    ``outputs``. Parameters named in ``uniform`` are the same for all lanes, and become arguments of the loop after
+    the block: ``f(W, *uniform)``.
 
     Args:
         layout: name of a quantity to its row.
         outputs: the rows that the function returns, in its order, separated by spaces.
+        uniform: parameters that are no rows, in the order in which the loop takes them.
+
+    Raises:
+        ValueError: for a parameter that is neither a row nor uniform, or both.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        names = list(inspect.signature(function).parameters)
-        uniform = [name for name in names if name not in layout]
-        arguments = ", ".join(f"W[{layout[n] * LANES} + j]" if n in layout else n for n in names)
-        targets = ", ".join(f"W[{layout[n] * LANES} + j]" for n in outputs.split())
+        arguments, targets = _places(function, layout, outputs, uniform)
         source = (
-            f"def {function.__name__}({', '.join(['W', *uniform])}):\n"
+            f"def {function.__name__}({', '.join(['W', *uniform.split()])}):\n"
             f"    for j in range({LANES}):\n"
             f"        {targets} = scalar({arguments})\n"
         )
@@ -67,16 +68,34 @@ def lanewise(layout: Mapping[str, int], outputs: str) -> Callable[[Callable[...,
     return decorate
 
 
-def at_lane(layout: Mapping[str, int]) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a scalar function to read its parameters from one lane: ``f(W, j)`` returns its value."""
+def at_lane(layout: Mapping[str, int], outputs: str = "", uniform: str = "") -> Callable[[Callable[..., Any]], Any]:
+    """Compile a scalar function to run on one lane: ``f(W, j, *uniform)``, otherwise as `lanewise`.
+
+    Without ``outputs`` it writes nothing, and returns its results.
+    """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        names = inspect.signature(function).parameters
-        arguments = ", ".join(f"W[{layout[name] * LANES} + j]" for name in names)
-        source = f"def {function.__name__}(W, j):\n    return scalar({arguments})\n"
+        arguments, targets = _places(function, layout, outputs, uniform)
+        source = (
+            f"def {function.__name__}({', '.join(['W', 'j', *uniform.split()])}):\n"
+            f"    {targets + ' =' if outputs else 'return'} scalar({arguments})\n"
+        )
         return jit(_define(source, function, scalar=jit(function)))
 
     return decorate
+
+
+def _places(
+    function: Callable[..., Any], layout: Mapping[str, int], outputs: str, uniform: str
+) -> tuple[str, str]:  # fmt: skip
+    """The arguments of a scalar function, and the places of its results, as source text."""
+    names = list(inspect.signature(function).parameters)
+    for name in names:
+        if (name in layout) == (name in uniform.split()):
+            raise ValueError(f"{name} of {function.__name__} must be a row or uniform, and not both; rename it")
+    arguments = ", ".join(f"W[{layout[n] * LANES} + j]" if n in layout else n for n in names)
+    targets = ", ".join(f"W[{layout[n] * LANES} + j]" for n in outputs.split())
+    return arguments, targets
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:

@@ -34,7 +34,7 @@ RECORD_SIZE = len(RECORD)
 
 #: What one structured update keeps between its loops.
 _STRUCTURED = """
-    predicted spread c_x0 c_x1 c_t1 c_t2 c_t3 c_e
+    predicted predicted_variance c_x0 c_x1 c_t1 c_t2 c_t3 c_e
     process_variance measurement_variance next_process_variance next_measurement_variance next_g_rate next_n_rate
 """
 

@@ -50,6 +50,7 @@ def begin(
     "t1 t2 t3 e P_t1_t1 P_t1_t2 P_t1_t3 P_t2_t2 P_t2_t3 P_t3_t3 P_e_e "
     "z0 z1 z0_variance q0 q1 Q_00 Q_01 Q_11 g_rate n_rate gamma xi "
     "e_information theta_information theta_shift residual_power error_power g_increment n_increment",
+    uniform="as_published",
 )
 def iterate(
     t1, t2, t3, z0, q0, q1, u, y, gamma, xi, g_shape, n_shape,

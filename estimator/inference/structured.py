@@ -24,7 +24,7 @@ from estimator.record import LAYOUT
 
 @lanewise(
     LAYOUT,
-    "predicted spread c_x0 c_x1 c_t1 c_t2 c_t3 c_e g_shape n_shape next_process_variance next_measurement_variance",
+    "predicted predicted_variance c_x0 c_x1 c_t1 c_t2 c_t3 c_e g_shape n_shape next_process_variance next_measurement_variance",
 )
 def predict(
     x0, x1, t1, t2, t3, e, u,
@@ -47,17 +47,17 @@ def predict(
     c_t3 = a0 * P_x0_t3 + a1 * P_x1_t3 + x0 * P_t1_t3 + cube * P_t2_t3 + x1 * P_t3_t3 + u * P_t3_e
     c_e = a0 * P_x0_e + a1 * P_x1_e + x0 * P_t1_e + cube * P_t2_e + x1 * P_t3_e + u * P_e_e
     predicted = t1 * x0 + t2 * cube + t3 * x1 + e * u
-    spread = a0 * c_x0 + a1 * c_x1 + x0 * c_t1 + cube * c_t2 + x1 * c_t3 + u * c_e
+    predicted_variance = a0 * c_x0 + a1 * c_x1 + x0 * c_t1 + cube * c_t2 + x1 * c_t3 + u * c_e
     return (
-        predicted, spread, c_x0, c_x1, c_t1, c_t2, c_t3, c_e,
+        predicted, predicted_variance, c_x0, c_x1, c_t1, c_t2, c_t3, c_e,
         g_shape + 0.5, n_shape + 0.5, g_rate / g_shape, n_rate / n_shape,
     )  # fmt: skip
 
 
 @inlined
-def _half_noise_powers(predicted, spread, y, q, r):
+def _half_noise_powers(predicted, predicted_variance, y, q, r):
     """Half of E[w²] and of E[v²] under the Kalman step with process variance q and measurement variance r."""
-    weight = 1.0 / (spread + q + r)
+    weight = 1.0 / (predicted_variance + q + r)
     step = (y - predicted) * weight
     w = q * step
     v = r * step
@@ -69,12 +69,12 @@ def _half_noise_powers(predicted, spread, y, q, r):
     "process_variance measurement_variance next_g_rate next_n_rate next_process_variance next_measurement_variance",
 )
 def learn_noise(
-    predicted, spread, y, g_shape, g_rate, n_shape, n_rate, next_process_variance, next_measurement_variance
+    predicted, predicted_variance, y, g_shape, g_rate, n_shape, n_rate, next_process_variance, next_measurement_variance
 ):  # fmt: skip
     """One iteration: the Kalman step's moments of w and v, then q(γ) and q(ξ), whose shapes count this sample already."""
     q = next_process_variance
     r = next_measurement_variance
-    half_w, half_v = _half_noise_powers(predicted, spread, y, q, r)
+    half_w, half_v = _half_noise_powers(predicted, predicted_variance, y, q, r)
     next_g_rate = g_rate + half_w
     next_n_rate = n_rate + half_v
     return q, r, next_g_rate, next_n_rate, next_g_rate / g_shape, next_n_rate / n_shape
@@ -91,7 +91,7 @@ def learn_noise(
 )
 def correct(
     x0, x1, t1, t2, t3, e, y,
-    predicted, spread, c_x0, c_x1, c_t1, c_t2, c_t3, c_e,
+    predicted, predicted_variance, c_x0, c_x1, c_t1, c_t2, c_t3, c_e,
     process_variance, measurement_variance,
     P_x0_x0, P_x0_x1, P_x0_t1, P_x0_t2, P_x0_t3, P_x0_e,
     P_x1_x1, P_x1_t1, P_x1_t2, P_x1_t3, P_x1_e,
@@ -102,7 +102,7 @@ def correct(
     next_g_rate, next_n_rate,
 ):  # fmt: skip
     """Shift the lags by one sample and condition on y: the new x0 is x_{t+1}, the old x0 becomes x1, and so on."""
-    prior_variance = spread + process_variance
+    prior_variance = predicted_variance + process_variance
     weight = 1.0 / (prior_variance + measurement_variance)
     step = (y - predicted) * weight
     keep = measurement_variance * weight
@@ -130,7 +130,7 @@ def correct(
 
 @at_lane(LAYOUT)
 def free_energy(
-    predicted, spread, y, g_shape, n_shape, next_g_rate, next_n_rate, process_variance, measurement_variance
+    predicted, predicted_variance, y, g_shape, n_shape, next_g_rate, next_n_rate, process_variance, measurement_variance
 ):  # fmt: skip
     """Free energy of this sample in nats after an iteration, to first order.
 
@@ -139,8 +139,8 @@ def free_energy(
     """
     q = process_variance
     r = measurement_variance
-    half_w, half_v = _half_noise_powers(predicted, spread, y, q, r)
-    innovation_variance = spread + q + r
+    half_w, half_v = _half_noise_powers(predicted, predicted_variance, y, q, r)
+    innovation_variance = predicted_variance + q + r
     innovation = y - predicted
     gaussian = 0.5 * (LOG_2PI + math.log(innovation_variance) + innovation * innovation / innovation_variance)
     process = half_w * (g_shape / next_g_rate - 1 / q) - 0.5 * (math.log(q) + expected_log_gamma(g_shape, next_g_rate))

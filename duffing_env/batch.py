@@ -1,0 +1,128 @@
+"""A batch of experiments: the memory that the kernel works on. Both faces of the environment stand on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from duffing_env import kernel
+from duffing_env.experiment import Experiment
+from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OUTCOME, SAVED
+from duffing_env.noise import stream_words
+from estimator.belief import Belief
+from estimator.lanes import LANES
+from estimator.parameters import FloatArray, PhysicalParameters
+from estimator.record import RECORD_SIZE
+
+
+class Batch:
+    """n experiments of one kind, stepped together.
+
+    Args:
+        experiment: what is fixed about them.
+        size: their number n; memory is laid out for a multiple of `LANES`.
+        reset_mode: `kernel.RESET_BY_HAND`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
+        threads: threads that step the blocks; results do not depend on it.
+
+    Attributes:
+        observations: (n, N_OBSERVATION) float32, overwritten by every step.
+        final_observations: the same, for what was reset within the step.
+    """
+
+    def __init__(self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1) -> None:
+        self.experiment = experiment
+        self.size = size
+        self._reset_mode = reset_mode
+        self._threads = threads
+        self._settings = experiment.settings
+        self._prior = experiment.prior_record
+        self._recorded = experiment.recorded
+        n_blocks = -(-size // LANES)
+        padded = n_blocks * LANES
+        self._blocks = np.zeros((n_blocks, N_ROWS, LANES))
+        self._flat_blocks = self._blocks.reshape(n_blocks, N_ROWS * LANES)
+        self._actions = np.zeros(padded, dtype=np.float32)
+        self._observations = np.zeros((padded, N_OBSERVATION), dtype=np.float32)
+        self._final_observations = np.zeros_like(self._observations)
+        self._outcome = np.zeros((N_OUTCOME, padded))
+        self.observations = self._observations[:size]
+        self.final_observations = self._final_observations[:size]
+        # Lanes beyond the last environment do the same work as the others, so that none of them runs wild.
+        self._reset(np.ones(padded, dtype=np.bool_))
+
+    def seed(self, index: int, generator: np.random.Generator) -> None:
+        """Start environment ``index``'s stream of random numbers from its ``np_random``."""
+        block, lane = divmod(index, LANES)
+        first = LAYOUT["stream_a"]
+        self._blocks[block, first : first + 4, lane] = stream_words(generator)
+
+    def reset(self, mask: npt.NDArray[np.bool_]) -> None:
+        """Start episodes where ``mask`` (n,) is true."""
+        self._reset(np.ascontiguousarray(mask, dtype=np.bool_))
+
+    def _reset(self, mask: npt.NDArray[np.bool_]) -> None:
+        kernel.reset(self._flat_blocks, mask, self._settings, self._prior, self._observations)
+
+    def step(self, actions: npt.ArrayLike) -> None:
+        """Apply actions (n,), in parts of the largest input and clipped to [-1, 1], for one sample."""
+        self._actions[: self.size] = actions
+        step = kernel.step_serial
+        if self._threads > 1:
+            import numba
+
+            numba.set_num_threads(self._threads)
+            step = kernel.step_parallel
+        step(
+            self._flat_blocks,
+            self._actions,
+            self._settings,
+            self._prior,
+            *self._recorded,
+            self._reset_mode,
+            self._observations,
+            self._final_observations,
+            self._outcome,
+        )
+
+    def outcome(self, name: str) -> FloatArray:
+        """(n,) what the last step left behind, by its name in `OUTCOME`; a view."""
+        return self._outcome[OUTCOME[name], : self.size]
+
+    def quantity(self, name: str) -> FloatArray:
+        """(n,) current values of a quantity of `LAYOUT`; a copy."""
+        return self._blocks[:, LAYOUT[name], :].reshape(-1)[: self.size].copy()
+
+    def belief(self, index: int, *, final: bool = False) -> Belief:
+        """The belief of environment ``index``; ``final``: the one its last episode ended with, if reset since."""
+        block, lane = divmod(index, LANES)
+        first = LAYOUT[SAVED[0]] if final else 0
+        record = self._blocks[block, first : first + RECORD_SIZE, lane]
+        return Belief(record, self.experiment.factorisation, self.experiment.is_nonlinear)
+
+    def truth(self) -> PhysicalParameters:
+        """The true oscillators, a batch of n; where a record is replayed, the twin of its circuit."""
+        return PhysicalParameters(*(self.quantity(name) for name in ("m", "c", "a", "b")))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles must not share memory through the views."""
+        state = self.__dict__.copy()
+        for view in ("observations", "final_observations", "_flat_blocks"):
+            del state[view]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._flat_blocks = self._blocks.reshape(len(self._blocks), -1)
+        self.observations = self._observations[: self.size]
+        self.final_observations = self._final_observations[: self.size]
+
+
+def spawn_seeds(seed: int | None, count: int) -> list[int]:
+    """Seeds of a batch's environments: the i-th does not depend on their number.
+
+    A single environment that is reset with the i-th of them follows row i of a batch that is reset with ``seed``.
+    """
+    children = np.random.SeedSequence(seed).spawn(count)
+    return [int(child.generate_state(1, np.uint64)[0]) for child in children]

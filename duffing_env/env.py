@@ -1,0 +1,306 @@
+"""The environments as `gymnasium.Env`: one experiment, one input per step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+
+from duffing_env.batch import Batch
+from duffing_env.experiment import Experiment, ReplayExperiment, SimulatedExperiment, make_experiment
+from duffing_env.kernel import RESET_BY_HAND
+from duffing_env.layout import OBSERVATION
+from estimator.belief import Belief
+from estimator.parameters import FloatArray, PhysicalParameters
+
+if TYPE_CHECKING:
+    from duffing_env.rendering import Screen
+
+Observation = npt.NDArray[np.float32]
+
+
+def observation_space() -> spaces.Box:
+    """The observation's space: a flat float32 Box with finite bounds, one per entry of `OBSERVATION`."""
+    low, high = np.array(list(OBSERVATION.values()), dtype=np.float32).T
+    return spaces.Box(low.copy(), high.copy(), dtype=np.float32)
+
+
+def action_space() -> spaces.Box:
+    """The action's space: the input in parts of the largest."""
+    return spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
+
+
+class DuffingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
+    """Choose the input of a Duffing oscillator so that its parameters are identified.
+
+    ## Description
+
+    An oscillator m x'' + c x' + a x + b x³ = u + w with unknown m, c, a, b is sampled every 1.6384 ms. At each step
+    the agent applies the input u_t, the plant moves from x_t to x_{t+1}, the sensor gives y_{t+1} = x_{t+1} + v, and
+    an online estimator updates its posterior over the coefficients (θ1, θ2, θ3, η) of the difference equation
+
+        x_{t+1} = θ1 x_t + θ2 x_t³ + θ3 x_{t-1} + η u_t + w̃_t
+
+    by free energy minimisation (Kouw 2020). **The observation is that posterior.** Good inputs make it contract.
+
+    ## Action space
+
+    `Box(-1, 1, (1,), float32)`; values outside are clipped.
+
+    | Num | Action | Min | Max | Unit |
+    |-----|--------|-----|-----|------|
+    | 0 | input u_t in parts of ``max_input`` | -1 | 1 | ``max_input`` (0.15 V) |
+
+    ## Observation space
+
+    `Box(22, float32)`, every entry clipped to its bounds.
+
+    | Num | Observation | Min | Max |
+    |-----|-------------|-----|-----|
+    | 0-3 | posterior means of θ1, θ2, θ3, η: deviation from the prior's, in its standard deviations | -10 | 10 |
+    | 4-7 | log of their standard deviations, relative to the prior's (0 at the start, falling) | -20 | 5 |
+    | 8-13 | posterior correlations θ1θ2, θ1θ3, θ1η, θ2θ3, θ2η, θ3η | -1 | 1 |
+    | 14, 15 | log E[γ], log E[ξ] (process and measurement precision), relative to the prior's | -20 | 20 |
+    | 16, 17 | filtered states E[x_t], E[x_{t-1}] in parts of ``max_output`` | -2 | 2 |
+    | 18 | last input in parts of ``max_input`` | -1 | 1 |
+    | 19 | last output in parts of ``max_output`` | -2 | 2 |
+    | 20 | time left, in parts of the horizon | 0 | 1 |
+    | 21 | input energy budget left; 1 on tracks without a budget | 0 | 1 |
+
+    ## Reward
+
+    By name (``reward=``), all in nats but ``parameter_error``; C is the posterior covariance of (θ, η), c* the truth.
+
+    | Name | Reward of a step | Range |
+    |------|------------------|-------|
+    | ``information_gain`` (default) | ½ log det C_{t-1} - ½ log det C_t | about 20 over an episode, mostly >= 0 |
+    | ``log_posterior`` | log q_t(c*) - log q_{t-1}(c*) | unbounded below; its mean is at most the information gain |
+    | ``parameter_error`` | e_{t-1} - e_t, e = mean of min(relative error, 1) over m, c, a, b | [-1, 1] |
+    | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
+
+    ## Starting state
+
+    m, c, a and b are drawn log-uniformly within ±30 % of the Silverbox circuit's twin (6.4568e-6 s², 2.5717e-4 s,
+    1.1747, 3.7672 V⁻²). The oscillator is at rest. The posterior is the prior: Gaussian, with the mean and covariance
+    of the coefficients of oscillators so drawn; γ and ξ are Gamma of shape 2 about the true noise precisions.
+
+    ## Episode end
+
+    - Termination: \\|y\\| > ``max_output`` (0.6 V); or a number that is not finite (``info["diverged"]``), which leaves
+      the belief as it was before that step.
+    - Truncation: after ``horizon`` (256) samples.
+
+    ## Information
+
+    Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], ``diverged``. At the end of an
+    episode also ``belief`` (`estimator.Belief`) and ``truth`` (`estimator.PhysicalParameters`). At any time:
+    ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+
+    ## Arguments
+
+    | Argument | Default | Meaning |
+    |----------|---------|---------|
+    | ``factorisation`` | ``structured`` | the estimator's: ``structured`` or ``mean_field`` |
+    | ``iterations`` | 3 or 10 | variational iterations per sample (structured, mean field) |
+    | ``reward`` | ``information_gain`` | see above |
+    | ``max_input`` | 0.15 | input limit [V] |
+    | ``max_output`` | 0.6 | displacement limit [V] |
+    | ``horizon`` | 256 | samples of an episode |
+    | ``process_noise`` | 5e-4 | standard deviation of w̃ [V] |
+    | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
+    | ``spread`` | 0.3 | half width of the parameters' range, relative |
+    | ``noise_shape`` | 2 | shape of the Gamma priors of γ and ξ |
+    | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
+
+    >>> import gymnasium as gym
+    >>> import duffing_env
+    >>> env = gym.make("duffing_env/Amplitude-v0", reward="log_posterior")
+    >>> observation, info = env.reset(seed=1)
+    >>> total = 0.0
+    >>> for _ in range(256):
+    ...     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    ...     total += reward
+    >>> truncated, sorted(info)
+    (True, ['belief', 'diverged', 'information_gain', 'log_posterior_gain', 'truth'])
+    >>> m, c, a, b = info["belief"].physical()[0]
+    >>> bool(abs(m / info["truth"].m - 1) < 0.05)
+    True
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}  # noqa: RUF012
+    experiment_kind: ClassVar[type[Experiment]] = SimulatedExperiment
+
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode must be one of {self.metadata['render_modes']}, but is {render_mode!r}")
+        self.experiment = make_experiment(self.experiment_kind, options)
+        self.observation_space = observation_space()
+        self.action_space = action_space()
+        self.render_mode = render_mode
+        self._batch = Batch(self.experiment, 1, RESET_BY_HAND)
+        self._streamed: np.random.Generator | None = None
+        self._running = False
+        self._screen: Screen | None = None
+
+    @property
+    def max_input(self) -> float:
+        """Input of the action 1 [V]."""
+        return self.experiment.max_input
+
+    @property
+    def horizon(self) -> int:
+        """Samples of an episode that no limit ends."""
+        return self.experiment.samples
+
+    @property
+    def belief(self) -> Belief:
+        """The posterior now."""
+        return self._batch.belief(0)
+
+    @property
+    def truth(self) -> PhysicalParameters:
+        """The oscillator that is to be identified."""
+        truth = self._batch.truth()
+        return PhysicalParameters(*(float(value[0]) for value in (truth.m, truth.c, truth.a, truth.b)))  # type: ignore[index]
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Draw an oscillator and start an episode; ``options`` has no keys."""
+        super().reset(seed=seed)
+        if self.np_random is not self._streamed:
+            self._streamed = self.np_random
+            self._batch.seed(0, self.np_random)
+        self._batch.reset(np.ones(1, dtype=np.bool_))
+        self._running = True
+        if self.render_mode is not None:
+            self._start_drawing()
+        return self._batch.observations[0].copy(), {}
+
+    def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Apply one input for one sample.
+
+        Raises:
+            ValueError: if the action is not one finite number; nothing has changed then.
+            gymnasium.error.ResetNeeded: before the first reset, and after the end of an episode.
+        """
+        if not self._running:
+            raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
+        value = _one_number(action)
+        batch = self._batch
+        batch.step(value)
+        terminated = bool(batch.outcome("terminated")[0])
+        truncated = bool(batch.outcome("truncated")[0])
+        info: dict[str, Any] = {name: batch.outcome(name)[0].item() for name in self._reported}
+        for flag in self._flags:
+            info[flag] = bool(batch.outcome(flag)[0])
+        if terminated or truncated:
+            self._running = False
+            info["belief"] = self.belief
+            info["truth"] = self.truth
+        if self._screen is not None:
+            self._draw()
+        return batch.observations[0].copy(), batch.outcome("reward")[0].item(), terminated, truncated, info
+
+    _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
+    _flags: ClassVar[tuple[str, ...]] = ("diverged",)
+
+    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+        """Input, output and posterior so far: an RGB array (height, width, 3) in mode ``rgb_array``."""
+        if self.render_mode is None or self._screen is None:
+            gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array', and reset it")
+            return None
+        return self._screen.frame() if self.render_mode == "rgb_array" else None
+
+    def _start_drawing(self) -> None:
+        from duffing_env.rendering import Screen
+
+        if self._screen is None:
+            self._screen = Screen(
+                self.render_mode, self.max_input, self.experiment.max_output, self.metadata["render_fps"]
+            )  # fmt: skip
+        self._screen.start(self.truth, self.belief, self.horizon)
+
+    def _draw(self) -> None:
+        assert self._screen is not None
+        u, y = self._batch.quantity("u")[0], self._batch.quantity("y")[0]
+        self._screen.add(float(u), float(y), self.belief)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._screen is not None:
+            self._screen.close()
+            self._screen = None
+
+
+class SilverboxReplayEnv(DuffingEnv):
+    """The paper's experiment: the recorded Silverbox input, sample by sample, through the environment.
+
+    ## Description
+
+    The record of the Silverbox circuit (Wigren and Schoukens 2013) takes the place of the plant. A record can only
+    answer the input that was applied: an action further than float32 rounding from the recorded input ends the
+    episode, flagged ``off_record``. Otherwise the recorded float64 input and output are what the estimator gets.
+    The reference policies ``silverbox-multisine`` and ``silverbox-arrow`` of `agents` play the record.
+
+    ## Action space, observation space, reward
+
+    As `DuffingEnv`. The true parameters of a circuit are not known: ``log_posterior`` and ``parameter_error`` are
+    relative to its twin, identified from the whole training part.
+
+    ## Starting state
+
+    The first sample of the regime; the prior is the one named by ``prior``.
+
+    ## Episode end
+
+    - Termination: an action off the record; \\|y\\| > ``max_output``; a number that is not finite.
+    - Truncation: the end of the regime.
+
+    ## Information
+
+    As `DuffingEnv`, and ``off_record``.
+
+    ## Arguments
+
+    ``factorisation``, ``iterations``, ``reward``, ``max_input``, ``max_output`` and ``render_mode`` as `DuffingEnv`.
+
+    | Argument | Default | Meaning |
+    |----------|---------|---------|
+    | ``regime`` | ``multisine`` | the paper's training part, or ``arrow``, its validation part |
+    | ``prior`` | ``silverbox_twin`` | or ``published_run``, ``paper_text`` |
+    | ``input_delay`` | 1 | samples between an input and the output it acts on; the published run had 0 |
+    | ``nonlinear`` | True | whether the estimator's model has the cubic term |
+    | ``as_published`` | False | mean field with the two departures of the published run |
+    | ``data`` | None | file or folder of the record; searched for where None |
+
+    Raises:
+        duffing_env.silverbox.RecordNotFound: saying where to get the record and where to put it.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    experiment_kind: ClassVar[type[Experiment]] = ReplayExperiment
+    _flags: ClassVar[tuple[str, ...]] = ("diverged", "off_record")
+
+    @property
+    def recorded_input(self) -> FloatArray:
+        """The inputs that the record can answer, in order [V]."""
+        return self.experiment.recorded[0]
+
+
+def _one_number(action: npt.ArrayLike) -> float:
+    value = np.asarray(action, dtype=np.float64)
+    if value.size != 1 or not np.isfinite(value).all():
+        raise ValueError(f"action must be one finite number in [-1, 1], but is {action!r}")
+    return value.item()

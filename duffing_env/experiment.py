@@ -1,0 +1,240 @@
+"""What is fixed about an experiment: limits, noises, priors, the estimator and the reward.
+
+The fields of these classes are the keyword arguments of `gymnasium.make`; all of them are JSON-able.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from duffing_env.layout import SETTINGS
+from duffing_env.rewards import reward_number
+from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
+from estimator.belief import Prior
+from estimator.inference import DEFAULT_ITERATIONS
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.record import RECORD
+
+_PRIORS = ("silverbox_twin", "published_run", "paper_text")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What all experiments have.
+
+    Attributes:
+        factorisation: of the estimator: ``structured`` or ``mean_field``.
+        iterations: variational iterations per sample; 3 structured and 10 mean field where it is None.
+        reward: its name, see `duffing_env.rewards`.
+        max_input: input of the action 1 [V].
+        max_output: displacement limit [V]: the episode ends at \\|y\\| above it.
+    """
+
+    factorisation: str = "structured"
+    iterations: int | None = None
+    reward: str = "information_gain"
+    max_input: float = 0.15
+    max_output: float = 0.6
+
+    def __post_init__(self) -> None:
+        if self.factorisation not in DEFAULT_ITERATIONS:
+            raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {self.factorisation!r}")
+        if self.iterations is not None:
+            self._check_count("iterations")
+        reward_number(self.reward)
+        self._check_positive("max_input")
+        self._check_positive("max_output")
+
+    def _check_positive(self, name: str) -> None:
+        value = getattr(self, name)
+        if not (isinstance(value, int | float | np.number) and 0 < value < np.inf):
+            raise ValueError(f"{name} must be a positive, finite number, but is {value!r}; pass a value above 0")
+
+    def _check_count(self, name: str) -> None:
+        value = getattr(self, name)
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"{name} must be a whole number of at least 1, but is {value!r}")
+
+    @property
+    def samples(self) -> int:
+        """Samples of an episode that no limit ends."""
+        raise NotImplementedError
+
+    @property
+    def believed(self) -> Prior:
+        """The belief that every episode starts from."""
+        raise NotImplementedError
+
+    @property
+    def is_nonlinear(self) -> bool:
+        """Whether the estimator's model has the cubic term."""
+        return True
+
+    @property
+    def recorded(self) -> tuple[FloatArray, FloatArray]:
+        """Recorded input and output [V]; of one sample each where the plant is simulated."""
+        return np.zeros(1), np.zeros(1)
+
+    @property
+    def plant_settings(self) -> dict[str, float]:
+        """Entries of `SETTINGS` that describe the plant."""
+        raise NotImplementedError
+
+    @property
+    def prior_record(self) -> FloatArray:
+        """The prior as the record (RECORD_SIZE,) that the kernel copies at a reset."""
+        return self.believed.to_record(factorisation=self.factorisation, nonlinear=self.is_nonlinear)
+
+    @property
+    def settings(self) -> FloatArray:
+        """The experiment as the kernel is told of it, (len(SETTINGS),)."""
+        prior = dict(zip(RECORD, self.prior_record, strict=True))
+        center = SILVERBOX_TWIN
+        values = {
+            "max_input": self.max_input,
+            "max_output": self.max_output,
+            "horizon": self.samples,
+            "process_noise": 0.0,
+            "measurement_noise": 0.0,
+            "spread": 0.0,
+            **dict(zip(("center_m", "center_c", "center_a", "center_b"), (center.m, center.c, center.a, center.b))),
+            "step": SAMPLING_STEP,
+            "reward": reward_number(self.reward),
+            "structured": self.factorisation == "structured",
+            "iterations": self.iterations or DEFAULT_ITERATIONS[self.factorisation],
+            "as_published": False,
+            "nonlinear": self.is_nonlinear,
+            "replayed": False,
+            "delay": 0,
+            **{f"prior_{c}": prior[c] for c in ("t1", "t2", "t3", "e")},
+            **{f"scale_{c}": _inverse_std(prior[f"P_{c}_{c}"]) for c in ("t1", "t2", "t3", "e")},
+            "prior_log_gamma": np.log(prior["g_shape"] / prior["g_rate"]),
+            "prior_log_xi": np.log(prior["n_shape"] / prior["n_rate"]),
+            **self.plant_settings,
+        }
+        return np.array([values[name] for name in SETTINGS], dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class SimulatedExperiment(Experiment):
+    """An experiment on the plant ``difference``, with a new oscillator in every episode.
+
+    Attributes:
+        horizon: samples of an episode; it is then truncated.
+        process_noise: standard deviation of the process noise w̃, on x [V].
+        measurement_noise: standard deviation of the measurement noise v, on y [V].
+        spread: m, c, a and b are drawn log-uniformly on the twin's value * [1 - spread, 1 + spread]; in (0, 1).
+        noise_shape: shape of the Gamma priors of γ and ξ, which are centred on the true precisions; 2 is weak.
+    """
+
+    horizon: int = 256
+    process_noise: float = 5e-4
+    measurement_noise: float = 5e-4
+    spread: float = 0.3
+    noise_shape: float = 2.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_count("horizon")
+        for name in ("process_noise", "measurement_noise", "spread", "noise_shape"):
+            self._check_positive(name)
+        if self.spread >= 1:
+            raise ValueError(f"spread must be below 1, but is {self.spread!r}; masses are positive")
+
+    @property
+    def samples(self) -> int:
+        return self.horizon
+
+    @cached_property
+    def believed(self) -> Prior:
+        return Prior.silverbox_twin(self.spread, self.process_noise, self.measurement_noise, self.noise_shape)
+
+    @property
+    def plant_settings(self) -> dict[str, float]:
+        return {
+            "process_noise": self.process_noise,
+            "measurement_noise": self.measurement_noise,
+            "spread": self.spread,
+        }
+
+
+@dataclass(frozen=True)
+class ReplayExperiment(Experiment):
+    """The recorded Silverbox experiment. A record can only answer the input that was applied.
+
+    Attributes:
+        regime: part of the record: ``multisine`` (the paper's training part) or ``arrow`` (its validation part).
+        prior: name of the prior: ``silverbox_twin``, ``published_run`` or ``paper_text``.
+        input_delay: samples between a recorded input and the output it acts on: 1 as Eq. (2) says, 0 as published.
+        nonlinear: whether the estimator's model has the cubic term.
+        as_published: mean field with the two departures of the published run.
+        data: file or folder of the record; searched for where it is None (`duffing_env.silverbox.load_record`).
+    """
+
+    regime: str = "multisine"
+    prior: str = "silverbox_twin"
+    input_delay: int = 1
+    nonlinear: bool = True
+    as_published: bool = False
+    data: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, choices in (("regime", REGIME_NAMES), ("prior", _PRIORS), ("input_delay", (0, 1))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {list(choices)}, but is {getattr(self, name)!r}")
+        if self.as_published and self.factorisation != "mean_field":
+            raise ValueError(
+                f"as_published goes with factorisation='mean_field', but factorisation is {self.factorisation!r}"
+            )
+        peak = float(np.abs(self._regime.u).max())
+        if self.max_input < peak:
+            raise ValueError(
+                f"max_input must reach the record's largest input, {peak} V, but is {self.max_input}; pass 0.15"
+            )
+
+    @cached_property
+    def _regime(self) -> Regime:
+        regime: Regime = getattr(load_record(self.data), self.regime)
+        return regime
+
+    @property
+    def samples(self) -> int:
+        return len(self._regime.u) - self.input_delay
+
+    @cached_property
+    def believed(self) -> Prior:
+        prior: Prior = getattr(Prior, self.prior)()
+        return prior
+
+    @property
+    def is_nonlinear(self) -> bool:
+        return self.nonlinear
+
+    @property
+    def recorded(self) -> tuple[FloatArray, FloatArray]:
+        return self._regime.u, self._regime.y
+
+    @property
+    def plant_settings(self) -> dict[str, float]:
+        return {"as_published": self.as_published, "replayed": True, "delay": self.input_delay}
+
+
+def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:
+    """An experiment from keyword arguments; ValueError for an unknown one, with the nearest known."""
+    known = [field.name for field in fields(kind)]
+    for name in options:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"{name}={options[name]!r} is no option of this environment, which has {known}{hint}")
+    return kind(**options)
+
+
+def _inverse_std(variance: float) -> float:
+    return 1.0 / np.sqrt(variance) if variance > 0 else 0.0

@@ -1,0 +1,56 @@
+"""The layout of an environment: its quantities in a block, what it is told, what a step leaves behind.
+
+Environments lie in blocks of `estimator.lanes.LANES`. A block holds an estimator's rows first (`estimator.record`),
+then those of `LAYOUT` below, so that the estimator's functions run on it as they are.
+"""
+
+from __future__ import annotations
+
+from estimator.lanes import rows
+from estimator.record import LAYOUT as BELIEF_LAYOUT
+from estimator.record import N_ROWS as N_BELIEF_ROWS
+from estimator.record import RECORD
+
+#: Entries of the observation, in order, with their bounds; the environment's docstring says what they are.
+OBSERVATION = {
+    **{f"mean_{c}": (-10.0, 10.0) for c in ("t1", "t2", "t3", "e")},
+    **{f"log_std_{c}": (-20.0, 5.0) for c in ("t1", "t2", "t3", "e")},
+    **{f"corr_{pair}": (-1.0, 1.0) for pair in ("12", "13", "1e", "23", "2e", "3e")},
+    **{f"log_{noise}": (-20.0, 20.0) for noise in ("gamma", "xi")},
+    **{f"state_{lag}": (-2.0, 2.0) for lag in ("x0", "x1")},
+    "last_input": (-1.0, 1.0),
+    "last_output": (-2.0, 2.0),
+    "time_left": (0.0, 1.0),
+    "budget_left": (0.0, 1.0),
+}
+N_OBSERVATION = len(OBSERVATION)
+
+#: What the kernel is told about a track: (len(SETTINGS),) float64, the same for all environments.
+SETTINGS = rows(
+    "max_input max_output horizon process_noise measurement_noise spread center_m center_c center_a center_b step",
+    "reward structured iterations as_published nonlinear replayed delay",
+    "prior_t1 prior_t2 prior_t3 prior_e scale_t1 scale_t2 scale_t3 scale_e prior_log_gamma prior_log_xi",
+)
+
+#: What a step leaves for an environment's face: rows of (len(OUTCOME), n) float64.
+OUTCOME = rows("reward information_gain log_posterior_gain terminated truncated diverged off_record")
+N_OUTCOME = len(OUTCOME)
+
+#: The record before the step, to return to where the step came to nothing.
+SAVED = tuple(f"saved_{name}" for name in RECORD)
+
+#: Name of a quantity to its row.
+LAYOUT = {
+    **BELIEF_LAYOUT,
+    **rows(
+        "stream_a stream_b stream_c stream_d noise_w noise_v",
+        "m c a b true_t1 true_t2 true_t3 true_e",
+        "x last_x elapsed waiting recorded_u recorded_y",
+        "log_det log_density error",
+        " ".join(OUTCOME),
+        " ".join(f"obs_{name}" for name in OBSERVATION),
+        " ".join(SAVED),
+        start=N_BELIEF_ROWS,
+    ),
+}
+N_ROWS = len(LAYOUT)

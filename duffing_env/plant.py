@@ -1,0 +1,41 @@
+"""The plants: what the oscillator does with an input, and what the sensor shows.
+
+``difference`` is Eq. (2) of the paper. It is explicit, and blows up above about 0.75 V where the real circuit does
+not, so every track ends the episode at a displacement limit. ``replay`` is a recorded pair of input and output.
+"""
+
+from __future__ import annotations
+
+from duffing_env.layout import LAYOUT
+from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
+from estimator.lanes import lanewise
+
+# A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).
+_FLOAT32_ROUNDING = 2.0**-22
+
+
+@lanewise(LAYOUT, "stream_a stream_b stream_c stream_d noise_w noise_v")
+def draw_noise(stream_a, stream_b, stream_c, stream_d, waiting):
+    """Two standard normal numbers. The stream of an environment that waits for its reset stands still."""
+    first, a, b, c, d = draw(as_word(stream_a), as_word(stream_b), as_word(stream_c), as_word(stream_d))
+    second, a, b, c, d = draw(a, b, c, d)
+    noise_w, noise_v = normal_pair(to_unit(first), to_unit(second))
+    live = waiting == 0.0
+    return (
+        as_bits(a) if live else stream_a, as_bits(b) if live else stream_b,
+        as_bits(c) if live else stream_c, as_bits(d) if live else stream_d, noise_w, noise_v,
+    )  # fmt: skip
+
+
+@lanewise(LAYOUT, "x last_x y", uniform="process_noise measurement_noise")
+def move_plant(x, last_x, u, true_t1, true_t2, true_t3, true_e, noise_w, noise_v, process_noise, measurement_noise):
+    """The plant ``difference``: Eq. (2) with Gaussian process noise, and the sensor."""
+    moved = true_t1 * x + true_t2 * x * x * x + true_t3 * last_x + true_e * u + process_noise * noise_w
+    return moved, x, moved + measurement_noise * noise_v
+
+
+@lanewise(LAYOUT, "u y off_record", uniform="max_input")
+def play_record(u, recorded_u, recorded_y, max_input):
+    """The plant ``replay``: a record answers the recorded input only."""
+    deviates = abs(u - recorded_u) > _FLOAT32_ROUNDING * max_input
+    return recorded_u, recorded_y, 1.0 if deviates else 0.0

@@ -1,0 +1,139 @@
+"""The rewards by name. What each is worth, and how it can be fooled, stands here; the kernel computes them.
+
+================== =============================================================================================
+``information_gain`` entropy decrease of q(θ, η) in nats: ½ log det C_{t-1} - ½ log det C_t. What the estimator
+                     believes it learned. Equals the true information gain only where the posterior is calibrated
+                     (structured); an over-confident one (mean field) pays for its own mistakes.
+``log_posterior``    increase of log q(θ, η) at the true coefficients, in nats. Its expected sum is a lower bound on
+                     the expected information gain, whatever q is: over-confidence lowers it. Needs the truth, so it
+                     is for training and for tests.
+``parameter_error``  decrease of the mean relative error of the estimates of m, c, a and b, each error capped at 1;
+                     an episode's sum lies in [-1, 1]. Noisy: the error of one estimate is one draw of what its
+                     posterior describes.
+``free_energy``      minus the free energy of the sample in nats: how well the output was predicted. Rewards inputs
+                     whose outcome is known already, so an agent that maximises it learns nothing; the foil.
+================== =============================================================================================
+
+Information gain and log posterior telescope: an episode's sum depends on its first and last belief only.
+"""
+
+from __future__ import annotations
+
+import difflib
+
+from duffing_env.layout import LAYOUT, OUTCOME
+from estimator.elementary import log
+from estimator.lanes import at_lane, inlined, lanewise
+
+#: Name of a reward to its number in the kernel.
+REWARDS = {"information_gain": 0, "log_posterior": 1, "parameter_error": 2, "free_energy": 3}
+
+
+def reward_number(name: str) -> int:
+    """The kernel's number of a reward; ValueError for an unknown name."""
+    if name not in REWARDS:
+        near = difflib.get_close_matches(str(name), REWARDS, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"reward must be one of {list(REWARDS)}, but is {name!r}{hint}")
+    return REWARDS[name]
+
+
+@inlined
+def _appraise(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear):
+    """Log det of the coefficients' covariance, and log density at the true ones, by an L D Lᵀ factorisation.
+
+    The order is θ1, θ3, η, θ2, so that a θ2 known to be zero is left out by leaving out the last pivot. ``sound``
+    says that all pivots are positive.
+    """
+    P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e = P
+    d1 = P_t1_t1
+    l31, le1, l21 = P_t1_t3 / d1, P_t1_e / d1, P_t1_t2 / d1
+    d3 = P_t3_t3 - l31 * P_t1_t3
+    w_e3 = P_t3_e - le1 * P_t1_t3
+    w_23 = P_t2_t3 - l21 * P_t1_t3
+    le3, l23 = w_e3 / d3, w_23 / d3
+    de = P_e_e - le1 * P_t1_e - le3 * w_e3
+    w_2e = P_t2_e - l21 * P_t1_e - l23 * w_e3
+    l2e = w_2e / de
+    d2 = P_t2_t2 - l21 * P_t1_t2 - l23 * w_23 - l2e * w_2e
+    z1 = true_t1 - t1
+    z3 = true_t3 - t3 - l31 * z1
+    ze = true_e - e - le1 * z1 - le3 * z3
+    z2 = true_t2 - t2 - l21 * z1 - l23 * z3 - l2e * ze
+    d2 = d2 if nonlinear else 1.0
+    z2 = z2 if nonlinear else 0.0
+    sound = d1 > 0.0 and d3 > 0.0 and de > 0.0 and d2 > 0.0
+    log_det = log(d1 * d3 * de * d2)
+    return log_det, -0.5 * (log_det + z1 * z1 / d1 + z2 * z2 / d2 + z3 * z3 / d3 + ze * ze / de), sound
+
+
+@inlined
+def _relative_error(t1, t2, t3, e, m, c, a, b, step):
+    """Mean relative error of the estimates of m, c, a, b by Eq. (4), each capped at 1."""
+    weight = 1.0 / e
+    return 0.25 * (
+        _capped(-t3 * step * step * weight / m)
+        + _capped((1.0 + t3) * step * weight / c)
+        + _capped((1.0 - t1 - t3) * weight / a)
+        + _capped(-t2 * weight / b)
+    )
+
+
+@inlined
+def _capped(ratio):
+    deviation = abs(ratio - 1.0)
+    return deviation if deviation < 1.0 else 1.0
+
+
+@lanewise(
+    LAYOUT,
+    " ".join(OUTCOME) + " log_det log_density error elapsed",
+    uniform="max_output horizon step nonlinear reward_kind",
+)
+def settle(
+    x0, x1, x2, t1, t2, t3, e, P_x0_x0, P_x1_x1, P_x2_x2,
+    P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
+    g_rate, n_rate, m, c, a, b, true_t1, true_t2, true_t3, true_e,
+    x, y, elapsed, log_det, log_density, error, off_record,
+    max_output, horizon, step, nonlinear, reward_kind,
+):  # fmt: skip
+    """What the step was worth, and whether the episode ends. A number that is not finite ends it, flagged."""
+    P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
+    new_log_det, new_log_density, sound = _appraise(
+        t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0
+    )  # fmt: skip
+    new_error = _relative_error(t1, t2, t3, e, m, c, a, b, step)
+    total = x + y + x0 + x1 + x2 + t1 + t2 + t3 + e + P_x0_x0 + P_x1_x1 + P_x2_x2 + g_rate + n_rate
+    total += new_log_density + new_error
+    diverged = 0.0 if (total - total == 0.0 and sound and g_rate > 0.0 and n_rate > 0.0) else 1.0
+    void = diverged != 0.0 or off_record != 0.0
+    new_log_det = log_det if void else new_log_det
+    new_log_density = log_density if void else new_log_density
+    new_error = error if void else new_error
+    information_gain = 0.5 * (log_det - new_log_det)
+    log_posterior_gain = new_log_density - log_density
+    reward = information_gain
+    if reward_kind == 1.0:
+        reward = log_posterior_gain
+    if reward_kind == 2.0:
+        reward = error - new_error
+    if reward_kind == 3.0:
+        reward = 0.0
+    terminated = 1.0 if (void or abs(y) > max_output) else 0.0
+    elapsed += 1.0
+    truncated = 1.0 if (elapsed >= horizon and terminated == 0.0) else 0.0
+    return (
+        reward, information_gain, log_posterior_gain, terminated, truncated, diverged, off_record,
+        new_log_det, new_log_density, new_error, elapsed,
+    )  # fmt: skip
+
+
+@at_lane(LAYOUT, "log_det log_density error", uniform="step nonlinear")
+def appraise_prior(
+    t1, t2, t3, e, P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
+    m, c, a, b, true_t1, true_t2, true_t3, true_e, step, nonlinear,
+):  # fmt: skip
+    """Log det, log density and error of a lane whose belief is the prior."""
+    P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
+    log_det, log_density, _ = _appraise(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0)
+    return log_det, log_density, _relative_error(t1, t2, t3, e, m, c, a, b, step)

@@ -1,0 +1,29 @@
+"""The registered environments. Light to import: Gymnasium does so through its plugin hook."""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: Id of a track to what it is registered with. Any change of numbers or spaces is a new version.
+TRACKS: dict[str, dict[str, Any]] = {
+    "duffing_env/Amplitude-v0": {
+        "entry_point": "duffing_env.env:DuffingEnv",
+        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
+        "max_episode_steps": 256,
+        "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
+    },
+    "duffing_env/SilverboxReplay-v0": {
+        "entry_point": "duffing_env.env:SilverboxReplayEnv",
+        "vector_entry_point": "duffing_env.vector_env:SilverboxReplayVectorEnv",
+        "kwargs": {"regime": "multisine"},
+    },
+}
+
+
+def register_tracks() -> None:
+    """Register every track with Gymnasium; what is registered already is left as it is."""
+    from gymnasium.envs.registration import register, registry
+
+    for track_id, spec in TRACKS.items():
+        if track_id not in registry:
+            register(track_id, **spec)

@@ -1,0 +1,236 @@
+"""The environments as `gymnasium.vector.VectorEnv`: many experiments, stepped inside one compiled call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from duffing_env.batch import Batch, spawn_seeds
+from duffing_env.env import DuffingEnv, SilverboxReplayEnv, action_space, observation_space
+from duffing_env.experiment import Experiment, make_experiment
+from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
+from estimator.belief import Belief
+from estimator.parameters import FloatArray, PhysicalParameters
+
+_RESET_MODES = {
+    AutoresetMode.DISABLED: RESET_BY_HAND,
+    AutoresetMode.NEXT_STEP: RESET_NEXT_STEP,
+    AutoresetMode.SAME_STEP: RESET_SAME_STEP,
+}
+
+Observations = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+
+
+class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDArray[Any]]):
+    """Many `DuffingEnv` at once: the same numbers, row by row.
+
+    Row i, reset with seed s, follows a single environment that is reset with ``spawn_seeds(s, num_envs)[i]``, bit for
+    bit, whatever the number of rows and threads. A row's random numbers go on over its episodes; autoreset does not
+    seed it anew. Rows that are being reset are neither integrated nor inferred.
+
+    Args:
+        num_envs: number of rows.
+        max_episode_steps: sets ``horizon`` where that is longer.
+        autoreset_mode: when a finished row starts its next episode: in the step after (``NEXT_STEP``, the default),
+            in the same step (``SAME_STEP``: ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended
+            with), or by ``reset(options={"reset_mask": mask})`` (``DISABLED``).
+        copy: give out copies of the observations; without it they are overwritten by the next step.
+        threads: threads that step the rows; results do not depend on it.
+        render_mode: None; render a single environment to look at one.
+        options: those of the single environment.
+
+    Infos are arrays with masks under ``_key``: of every step ``information_gain`` and ``log_posterior_gain`` [nats]
+    and the flags; at the end of an episode ``belief`` and ``truth``.
+
+    >>> import gymnasium as gym
+    >>> envs = gym.make_vec("duffing_env/Amplitude-v0", num_envs=4, vectorization_mode="vector_entry_point")
+    >>> observations, infos = envs.reset(seed=1)
+    >>> observations, rewards, terminated, truncated, infos = envs.step(envs.action_space.sample())
+    >>> observations.shape, rewards.shape, sorted(infos)[:2]
+    ((4, 22), (4,), ['_diverged', '_information_gain'])
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    single: ClassVar[type[DuffingEnv]] = DuffingEnv
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
+        threads: int = 1,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        for name, value in (("num_envs", num_envs), ("threads", threads)):
+            if not isinstance(value, int | np.integer) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, but is {value!r}")
+        if render_mode is not None:
+            raise ValueError(f"render_mode must be None, but is {render_mode!r}; render a single environment")
+        if max_episode_steps is not None and "horizon" in options:
+            options["horizon"] = min(options["horizon"], max_episode_steps)
+        try:
+            self._autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            modes = [mode.value for mode in AutoresetMode]
+            raise ValueError(f"autoreset_mode must be one of {modes}, but is {autoreset_mode!r}") from None
+        self.num_envs = int(num_envs)
+        self.metadata = {**type(self).metadata, "autoreset_mode": self._autoreset_mode}
+        self.render_mode = None
+        self.single_observation_space = observation_space()
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
+        self._batch = Batch(self.experiment, self.num_envs, _RESET_MODES[self._autoreset_mode], int(threads))
+        self._copy = copy
+        self._seeded = False
+        self._finished: Flags = np.ones(self.num_envs, dtype=np.bool_)
+        self._everywhere: Flags = np.ones(self.num_envs, dtype=np.bool_)
+
+    @property
+    def max_input(self) -> float:
+        """Input of the action 1 [V]."""
+        return self.experiment.max_input
+
+    @property
+    def horizon(self) -> int:
+        """Samples of an episode that no limit ends."""
+        return self.experiment.samples
+
+    @property
+    def truth(self) -> PhysicalParameters:
+        """The oscillators that are to be identified, a batch of ``num_envs``."""
+        return self._batch.truth()
+
+    def belief(self, index: int) -> Belief:
+        """The posterior of row ``index`` now."""
+        return self._batch.belief(index)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start episodes in all rows, or in those of ``options["reset_mask"]`` (num_envs,).
+
+        Args:
+            seed: of the batch, from which `spawn_seeds` makes the rows'; or one seed for each row.
+            options: may hold ``reset_mask``.
+        """
+        mask = self._reset_mask(options)
+        if seed is not None or not self._seeded:
+            self._seed(seed, mask)
+        self._batch.reset(mask)
+        self._finished[mask] = False
+        return self._observations(), {}
+
+    def step(
+        self, actions: npt.NDArray[np.float32]
+    ) -> tuple[Observations, npt.NDArray[np.float64], Flags, Flags, dict[str, Any]]:
+        """Apply one input to each row for one sample.
+
+        Raises:
+            ValueError: if the actions are not finite numbers of shape (num_envs, 1); nothing has changed then.
+            gymnasium.error.ResetNeeded: before the first reset; with ``DISABLED`` also for finished rows.
+        """
+        actions = np.asarray(actions)
+        if actions.shape != (self.num_envs, 1):
+            raise ValueError(f"actions must have shape {(self.num_envs, 1)}, but have {actions.shape}; one per row")
+        if not np.isfinite(actions).all():
+            row = int(np.argmin(np.isfinite(actions)))
+            raise ValueError(f"actions must be finite, but row {row} is {actions[row, 0]}; pass values in [-1, 1]")
+        if self._finished.any() and (not self._seeded or self._autoreset_mode == AutoresetMode.DISABLED):
+            rows = np.flatnonzero(self._finished).tolist()
+            raise ResetNeeded(f"rows {rows} have finished or not begun: reset them with options={{'reset_mask': mask}}")
+        batch = self._batch
+        being_reset = self._finished if self._autoreset_mode == AutoresetMode.NEXT_STEP else None
+        batch.step(actions[:, 0])
+        terminated = batch.outcome("terminated") != 0.0
+        truncated = batch.outcome("truncated") != 0.0
+        finished = terminated | truncated
+        infos = self._infos(self._everywhere if being_reset is None else ~being_reset)
+        if finished.any():
+            self._add_endings(infos, finished)
+        self._finished = finished
+        return self._observations(), batch.outcome("reward").copy(), terminated, truncated, infos
+
+    def _observations(self) -> Observations:
+        return self._batch.observations.copy() if self._copy else self._batch.observations
+
+    def _reset_mask(self, options: dict[str, Any] | None) -> Flags:
+        if not options or "reset_mask" not in options:
+            return self._everywhere
+        mask = np.asarray(options["reset_mask"])
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise ValueError(
+                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is {mask!r}"
+            )
+        return mask
+
+    def _seed(self, seed: int | Sequence[int | None] | None, mask: Flags) -> None:
+        """Start the rows' streams of random numbers, each from an ``np_random`` of its own."""
+        if seed is None or isinstance(seed, int | np.integer):
+            super().reset(seed=None if seed is None else int(seed))
+            seeds: Sequence[int | None] = spawn_seeds(seed, self.num_envs)
+        else:
+            seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"seed must hold {self.num_envs} seeds, but holds {len(seeds)}; pass one for each row")
+        for row in np.flatnonzero(mask):
+            generator, _ = gym.utils.seeding.np_random(seeds[row])
+            self._batch.seed(int(row), generator)
+        self._seeded = True
+
+    def _infos(self, mask: Flags) -> dict[str, Any]:
+        infos: dict[str, Any] = {}
+        for name in self.single._reported:
+            infos[name] = self._batch.outcome(name).copy()
+            infos[f"_{name}"] = mask.copy()
+        for name in self.single._flags:
+            infos[name] = self._batch.outcome(name) != 0.0
+            infos[f"_{name}"] = mask.copy()
+        return infos
+
+    def _add_endings(self, infos: dict[str, Any], finished: Flags) -> None:
+        """Add what the finished rows ended with."""
+        same_step = self._autoreset_mode == AutoresetMode.SAME_STEP
+        beliefs = np.full(self.num_envs, None, dtype=object)
+        for row in np.flatnonzero(finished):
+            beliefs[row] = self._batch.belief(int(row), final=same_step)
+        endings: dict[str, Any] = {"belief": beliefs, "_belief": finished.copy()}
+        if not same_step:
+            infos.update(endings)
+            return
+        final_observations = np.full(self.num_envs, None, dtype=object)
+        for row in np.flatnonzero(finished):
+            final_observations[row] = self._batch.final_observations[row].copy()
+        infos["final_obs"] = final_observations
+        infos["final_info"] = {**self._masked(infos, finished), **endings}
+        infos["_final_obs"] = infos["_final_info"] = finished.copy()
+
+    @staticmethod
+    def _masked(infos: dict[str, Any], finished: Flags) -> dict[str, Any]:
+        return {
+            key: (finished.copy() if key.startswith("_") else np.where(finished, value, np.zeros_like(value)))
+            for key, value in infos.items()
+        }
+
+
+class SilverboxReplayVectorEnv(DuffingVectorEnv):
+    """Many `SilverboxReplayEnv` at once; all rows replay the same record."""
+
+    single: ClassVar[type[DuffingEnv]] = SilverboxReplayEnv
+
+    @property
+    def recorded_input(self) -> FloatArray:
+        """The inputs that the record can answer, in order [V]."""
+        return self.experiment.recorded[0]

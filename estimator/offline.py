@@ -1,0 +1,298 @@
+"""`PEMNARX`: the paper's offline baseline, a sigmoid network fitted to a whole record by prediction-error minimisation.
+
+The network is that of MATLAB's ``idnlarx`` with a ``sigmoidnet`` of K units,
+
+    f(r) = (r - r0)' L + d + sum_k a_k σ((r - r0)' b_k + c_k),    σ(s) = 1 / (1 + exp(-s)),
+
+with the regressors r = (y_{t-1}, y_{t-2}, u_{t-delay}) and their mean r0. MATLAB's projections P and Q only rotate and
+scale the regressors where there are as many columns as regressors, so they are part of L and b_k here.
+
+The 4 + 5K parameters lie in one vector, in the order L (3), d, a (K), c (K), b (3K, a row per regressor).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+from scipy.special import expit
+
+from estimator.parameters import FloatArray
+
+TOLERANCE = 1e-6
+"""A fit has converged where a step lowers the cost by less than this fraction. On the Silverbox record the whole gain
+over a linear model is 0.8 %, and a tolerance ten times smaller changes the training error by less than 0.02 %."""
+
+MAX_EVALUATIONS = 200
+"""Evaluations of the network over the whole record after which a restart ends, converged or not."""
+
+DIVERGED = 1e6
+"""Output of a free run [V] from which on it counts as diverged."""
+
+
+@dataclass(eq=False)
+class PEMNARX:
+    """Nonlinear autoregression y_t = f(y_{t-1}, y_{t-2}, u_{t-delay}), fitted offline by prediction-error minimisation.
+
+    `fit` minimises the mean squared one-step prediction error with Levenberg-Marquardt (MINPACK) and the analytic
+    Jacobian, on regressors and outputs of zero mean and unit variance. Every restart begins at the least-squares linear
+    model, with silent units (a = 0) of random direction and bias; the one with the lowest training error is kept.
+
+    **Against the published row.** Trained on samples 40,101 to 131,072 of the Silverbox record with ``input_delay=0``
+    and validated on the first 40,100 (mean squared errors in V²; the published indexing):
+
+    | model                     | training        | prediction      | simulation     |
+    |---------------------------|-----------------|-----------------|----------------|
+    | linear ARX, ``units=0``   | 5.7393e-5       | 5.8364e-5       | 9.943e-4       |
+    | MATLAB's, as published    | 5.7379e-5       | 5.8308e-5       | 10.014e-4      |
+    | this fit, seeds 0 to 7    | 5.694…5.696e-5  | 5.712…5.716e-5  | 8.84…9.01e-4   |
+
+    This fit is better than the published row in all three, because MATLAB's model is not a minimum of its criterion.
+    The published free run determines that model's network to 1 µV, and with it the training error above: it makes 3 %
+    of the improvement over the linear model that four units can make. The same search, started at MATLAB's network,
+    lowers its training error to 5.697e-5 and its simulation error to 8.90e-4 within 20 evaluations. Nor was it fitted
+    to the simulation error, which on the training samples too is larger than the linear model's (9.63e-4 against
+    9.46e-4). The likely reason is an unfinished search, since MATLAB's ends after 20 iterations by default. So the
+    published row is, to 1 %, that of a linear model. Nothing here was chosen on the validation samples.
+
+    Args:
+        units: number K >= 0 of sigmoid units; with 0 the model is a linear ARX model with an offset.
+        input_delay: samples between an input and the output it acts on, 0 (as published) or 1 (Eq. (2) of the paper),
+            where u and y are paired by array index.
+        seed: seed of the random initial directions and biases.
+        restarts: number of searches, at least 1.
+
+    Attributes:
+        parameters: (4 + 5K,) fitted network, for regressors and outputs in volts; None before `fit`.
+        regressor_mean: (3,) r0, the mean of the training regressors [V]; None before `fit`.
+        training_mse: mean squared one-step error over the training samples [V²]; NaN before `fit`.
+
+    Raises:
+        ValueError: naming the argument, the value and the remedy.
+
+    Example:
+        >>> import numpy as np
+        >>> from estimator.offline import PEMNARX
+        >>> u = 0.05 * np.random.default_rng(0).standard_normal(500)
+        >>> y = np.zeros(500)
+        >>> for t in range(2, 500):
+        ...     y[t] = 1.5 * y[t - 1] - 0.9 * y[t - 2] - 0.5 * y[t - 1] ** 3 + 0.2 * u[t]
+        >>> model = PEMNARX(units=2).fit(u, y)
+        >>> bool(np.abs(model.simulate(u, y[:2]) - y).max() < 0.01 * np.abs(y).max())
+        True
+    """
+
+    units: int = 4
+    input_delay: int = 0
+    seed: int = 0
+    restarts: int = 4
+    parameters: FloatArray | None = field(default=None, init=False, repr=False)
+    regressor_mean: FloatArray | None = field(default=None, init=False, repr=False)
+    training_mse: float = field(default=math.nan, init=False)
+
+    def __post_init__(self) -> None:
+        for name, least in (("units", 0), ("seed", 0), ("restarts", 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"{name} must be a whole number of at least {least}, but is {value!r}")
+        if self.input_delay not in (0, 1):
+            raise ValueError(f"input_delay must be 0 or 1, but is {self.input_delay!r}; the published run had 0")
+
+    def fit(self, u: npt.ArrayLike, y: npt.ArrayLike, progress: bool = False) -> PEMNARX:
+        """Fits the network to one record. An earlier fit is replaced.
+
+        Args:
+            u: (T,) inputs [V].
+            y: (T,) outputs [V], paired with u by index; T - 2 must exceed the number of parameters 4 + 5K.
+            progress: Show a progress bar over the restarts.
+
+        Returns:
+            This model.
+
+        Raises:
+            ValueError: If u or y is not a finite series, they differ in length, are too short, or do not vary.
+        """
+        u, y = _pair(u, y)
+        n_parameters = 4 + 5 * self.units
+        if len(y) - 2 <= n_parameters:
+            raise ValueError(
+                f"u and y must have more than {n_parameters + 2} samples to fit {n_parameters} parameters, but have "
+                f"{len(y)}; use a longer record or fewer units"
+            )
+        regressors, target = self._regressors(u, y), y[2:]
+        mean, scale = regressors.mean(axis=0), regressors.std(axis=0)
+        for name, samples in (("y", y[:-2]), ("y", y[1:-1]), ("y", target), ("u", regressors[:, 2])):
+            if np.ptp(samples) == 0:
+                raise ValueError(f"{name} must vary, but is constant over the samples of the fit; excite the system")
+
+        z = (regressors - mean) / scale
+        target_mean, target_scale = target.mean(), target.std()
+        standard_target = (target - target_mean) / target_scale
+        linear = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), standard_target, rcond=None)[0]
+        rng = np.random.default_rng(self.seed)
+        solutions = []
+        for _ in _restarts(self.restarts, progress):
+            start = np.concatenate([linear, np.zeros(self.units), rng.standard_normal(4 * self.units)])
+            solution = least_squares(
+                lambda parameters: network(parameters, z) - standard_target,
+                start,
+                lambda parameters: network_jacobian(parameters, z),
+                method="lm",
+                ftol=TOLERANCE,
+                max_nfev=MAX_EVALUATIONS,
+            )
+            solutions.append(solution)
+        best = min(solutions, key=lambda solution: solution.cost)
+
+        self.parameters = _in_volts(best.x, scale, target_mean, target_scale)
+        self.regressor_mean = mean
+        self.training_mse = float(np.mean((network(self.parameters, regressors - mean) - target) ** 2))
+        return self
+
+    def predict(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """One-step predictions: each output from the two measured before it.
+
+        Args:
+            u: (T,) inputs [V].
+            y: (T,) outputs [V], paired with u by index; T >= 2.
+
+        Returns:
+            Predictions (T,) [V]; the first two entries repeat y.
+
+        Raises:
+            ValueError: If u or y is not a finite series, they differ in length, or T < 2.
+            RuntimeError: Before `fit`.
+        """
+        parameters, mean = self._fitted()
+        u, y = _pair(u, y)
+        predicted = y.copy()
+        predicted[2:] = network(parameters, self._regressors(u, y) - mean)
+        return predicted
+
+    def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:
+        """Free run over all of u: each output from the two simulated before it.
+
+        The units are bounded, so a free run diverges only if the linear part is unstable. It then counts as diverged
+        from the first output beyond 1e6 V on, and everything from there is NaN: errors computed from it are NaN too,
+        neither an overflow nor a number that looks like a result.
+
+        Args:
+            u: (T,) inputs [V].
+            y_init: The first outputs, which are given and start the run; between 2 and T of them [V].
+
+        Returns:
+            Simulated outputs (T,) [V], beginning with y_init; NaN from where the model diverges.
+
+        Raises:
+            ValueError: If u or y_init is not a finite series, or y_init has fewer than 2 or more than T entries.
+            RuntimeError: Before `fit`.
+        """
+        parameters, mean = self._fitted()
+        u, y_init = _series("u", u), _series("y_init", y_init)
+        if not 2 <= len(y_init) <= len(u):
+            raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(y_init)}")
+        simulated = np.empty(len(u))
+        simulated[: len(y_init)] = y_init
+        _free_run(parameters, mean, u, self.input_delay, simulated, len(y_init))
+        return simulated
+
+    def _regressors(self, u: FloatArray, y: FloatArray) -> FloatArray:
+        """(T - 2, 3) regressors of y_2, ..., y_{T-1}."""
+        first = 2 - self.input_delay
+        return np.column_stack([y[1:-1], y[:-2], u[first : first + len(y) - 2]])
+
+    def _fitted(self) -> tuple[FloatArray, FloatArray]:
+        if self.parameters is None or self.regressor_mean is None:
+            raise RuntimeError("the model has no parameters yet; call fit(u, y) first")
+        return self.parameters, self.regressor_mean
+
+
+def network(parameters: FloatArray, z: FloatArray) -> FloatArray:
+    """Outputs f (N,) of the network at N centred regressors z = r - r0 (N, 3)."""
+    linear, offset, amplitude, bias, direction = _split(parameters)
+    return z @ linear + offset + expit(z @ direction + bias) @ amplitude
+
+
+def network_jacobian(parameters: FloatArray, z: FloatArray) -> FloatArray:
+    """Derivatives (N, 4 + 5K) of `network` with respect to its parameters."""
+    _, _, amplitude, bias, direction = _split(parameters)
+    unit = expit(z @ direction + bias)
+    slope = amplitude * unit * (1 - unit)
+    return np.hstack([z, np.ones((len(z), 1)), unit, slope, *(z[:, i : i + 1] * slope for i in range(3))])
+
+
+def _split(parameters: FloatArray) -> tuple[FloatArray, np.float64, FloatArray, FloatArray, FloatArray]:
+    """Views of L (3,), d, a (K,), c (K,) and b (3, K)."""
+    units = (len(parameters) - 4) // 5
+    amplitude, bias, direction = np.split(parameters[4:], [units, 2 * units])
+    return parameters[:3], parameters[3], amplitude, bias, direction.reshape(3, units)
+
+
+def _in_volts(parameters: FloatArray, scale: FloatArray, target_mean: float, target_scale: float) -> FloatArray:
+    """The network of centred regressors and outputs in volts, from that of the standardised ones."""
+    linear, offset, amplitude, bias, direction = _split(parameters)
+    return np.concatenate(
+        [
+            target_scale * linear / scale,
+            [target_scale * offset + target_mean],
+            target_scale * amplitude,
+            bias,
+            (direction / scale[:, None]).ravel(),
+        ]
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _free_run(parameters, regressor_mean, u, input_delay, y, start):
+    """Continues y in place from sample ``start`` on."""
+    units = (len(parameters) - 4) // 5
+    amplitude, bias = parameters[4 : 4 + units], parameters[4 + units : 4 + 2 * units]
+    direction = parameters[4 + 2 * units :].reshape(3, units)
+    for t in range(start, len(y)):
+        z0 = y[t - 1] - regressor_mean[0]
+        z1 = y[t - 2] - regressor_mean[1]
+        z2 = u[t - input_delay] - regressor_mean[2]
+        output = parameters[0] * z0 + parameters[1] * z1 + parameters[2] * z2 + parameters[3]
+        for k in range(units):
+            ridge = direction[0, k] * z0 + direction[1, k] * z1 + direction[2, k] * z2 + bias[k]
+            output += amplitude[k] / (1 + math.exp(-ridge))
+        if not abs(output) <= DIVERGED:
+            y[t:] = np.nan
+            return
+        y[t] = output
+
+
+def _restarts(number: int, progress: bool) -> Iterable[int]:
+    """The restarts, behind a progress bar if there is to be one."""
+    if not progress:
+        return range(number)
+    from rich.progress import track
+
+    return track(range(number), description="Fitting")
+
+
+def _pair(u: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two finite series of one length of at least 2."""
+    inputs, outputs = _series("u", u), _series("y", y)
+    if inputs.shape != outputs.shape or len(outputs) < 2:
+        raise ValueError(
+            f"u and y must have one length of at least 2, but have {len(inputs)} and {len(outputs)}; cut the longer one"
+        )
+    return inputs, outputs
+
+
+def _series(name: str, values: npt.ArrayLike) -> FloatArray:
+    """A contiguous finite series (T,)."""
+    series = np.ascontiguousarray(values, dtype=np.float64)
+    if series.ndim != 1:
+        raise ValueError(f"{name} must have shape (T,), but has {series.shape}; pass one channel, e.g. {name}.ravel()")
+    finite = np.isfinite(series)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise ValueError(f"{name} must be finite, but {name}[{bad}] is {series[bad]}; remove or interpolate the sample")
+    return series
