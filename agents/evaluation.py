@@ -1,0 +1,241 @@
+"""What policies are worth: any number of them, on the same systems and the same noise."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from agents.files import write_atomically
+from agents.policies import make_policy
+from duffing_env.silverbox import load_record, record_available
+from duffing_env.vector_env import DuffingVectorEnv
+from estimator import NLARX, Belief, to_coefficients
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Half width of a central 90 % interval in standard deviations.
+_NINETY = float(stats.norm.ppf(0.95))
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What happened under one policy, system by system.
+
+    Attributes:
+        policy: its name.
+        metrics: name of a metric to its value for each system (systems,); see `METRICS`.
+        curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats].
+        inputs: (horizon, systems) inputs [V], NaN after the end of an episode.
+        outputs: (horizon, systems) outputs [V], likewise.
+    """
+
+    policy: str
+    metrics: dict[str, FloatArray]
+    curve: FloatArray
+    inputs: FloatArray
+    outputs: FloatArray
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A column of the table.
+
+    Attributes:
+        title: with its unit.
+        digits: decimals that are printed.
+        scale: from the stored to the printed unit.
+        center: the statistic over systems, and its name.
+    """
+
+    title: str
+    digits: int
+    scale: float = 1.0
+    center: tuple[str, Callable[..., Any]] = field(default=("mean", np.mean))
+
+
+_MEDIAN = ("median", np.median)
+
+METRICS = {
+    "information_gain": Metric("information gained / nat", 2),
+    "log_posterior_gain": Metric("log posterior gain / nat", 2),
+    "error_m": Metric("error of m / %", 3, 100, _MEDIAN),
+    "error_c": Metric("error of c / %", 2, 100, _MEDIAN),
+    "error_a": Metric("error of a / %", 3, 100, _MEDIAN),
+    "error_b": Metric("error of b / %", 2, 100, _MEDIAN),
+    "coverage": Metric("90 % intervals that cover / %", 1, 100),
+    "ended_early": Metric("episodes ended early / %", 1, 100),
+    "input_power": Metric("input power / mV²", 0, 1e6),
+    "arrow_rmse": Metric("RMSE on the real arrow / mV", 2, 1e3, _MEDIAN),
+}
+
+
+def evaluate(
+    policies: Sequence[str],
+    env_id: str = "duffing_env/Amplitude-v0",
+    systems: int = 256,
+    seed: int = 0,
+    options: dict[str, Any] | None = None,
+    on_policy: Callable[[str], None] | None = None,
+) -> list[Evaluation]:
+    """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
+
+    Learned policies act by their mean. An episode that a limit ends counts with what was known by then. The arrow
+    error is that of the coefficients identified on the Silverbox twin (``plant_spread=0``) in a free run over the
+    real arrow record; it is left out without the record, and on environments that do not simulate a plant.
+
+    Args:
+        policies: names or run folders, see `agents.policies.make_policy`.
+        env_id: a registered track.
+        systems: number of systems, at least 2.
+        seed: of systems and noise; and of the policies' own randomness.
+        options: of the environment.
+        on_policy: called with each policy's name before its turn.
+    """
+    if systems < 2:
+        raise ValueError(f"systems must be at least 2, but is {systems}; intervals need more than one")
+    options = dict(options or {})
+    evaluations = []
+    for name in policies:
+        if on_policy is not None:
+            on_policy(name)
+        evaluation, _ = _roll_out(name, env_id, systems, seed, options)
+        if record_available() and "Replay" not in env_id:
+            _, beliefs = _roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
+            evaluation.metrics["arrow_rmse"] = _arrow_errors(beliefs)
+        evaluations.append(evaluation)
+    return evaluations
+
+
+def _roll_out(
+    name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]
+) -> tuple[Evaluation, list[Belief]]:
+    """One episode of every system, and the belief that it ended with."""
+    envs = gym.make_vec(env_id, num_envs=systems, vectorization_mode="vector_entry_point", **options)
+    assert isinstance(envs, DuffingVectorEnv)
+    policy = make_policy(name, envs, seed=seed)
+    observations, _ = envs.reset(seed=seed)
+    prior = envs.belief(0)
+    truth = envs.truth
+    horizon = envs.horizon
+    curve = np.zeros((horizon + 1, systems))
+    inputs = np.full((horizon, systems), np.nan)
+    outputs = np.full((horizon, systems), np.nan)
+    beliefs: list[Belief] = [prior] * systems
+    ended_early = np.zeros(systems)
+    running = np.ones(systems, dtype=np.bool_)
+    state, episode_start = None, np.ones(systems, dtype=np.bool_)
+    for t in range(horizon):
+        actions, state = policy.predict(observations, state, episode_start, deterministic=True)
+        observations, _, terminated, truncated, infos = envs.step(actions)
+        curve[t + 1] = curve[t] + np.where(running, infos["log_posterior_gain"], 0.0)
+        inputs[t, running] = envs.max_input * np.clip(actions[running, 0], -1, 1)
+        outputs[t, running] = envs.experiment.max_output * observations[running, 19]
+        finished = running & (terminated | truncated)
+        for row in np.flatnonzero(finished):
+            beliefs[row] = infos["belief"][row]
+        ended_early[finished & terminated] = 1.0
+        running &= ~finished
+        episode_start = terminated | truncated
+        if not running.any():
+            break
+    envs.close()
+    metrics = {
+        "information_gain": np.array([prior.entropy() - belief.entropy() for belief in beliefs]),
+        "log_posterior_gain": curve[-1],
+        **_parameter_metrics(beliefs, truth),
+        "ended_early": ended_early,
+        "input_power": np.nanmean(inputs**2, axis=0),
+    }
+    return Evaluation(name, metrics, curve, inputs, outputs), beliefs
+
+
+def _parameter_metrics(beliefs: list[Belief], truth: Any) -> dict[str, FloatArray]:
+    """Relative errors of m, c, a, b, and the share of the four coefficients that their 90 % intervals cover."""
+    true_physical = np.stack([truth.m, truth.c, truth.a, truth.b], axis=-1)
+    coefficients = to_coefficients(truth)
+    true_coefficients = np.stack(
+        [coefficients.theta1, coefficients.theta2, coefficients.theta3, coefficients.eta], axis=-1
+    )
+    estimates = np.array([belief.physical()[0] for belief in beliefs])
+    errors = np.abs(estimates / true_physical - 1)
+    means = np.array([belief.coefficients_mean for belief in beliefs])
+    stds = np.array([np.sqrt(np.diag(belief.coefficients_cov)) for belief in beliefs])
+    covered = np.abs(means - true_coefficients) <= _NINETY * stds
+    return {
+        **{f"error_{name}": errors[:, i] for i, name in enumerate("mcab")},
+        "coverage": covered.mean(axis=1),
+    }
+
+
+def _arrow_errors(beliefs: list[Belief]) -> FloatArray:
+    """Root mean square error [V] of free runs over the real arrow record; inf where a run diverges."""
+    arrow = load_record().arrow
+    model = NLARX(input_delay=1)
+    errors = np.empty(len(beliefs))
+    for i, belief in enumerate(beliefs):
+        simulated = model.simulate(belief.coefficients_mean, arrow.u, arrow.y[:2])
+        with np.errstate(invalid="ignore", over="ignore"):
+            error = np.sqrt(np.mean((simulated - arrow.y)[2:] ** 2))
+        errors[i] = error if np.isfinite(error) else np.inf
+    return errors
+
+
+def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, float | str]]:
+    """The centre of each metric over systems, with a 95 % bootstrap interval (percentile, 2000 resamples)."""
+    summary: dict[str, dict[str, float | str]] = {}
+    for name, values in evaluation.metrics.items():
+        kind, statistic = METRICS[name].center
+        center = float(statistic(values))
+        low = high = center
+        if np.ptp(values) > 0:
+            low, high = stats.bootstrap(
+                (values,), statistic, n_resamples=_RESAMPLES, method="percentile", vectorized=True,
+                rng=np.random.default_rng(seed),
+            ).confidence_interval  # fmt: skip
+        summary[name] = {kind: center, "low": float(low), "high": float(high)}
+    return summary
+
+
+def write_json(path: Path, evaluations: list[Evaluation], settings: dict[str, Any]) -> None:
+    """Write summaries and the settings that they were made with."""
+    results = {evaluation.policy: summarise(evaluation) for evaluation in evaluations}
+    write_atomically(path, json.dumps({"settings": settings, "policies": results}, indent=2, allow_nan=True))
+
+
+def print_table(evaluations: list[Evaluation], title: str) -> None:
+    """Print the leaderboard: a column for each policy, the best log posterior gain first; intervals below."""
+    from rich.console import Console
+    from rich.table import Table
+
+    summaries = {evaluation.policy: summarise(evaluation) for evaluation in evaluations}
+    order = sorted(summaries, key=lambda policy: -_center(summaries[policy]["log_posterior_gain"]))
+    table = Table(title=title, caption="means, errors as medians; [95 % bootstrap intervals over systems]")
+    table.add_column("", no_wrap=True)
+    for policy in order:
+        table.add_column(policy, justify="right")
+    for name, metric in METRICS.items():
+        if any(name in summary for summary in summaries.values()):
+            table.add_row(metric.title, *(_cell(metric, summaries[policy].get(name)) for policy in order))
+    console = Console()
+    console.width = max(console.width, 30 + 20 * len(order))
+    console.print(table)
+
+
+def _center(entry: dict[str, float | str]) -> float:
+    return float(next(value for key, value in entry.items() if key in ("mean", "median")))
+
+
+def _cell(metric: Metric, entry: dict[str, float | str] | None) -> str:
+    if entry is None:
+        return "-"
+    center, low, high = (metric.scale * float(value) for value in (_center(entry), entry["low"], entry["high"]))
+    return f"{center:.{metric.digits}f}\n[{low:.{metric.digits}f}, {high:.{metric.digits}f}]"

@@ -1,0 +1,86 @@
+"""Figures of trainings and evaluations, as PNG files. No display is needed."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.files import write_atomically
+from estimator import SAMPLING_STEP
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from agents.evaluation import Evaluation
+
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
+_MILLISECONDS = 1e3 * SAMPLING_STEP
+
+
+def draw_learning_curve(path: Path, curve: list[tuple[int, float, float]], reward: str) -> None:
+    """Mean return of the last episodes over the samples that were trained on, with wall time above."""
+    figure = _figure(7, 4)
+    axes = figure.add_subplot()
+    steps, seconds, returns = np.array(curve, dtype=float).reshape(-1, 3).T
+    axes.plot(steps / 1e6, returns, color=_COLOURS[0])
+    axes.set_xlabel("samples / 10⁶")
+    axes.set_ylabel(f"mean return: {reward.replace('_', ' ')}")
+    axes.grid(alpha=0.3)
+    if len(steps) > 1:
+        above = axes.secondary_xaxis(
+            "top",
+            functions=(lambda x: np.interp(x, steps / 1e6, seconds), lambda s: np.interp(s, seconds, steps / 1e6)),
+        )
+        above.set_xlabel("wall time / s")
+    _save(figure, path)
+
+
+def draw_contraction(path: Path, evaluations: list[Evaluation], title: str) -> None:
+    """Gain of log posterior of the truth over the samples: median over systems, band from 25 to 75 %."""
+    figure = _figure(7.5, 4.5)
+    axes = figure.add_subplot()
+    for evaluation, colour in zip(evaluations, _COLOURS, strict=False):
+        low, median, high = np.percentile(evaluation.curve, [25, 50, 75], axis=1)
+        samples = np.arange(len(median))
+        axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
+        axes.plot(samples, median, color=colour, label=evaluation.policy)
+    axes.set_xlabel("samples")
+    axes.set_ylabel("log posterior gain of the truth / nat")
+    axes.set_title(title)
+    axes.set_xlim(0, None)
+    axes.set_ylim(0, None)
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right")
+    _save(figure, path)
+
+
+def draw_excitations(path: Path, evaluations: list[Evaluation], system: int = 0) -> None:
+    """Input and output of one system under each policy."""
+    figure = _figure(9, 1.6 * len(evaluations) + 0.8)
+    grid = figure.subplots(len(evaluations), 2, sharex=True, sharey="col", squeeze=False)
+    for row, evaluation, colour in zip(grid, evaluations, _COLOURS, strict=False):
+        for axes, signal in zip(row, (evaluation.inputs, evaluation.outputs), strict=True):
+            time = _MILLISECONDS * np.arange(len(signal))
+            axes.plot(time, signal[:, system], color=colour, linewidth=0.8)
+            axes.grid(alpha=0.3)
+        row[0].set_ylabel("u / V")
+        row[1].set_ylabel("y / V")
+        row[0].set_title(evaluation.policy, loc="left", fontsize=9)
+    for axes in grid[-1]:
+        axes.set_xlabel("time / ms")
+    _save(figure, path)
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure((width, height), layout="constrained", dpi=120)
+
+
+def _save(figure: Any, path: Path) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    write_atomically(path, buffer.getvalue())
