@@ -6,7 +6,8 @@ READY := .venv/.ready
 .PHONY: demo test lint format bench evidence lock clean
 
 demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
-	$(BIN)/python train.py --preset demo
+	rm -rf runs/demo
+	$(BIN)/python train.py --output runs/demo
 
 test: $(READY)  ## all tests but the slow evidence
 	$(BIN)/python -m pytest -m "not slow"

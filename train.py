@@ -7,17 +7,15 @@ python train.py --reward log_posterior           another reward
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
-import tyro
-
+from agents.cli import run_script
 from agents.training import TrainConfig, train
 
 
 @dataclass(frozen=True)
 class Config(TrainConfig):
-    """Train a policy that chooses the input, and compare it with the reference policies."""
+    """Train a policy, and compare it."""
 
     systems: int = 256
     """Systems to compare on afterwards; 0 to skip the comparison."""
@@ -25,16 +23,15 @@ class Config(TrainConfig):
 
 def main(config: Config) -> None:
     """Train, compare, and say where everything is."""
-    from agents.comparison import compare
+    from agents.leaderboard import BASELINES, compare
 
     run = train(config)
-    print(f"trained in {run.seconds:.0f} s; the run is in {run.folder}")
+    print(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
     if config.systems:
-        compare([str(run.folder)], config.env, config.systems, config.env_options, run.folder)
+        policies = (str(run.folder), *BASELINES)
+        compare(policies, config.env, config.systems, config.options, run.folder)
+    print(run.folder / "learning_curve.png")
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except ValueError as error:
-        sys.exit(f"train.py: {error}")
+    run_script(main, Config, __doc__)

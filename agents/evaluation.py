@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from agents.files import write_atomically
 from agents.policies import make_policy
 from duffing_env.silverbox import load_record, record_available
 from duffing_env.vector_env import DuffingVectorEnv
@@ -23,7 +20,6 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Half width of a central 90 % interval in standard deviations.
 _NINETY = float(stats.norm.ppf(0.95))
-_RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
@@ -32,7 +28,7 @@ class Evaluation:
 
     Attributes:
         policy: its name.
-        metrics: name of a metric to its value for each system (systems,); see `METRICS`.
+        metrics: name of a metric to its value for each system (systems,); see `agents.leaderboard.METRICS`.
         curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats].
         inputs: (horizon, systems) inputs [V], NaN after the end of an episode.
         outputs: (horizon, systems) outputs [V], likewise.
@@ -43,39 +39,6 @@ class Evaluation:
     curve: FloatArray
     inputs: FloatArray
     outputs: FloatArray
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A column of the table.
-
-    Attributes:
-        title: with its unit.
-        digits: decimals that are printed.
-        scale: from the stored to the printed unit.
-        center: the statistic over systems, and its name.
-    """
-
-    title: str
-    digits: int
-    scale: float = 1.0
-    center: tuple[str, Callable[..., Any]] = field(default=("mean", np.mean))
-
-
-_MEDIAN = ("median", np.median)
-
-METRICS = {
-    "information_gain": Metric("information gained / nat", 2),
-    "log_posterior_gain": Metric("log posterior gain / nat", 2),
-    "error_m": Metric("error of m / %", 3, 100, _MEDIAN),
-    "error_c": Metric("error of c / %", 2, 100, _MEDIAN),
-    "error_a": Metric("error of a / %", 3, 100, _MEDIAN),
-    "error_b": Metric("error of b / %", 2, 100, _MEDIAN),
-    "coverage": Metric("90 % intervals that cover / %", 1, 100),
-    "ended_early": Metric("episodes ended early / %", 1, 100),
-    "input_power": Metric("input power / mV²", 0, 1e6),
-    "arrow_rmse": Metric("RMSE on the real arrow / mV", 2, 1e3, _MEDIAN),
-}
 
 
 def evaluate(
@@ -187,55 +150,3 @@ def _arrow_errors(beliefs: list[Belief]) -> FloatArray:
             error = np.sqrt(np.mean((simulated - arrow.y)[2:] ** 2))
         errors[i] = error if np.isfinite(error) else np.inf
     return errors
-
-
-def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, float | str]]:
-    """The centre of each metric over systems, with a 95 % bootstrap interval (percentile, 2000 resamples)."""
-    summary: dict[str, dict[str, float | str]] = {}
-    for name, values in evaluation.metrics.items():
-        kind, statistic = METRICS[name].center
-        center = float(statistic(values))
-        low = high = center
-        if np.ptp(values) > 0:
-            low, high = stats.bootstrap(
-                (values,), statistic, n_resamples=_RESAMPLES, method="percentile", vectorized=True,
-                rng=np.random.default_rng(seed),
-            ).confidence_interval  # fmt: skip
-        summary[name] = {kind: center, "low": float(low), "high": float(high)}
-    return summary
-
-
-def write_json(path: Path, evaluations: list[Evaluation], settings: dict[str, Any]) -> None:
-    """Write summaries and the settings that they were made with."""
-    results = {evaluation.policy: summarise(evaluation) for evaluation in evaluations}
-    write_atomically(path, json.dumps({"settings": settings, "policies": results}, indent=2, allow_nan=True))
-
-
-def print_table(evaluations: list[Evaluation], title: str) -> None:
-    """Print the leaderboard: a column for each policy, the best log posterior gain first; intervals below."""
-    from rich.console import Console
-    from rich.table import Table
-
-    summaries = {evaluation.policy: summarise(evaluation) for evaluation in evaluations}
-    order = sorted(summaries, key=lambda policy: -_center(summaries[policy]["log_posterior_gain"]))
-    table = Table(title=title, caption="means, errors as medians; [95 % bootstrap intervals over systems]")
-    table.add_column("", no_wrap=True)
-    for policy in order:
-        table.add_column(policy, justify="right")
-    for name, metric in METRICS.items():
-        if any(name in summary for summary in summaries.values()):
-            table.add_row(metric.title, *(_cell(metric, summaries[policy].get(name)) for policy in order))
-    console = Console()
-    console.width = max(console.width, 30 + 20 * len(order))
-    console.print(table)
-
-
-def _center(entry: dict[str, float | str]) -> float:
-    return float(next(value for key, value in entry.items() if key in ("mean", "median")))
-
-
-def _cell(metric: Metric, entry: dict[str, float | str] | None) -> str:
-    if entry is None:
-        return "-"
-    center, low, high = (metric.scale * float(value) for value in (_center(entry), entry["low"], entry["high"]))
-    return f"{center:.{metric.digits}f}\n[{low:.{metric.digits}f}, {high:.{metric.digits}f}]"

@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.cli import JsonOptions
 from agents.files import write_atomically
 from agents.policies.learned import save_policy
 
@@ -57,8 +58,8 @@ class TrainConfig:
     """Samples to train on, over all environments."""
     seed: int = 0
     """Seed of systems, noise, weights and exploration; the same seed gives the same policy."""
-    env_options: dict[str, Any] = field(default_factory=dict)
-    """Further options of the environment, as JSON: '{"spread": 0.2}'."""
+    options: JsonOptions = field(default_factory=dict)
+    """Further options of the environment, as JSON."""
     output: Path | None = None
     """Run folder; runs/ppo-TRACK-SEED where it is not given, with a number where that exists."""
     checkpoints: int = 5
@@ -90,7 +91,9 @@ class Run:
 
 
 def train(config: TrainConfig) -> Run:
-    """Train a policy. The run folder then holds
+    """Train a policy, and write a run folder.
+
+    The folder then holds
 
     - ``config.json``: the resolved configuration, the command and the versions,
     - ``policy.safetensors``, ``policy.json``: the policy,
@@ -108,7 +111,7 @@ def train(config: TrainConfig) -> Run:
     started = time.perf_counter()
     torch.set_num_threads(config.torch_threads)
     ppo = config.ppo
-    envs = DuffingVecEnv(config.env, ppo.num_envs, seed=config.seed, reward=config.reward, **config.env_options)
+    envs = DuffingVecEnv(config.env, ppo.num_envs, seed=config.seed, reward=config.reward, **config.options)
     folder = _run_folder(config)
     description = _describe(config)
     write_atomically(folder / "config.json", json.dumps(description, indent=2))
@@ -133,13 +136,13 @@ def train(config: TrainConfig) -> Run:
         save_policy(target, model, {"algorithm": "ppo", "steps": model.num_timesteps, **description})
 
     def on_update(steps: int, mean_return: float) -> None:
+        nonlocal checkpoints
         curve.append((steps, time.perf_counter() - started, mean_return))
-        reached = steps * config.checkpoints // config.steps
-        if reached > on_update.saved and steps < config.steps:  # type: ignore[attr-defined]
-            on_update.saved = reached  # type: ignore[attr-defined]
+        if steps * config.checkpoints // config.steps > checkpoints:
+            checkpoints += 1
             save(folder / "checkpoints" / f"{steps:09d}")
 
-    on_update.saved = 0  # type: ignore[attr-defined]
+    checkpoints = 0
     _learn(model, config.steps, on_update)
     save(folder)
     draw_learning_curve(folder / "learning_curve.png", curve, config.reward)

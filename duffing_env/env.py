@@ -114,6 +114,7 @@ class DuffingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
     | ``spread`` | 0.3 | half width of the parameters' range, relative |
     | ``noise_shape`` | 2 | shape of the Gamma priors of γ and ξ |
+    | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
 
     >>> import gymnasium as gym

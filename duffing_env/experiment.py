@@ -130,6 +130,8 @@ class SimulatedExperiment(Experiment):
         measurement_noise: standard deviation of the measurement noise v, on y [V].
         spread: m, c, a and b are drawn log-uniformly on the twin's value * [1 - spread, 1 + spread]; in (0, 1).
         noise_shape: shape of the Gamma priors of γ and ξ, which are centred on the true precisions; 2 is weak.
+        plant_spread: as ``spread``, for the plant alone, whose range the prior then does not match: with 0 every
+            oscillator is the twin itself. That of the prior where it is None.
     """
 
     horizon: int = 256
@@ -137,6 +139,7 @@ class SimulatedExperiment(Experiment):
     measurement_noise: float = 5e-4
     spread: float = 0.3
     noise_shape: float = 2.0
+    plant_spread: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -145,6 +148,8 @@ class SimulatedExperiment(Experiment):
             self._check_positive(name)
         if self.spread >= 1:
             raise ValueError(f"spread must be below 1, but is {self.spread!r}; masses are positive")
+        if self.plant_spread is not None and not 0 <= self.plant_spread < 1:
+            raise ValueError(f"plant_spread must be in [0, 1), but is {self.plant_spread!r}; 0 is the twin itself")
 
     @property
     def samples(self) -> int:
@@ -159,7 +164,7 @@ class SimulatedExperiment(Experiment):
         return {
             "process_noise": self.process_noise,
             "measurement_noise": self.measurement_noise,
-            "spread": self.spread,
+            "spread": self.spread if self.plant_spread is None else self.plant_spread,
         }
 
 

@@ -1,0 +1,42 @@
+"""Compare policies on common random numbers: a table, JSON and figures.
+
+python evaluate.py                                        the reference and baseline policies
+python evaluate.py --policies runs/demo prbs              a trained policy beside PRBS
+python evaluate.py --options '{"max_output": 0.3}'        under another limit
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from agents.cli import JsonOptions, run_script
+
+
+@dataclass(frozen=True)
+class Config:
+    """Compare policies on common random numbers."""
+
+    policies: tuple[str, ...] = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")
+    """Names of policies, or run folders."""
+    env: str = "duffing_env/Amplitude-v0"
+    """Id of the track."""
+    options: JsonOptions = field(default_factory=dict)
+    """Further options of the environment, as JSON."""
+    systems: int = 256
+    """Systems that every policy is evaluated on, the same for all."""
+    seed: int = 0
+    """Seed of systems and noise."""
+    output: Path = Path("runs/evaluation")
+    """Folder for evaluation.json and the figures."""
+
+
+def main(config: Config) -> None:
+    """Compare, and say where everything is."""
+    from agents.leaderboard import compare
+
+    compare(config.policies, config.env, config.systems, config.options, config.output, seed=config.seed)
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__)
