@@ -30,9 +30,13 @@ def draw_learning_curve(path: Path, curve: list[tuple[int, float, float]], rewar
     axes.set_ylabel(f"mean return: {reward.replace('_', ' ')}")
     axes.grid(alpha=0.3)
     if len(steps) > 1:
+        axes.set_xlim(steps[0] / 1e6, steps[-1] / 1e6)
         above = axes.secondary_xaxis(
             "top",
-            functions=(lambda x: np.interp(x, steps / 1e6, seconds), lambda s: np.interp(s, seconds, steps / 1e6)),
+            functions=(
+                lambda samples: np.interp(np.asarray(samples), steps / 1e6, seconds),
+                lambda time: np.interp(np.asarray(time), seconds, steps / 1e6),
+            ),
         )
         above.set_xlabel("wall time / s")
     _save(figure, path)

@@ -1,25 +1,25 @@
 """The experiment of Kouw (2020), section 4, repeated on the Silverbox record and set against the published numbers.
 
-Every model is trained on the multisine part of the record (90,972 samples, in one pass for the online ones) and
-validated on the arrow part (40,100 samples) with its parameters fixed: by one-step predictions from the measured
-outputs, and by a free run, the simulation, from the first two of them. `reproduce` does it all; ``docs/reproduction.md``
-discusses the outcome.
+Every model is trained on the multisine part of the record, 90,972 samples, and validated on the arrow part, 40,100
+samples, with its parameters fixed: by one-step predictions from the measured outputs, and by a simulation, a free run
+from the first two of them. `reproduce` does it all; ``docs/reproduction.md`` discusses the outcome.
 """
 
 from __future__ import annotations
 
 import io
-import json as json_format
+import os
 import platform
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
+from json import dumps
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
@@ -27,7 +27,7 @@ from rich.table import Table
 
 from agents.policies import make_policy
 from duffing_env.env import DuffingEnv
-from duffing_env.silverbox import Regime, load_record
+from duffing_env.silverbox import Regime, SilverboxRecord, load_record
 from estimator import NLARX, OnlineEstimator, Prior
 from estimator.offline import PEMNARX
 from estimator.parameters import FloatArray
@@ -40,50 +40,305 @@ PUBLISHED = {
     "FEM-LARX": {"prediction_mse": 5.9446129987526364e-05, "simulation_mse": 1.0204335589997665e-03},
     "FEM-NLARX": {"prediction_mse": 5.8304968780121563e-05, "simulation_mse": 9.256401174690808e-04},
 }
-"""Mean squared errors [V²] of the published run, from its own code and files; its text has 1.002e-3 for FEM-LARX."""
+"""Mean squared errors [V²] of the published run, from its own files; the paper's text has 1.002e-3 for FEM-LARX."""
 
+BASELINE = "PEM-NARX"
+MEASURES = ("prediction_mse", "simulation_mse")
 VERSIONED = ("duffing-env", "gymnasium", "matplotlib", "numba", "numpy", "scipy")
-"""Distributions whose versions are written beside the results."""
 
 EVERY = 80
-"""Of so many samples the figures show one, as the paper's do."""
+"""The figures show one sample of this many, as the paper's do."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to run the experiment. All of them start from `Prior.published_run`.
+    """One way to run the experiment. All start from `Prior.published_run`, with the default number of iterations.
 
     Attributes:
-        summary: what a reader of the table is told.
+        summary: what it is, for the reader of the table.
         factorisation: of the online estimator, ``mean_field`` or ``structured``.
         input_delay: samples between an input and the output it acts on, 0 or 1.
-        as_published: keep the published run's two departures from the derived messages.
-        through_environment: the samples pass through the Gymnasium environment, one step each.
-        with_baseline: fit the offline baseline, PEM-NARX, with this input delay too.
+        as_published: with the published run's two departures from the derived messages.
+        through_environment: every sample is one step of the Gymnasium environment.
+        models: names of the models, in the paper's order.
     """
 
     summary: str
-    factorisation: str = "mean_field"
-    input_delay: int = 0
+    factorisation: str
+    input_delay: int
     as_published: bool = False
     through_environment: bool = False
-    with_baseline: bool = False
-
-    @property
-    def models(self) -> list[str]:
-        """Names of the models that are run, in the paper's order."""
-        return [model for model in PUBLISHED if model != "PEM-NARX" or self.with_baseline]
+    models: tuple[str, ...] = ("FEM-LARX", "FEM-NLARX")
 
 
 SETTINGS = {
     "as_published": Setting(
-        "mean field, input delay 0, the published run's two departures", as_published=True, with_baseline=True
+        "mean field, input delay 0, the two departures", "mean_field", 0, as_published=True, models=tuple(PUBLISHED)
     ),
     "through_environment": Setting(
-        "the same, but every sample is a step of SilverboxReplay-v0", as_published=True, through_environment=True
+        "the same, a step of SilverboxReplay-v0 per sample", "mean_field", 0, as_published=True, through_environment=True
     ),
-    "corrected_messages": Setting("mean field, input delay 0, messages as derived"),
-    "as_derived": Setting("mean field, input delay 1 as in Eq. (2), messages as derived", "mean_field", 1)
-    | {"with_baseline": True},
+    "corrected_messages": Setting("mean field, input delay 0, messages as derived", "mean_field", 0),
+    "as_derived": Setting(
+        "mean field, input delay 1, messages as derived", "mean_field", 1, models=tuple(PUBLISHED)
+    ),
     "structured": Setting("states and coefficients jointly Gaussian, input delay 1", "structured", 1),
-}
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A trained model on the validation part.
+
+    Attributes:
+        predicted: (T,) one-step predictions [V]; the first two entries repeat the measured outputs.
+        simulated: (T,) free run [V]; likewise.
+        prediction_mse: see `prediction_mse` [V²].
+        simulation_mse: see `simulation_mse` [V²].
+        seconds: time that the training took, once compiled [s].
+    """
+
+    predicted: FloatArray
+    simulated: FloatArray
+    prediction_mse: float
+    simulation_mse: float
+    seconds: float
+
+
+def reproduce(
+    data: Path | None = None, json: Path | None = None, figures: Path = Path("runs/reproduction")
+) -> dict[str, Any]:
+    """Repeats the experiment in all `SETTINGS`: progress on stderr, a table on stdout, figures and results in files.
+
+    Args:
+        data: File or folder of the record; searched for where it is None (`load_record`).
+        json: File for the results; None writes none.
+        figures: Folder for ``prediction_error.png`` and ``simulation_error.png``, which show ``as_published``.
+
+    Returns:
+        What the JSON file holds: for ``published`` and every name in `SETTINGS`, for each of its models, the two
+        mean squared errors [V²]; and under ``meta`` the settings, seconds of training, sample counts and versions.
+
+    Raises:
+        RecordNotFound: The record is not on this machine; the message says where to get it.
+        RecordDamaged: The file found is not the record.
+        OSError: A result cannot be written; found out before the work begins, where it can be.
+    """
+    record = load_record(data)
+    if json is not None:
+        if json.is_dir():
+            raise IsADirectoryError(f"json must be a file, but is the folder {json}; name a file in it")
+        json.parent.mkdir(parents=True, exist_ok=True)
+    figures.mkdir(parents=True, exist_ok=True)
+
+    runs = run_all(record, data)
+    results = summarise(runs, record)
+    if json is not None:
+        _write(json, (dumps(results, indent=2) + "\n").encode())
+    for measure, series in (("prediction", "predicted"), ("simulation", "simulated")):
+        png = io.BytesIO()
+        draw(runs["as_published"], record.arrow, measure, series).savefig(png, format="png")
+        _write(figures / f"{measure}_error.png", png.getvalue())
+
+    console = Console()
+    console.print(table(results))
+    for name, setting in SETTINGS.items():
+        console.print(f"{name:20} {setting.summary}", highlight=False)
+    return results
+
+
+def run_all(record: SilverboxRecord, data: Path | None) -> dict[str, dict[str, Run]]:
+    """Trains and validates each model of each setting, behind a progress bar on stderr."""
+    runs: dict[str, dict[str, Run]] = {}
+    columns = (SpinnerColumn(), *Progress.get_default_columns(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task("compiling", total=sum(len(setting.models) for setting in SETTINGS.values()))
+        compile_kernels(record, data)
+        for name, setting in SETTINGS.items():
+            runs[name] = {}
+            for model in setting.models:
+                progress.update(task, description=f"{name}, {model}")
+                runs[name][model] = run(setting, model, record, data)
+                progress.advance(task)
+        progress.update(task, description="done")
+    return runs
+
+
+def compile_kernels(record: SilverboxRecord, data: Path | None) -> None:
+    """Compiles what `run` trains with, so that its seconds do not count that.
+
+    Numba compiles anew for the record's arrays, which are read-only, and for the delayed copies of them.
+    """
+    for setting in SETTINGS.values():
+        if setting.through_environment:
+            env = make_environment(setting, True, data)
+            env.reset(seed=0)
+            env.step(np.zeros(1, dtype=np.float32))
+        else:
+            train_online(setting, True, Regime("multisine", record.multisine.u[:2], record.multisine.y[:2]))
+
+
+def run(setting: Setting, model: str, record: SilverboxRecord, data: Path | None) -> Run:
+    """Trains one model on the multisine part and validates it on the arrow part."""
+    training, validation = record.multisine, record.arrow
+    u, y = validation.u, validation.y
+    start = perf_counter()
+    if model == BASELINE:
+        narx = PEMNARX(input_delay=setting.input_delay).fit(training.u, training.y)
+        seconds = perf_counter() - start
+        predicted, simulated = narx.predict(u, y), narx.simulate(u, y[:2])
+    else:
+        nonlinear = model == "FEM-NLARX"
+        if setting.through_environment:
+            coefficients = train_through_environment(setting, nonlinear, data)
+        else:
+            coefficients = train_online(setting, nonlinear, training)
+        seconds = perf_counter() - start
+        nlarx = NLARX(nonlinear, setting.input_delay)
+        predicted, simulated = nlarx.predict(coefficients, u, y), nlarx.simulate(coefficients, u, y[:2])
+    return Run(predicted, simulated, prediction_mse(predicted, y), simulation_mse(simulated, y), seconds)
+
+
+def train_online(setting: Setting, nonlinear: bool, training: Regime) -> FloatArray:
+    """Posterior means (4,) of θ1, θ2, θ3, η after the whole training part."""
+    estimator = OnlineEstimator(
+        NLARX(nonlinear, setting.input_delay),
+        Prior.published_run(),
+        factorisation=setting.factorisation,
+        as_published=setting.as_published,
+    )
+    estimator.run(training.u, training.y)
+    return estimator.belief.coefficients_mean
+
+
+def train_through_environment(setting: Setting, nonlinear: bool, data: Path | None) -> FloatArray:
+    """The same means, from an episode in which the reference policy plays the recorded input.
+
+    Raises:
+        RuntimeError: The episode ended before the record did.
+    """
+    env = make_environment(setting, nonlinear, data)
+    policy = make_policy("silverbox-multisine", env=env)
+    observation, info = env.reset(seed=0)
+    state, terminated, truncated = None, False, False
+    while not (terminated or truncated):
+        action, state = policy.predict(observation, state)
+        observation, _, terminated, truncated, info = env.step(action)
+    if terminated:
+        raise RuntimeError(f"the episode must reach the end of the record, but was terminated before: {info}")
+    means: FloatArray = info["belief"].coefficients_mean
+    return means
+
+
+def make_environment(setting: Setting, nonlinear: bool, data: Path | None) -> gym.Env:
+    """The environment that replays the training part."""
+    return gym.make(
+        "duffing_env/SilverboxReplay-v0",
+        regime="multisine",
+        prior="published_run",
+        input_delay=setting.input_delay,
+        factorisation=setting.factorisation,
+        as_published=setting.as_published,
+        nonlinear=nonlinear,
+        data=None if data is None else str(data),
+    )
+
+
+def prediction_mse(predicted: FloatArray, y: FloatArray) -> float:
+    """Mean squared one-step prediction error [V²], indexed as in the published run.
+
+    With samples numbered from 1, that run predicts y_4, ..., y_T, and takes the mean over y_3, ..., y_T with the value
+    0 in place of a prediction of y_3.
+
+    Args:
+        predicted: (T,) predictions [V], of which the first three do not count.
+        y: (T,) measured outputs [V], T >= 3.
+    """
+    errors = predicted[2:] - y[2:]
+    errors[0] = 0.0 - y[2]
+    return float(np.mean(errors**2))
+
+
+def simulation_mse(simulated: FloatArray, y: FloatArray) -> float:
+    """Mean squared simulation error [V²] over y_3, ..., y_T: all but the two outputs that were given.
+
+    Args:
+        simulated: (T,) free run [V].
+        y: (T,) measured outputs [V], T >= 3.
+    """
+    return float(np.mean((simulated[2:] - y[2:]) ** 2))
+
+
+def summarise(runs: dict[str, dict[str, Run]], record: SilverboxRecord) -> dict[str, Any]:
+    """The results as `reproduce` returns them: plain dictionaries, fit for JSON."""
+    errors = {
+        name: {model: {measure: getattr(run, measure) for measure in MEASURES} for model, run in models.items()}
+        for name, models in runs.items()
+    }
+    meta = {
+        "prior": "published_run",
+        "settings": {name: asdict(setting) for name, setting in SETTINGS.items()},
+        "seconds": {name: {model: run.seconds for model, run in models.items()} for name, models in runs.items()},
+        "samples": {"training": len(record.multisine.u), "validation": len(record.arrow.u)},
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in VERSIONED},
+    }
+    return {"published": PUBLISHED, **errors, "meta": meta}
+
+
+def table(results: dict[str, Any]) -> Table:
+    """The errors, what part of the published ones they are, and their square roots."""
+    shown = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    shown.add_column("\nrun")
+    shown.add_column("\nmodel")
+    for measure in ("prediction", "simulation"):
+        shown.add_column(f"{measure}\nMSE [V²]", justify="right")
+        shown.add_column("of the\npublished", justify="right")
+        shown.add_column("RMSE\n[mV]", justify="right")
+    for name in ("published", *SETTINGS):
+        for model, errors in results[name].items():
+            cells = []
+            for measure in MEASURES:
+                mse = errors[measure]
+                ratio = mse / PUBLISHED[model][measure]  # type: ignore[literal-required]
+                cells += [f"{mse:.4e}", f"{ratio:.4f}", f"{1e3 * np.sqrt(mse):.3f}"]
+            shown.add_row(name, model, *cells)
+        shown.add_section()
+    return shown
+
+
+def draw(runs: dict[str, Run], validation: Regime, measure: str, series: str) -> Figure:
+    """One of the paper's two figures of errors: a column for each model, the lower row in log scale.
+
+    Args:
+        runs: The models by name.
+        validation: What they were validated on.
+        measure: ``prediction`` or ``simulation``.
+        series: Which series of a `Run` that is: ``predicted`` or ``simulated``.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5.2), dpi=110, layout="constrained")
+    axes = figure.subplots(2, len(runs), sharex=True, sharey="row")
+    samples = np.arange(0, len(validation.y), EVERY)
+    for (upper, lower), (model, run) in zip(axes.T, runs.items(), strict=True):
+        output = getattr(run, series)[samples]
+        squared_error = (output - validation.y[samples]) ** 2
+        upper.plot(samples, output, color="purple", linewidth=0.8, label=f"{measure} [V]")
+        upper.plot(samples, squared_error, color="black", linewidth=1.0, label="squared error [V²]")
+        upper.set_title(f"{model}: MSE {getattr(run, f'{measure}_mse'):.3e} V²", fontsize=11)
+        lower.semilogy(samples, squared_error, color="black", linewidth=0.6, nonpositive="mask")
+        lower.set_xlabel("sample")
+    axes[0, 0].set_ylabel("output [V], squared error [V²]")
+    axes[1, 0].set_ylabel("squared error [V²]")
+    axes[0, 0].legend(loc="upper left", fontsize=9)
+    return figure
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Writes a file whole or not at all."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

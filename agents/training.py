@@ -131,6 +131,7 @@ def train(config: TrainConfig) -> Run:
     )
     model.set_logger(configure(str(folder), ["csv"]))
     curve: list[tuple[int, float, float]] = []
+    checkpoints = 0
 
     def save(target: Path) -> None:
         save_policy(target, model, {"algorithm": "ppo", "steps": model.num_timesteps, **description})
@@ -142,7 +143,6 @@ def train(config: TrainConfig) -> Run:
             checkpoints += 1
             save(folder / "checkpoints" / f"{steps:09d}")
 
-    checkpoints = 0
     _learn(model, config.steps, on_update)
     save(folder)
     draw_learning_curve(folder / "learning_curve.png", curve, config.reward)
@@ -166,7 +166,7 @@ def _learn(model: PPO, steps: int, on_update: Callable[[int, float], None]) -> N
                 return True
 
             def _on_rollout_end(self) -> None:
-                episodes = self.model.ep_info_buffer or []
+                episodes: Any = self.model.ep_info_buffer or []
                 mean_return = float(np.mean([episode["r"] for episode in episodes])) if episodes else float("nan")
                 rate = self.num_timesteps / (time.perf_counter() - started)
                 status = f"{self.num_timesteps:,} samples, {rate:,.0f}/s, return {mean_return:.2f}"

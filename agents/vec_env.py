@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -108,5 +108,5 @@ class DuffingVecEnv(VecEnv):
 
         return [wrapper_class is Monitor] * len(self._rows(indices))
 
-    def _rows(self, indices: VecEnvIndices) -> Iterable[int]:
+    def _rows(self, indices: VecEnvIndices) -> list[int]:
         return list(self._get_indices(indices))

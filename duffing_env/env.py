@@ -34,7 +34,7 @@ def action_space() -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
 
 
-class DuffingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
+class DuffingEnv(gym.Env[Any, Any]):
     """Choose the input of a Duffing oscillator so that its parameters are identified.
 
     ## Description
@@ -169,8 +169,7 @@ class DuffingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     @property
     def truth(self) -> PhysicalParameters:
         """The oscillator that is to be identified."""
-        truth = self._batch.truth()
-        return PhysicalParameters(*(float(value[0]) for value in (truth.m, truth.c, truth.a, truth.b)))  # type: ignore[index]
+        return PhysicalParameters(*(float(self._batch.quantity(name)[0]) for name in ("m", "c", "a", "b")))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -214,7 +213,7 @@ class DuffingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> npt.NDArray[np.uint8] | None:
         """Input, output and posterior so far: an RGB array (height, width, 3) in mode ``rgb_array``."""
         if self.render_mode is None or self._screen is None:
             gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array', and reset it")

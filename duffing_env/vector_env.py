@@ -186,7 +186,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
             if len(seeds) != self.num_envs:
                 raise ValueError(f"seed must hold {self.num_envs} seeds, but holds {len(seeds)}; pass one for each row")
         for row in np.flatnonzero(mask):
-            generator, _ = gym.utils.seeding.np_random(seeds[row])
+            generator, _ = gym.utils.seeding.np_random(seeds[int(row)])
             self._batch.seed(int(row), generator)
         self._seeded = True
 
