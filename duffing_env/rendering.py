@@ -1,0 +1,342 @@
+"""The environment as a picture: input and output on the left, what is believed of m, c, a and b on the right.
+
+``python -m duffing_env.rendering PATH.png`` draws an episode of uniform noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from estimator.belief import Belief
+from estimator.parameters import SAMPLING_STEP, FloatArray, PhysicalParameters, propagate_to_physical
+
+Frame = npt.NDArray[np.uint8]
+
+WIDTH, HEIGHT = 960, 540
+"""Size of a frame in pixels."""
+
+SPAN = 256
+"""Samples on the time axes. Longer episodes scroll: more samples would hide the single periods."""
+
+HALF_90 = 1.6449
+"""Half of the central 90 % of a Gaussian, in standard deviations."""
+
+# m, c, a and b: label, and the power of ten that its numbers are in.
+PARAMETERS = (
+    ("mass m [10⁻⁶ s²]", 1e-6),
+    ("damping c [10⁻⁴ s]", 1e-4),
+    ("stiffness a", 1.0),
+    ("cubic stiffness b [V⁻²]", 1.0),
+)
+
+MILLISECONDS = 1e3 * SAMPLING_STEP
+
+INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
+SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"
+_TITLE: dict[str, Any] = {"fontsize": 9, "pad": 4}
+# A curve ends in a dot. What is "animated" Matplotlib leaves out of the background.
+_CURVE: dict[str, Any] = {"marker": "o", "markersize": 3.5, "markevery": [-1], "animated": True}
+
+
+class Screen:
+    """Draws one episode after another: as RGB arrays and, in mode ``human``, in a window.
+
+    Copies and pickles go on drawing, but have no window: a planner that tries inputs on a copy shows nothing.
+
+    Args:
+        render_mode: ``rgb_array``, or ``human``: then `start` and `add` show the frame in a window.
+        max_input, max_output: where the limits are drawn [V].
+        fps: frames per second that the window does not exceed.
+
+    Raises:
+        gymnasium.error.DependencyNotInstalled: in mode ``human`` without pygame.
+    """
+
+    def __init__(self, render_mode: str | None, max_input: float, max_output: float, fps: float) -> None:
+        self._limits = max_input, max_output
+        self._picture: _Picture | None = None
+        self._window = _Window(fps) if render_mode == "human" else None
+
+    def start(self, truth: PhysicalParameters, belief: Belief, horizon: int) -> None:
+        """Begin an episode of at most ``horizon`` samples; ``belief`` is the prior."""
+        self._truth = np.array([truth.m, truth.c, truth.a, truth.b])
+        self._horizon = horizon
+        self._samples = 0
+        self._prior_entropy = belief.entropy()
+        # Input, output and the belief after them; nothing was applied before the prior.
+        self._history: deque[tuple[float, float, Belief]] = deque([(np.nan, np.nan, belief)], maxlen=SPAN + 1)
+        self._show()
+
+    def add(self, u: float, y: float, belief: Belief) -> None:
+        """Take note of a sample: the input applied [V], the output that followed [V] and the belief after it."""
+        self._samples += 1
+        self._history.append((u, y, belief))
+        self._show()
+
+    def frame(self) -> Frame:
+        """The episode so far (of a long one the last `SPAN` samples) as a new RGB array (HEIGHT, WIDTH, 3)."""
+        if self._picture is None:
+            self._picture = _Picture(*self._limits)
+        inputs, outputs, beliefs = zip(*self._history, strict=True)
+        means, stds = _physical_moments(beliefs)
+        gained = self._prior_entropy - beliefs[-1].entropy()
+        first = self._samples + 1 - len(beliefs)
+        return self._picture.draw(
+            status=f"sample {self._samples} of {self._horizon}, {gained:.1f} nats gained",
+            extent=(first, max(self._samples, min(self._horizon, SPAN))),
+            signals=np.array([inputs, outputs]),
+            means=means,
+            stds=stds,
+            truth=self._truth,
+        )
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _show(self) -> None:
+        if self._window is not None:
+            self._window.show(self.frame())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_picture": None, "_window": None}
+
+
+def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray]:
+    """(4, n) means and standard deviations of m, c, a and b, first order.
+
+    NaN where a belief has none: Eq. (4) divides by η, whose mean is about 0.4 but may pass 0 on the way.
+    """
+    mean = np.array([belief.coefficients_mean for belief in beliefs])
+    cov = np.array([belief.coefficients_cov for belief in beliefs])
+    known = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2)) & (np.abs(mean[:, -1]) > 1e-9)
+    means, stds = np.full((2, *mean.shape), np.nan)
+    with np.errstate(all="ignore"):
+        means[known], physical_cov = propagate_to_physical(mean[known], cov[known])
+        stds[known] = np.sqrt(np.diagonal(physical_cov, axis1=-2, axis2=-1))
+    return means.T, stds.T
+
+
+class _Picture:
+    """The figure, on the Agg canvas itself: pyplot would look for a display, and keep the figure for good.
+
+    Axes and labels are drawn when the time axes change, and kept as a background; a frame adds curves and numbers.
+    """
+
+    def __init__(self, max_input: float, max_output: float) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        self._figure = Figure((WIDTH / 100, HEIGHT / 100), dpi=100, facecolor="white")
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._background: Any = None
+        self._extent: tuple[int, int] | None = None
+
+        left, right = (0.06, 0.41), (0.575, 0.405)
+        self._signals = (
+            _SignalPanel(self._add_axes(*left, 0.52, 0.34), "input u [V]", max_input, "steps-pre"),
+            _SignalPanel(self._add_axes(*left, 0.10, 0.34), "output y [V]", max_output, "default"),
+        )
+        self._parameters = [
+            _ParameterPanel(self._add_axes(*right, 0.10 + 0.205 * row, 0.145), name, unit)
+            for row, (name, unit) in zip((3, 2, 1, 0), PARAMETERS, strict=True)
+        ]
+        self._panels: tuple[_SignalPanel | _ParameterPanel, ...] = (*self._signals, *self._parameters)
+        style: dict[str, Any] = {"color": INK, "verticalalignment": "center_baseline"}
+        self._figure.text(0.06, 0.945, "Duffing oscillator", fontsize=12, weight="bold", **style)
+        self._status = self._figure.text(0.245, 0.945, "", fontsize=9, animated=True, **style)
+        self._figure.text(0.505, 0.48, "deviation from the truth [%]", color=INK, fontsize=9, rotation=90, va="center")
+        self._add_legend()
+
+    def draw(
+        self,
+        status: str,
+        extent: tuple[int, int],
+        signals: FloatArray,
+        means: FloatArray,
+        stds: FloatArray,
+        truth: FloatArray,
+    ) -> Frame:
+        """Draw a frame.
+
+        Args:
+            status: the line beside the title.
+            extent: first and last sample of the time axes. The arrays begin with the first.
+            signals: (2, n) inputs and outputs [V].
+            means: (4, n) of m, c, a, b.
+            stds: (4, n) their standard deviations.
+            truth: (4,) true m, c, a, b.
+        """
+        if extent != self._extent:
+            self._draw_background(extent)
+        times = MILLISECONDS * np.arange(extent[0], extent[0] + signals.shape[1])
+        self._status.set_text(status)
+        for signal_panel, values in zip(self._signals, signals, strict=True):
+            signal_panel.update(times, values)
+        for parameter_panel, mean, std, true in zip(self._parameters, means, stds, truth, strict=True):
+            parameter_panel.update(times, mean, HALF_90 * std, true)
+
+        self._canvas.restore_region(self._background)
+        for panel in self._panels:
+            for artist in panel.moving:
+                self._figure.draw_artist(artist)
+        self._figure.draw_artist(self._status)
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _draw_background(self, extent: tuple[int, int]) -> None:
+        margin = 0.01 * (extent[1] - extent[0])  # for the dots
+        for panel in self._panels:
+            panel.axes.set_xlim(MILLISECONDS * (extent[0] - margin), MILLISECONDS * (extent[1] + margin))
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._extent = extent
+
+    def _add_axes(self, left: float, width: float, bottom: float, height: float) -> Any:
+        axes = self._figure.add_axes((left, bottom, width, height))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["bottom", "left"]].set_color(GREY)
+        axes.tick_params(labelsize=8, colors=GREY, length=3)
+        axes.grid(axis="y", color=RULE, linewidth=0.6)
+        axes.set_axisbelow(True)
+        if bottom == 0.10:
+            axes.set_xlabel("time [ms]", fontsize=9, color=INK)
+        else:
+            axes.tick_params(labelbottom=False)
+        return axes
+
+    def _add_legend(self) -> None:
+        parameter = self._parameters[0]
+        entries = {
+            "limit": self._signals[0].limit,
+            "truth": parameter.truth,
+            "posterior mean": parameter.mean,
+            "90 % band": parameter.band,
+        }
+        self._figure.legend(
+            entries.values(),
+            entries.keys(),
+            loc="center right",
+            bbox_to_anchor=(0.99, 0.947),
+            ncols=len(entries),
+            fontsize=8.5,
+            labelcolor=INK,
+            frameon=False,
+            handlelength=1.6,
+            columnspacing=1.4,
+        )
+
+
+class _SignalPanel:
+    """Input or output over time, between its limits [V]. ``moving``: what a frame draws over the background."""
+
+    def __init__(self, axes: Any, name: str, limit: float, drawstyle: str) -> None:
+        self.axes = axes
+        axes.set_title(name, loc="left", color=INK, **_TITLE)
+        self._edge = 1.15 * limit
+        axes.set_ylim(-self._edge, self._edge)
+        axes.set_yticks(limit * np.array([-1, -0.5, 0, 0.5, 1]))
+        axes.yaxis.set_major_formatter("{x:.4g}")
+        for edge in (-limit, limit):
+            self.limit = axes.axhline(edge, color=GREY, linewidth=1, linestyle=(0, (1, 2)))
+        (self._curve,) = axes.plot([], color=SIGNAL, linewidth=1, drawstyle=drawstyle, **_CURVE)
+        self.moving = (self._curve,)
+
+    def update(self, times: FloatArray, values: FloatArray) -> None:
+        self._curve.set_data(times, np.clip(values, -self._edge, self._edge))
+
+
+class _ParameterPanel:
+    """Mean and credible band of one parameter as deviations from the truth, and as numbers above."""
+
+    _EDGE = 150.0  # [%]; what is further from the truth is drawn there
+
+    def __init__(self, axes: Any, name: str, unit: float) -> None:
+        self.axes = axes
+        self._unit = unit
+        axes.set_title(name, loc="left", color=INK, **_TITLE)
+        # Linear near the truth and logarithmic away from it: a belief contracts by a factor of a hundred and more.
+        axes.set_yscale("asinh", linear_width=0.3)
+        axes.set_ylim(-self._EDGE, self._EDGE)
+        axes.set_yticks([-100, -10, -1, 0, 1, 10, 100], ["−100", "−10", "−1", "", "1", "10", "100"])
+        axes.yaxis.minorticks_off()
+        self.truth = axes.axhline(0, color=TRUTH, linewidth=1, linestyle=(0, (4, 2)))
+        self.band = axes.fill_between([], [], color=POSTERIOR, alpha=0.22, linewidth=0, animated=True)
+        (self.mean,) = axes.plot([], color=POSTERIOR, linewidth=1.3, **_CURVE)
+        self._true_value = axes.set_title("", loc="center", color=TRUTH, animated=True, **_TITLE)
+        self._estimate = axes.set_title("", loc="right", color=POSTERIOR, animated=True, **_TITLE)
+        self.moving = (self.band, self.mean, self._true_value, self._estimate)
+
+    def update(self, times: FloatArray, mean: FloatArray, half: FloatArray, true: float) -> None:
+        percent = 100 * np.array([mean - half - true, mean - true, mean + half - true]) / abs(true)
+        low, middle, high = np.clip(percent, -self._EDGE, self._EDGE)
+        self.mean.set_data(times, middle)
+        known = np.isfinite(low) & np.isfinite(high)
+        there, back = (times[known], low[known]), (times[known][::-1], high[known][::-1])
+        self.band.set_verts([np.hstack([there, back]).T])
+        self._true_value.set_text(f"true {true / self._unit:.3f}")
+        in_sight = half[-1] < 10 * abs(true)
+        numbers = f"{mean[-1] / self._unit:z.3f} ± {half[-1] / self._unit:.3f}".replace("-", "−")
+        self._estimate.set_text(numbers if in_sight else "not known yet")
+
+
+class _Window:
+    """A window of pygame's that shows frames."""
+
+    def __init__(self, fps: float) -> None:
+        try:
+            import pygame
+        except ImportError as error:
+            raise gym.error.DependencyNotInstalled(
+                "render_mode='human' needs pygame: pip install \"duffing-env[human]\", or use render_mode='rgb_array'"
+            ) from error
+        self._pygame = pygame
+        self._fps = fps
+        pygame.display.init()
+        pygame.display.set_caption("Duffing oscillator")
+        self._surface = pygame.display.set_mode((WIDTH, HEIGHT))
+        self._clock = pygame.time.Clock()
+
+    def show(self, frame: Frame) -> None:
+        """Show a frame, once the last has been seen for 1 / fps."""
+        self._pygame.event.pump()
+        self._surface.blit(self._pygame.image.frombuffer(frame.tobytes(), (WIDTH, HEIGHT), "RGB"), (0, 0))
+        self._clock.tick(self._fps)
+        self._pygame.display.flip()
+
+    def close(self) -> None:
+        self._pygame.display.quit()
+
+
+def main() -> None:
+    """Write the picture of an episode of uniform noise, as PNG."""
+    parser = argparse.ArgumentParser(prog="python -m duffing_env.rendering", description=main.__doc__)
+    parser.add_argument("path", type=Path, help="the file to write")
+    path: Path = parser.parse_args().path
+
+    import matplotlib.image
+
+    env = gym.make("duffing_env/Amplitude-v0", render_mode="rgb_array")
+    env.reset(seed=1)
+    env.action_space.seed(1)
+    ended = False
+    while not ended:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        ended = terminated or truncated
+    partial = path.with_name(f".{path.name}.partial")
+    matplotlib.image.imsave(partial, np.asarray(env.render()), format="png")
+    os.replace(partial, path)
+
+
+if __name__ == "__main__":
+    main()
