@@ -4,7 +4,10 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 """
 
 from estimator.belief import Belief, Prior
+from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
+from estimator.models.ode import DuffingODE
+from estimator.offline import PEMNARX
 from estimator.online import OnlineEstimator
 from estimator.parameters import (
     SAMPLING_STEP,
@@ -17,10 +20,13 @@ from estimator.parameters import (
 
 __all__ = [
     "NLARX",
+    "PEMNARX",
     "SAMPLING_STEP",
     "SILVERBOX_TWIN",
     "Belief",
     "Coefficients",
+    "DuffingODE",
+    "JointBelief",
     "OnlineEstimator",
     "PhysicalParameters",
     "Prior",

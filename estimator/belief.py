@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from estimator.gaussian import GaussianCoefficients
 from estimator.parameters import (
     SILVERBOX_TWIN,
     Coefficients,
@@ -33,7 +34,7 @@ def _covariance_index() -> npt.NDArray[np.intp]:
 _COVARIANCE = _covariance_index()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prior:
     """What is believed before the first sample.
 
@@ -85,7 +86,10 @@ class Prior:
         else:
             joint = self._settle("coefficients_cov", (4, 4))
             _check_covariance("coefficients_cov", joint)
-            if not (np.allclose(joint[:3, :3], self.theta_cov) and np.isclose(joint[3, 3], self.eta_var)):
+            blocks = joint.copy()
+            blocks[:3, :3] = self.theta_cov
+            blocks[3, 3] = self.eta_var
+            if not _agree(joint, blocks):
                 raise ValueError(
                     f"coefficients_cov must contain theta_cov and eta_var as its blocks, but has diagonal "
                     f"{np.diag(joint)}; pass theta_cov=coefficients_cov[:3, :3] and eta_var=coefficients_cov[3, 3]"
@@ -128,7 +132,8 @@ class Prior:
             spread: m, c, a and b are log-uniform on center * [1 - spread, 1 + spread]; in (0, 1).
             process_noise: standard deviation of w̃ [V] at which the prior of γ is centred.
             measurement_noise: standard deviation of v [V] at which the prior of ξ is centred.
-            noise_shape: shape of both Gamma priors: 2 is weak, worth four samples.
+            noise_shape: shape of both Gamma priors: 2 is worth four noises seen one by one. They never are, so that
+                even such a prior binds for thousands of samples (docs/coverage.md): centre it with care.
             state_std: standard deviation of x_0 and x_{-1} [V].
             center: the oscillator in the middle of the range.
         """
@@ -160,10 +165,11 @@ class Prior:
         mean[_STATES:] = [*self.theta_mean, self.eta_mean]
         cov = np.zeros((7, 7))
         cov[:2, :2] = self.state_cov
-        cov[2, 2] = self.state_cov[1, 1]
         assert self.coefficients_cov is not None
         cov[_STATES:, _STATES:] = self.coefficients_cov
-        if factorisation == "mean_field":
+        if factorisation == "structured":
+            cov[2, 2] = self.state_cov[1, 1]
+        else:
             cov[_STATES:-1, -1] = cov[-1, _STATES:-1] = 0.0
         if not nonlinear:
             mean[4] = 0.0
@@ -175,8 +181,8 @@ class Prior:
         return record
 
 
-@dataclass(frozen=True)
-class Belief:
+@dataclass(frozen=True, eq=False)
+class Belief(GaussianCoefficients):
     """A posterior: q(x, θ, η) Gaussian, q(γ) and q(ξ) Gamma. A copy; later updates do not change it.
 
     Attributes:
@@ -198,10 +204,6 @@ class Belief:
     @property
     def _lags(self) -> int:
         return 3 if self.factorisation == "structured" else 2
-
-    @property
-    def _active(self) -> list[int]:
-        return [0, 1, 2, 3] if self.nonlinear else [0, 2, 3]
 
     @property
     def state_mean(self) -> FloatArray:
@@ -275,17 +277,12 @@ class Belief:
 
     def coefficients(self) -> Coefficients:
         """The posterior means as coefficients."""
-        return Coefficients(*self.coefficients_mean, gamma=self.gamma_mean, xi=self.xi_mean)
+        theta1, theta2, theta3, eta = self.coefficients_mean.tolist()
+        return Coefficients(theta1, theta2, theta3, eta, self.gamma_mean, self.xi_mean)
 
     def physical(self) -> tuple[FloatArray, FloatArray]:
         """Mean (4,) and covariance (4, 4) of (m, c, a, b), first order, Eq. (4)."""
         return propagate_to_physical(self.coefficients_mean, self.coefficients_cov)
-
-    def entropy(self) -> float:
-        """Entropy of q(θ, η) in nats."""
-        active = self._active
-        sign, log_det = np.linalg.slogdet(self.coefficients_cov[np.ix_(active, active)])
-        return float(0.5 * (len(active) * np.log(2 * np.pi * np.e) + log_det)) if sign > 0 else float("nan")
 
     def log_prob(self, coefficients: Coefficients | npt.ArrayLike) -> float | FloatArray:
         """Log density of q(θ, η) at given coefficients.
@@ -301,24 +298,18 @@ class Belief:
         """
         if isinstance(coefficients, Coefficients):
             c = coefficients
-            points = np.stack([c.theta1, c.theta2, c.theta3, c.eta], axis=-1)
-        else:
-            points = np.asarray(coefficients, dtype=np.float64)
-        if points.ndim == 0 or points.shape[-1] != 4:
-            raise ValueError(f"coefficients must have shape (..., 4), but has {points.shape}; order θ1, θ2, θ3, η")
-        if not np.isfinite(points).all():
-            raise ValueError("coefficients must be finite, but has entries that are not; remove them")
-        active = self._active
-        deviation = (points - self.coefficients_mean)[..., active]
-        factor = np.linalg.cholesky(self.coefficients_cov[np.ix_(active, active)])
-        whitened = np.linalg.solve(factor, deviation[..., None])[..., 0]
-        log_det = 2 * np.log(np.diag(factor)).sum()
-        value = -0.5 * ((whitened**2).sum(-1) + log_det + len(active) * np.log(2 * np.pi))
-        return float(value) if np.ndim(value) == 0 else value
+            coefficients = np.stack([c.theta1, c.theta2, c.theta3, c.eta], axis=-1)
+        return super().log_prob(coefficients)
+
+
+def _agree(first: FloatArray, second: FloatArray) -> bool:
+    """Whether two covariances are the same up to rounding, each entry beside the standard deviations it belongs to."""
+    std = np.sqrt(np.abs(np.diag(first)))
+    return bool((np.abs(first - second) <= 1e-9 * np.outer(std, std)).all())
 
 
 def _check_covariance(name: str, value: FloatArray) -> None:
-    if not np.allclose(value, value.T, rtol=1e-9):
+    if not _agree(value, value.T):
         raise ValueError(f"{name} must be symmetric, but is {value.tolist()}; pass (C + C.T) / 2")
     smallest = np.linalg.eigvalsh(value)[0]
     if smallest <= 0:

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.special import expit
 
+from estimator.checks import series
 from estimator.parameters import FloatArray
 
 TOLERANCE = 1e-6
@@ -193,7 +194,7 @@ class PEMNARX:
             RuntimeError: Before `fit`.
         """
         parameters, mean = self._fitted()
-        u, y_init = _series("u", u), _series("y_init", y_init)
+        u, y_init = series("u", u), series("y_init", y_init)
         if not 2 <= len(y_init) <= len(u):
             raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(y_init)}")
         simulated = np.empty(len(u))
@@ -278,21 +279,9 @@ def _restarts(number: int, progress: bool) -> Iterable[int]:
 
 def _pair(u: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Two finite series of one length of at least 2."""
-    inputs, outputs = _series("u", u), _series("y", y)
+    inputs, outputs = series("u", u), series("y", y)
     if inputs.shape != outputs.shape or len(outputs) < 2:
         raise ValueError(
             f"u and y must have one length of at least 2, but have {len(inputs)} and {len(outputs)}; cut the longer one"
         )
     return inputs, outputs
-
-
-def _series(name: str, values: npt.ArrayLike) -> FloatArray:
-    """A contiguous finite series (T,)."""
-    series = np.ascontiguousarray(values, dtype=np.float64)
-    if series.ndim != 1:
-        raise ValueError(f"{name} must have shape (T,), but has {series.shape}; pass one channel, e.g. {name}.ravel()")
-    finite = np.isfinite(series)
-    if not finite.all():
-        bad = int(np.argmin(finite))
-        raise ValueError(f"{name} must be finite, but {name}[{bad}] is {series[bad]}; remove or interpolate the sample")
-    return series

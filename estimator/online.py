@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief, Prior
-from estimator.inference import DEFAULT_ITERATIONS, update
-from estimator.lanes import LANES, kernel
+from estimator.checks import scalar, series
+from estimator.filters import Filter, NLARXFilter, ODEFilter
+from estimator.gaussian import JointBelief
+from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.nlarx import NLARX
+from estimator.models.ode import DuffingODE
 from estimator.parameters import FloatArray
-from estimator.record import LAYOUT, N_ROWS, RECORD_SIZE
 
-_U = LAYOUT["u"]
-_Y = LAYOUT["y"]
 _SAMPLES_BETWEEN_REPORTS = 5_000
 
 
@@ -25,8 +27,9 @@ class OnlineEstimator:
     those two; feed such pairs to a model with ``input_delay=0``.
 
     Args:
-        model: the model, `NLARX`.
-        prior: belief before the first sample; `Prior.silverbox_twin` where it is not given.
+        model: `NLARX`, the paper's difference equation, where it is not given; or `DuffingODE`, the physical one.
+        prior: belief before the first sample. A `Prior` for `NLARX`, `Prior.silverbox_twin()` where it is not given;
+            a `JointBelief` for `DuffingODE`, whose method `prior` makes the one that is used where it is not given.
         factorisation: ``structured`` (states and coefficients jointly Gaussian) or ``mean_field`` (the paper's).
         iterations: variational iterations per sample; 3 structured, 10 mean field where it is not given.
         as_published: mean field with the two departures of the published run, to reproduce its numbers.
@@ -40,8 +43,8 @@ class OnlineEstimator:
         >>> truth = to_coefficients(SILVERBOX_TWIN)
         >>> rng = np.random.default_rng(0)
         >>> u = rng.uniform(-0.15, 0.15, 500)
-        >>> x = np.zeros(501)
-        >>> for t in range(1, 500):
+        >>> x = np.zeros(501)  # x[-1] is 0 while it stands for the displacement before the first
+        >>> for t in range(500):
         ...     x[t + 1] = truth.theta1 * x[t] + truth.theta2 * x[t] ** 3 + truth.theta3 * x[t - 1]
         ...     x[t + 1] += truth.eta * u[t] + 5e-4 * rng.standard_normal()
         >>> y = x[:500] + 5e-4 * rng.standard_normal(500)
@@ -53,8 +56,8 @@ class OnlineEstimator:
 
     def __init__(
         self,
-        model: NLARX | None = None,
-        prior: Prior | None = None,
+        model: NLARX | DuffingODE | None = None,
+        prior: Prior | JointBelief | None = None,
         factorisation: str = "structured",
         iterations: int | None = None,
         as_published: bool = False,
@@ -71,20 +74,33 @@ class OnlineEstimator:
                 f"the published run was mean field"
             )
         self.model = model if model is not None else NLARX()
-        self.prior = prior if prior is not None else Prior.silverbox_twin()
         self.factorisation = factorisation
         self.iterations = int(iterations)
         self.as_published = as_published
-        self._last_input = 0.0
+        self._filter = self._make_filter(prior)
         self._free_energies = np.full(self.iterations, np.nan)
-        record = self.prior.to_record(factorisation=factorisation, nonlinear=self.model.nonlinear)
-        self._block = np.zeros((N_ROWS, LANES))
-        self._block[:RECORD_SIZE] = record[:, None]
+        self._forecasts = np.empty((0, 2))
+
+    def _make_filter(self, prior: Prior | JointBelief | None) -> Filter:
+        if isinstance(self.model, DuffingODE):
+            if self.factorisation != "structured":
+                raise ValueError(
+                    f"factorisation must be 'structured' for DuffingODE, but is {self.factorisation!r}; mean field is "
+                    f"for NLARX"
+                )
+            prior = prior if prior is not None else self.model.prior()
+            if not isinstance(prior, JointBelief) or prior.names != self.model.names:
+                raise ValueError(f"prior must be one of DuffingODE's, but is {prior!r:.60}; use model.prior(...)")
+            return ODEFilter(self.model, prior)
+        prior = prior if prior is not None else Prior.silverbox_twin()
+        if not isinstance(prior, Prior):
+            raise ValueError(f"prior must be a Prior for NLARX, but is {prior!r:.60}; use Prior.silverbox_twin(...)")
+        return NLARXFilter(self.model, prior, self.factorisation, self.as_published)
 
     @property
-    def belief(self) -> Belief:
-        """The posterior after the last sample."""
-        return Belief(self._block[:RECORD_SIZE, 0], self.factorisation, self.model.nonlinear)
+    def belief(self) -> Belief | JointBelief:
+        """The posterior after the last sample: `Belief` of an `NLARX`, `JointBelief` of a `DuffingODE`."""
+        return self._filter.belief
 
     @property
     def free_energy(self) -> float:
@@ -96,6 +112,11 @@ class OnlineEstimator:
         """(iterations,) free energy of the last sample after each iteration [nats]."""
         return self._free_energies.copy()
 
+    @property
+    def forecasts(self) -> FloatArray:
+        """(T, 2) mean [V] and variance [V²] of each output of the last `run` before it was seen; NaN in mean field."""
+        return self._forecasts.copy()
+
     def update(self, u: float, y: float) -> None:
         """Update the posterior with the sample (u, y), both in volts.
 
@@ -103,7 +124,9 @@ class OnlineEstimator:
             ValueError: if u or y is not a finite number, or drives the belief out of the range of floating-point
                 numbers. The estimator is then as it was before.
         """
-        self.run(np.array([_scalar("u", u)]), np.array([_scalar("y", y)]))
+        if self.model.needs_all_inputs:
+            raise ValueError("interpolation must not be 'spline' for single samples; use run() or 'look_ahead'")
+        self.run(np.array([scalar("u", u)]), np.array([scalar("y", y)]))
 
     def run(self, u: npt.ArrayLike, y: npt.ArrayLike, progress: bool = False) -> FloatArray:
         """Update the posterior with T samples, in order. The same as `update` with each of them.
@@ -114,58 +137,61 @@ class OnlineEstimator:
             progress: show a progress bar.
 
         Returns:
-            Free energy (T, iterations) of each sample after each iteration [nats].
+            Free energy (T, iterations) of each sample after each iteration [nats]. A model that looks ahead uses a
+            sample when the next input is known: then the rows begin with the sample that waited, if there was one.
 
         Raises:
             ValueError: as `update`; the estimator is then as it was before the first of the samples.
         """
-        u, y = _series("u", u), _series("y", y)
+        u, y = series("u", u), series("y", y)
         if u.shape != y.shape:
             raise ValueError(f"u and y must have one length, but have {len(u)} and {len(y)}; cut the longer one")
         if not len(u):
             return np.empty((0, self.iterations))
-        acting = u
-        if self.model.input_delay:
-            acting = np.concatenate(([self._last_input], u[:-1]))
-        block = self._block.copy()
+        memory = self._filter.copy()
         free_energies = np.empty((len(u), self.iterations))
-        for start, stop in _chunks(len(u), progress):
-            _run(
-                block.reshape(-1),
-                acting[start:stop],
-                y[start:stop],
-                self.factorisation == "structured",
-                self.as_published,
-                free_energies[start:stop],
-            )
-        if not np.isfinite(block[:RECORD_SIZE, 0]).all():
-            bad = int(np.argmin(np.isfinite(free_energies).all(axis=1)))
+        forecasts = np.empty((len(u), 2))
+        used = 0
+        for start, stop in self._chunks(len(u), progress):
+            used += memory.run(u[start:stop], y[start:stop], free_energies[used:], forecasts[used:])
+        free_energies, forecasts = free_energies[:used], forecasts[:used]
+        finite = np.asarray(np.isfinite(free_energies).all(axis=1))
+        if used:
+            finite[-1] &= memory.is_finite
+        if not finite.all():
+            bad = int(np.argmin(finite))
             raise ValueError(
-                f"u and y must keep the belief finite, but near sample {bad} (u = {u[bad]}, y = {y[bad]}) it overflowed; "
-                f"the estimator is unchanged: check the sample's scale (volts), or use a prior nearer to the system"
+                f"u and y must keep the belief finite, but near sample {bad} (u = {u[bad]}, y = {y[bad]}) it "
+                f"overflowed; the estimator is unchanged: check the sample's scale (volts), or use a prior nearer to "
+                f"the system"
             )
-        self._block = block
-        self._last_input = float(u[-1])
-        self._free_energies = free_energies[-1]
+        self._filter = memory
+        self._forecasts = forecasts
+        if used:
+            self._free_energies = free_energies[-1].copy()
         return free_energies
 
+    def rewind(self) -> None:
+        """Forget where the oscillator is and what drove it, keep what is known about it: for another record or pass."""
+        self._filter.rewind()
+
     def predict(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """One-step predictions at the posterior means: each output from the two measured before it.
+        """One-step predictions at the posterior means: each output from those measured before it.
 
         Args:
             u: (T,) inputs [V].
             y: (T,) outputs [V], paired with u by index; T >= 2.
 
         Returns:
-            Predictions (T,) [V]; the first two entries repeat y.
+            Predictions (T,) [V]; those of an `NLARX` are from the last two outputs, and the first two repeat y.
         """
-        u, y = _series("u", u), _series("y", y)
+        u, y = series("u", u), series("y", y)
         if u.shape != y.shape or len(y) < 2:
             raise ValueError(f"u and y must have one length of at least 2, but have {len(u)} and {len(y)}")
-        return self.model.predict(self.belief.coefficients_mean, u, y)
+        return self._filter.predict(u, y)
 
     def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:
-        """Free run at the posterior means over all of u: each output from the two simulated before it.
+        """Free run at the posterior means over all of u.
 
         Args:
             u: (T,) inputs [V].
@@ -174,48 +200,17 @@ class OnlineEstimator:
         Returns:
             Simulated outputs (T,) [V]; inf or NaN from where the model diverges.
         """
-        u, y_init = _series("u", u), _series("y_init", y_init)
+        u, y_init = series("u", u), series("y_init", y_init)
         if not 2 <= len(y_init) <= len(u):
             raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(y_init)}")
-        return self.model.simulate(self.belief.coefficients_mean, u, y_init)
+        return self._filter.simulate(u, y_init)
 
+    def _chunks(self, samples: int, progress: bool) -> Iterator[tuple[int, int]]:
+        """Ranges that cover all samples; one range without progress, else many with a bar that counts them."""
+        if not progress or self.model.needs_all_inputs:
+            yield 0, samples
+            return
+        from rich.progress import track
 
-@kernel
-def _run(W, u, y, is_structured, as_published, free_energies):
-    """Update lane 0 with every sample. The other lanes do the same work, so that none of them runs wild."""
-    for t in range(len(u)):
-        for j in range(LANES):
-            W[_U * LANES + j] = u[t]
-            W[_Y * LANES + j] = y[t]
-        update(W, is_structured, free_energies.shape[1], as_published, free_energies[t])
-
-
-def _chunks(samples: int, progress: bool):
-    """Ranges that cover all samples; one range without progress, else many with a bar that counts them."""
-    if not progress:
-        yield 0, samples
-        return
-    from rich.progress import track
-
-    starts = range(0, samples, _SAMPLES_BETWEEN_REPORTS)
-    for start in track(starts, description="Identifying"):
-        yield start, min(start + _SAMPLES_BETWEEN_REPORTS, samples)
-
-
-def _scalar(name: str, value: float) -> float:
-    number = np.asarray(value, dtype=np.float64)
-    if number.size != 1:
-        raise ValueError(f"{name} must be one number, but has shape {number.shape}; use run() for many samples")
-    return float(number.reshape(()))
-
-
-def _series(name: str, values: npt.ArrayLike) -> FloatArray:
-    """A contiguous finite series (T,)."""
-    series = np.ascontiguousarray(values, dtype=np.float64)
-    if series.ndim != 1:
-        raise ValueError(f"{name} must have shape (T,), but has {series.shape}; pass one channel, e.g. {name}.ravel()")
-    finite = np.isfinite(series)
-    if not finite.all():
-        bad = int(np.argmin(finite))
-        raise ValueError(f"{name} must be finite, but {name}[{bad}] is {series[bad]}; remove or interpolate the sample")
-    return series
+        for start in track(range(0, samples, _SAMPLES_BETWEEN_REPORTS), description="Identifying"):
+            yield start, min(start + _SAMPLES_BETWEEN_REPORTS, samples)

@@ -32,6 +32,9 @@ NOISES = ("g_shape", "g_rate", "n_shape", "n_rate")
 RECORD = QUANTITIES + COVARIANCES + NOISES
 RECORD_SIZE = len(RECORD)
 
+#: The noises' rates before the sample, which the free energy of either update needs.
+_PRIOR_RATES = "prior_g_rate prior_n_rate"
+
 #: What one structured update keeps between its loops.
 _STRUCTURED = """
     predicted predicted_variance c_x0 c_x1 c_t1 c_t2 c_t3 c_e
@@ -42,11 +45,11 @@ _STRUCTURED = """
 _MEAN_FIELD = """
     prior_t1 prior_t2 prior_t3 prior_e
     prior_V_11 prior_V_12 prior_V_13 prior_V_22 prior_V_23 prior_V_33 prior_e_variance
-    prior_L_00 prior_L_01 prior_L_11 prior_h_0 prior_h_1 prior_g_rate prior_n_rate
+    prior_L_00 prior_L_01 prior_L_11 prior_h_0 prior_h_1
     prior_x0 prior_x1 z0 z1 z0_variance q0 q1 Q_00 Q_01 Q_11 gamma xi
     e_information theta_information theta_shift residual_power error_power g_increment n_increment
 """
 
 #: Rows of an estimator's block. An environment's block has these first, then its own.
-LAYOUT = rows(" ".join(RECORD), "u y", _STRUCTURED, _MEAN_FIELD)
+LAYOUT = rows(" ".join(RECORD), "u y", _PRIOR_RATES, _STRUCTURED, _MEAN_FIELD)
 N_ROWS = len(LAYOUT)

@@ -15,16 +15,15 @@ which are the moments of w = x_{t+1} - g - η u and v = y - x_{t+1} under the jo
 
 from __future__ import annotations
 
-import math
-
-from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
-from estimator.lanes import at_lane, inlined, lanewise
+from estimator.inference.noise import half_noise_powers, sample_free_energy
+from estimator.lanes import at_lane, lanewise
 from estimator.record import LAYOUT
 
 
 @lanewise(
     LAYOUT,
-    "predicted predicted_variance c_x0 c_x1 c_t1 c_t2 c_t3 c_e g_shape n_shape next_process_variance next_measurement_variance",
+    "predicted predicted_variance c_x0 c_x1 c_t1 c_t2 c_t3 c_e "
+    "g_shape n_shape prior_g_rate prior_n_rate next_process_variance next_measurement_variance",
 )
 def predict(
     x0, x1, t1, t2, t3, e, u,
@@ -50,18 +49,8 @@ def predict(
     predicted_variance = a0 * c_x0 + a1 * c_x1 + x0 * c_t1 + cube * c_t2 + x1 * c_t3 + u * c_e
     return (
         predicted, predicted_variance, c_x0, c_x1, c_t1, c_t2, c_t3, c_e,
-        g_shape + 0.5, n_shape + 0.5, g_rate / g_shape, n_rate / n_shape,
+        g_shape + 0.5, n_shape + 0.5, g_rate, n_rate, g_rate / g_shape, n_rate / n_shape,
     )  # fmt: skip
-
-
-@inlined
-def _half_noise_powers(predicted, predicted_variance, y, q, r):
-    """Half of E[w²] and of E[v²] under the Kalman step with process variance q and measurement variance r."""
-    weight = 1.0 / (predicted_variance + q + r)
-    step = (y - predicted) * weight
-    w = q * step
-    v = r * step
-    return 0.5 * (w * w + q * (1.0 - q * weight)), 0.5 * (v * v + r * (1.0 - r * weight))
 
 
 @lanewise(
@@ -71,10 +60,10 @@ def _half_noise_powers(predicted, predicted_variance, y, q, r):
 def learn_noise(
     predicted, predicted_variance, y, g_shape, g_rate, n_shape, n_rate, next_process_variance, next_measurement_variance
 ):  # fmt: skip
-    """One iteration: the Kalman step's moments of w and v, then q(γ) and q(ξ), whose shapes count this sample already."""
+    """One iteration: the Kalman step's moments of w and v, then q(γ) and q(ξ). Their shapes count the sample."""
     q = next_process_variance
     r = next_measurement_variance
-    half_w, half_v = _half_noise_powers(predicted, predicted_variance, y, q, r)
+    half_w, half_v = half_noise_powers(y - predicted, predicted_variance, q, r)
     next_g_rate = g_rate + half_w
     next_n_rate = n_rate + half_v
     return q, r, next_g_rate, next_n_rate, next_g_rate / g_shape, next_n_rate / n_shape
@@ -130,23 +119,11 @@ def correct(
 
 @at_lane(LAYOUT)
 def free_energy(
-    predicted, predicted_variance, y, g_shape, n_shape, next_g_rate, next_n_rate, process_variance, measurement_variance
+    predicted, predicted_variance, y, g_shape, n_shape, prior_g_rate, prior_n_rate,
+    process_variance, measurement_variance,
 ):  # fmt: skip
-    """Free energy of this sample in nats after an iteration, to first order.
-
-    F = KL[q(x, θ, η) || prior, transition, likelihood] + KL[q(γ) || prior] + KL[q(ξ) || prior]: the Gaussian part is
-    ½ log 2πS + ν²/2S at the noise variances of the Kalman step, corrected for those that q(γ) and q(ξ) moved to.
-    """
-    q = process_variance
-    r = measurement_variance
-    half_w, half_v = _half_noise_powers(predicted, predicted_variance, y, q, r)
-    innovation_variance = predicted_variance + q + r
-    innovation = y - predicted
-    gaussian = 0.5 * (LOG_2PI + math.log(innovation_variance) + innovation * innovation / innovation_variance)
-    process = half_w * (g_shape / next_g_rate - 1 / q) - 0.5 * (math.log(q) + expected_log_gamma(g_shape, next_g_rate))
-    measurement = half_v * (n_shape / next_n_rate - 1 / r) - 0.5 * (
-        math.log(r) + expected_log_gamma(n_shape, next_n_rate)
-    )
-    divergences = gamma_step_divergence(g_shape - 0.5, next_g_rate - half_w, half_w)
-    divergences += gamma_step_divergence(n_shape - 0.5, next_n_rate - half_v, half_v)
-    return gaussian + process + measurement + divergences
+    """Free energy of this sample in nats after an iteration, to first order."""
+    return sample_free_energy(
+        y - predicted, predicted_variance, process_variance, measurement_variance,
+        g_shape, prior_g_rate, n_shape, prior_n_rate,
+    )  # fmt: skip

@@ -6,6 +6,7 @@ x_t = θ1 x_{t-1} + θ2 x_{t-1}³ + θ3 x_{t-2} + η u_{t-d},   y_t = x_t + v_t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,6 +29,8 @@ class NLARX:
 
     nonlinear: bool = True
     input_delay: int = 1
+
+    needs_all_inputs: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.input_delay not in (0, 1):

@@ -1,0 +1,256 @@
+"""The physical equation itself as the model: Eq. (1), integrated over each sample.
+
+    x'' = g (u - u0) - c x' - k x - b x³ - e x'³,        y = x + y0 + d u + v
+
+The measured input is band-limited, so it must not be held between samples: it is interpolated by a cubic polynomial
+per sample, whose coefficients say how much of the future is used. The integration is the classical Runge-Kutta
+method of order 4 with exact sensitivities: the derivative of its arithmetic, not finite differences.
+
+Inside, time is counted in samples (δ = 1), so that all parameters are of the order of one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from estimator.gaussian import JointBelief
+from estimator.inference import joint
+from estimator.lanes import jit, kernel
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+
+#: Parameters with their units, in the order of the joint state after (x, x').
+PARAMETERS = {
+    "stiffness": "s⁻²",
+    "damping": "s⁻¹",
+    "gain": "s⁻²",
+    "cubic": "V⁻² s⁻²",
+    "input_offset": "V",
+    "cubic_damping": "V⁻² s",
+    "output_offset": "V",
+    "feedthrough": "1",
+}
+N_STATES = 2
+N_JOINT = N_STATES + len(PARAMETERS)
+
+#: What the motion depends on: the state, and the first six parameters. The last two are of the sensor.
+N_MOTION = 8
+
+#: Direction of the process noise in (x, x'): an acceleration held over a sample, scaled to move x by 1.
+NOISE_DIRECTION = np.array([1.0, 2.0])
+
+INTERPOLATIONS = ("linear", "look_ahead", "spline")
+
+
+@dataclass(frozen=True)
+class DuffingODE:
+    """Model of the oscillator as an ordinary differential equation.
+
+    Attributes:
+        interpolation: of the input between samples. ``linear``: causal. ``look_ahead``: the cubic through the two
+            samples before and the two after, so that a sample is used when the next input is known. ``spline``: the
+            cubic spline through all inputs, for recorded data that is given at once.
+        cubic_damping: whether the damping has the cubic term e x'³; without it e = 0.
+        substeps: Runge-Kutta steps per sample.
+
+    Raises:
+        ValueError: for an unknown interpolation, or substeps below 1.
+    """
+
+    interpolation: str = "linear"
+    cubic_damping: bool = False
+    substeps: int = 2
+
+    names: ClassVar[tuple[str, ...]] = tuple(PARAMETERS)
+    units: ClassVar[tuple[str, ...]] = tuple(PARAMETERS.values())
+
+    def __post_init__(self) -> None:
+        if self.interpolation not in INTERPOLATIONS:
+            raise ValueError(f"interpolation must be one of {list(INTERPOLATIONS)}, but is {self.interpolation!r}")
+        if not isinstance(self.substeps, int) or self.substeps < 1:
+            raise ValueError(f"substeps must be a whole number of at least 1, but is {self.substeps!r}")
+
+    @property
+    def look_ahead(self) -> int:
+        """Inputs after a sample that must be known before it is used."""
+        return 1 if self.interpolation == "look_ahead" else 0
+
+    @property
+    def needs_all_inputs(self) -> bool:
+        """Whether no sample can be used before all inputs are known."""
+        return self.interpolation == "spline"
+
+    def prior(
+        self,
+        spread: float = 0.3,
+        process_noise: float = 5e-6,
+        measurement_noise: float = 1e-3,
+        noise_shape: float = 2.0,
+    ) -> JointBelief:
+        """A weak prior about the Silverbox twin.
+
+        Args:
+            spread: relative standard deviation of stiffness, damping, gain and cubic stiffness.
+            process_noise: what the process noise of a sample does to x: standard deviation [V] at which γ is centred.
+            measurement_noise: standard deviation [V] at which ξ is centred.
+            noise_shape: shape of both Gamma priors.
+
+        The offsets are 0 with a standard deviation of 20 mV, the feedthrough 0 with one of 0.1, the cubic damping 0
+        with one of 0.1 per sample; the oscillator is at rest to within 0.1 V.
+        """
+        twin = SILVERBOX_TWIN
+        main = np.array([twin.a / twin.m, twin.c / twin.m, 1 / twin.m, twin.b / twin.m])
+        mean = np.concatenate([[0.0, 0.0], main, [0.0, 0.0, 0.0, 0.0]])
+        std = np.concatenate(
+            [[0.1, 0.1 / SAMPLING_STEP], spread * main, [0.02, 0.1 * SAMPLING_STEP, 0.02, 0.1]]
+        )  # fmt: skip
+        noises = (noise_shape, noise_shape * process_noise**2, noise_shape, noise_shape * measurement_noise**2)
+        return JointBelief(self.names, self.units, mean, np.diag(std**2), *noises)
+
+    @staticmethod
+    def scales(step: float = SAMPLING_STEP) -> FloatArray:
+        """(8,) factors from parameters per sample to parameters in physical units."""
+        return np.array([step**-2, 1 / step, step**-2, step**-2, 1.0, step, 1.0, 1.0])
+
+    def pieces(self, u: FloatArray) -> FloatArray:
+        """The input between samples as polynomials: (T - 1, 4) coefficients of 1, τ, τ², τ³ with τ in [0, 1]."""
+        if len(u) < 2:
+            return np.zeros((0, 4))
+        start, stop = u[:-1], u[1:]
+        if self.interpolation == "linear":
+            zeros = np.zeros_like(start)
+            return np.column_stack([start, stop - start, zeros, zeros])
+        if self.interpolation == "look_ahead":
+            before = np.concatenate([u[:1], u[:-2]])
+            after = np.concatenate([u[2:], u[-1:]])
+            return np.column_stack(
+                [
+                    start,
+                    stop - start / 2 - before / 3 - after / 6,
+                    (before + stop) / 2 - start,
+                    (start - stop) / 2 + (after - before) / 6,
+                ]
+            )
+        from scipy.interpolate import CubicSpline
+
+        return np.ascontiguousarray(CubicSpline(np.arange(len(u)), u).c[::-1].T)
+
+
+@jit
+def _derivative(x, v, p, u, J, D):
+    """(x', x'') at a point, and into ``D`` the derivative of the sensitivities ``J`` (2, N_MOTION)."""
+    drive = u - p[4]
+    slope_x = -p[0] - 3.0 * p[3] * x * x
+    slope_v = -p[1] - 3.0 * p[5] * v * v
+    for j in range(N_MOTION):
+        D[0, j] = J[1, j]
+        D[1, j] = slope_x * J[0, j] + slope_v * J[1, j]
+    D[1, 2] -= x
+    D[1, 3] -= v
+    D[1, 4] += drive
+    D[1, 5] -= x * x * x
+    D[1, 6] -= p[2]
+    D[1, 7] -= v * v * v
+    return v, p[2] * drive - p[1] * v - p[0] * x - p[3] * x * x * x - p[5] * v * v * v
+
+
+@jit
+def flow(x, v, p, piece, substeps, J, work):
+    """Move (x, x') over one sample.
+
+    Args:
+        x: displacement [V].
+        v: its change per sample [V].
+        p: (6,) parameters of the motion, per sample.
+        piece: (4,) the input's polynomial.
+        substeps: Runge-Kutta steps.
+        J: (2, N_MOTION) receives the sensitivities of the result to x, v and p.
+        work: (3, 2, N_MOTION) memory.
+    """
+    D, trial, total = work[0], work[1], work[2]
+    J[:] = 0.0
+    J[0, 0] = J[1, 1] = 1.0
+    h = 1.0 / substeps
+    for s in range(substeps):
+        u0 = _polynomial(piece, s * h)
+        u1 = _polynomial(piece, (s + 0.5) * h)
+        u2 = _polynomial(piece, (s + 1.0) * h)
+        x1, v1 = _derivative(x, v, p, u0, J, D)
+        for i in range(2):
+            for j in range(N_MOTION):
+                total[i, j] = D[i, j]
+                trial[i, j] = J[i, j] + 0.5 * h * D[i, j]
+        x2, v2 = _derivative(x + 0.5 * h * x1, v + 0.5 * h * v1, p, u1, trial, D)
+        for i in range(2):
+            for j in range(N_MOTION):
+                total[i, j] += 2.0 * D[i, j]
+                trial[i, j] = J[i, j] + 0.5 * h * D[i, j]
+        x3, v3 = _derivative(x + 0.5 * h * x2, v + 0.5 * h * v2, p, u1, trial, D)
+        for i in range(2):
+            for j in range(N_MOTION):
+                total[i, j] += 2.0 * D[i, j]
+                trial[i, j] = J[i, j] + h * D[i, j]
+        x4, v4 = _derivative(x + h * x3, v + h * v3, p, u2, trial, D)
+        for i in range(2):
+            for j in range(N_MOTION):
+                J[i, j] += h / 6.0 * (total[i, j] + D[i, j])
+        x += h / 6.0 * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
+        v += h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)
+    return x, v
+
+
+@jit
+def _polynomial(piece, tau):
+    return piece[0] + tau * (piece[1] + tau * (piece[2] + tau * piece[3]))
+
+
+@kernel
+def run_samples(mean, cov, noises, pieces, u, y, moving, substeps, free_energies, forecasts):
+    """Update a joint belief with T samples.
+
+    Args:
+        mean: (N_JOINT,) of (x, x', parameters), per sample; overwritten, as ``cov`` and ``noises``.
+        cov: (N_JOINT, N_JOINT).
+        noises: (4,) shapes and rates of q(γ) and q(ξ).
+        pieces: (T, 4) the input on the way to each sample.
+        u: (T,) inputs at the samples [V].
+        y: (T,) outputs [V].
+        moving: False if the first sample is the first ever, to which nothing has moved.
+        substeps: Runge-Kutta steps per sample.
+        free_energies: (T, iterations) receives the free energies [nats].
+        forecasts: (T, 2) receives mean [V] and variance [V²] of each output before it was seen.
+    """
+    moved = np.empty(N_STATES)
+    jacobian = np.zeros((N_STATES, N_JOINT))
+    sensitivities = np.empty((N_STATES, N_MOTION))
+    rows = np.empty((N_STATES, N_JOINT))
+    work = np.empty((3, N_STATES, N_MOTION))
+    gain = np.empty(N_JOINT)
+    readout = np.zeros(N_JOINT)
+    readout[0] = readout[N_JOINT - 2] = 1.0
+    direction = NOISE_DIRECTION.copy()
+    for t in range(len(y)):
+        if moving or t > 0:
+            moved[0], moved[1] = flow(
+                mean[0], mean[1], mean[N_STATES : N_STATES + 6], pieces[t], substeps, sensitivities, work
+            )  # fmt: skip
+            jacobian[:, :N_MOTION] = sensitivities
+            joint.predict(mean, cov, moved, jacobian, rows)
+        readout[N_JOINT - 1] = u[t]
+        expected = mean[0] + mean[N_JOINT - 2] + mean[N_JOINT - 1] * u[t]
+        forecasts[t, 0] = expected
+        forecasts[t, 1] = joint.correct(
+            mean, cov, readout, direction, y[t] - expected, noises, free_energies.shape[1], free_energies[t], gain
+        )  # fmt: skip
+
+
+@kernel
+def simulate_samples(x, v, p, pieces, u, substeps, y):
+    """Free run from (x, v): the output (T,) after each of the pieces, into ``y``."""
+    sensitivities = np.empty((N_STATES, N_MOTION))
+    work = np.empty((3, N_STATES, N_MOTION))
+    for t in range(len(y)):
+        x, v = flow(x, v, p[:6], pieces[t], substeps, sensitivities, work)
+        y[t] = x + p[6] + p[7] * u[t]

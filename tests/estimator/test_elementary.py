@@ -1,0 +1,92 @@
+"""Elementary functions against the standard library, SciPy and 50-digit arithmetic."""
+
+import math
+
+import mpmath
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import special
+
+from estimator import elementary
+from estimator.elementary import digamma, expected_log_gamma, gamma_step_divergence, log_gamma_half_step
+
+EPS = np.finfo(float).eps
+SMALLEST_NORMAL = np.finfo(float).tiny
+LARGEST = np.finfo(float).max
+SHAPES = [1e-3, 0.1, 0.5, 1.0, 2.0, 3.3, 9.99, 10.0, 19.99, 20.0, 123.0, 1e3, 1e5, 1e8, 1e9, 1e12]
+
+
+@numba.njit
+def log(x):
+    return elementary.log(x)
+
+
+repeatable = settings(derandomize=True, deadline=None, max_examples=500)
+
+
+@repeatable
+@given(st.floats(SMALLEST_NORMAL, LARGEST))
+def test_log_over_the_whole_range(x):
+    # Three units in the last place of the specification, and half a unit of math.log.
+    assert abs(log(x) - math.log(x)) <= 3.5 * math.ulp(math.log(x))
+
+
+@repeatable
+@given(st.floats(-1.0, 1.0), st.integers(0, 15))
+def test_log_near_one_keeps_its_relative_accuracy(offset, digits):
+    x = 1.0 + offset * 10.0**-digits
+    if x > 0:
+        assert abs(log(x) - math.log(x)) <= 3.5 * math.ulp(math.log(x))
+
+
+def test_log_on_a_dense_sample():
+    # Hypothesis favours simple numbers; a million draws find the worst mantissas.
+    x = np.exp(np.random.default_rng(0).uniform(-708.0, 709.0, 1_000_000))
+    x[::2] = np.random.default_rng(1).uniform(0.5, 2.0, len(x[::2]))
+    ours = _log_of_each(x)
+    assert (np.abs(ours - np.log(x)) <= 4 * np.spacing(np.abs(np.log(x)))).all()
+
+
+@numba.njit
+def _log_of_each(x):
+    out = np.empty_like(x)
+    for i in range(len(x)):
+        out[i] = elementary.log(x[i])
+    return out
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_digamma_equals_scipy(shape):
+    # Beside 1 where digamma passes through 0 at 1.46.
+    assert digamma(shape) == pytest.approx(special.digamma(shape), rel=4 * EPS, abs=5e-14)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_log_gamma_half_step_in_fifty_digits(shape):
+    with mpmath.workdps(50):
+        exact = float(mpmath.loggamma(mpmath.mpf(shape) + 0.5) - mpmath.loggamma(mpmath.mpf(shape)))
+    assert log_gamma_half_step(shape) == pytest.approx(exact, rel=4 * EPS, abs=2e-14)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("ratio", [1e-14, 1e-8, 1e-3, 1.0, 1e3])
+def test_gamma_step_divergence_in_fifty_digits(shape, ratio):
+    rate = 1.3
+    with mpmath.workdps(50):
+        a0, b0 = mpmath.mpf(shape), mpmath.mpf(rate)
+        a, b = a0 + 0.5, b0 + mpmath.mpf(ratio * rate)
+        exact = (a - a0) * mpmath.digamma(a) - mpmath.loggamma(a) + mpmath.loggamma(a0)
+        exact = float(exact + a0 * mpmath.log(b / b0) + a * (b0 - b) / b)
+    # The terms that nearly cancel are as large as log shape, and shape * ratio where that is large.
+    largest = max(1.0, shape * ratio)
+    assert gamma_step_divergence(shape, rate, ratio * rate) == pytest.approx(exact, abs=3e-14 * largest)
+
+
+def test_expected_log_gamma_equals_monte_carlo_and_scipy():
+    shape, rate = 2.5, 0.3
+    draws = np.log(np.random.default_rng(0).gamma(shape, 1 / rate, 200_000))
+    assert expected_log_gamma(shape, rate) == pytest.approx(draws.mean(), abs=5 * draws.std() / np.sqrt(len(draws)))
+    assert expected_log_gamma(shape, rate) == pytest.approx(special.digamma(shape) - np.log(rate), rel=1e-14)

@@ -1,0 +1,129 @@
+"""Lanes: names of rows, compiled loops, the stamp of the cache, and vector instructions."""
+
+import importlib
+import re
+import sys
+
+import llvmlite.binding
+import numba
+import numpy as np
+import pytest
+
+from estimator import lanes
+from estimator.inference import mean_field, structured
+from estimator.lanes import LANES, at_lane, lanewise, rows
+
+LAYOUT = {"a": 0, "b": 1, "total": 2, "product": 3}
+
+
+def block():
+    return np.random.default_rng(0).standard_normal(len(LAYOUT) * LANES)
+
+
+def test_rows_are_numbered_in_order():
+    assert rows("a b", " c\n d", start=3) == {"a": 3, "b": 4, "c": 5, "d": 6}
+
+
+def test_rows_refuse_a_name_that_stands_there_twice():
+    with pytest.raises(ValueError, match=re.escape("every row once, but ['b'] stand there twice; rename")):
+        rows("a b", "c b")
+
+
+def add_and_multiply(a, b, factor, shift):
+    return a + factor * b, a * b + shift
+
+
+def test_lanewise_with_uniform_arguments():
+    W = block()
+    a, b = W.reshape(-1, LANES)[:2].copy()
+    # The loop takes them in the order of `uniform`, not of the function.
+    loop = lanewise(LAYOUT, "total product", uniform="shift factor")(add_and_multiply)
+    loop(W, 100.0, 2.0)
+    np.testing.assert_array_equal(W.reshape(-1, LANES)[:2], [a, b])
+    np.testing.assert_allclose(W.reshape(-1, LANES)[2:], [a + 2.0 * b, a * b + 100.0], rtol=1e-14)
+
+
+def swapped(a, b):
+    return b, a
+
+
+def test_lanewise_writes_after_it_has_read():
+    W = block()
+    a, b = W.reshape(-1, LANES)[:2].copy()
+    lanewise(LAYOUT, "a b")(swapped)(W)
+    np.testing.assert_array_equal(W.reshape(-1, LANES)[:2], [b, a])
+
+
+def test_at_lane_touches_one_lane_or_none():
+    W = block()
+    before = W.reshape(-1, LANES).copy()
+    a, b = before[:2]
+    total, product = at_lane(LAYOUT, uniform="factor shift")(add_and_multiply)(W, 5, 2.0, 100.0)
+    np.testing.assert_allclose([total, product], [a[5] + 2.0 * b[5], a[5] * b[5] + 100.0], rtol=1e-14)
+    np.testing.assert_array_equal(W.reshape(-1, LANES), before)
+    at_lane(LAYOUT, "total product", uniform="factor shift")(add_and_multiply)(W, 5, 2.0, 100.0)
+    changed = W.reshape(-1, LANES) != before
+    np.testing.assert_array_equal(np.argwhere(changed), [[2, 5], [3, 5]])
+
+
+@pytest.mark.parametrize("uniform", ["factor", "factor shift a"])
+def test_a_parameter_is_a_row_or_uniform(uniform):
+    with pytest.raises(ValueError, match=r"(shift|a) of add_and_multiply must be a row or uniform, and not both"):
+        lanewise(LAYOUT, "total product", uniform=uniform)(add_and_multiply)
+
+
+def test_source_digest_covers_every_source_of_the_package(tmp_path):
+    digest = lanes._source_digest.__wrapped__
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "kernel.py").write_text("a = 1\n")
+    (tmp_path / "folder" / "scalar.py").write_text("b = 1\n")
+    first = digest(tmp_path)
+    assert digest(tmp_path) == first
+    (tmp_path / "notes.txt").write_text("no source")
+    assert digest(tmp_path) == first
+    (tmp_path / "folder" / "scalar.py").write_text("b = 2\n")
+    changed = digest(tmp_path)
+    assert changed != first
+    (tmp_path / "new.py").write_text("c = 1\n")
+    assert digest(tmp_path) not in (first, changed)
+
+
+def test_a_cached_kernel_follows_the_functions_it_calls(tmp_path, monkeypatch):
+    (tmp_path / "scalar_of_lanes.py").write_text("from estimator.lanes import jit\n\n@jit\ndef f():\n    return 1\n")
+    (tmp_path / "kernel_of_lanes.py").write_text(
+        "from estimator.lanes import kernel\nfrom scalar_of_lanes import f\n\n@kernel\ndef run():\n    return f()\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    digest = lanes._source_digest.__wrapped__
+    monkeypatch.setattr(lanes, "_source_digest", digest)  # a new process reads the sources again
+
+    def result():
+        for name in ("scalar_of_lanes", "kernel_of_lanes"):
+            sys.modules.pop(name, None)
+        importlib.invalidate_caches()
+        run = importlib.import_module("kernel_of_lanes").run
+        return run(), sum(run.stats.cache_hits.values())
+
+    assert result() == (1, 0)
+    assert result() == (1, 1)
+    # Only the called function changes; its file is longer, so that Python itself compiles it again.
+    (tmp_path / "scalar_of_lanes.py").write_text("from estimator.lanes import jit\n\n@jit\ndef f():\n    return 1234\n")
+    assert result() == (1234, 0)
+
+
+@pytest.mark.parametrize(
+    ("loop", "uniform"),
+    [(structured.predict, ()), (structured.correct, ()), (mean_field.iterate, (numba.boolean,))],
+    ids=["structured.predict", "structured.correct", "mean_field.iterate"],
+)
+def test_loops_hold_packed_vector_instructions(loop, uniform):
+    if not llvmlite.binding.get_host_cpu_features().get("avx2"):
+        pytest.skip("this processor has no AVX2, so there are no 256-bit registers to look for")
+    signature = (numba.float64[::1], *uniform)
+    loop.compile(signature)
+    assembly = loop.inspect_asm(signature)
+    packed = re.findall(r"^\s+(?:vmulpd|vfn?m(?:add|sub)\d+pd)\s.*%[yz]mm", assembly, flags=re.MULTILINE)
+    scalar = re.findall(r"^\s+(?:vmulsd|vfn?m(?:add|sub)\d+sd)\s", assembly, flags=re.MULTILINE)
+    # Scalar code has none of the first kind; of the second, a uniform argument may bring a few.
+    assert len(packed) > 20
+    assert len(scalar) < len(packed) / 10
