@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from copy import copy
 from typing import Protocol, TypeVar
 
@@ -12,7 +13,8 @@ from estimator.gaussian import JointBelief
 from estimator.inference import update
 from estimator.lanes import LANES, kernel
 from estimator.models.nlarx import NLARX
-from estimator.models.ode import N_STATES, DuffingODE, run_samples, simulate_samples
+from estimator.models.ode import DuffingODE, run_samples, simulate_samples
+from estimator.models.regressors import LONGEST_DELAY, as_arrays, run_regressors, simulate_regressors
 from estimator.parameters import SAMPLING_STEP, FloatArray
 from estimator.record import LAYOUT, N_ROWS, RECORD, RECORD_SIZE, STATES
 
@@ -114,49 +116,68 @@ class NLARXFilter:
         return self.model.simulate(self.belief.coefficients_mean, u, y_init)
 
 
-class ODEFilter:
-    """Memory for `DuffingODE`: mean and covariance per sample, and the inputs that the next piece needs."""
+class JointFilter(ABC):
+    """Memory of a structured estimator with matrices: mean and covariance in the model's own units, and past inputs.
 
-    def __init__(self, model: DuffingODE, prior: JointBelief) -> None:
-        self.model = model
-        self._scale = np.concatenate([[1.0, 1 / SAMPLING_STEP], model.scales()])
-        self._mean = prior.mean / self._scale
-        self._cov = prior.cov / np.outer(self._scale, self._scale)
-        if not model.cubic_damping:
-            fixed = N_STATES + model.names.index("cubic_damping")
-            self._mean[fixed] = self._cov[fixed, :] = self._cov[:, fixed] = 0.0
+    Args:
+        prior: belief before the first sample.
+        scale: (k + K,) factors from the model's units to those of the prior.
+        look_ahead: inputs after a sample that must be known before it is used.
+    """
+
+    def __init__(self, prior: JointBelief, scale: FloatArray, look_ahead: int) -> None:
+        self._names, self._units, self._scale, self._look_ahead = prior.names, prior.units, scale, look_ahead
+        self._mean = prior.mean / scale
+        self._cov = prior.cov / np.outer(scale, scale)
         self._noises = np.array([prior.gamma_shape, prior.gamma_rate, prior.xi_shape, prior.xi_rate])
-        self._first_state = self._mean[:N_STATES].copy(), self._cov[:N_STATES, :N_STATES].copy()
+        self._states = len(prior.state_mean)
+        self._first_state = self._mean[: self._states].copy(), self._cov[: self._states, : self._states].copy()
         self._past: FloatArray = np.zeros(0)
         self._waiting_u: FloatArray = np.zeros(0)
         self._waiting_y: FloatArray = np.zeros(0)
 
-    def copy(self) -> ODEFilter:
+    def copy(self: Self) -> Self:
         """An independent copy."""
         other = copy(self)
-        other._mean, other._cov, other._noises = self._mean.copy(), self._cov.copy(), self._noises.copy()
+        for name in ("_mean", "_cov", "_noises"):
+            setattr(other, name, getattr(self, name).copy())
         return other
 
     def run(self, u: FloatArray, y: FloatArray, free_energies: FloatArray, forecasts: FloatArray) -> int:
         """Take samples; those that wait for a later input are used by the next call."""
         inputs = np.concatenate([self._past, self._waiting_u, u])
         outputs = np.concatenate([self._waiting_y, y])
-        begun, used = len(self._past), max(0, len(outputs) - self.model.look_ahead)
+        begun, used = len(self._past), max(0, len(outputs) - self._look_ahead)
         if used:
-            new = slice(begun, begun + used)
-            run_samples(
-                self._mean, self._cov, self._noises, self._pieces(inputs)[new], inputs[new], outputs[:used],
-                begun > 0, self.model.substeps, free_energies, forecasts,
-            )  # fmt: skip
-        self._past = inputs[: begun + used][-2:]
+            self._take(self._mean, self._cov, self._noises, inputs, begun, outputs[:used], free_energies, forecasts)
+        self._past = inputs[: begun + used][-LONGEST_DELAY:]
         self._waiting_u, self._waiting_y = inputs[begun + used :], outputs[used:]
         return used
 
+    @abstractmethod
+    def _take(
+        self,
+        mean: FloatArray,
+        cov: FloatArray,
+        noises: FloatArray,
+        inputs: FloatArray,
+        begun: int,
+        outputs: FloatArray,
+        free_energies: FloatArray,
+        forecasts: FloatArray,
+    ) -> None:
+        """Update mean, covariance and noises with the outputs (T,), whose inputs begin at ``inputs[begun]``."""
+
+    @abstractmethod
+    def _free_run(self, state: FloatArray, u: FloatArray, y: FloatArray, start: int) -> None:
+        """Continue ``y`` (T,) from sample ``start`` on, in the state that the sample before left."""
+
     def rewind(self) -> None:
         """Forget the state and the inputs."""
-        self._mean[:N_STATES] = self._first_state[0]
-        self._cov[:N_STATES, :] = self._cov[:, :N_STATES] = 0.0
-        self._cov[:N_STATES, :N_STATES] = self._first_state[1]
+        k = self._states
+        self._mean[:k] = self._first_state[0]
+        self._cov[:k, :] = self._cov[:, :k] = 0.0
+        self._cov[:k, :k] = self._first_state[1]
         self._past = self._waiting_u = self._waiting_y = np.zeros(0)
 
     @property
@@ -166,38 +187,93 @@ class ODEFilter:
 
     @property
     def belief(self) -> JointBelief:
-        """The belief now, in physical units."""
+        """The belief now, in the units of the prior."""
         mean, cov = self._mean * self._scale, self._cov * np.outer(self._scale, self._scale)
-        return JointBelief(self.model.names, self.model.units, mean, cov, *self._noises.tolist())
+        return JointBelief(self._names, self._units, mean, cov, *self._noises.tolist())
 
     def predict(self, u: FloatArray, y: FloatArray) -> FloatArray:
         """One-step predictions: of a filter that follows the record with everything fixed but the state."""
-        return self._follow(self._pieces(u), u, y)[1]
+        return self._follow(u, y)[1]
 
     def simulate(self, u: FloatArray, y_init: FloatArray) -> FloatArray:
         """Free run from the state that the first outputs leave such a filter with."""
-        pieces, given = self._pieces(u), len(y_init)
-        (x, v), _ = self._follow(pieces[:given], u[:given], y_init)
-        simulated = np.concatenate([y_init, np.empty(len(u) - given)])
-        simulate_samples(
-            x, v, self._mean[N_STATES:], pieces[given:], u[given:], self.model.substeps, simulated[given:]
-        )  # fmt: skip
+        state, _ = self._follow(u, y_init)
+        simulated = np.concatenate([y_init, np.empty(len(u) - len(y_init))])
+        self._free_run(state, u, simulated, len(y_init))
         return simulated
+
+    def _follow(self, u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Follow a record with parameters and noises fixed at their means: the last state, and the forecasts (T,)."""
+        k = self._states
+        mean, cov = self._mean.copy(), np.zeros_like(self._cov)
+        mean[:k], cov[:k, :k] = self._first_state
+        noises = self._noises * np.repeat(_CERTAIN / self._noises[::2], 2)
+        forecasts = np.empty((len(y), 2))
+        self._take(mean, cov, noises, u, 0, y, np.empty((len(y), 1)), forecasts)
+        return mean[:k], forecasts[:, 0]
+
+
+class ODEFilter(JointFilter):
+    """Memory for `DuffingODE`; its own unit of time is the sample."""
+
+    def __init__(self, model: DuffingODE, prior: JointBelief) -> None:
+        super().__init__(prior, np.concatenate([[1.0, 1 / SAMPLING_STEP], model.scales()]), model.look_ahead)
+        self._model = model
+        if not model.cubic_damping:
+            fixed = self._states + model.names.index("cubic_damping")
+            self._mean[fixed] = self._cov[fixed, :] = self._cov[:, fixed] = 0.0
+
+    def _take(
+        self,
+        mean: FloatArray,
+        cov: FloatArray,
+        noises: FloatArray,
+        inputs: FloatArray,
+        begun: int,
+        outputs: FloatArray,
+        free_energies: FloatArray,
+        forecasts: FloatArray,
+    ) -> None:
+        new = slice(begun, begun + len(outputs))
+        pieces, substeps = self._pieces(inputs)[new], self._model.substeps
+        run_samples(
+            mean, cov, noises, pieces, inputs[new], outputs, begun > 0, substeps, free_energies, forecasts
+        )  # fmt: skip
+
+    def _free_run(self, state: FloatArray, u: FloatArray, y: FloatArray, start: int) -> None:
+        parameters, pieces = self._mean[self._states :], self._pieces(u)[start:]
+        simulate_samples(state[0], state[1], parameters, pieces, u[start:], self._model.substeps, y[start:])
 
     def _pieces(self, u: FloatArray) -> FloatArray:
         """(T, 4) the input on the way to each sample; nothing moves to the first."""
-        return np.concatenate([np.zeros((1, 4)), self.model.pieces(u)])
+        return np.concatenate([np.zeros((1, 4)), self._model.pieces(u)])
 
-    def _follow(self, pieces: FloatArray, u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Follow a record with parameters and noises fixed at their means: the last state, and the forecasts (T,)."""
-        mean, cov = self._mean.copy(), np.zeros_like(self._cov)
-        mean[:N_STATES], cov[:N_STATES, :N_STATES] = self._first_state
-        noises = self._noises * np.repeat(_CERTAIN / self._noises[::2], 2)
-        forecasts = np.empty((len(y), 2))
-        run_samples(
-            mean, cov, noises, pieces, u, y, False, self.model.substeps, np.empty((len(y), 1)), forecasts
-        )  # fmt: skip
-        return mean[:N_STATES], forecasts[:, 0]
+
+class RegressorFilter(JointFilter):
+    """Memory for an `NLARX` with other regressors than the paper's."""
+
+    def __init__(self, model: NLARX, prior: JointBelief) -> None:
+        super().__init__(prior, np.ones(len(prior.mean)), look_ahead=0)
+        self._terms = as_arrays(model.terms)
+
+    def _take(
+        self,
+        mean: FloatArray,
+        cov: FloatArray,
+        noises: FloatArray,
+        inputs: FloatArray,
+        begun: int,
+        outputs: FloatArray,
+        free_energies: FloatArray,
+        forecasts: FloatArray,
+    ) -> None:
+        run_regressors(mean, cov, noises, self._terms, inputs, begun, outputs, free_energies, forecasts)
+
+    def _free_run(self, state: FloatArray, u: FloatArray, y: FloatArray, start: int) -> None:
+        given = y[:start].copy()
+        y[start - 2 : start] = state[::-1]
+        simulate_regressors(self._mean[self._states :], self._terms, u, y, start)
+        y[:start] = given
 
 
 @kernel

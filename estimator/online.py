@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief, Prior
 from estimator.checks import scalar, series
-from estimator.filters import Filter, NLARXFilter, ODEFilter
+from estimator.filters import Filter, NLARXFilter, ODEFilter, RegressorFilter
 from estimator.gaussian import JointBelief
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.nlarx import NLARX
@@ -29,7 +29,8 @@ class OnlineEstimator:
     Args:
         model: `NLARX`, the paper's difference equation, where it is not given; or `DuffingODE`, the physical one.
         prior: belief before the first sample. A `Prior` for `NLARX`, `Prior.silverbox_twin()` where it is not given;
-            a `JointBelief` for `DuffingODE`, whose method `prior` makes the one that is used where it is not given.
+            a `JointBelief` for `DuffingODE` and for `NLARX` with other regressors, whose method `prior` makes the one
+            that is used where it is not given.
         factorisation: ``structured`` (states and coefficients jointly Gaussian) or ``mean_field`` (the paper's).
         iterations: variational iterations per sample; 3 structured, 10 mean field where it is not given.
         as_published: mean field with the two departures of the published run, to reproduce its numbers.
@@ -82,16 +83,19 @@ class OnlineEstimator:
         self._forecasts = np.empty((0, 2))
 
     def _make_filter(self, prior: Prior | JointBelief | None) -> Filter:
-        if isinstance(self.model, DuffingODE):
+        if isinstance(self.model, DuffingODE) or not self.model.is_paper:
             if self.factorisation != "structured":
                 raise ValueError(
-                    f"factorisation must be 'structured' for DuffingODE, but is {self.factorisation!r}; mean field is "
-                    f"for NLARX"
+                    f"factorisation must be 'structured' for {self.model}, but is {self.factorisation!r}; mean field "
+                    f"is for the paper's regressors"
                 )
-            prior = prior if prior is not None else self.model.prior()
-            if not isinstance(prior, JointBelief) or prior.names != self.model.names:
-                raise ValueError(f"prior must be one of DuffingODE's, but is {prior!r:.60}; use model.prior(...)")
-            return ODEFilter(self.model, prior)
+            own = self.model.prior()
+            prior = prior if prior is not None else own
+            if not isinstance(prior, JointBelief) or prior.names != own.names:
+                raise ValueError(f"prior must have the parameters {own.names}, but is {prior!r:.60}; use model.prior()")
+            if isinstance(self.model, DuffingODE):
+                return ODEFilter(self.model, prior)
+            return RegressorFilter(self.model, prior)
         prior = prior if prior is not None else Prior.silverbox_twin()
         if not isinstance(prior, Prior):
             raise ValueError(f"prior must be a Prior for NLARX, but is {prior!r:.60}; use Prior.silverbox_twin(...)")
@@ -99,7 +103,7 @@ class OnlineEstimator:
 
     @property
     def belief(self) -> Belief | JointBelief:
-        """The posterior after the last sample: `Belief` of an `NLARX`, `JointBelief` of a `DuffingODE`."""
+        """The posterior after the last sample: `Belief` with the paper's regressors, else `JointBelief`."""
         return self._filter.belief
 
     @property
