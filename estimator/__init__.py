@@ -4,6 +4,7 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 """
 
 from estimator.belief import Belief, Prior
+from estimator.files import load_estimator, save_estimator
 from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE
@@ -30,6 +31,8 @@ __all__ = [
     "OnlineEstimator",
     "PhysicalParameters",
     "Prior",
+    "load_estimator",
+    "save_estimator",
     "to_coefficients",
     "to_physical",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from copy import copy
 from typing import Protocol, TypeVar
 
@@ -27,6 +28,9 @@ _OF_STATES = [i for i, name in enumerate(RECORD) if set(name.split("_")) & set(S
 #: Shape of a Gamma belief that further samples do not move.
 _CERTAIN = 1e15
 
+#: What a `JointFilter` consists of.
+_JOINT_ARRAYS = ("mean", "cov", "noises", "first_mean", "first_cov", "past", "waiting_u", "waiting_y")
+
 Self = TypeVar("Self")
 
 
@@ -43,6 +47,14 @@ class Filter(Protocol):
 
     def rewind(self) -> None:
         """Forget the state and the inputs, keep the coefficients and noises."""
+        ...
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Everything that the future depends on, by name."""
+        ...
+
+    def restore(self, arrays: Mapping[str, FloatArray]) -> None:
+        """Become what `arrays` said of another filter of the same model."""
         ...
 
     @property
@@ -97,6 +109,17 @@ class NLARXFilter:
         self._block[_OF_STATES] = self._prior_record[_OF_STATES, None]
         self._last_input = 0.0
 
+    def arrays(self) -> dict[str, FloatArray]:
+        """Everything that the future depends on."""
+        last_input = np.array(self._last_input)
+        return {"record": self._block[:RECORD_SIZE, 0], "prior_record": self._prior_record, "last_input": last_input}
+
+    def restore(self, arrays: Mapping[str, FloatArray]) -> None:
+        """Become another filter."""
+        self._block[:RECORD_SIZE] = arrays["record"][:, None]
+        self._prior_record = arrays["prior_record"]
+        self._last_input = float(arrays["last_input"])
+
     @property
     def is_finite(self) -> bool:
         """Whether all numbers of the record are."""
@@ -131,7 +154,8 @@ class JointFilter(ABC):
         self._cov = prior.cov / np.outer(scale, scale)
         self._noises = np.array([prior.gamma_shape, prior.gamma_rate, prior.xi_shape, prior.xi_rate])
         self._states = len(prior.state_mean)
-        self._first_state = self._mean[: self._states].copy(), self._cov[: self._states, : self._states].copy()
+        self._first_mean = self._mean[: self._states].copy()
+        self._first_cov = self._cov[: self._states, : self._states].copy()
         self._past: FloatArray = np.zeros(0)
         self._waiting_u: FloatArray = np.zeros(0)
         self._waiting_y: FloatArray = np.zeros(0)
@@ -175,10 +199,19 @@ class JointFilter(ABC):
     def rewind(self) -> None:
         """Forget the state and the inputs."""
         k = self._states
-        self._mean[:k] = self._first_state[0]
+        self._mean[:k] = self._first_mean
         self._cov[:k, :] = self._cov[:, :k] = 0.0
-        self._cov[:k, :k] = self._first_state[1]
+        self._cov[:k, :k] = self._first_cov
         self._past = self._waiting_u = self._waiting_y = np.zeros(0)
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Everything that the future depends on."""
+        return {name: getattr(self, f"_{name}") for name in _JOINT_ARRAYS}
+
+    def restore(self, arrays: Mapping[str, FloatArray]) -> None:
+        """Become another filter."""
+        for name in _JOINT_ARRAYS:
+            setattr(self, f"_{name}", arrays[name])
 
     @property
     def is_finite(self) -> bool:
@@ -206,7 +239,7 @@ class JointFilter(ABC):
         """Follow a record with parameters and noises fixed at their means: the last state, and the forecasts (T,)."""
         k = self._states
         mean, cov = self._mean.copy(), np.zeros_like(self._cov)
-        mean[:k], cov[:k, :k] = self._first_state
+        mean[:k], cov[:k, :k] = self._first_mean, self._first_cov
         noises = self._noises * np.repeat(_CERTAIN / self._noises[::2], 2)
         forecasts = np.empty((len(y), 2))
         self._take(mean, cov, noises, u, 0, y, np.empty((len(y), 1)), forecasts)

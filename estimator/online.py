@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -178,6 +178,14 @@ class OnlineEstimator:
     def rewind(self) -> None:
         """Forget where the oscillator is and what drove it, keep what is known about it: for another record or pass."""
         self._filter.rewind()
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Everything that the future depends on, by name; `estimator.save_estimator` writes it to a file."""
+        return self._filter.arrays()
+
+    def restore(self, arrays: Mapping[str, FloatArray]) -> None:
+        """Become what `arrays` said of another estimator with the same settings."""
+        self._filter.restore(arrays)
 
     def predict(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """One-step predictions at the posterior means: each output from those measured before it.
