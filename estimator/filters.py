@@ -278,8 +278,9 @@ class ODEFilter(JointFilter):
         simulate_samples(state[0], state[1], parameters, pieces, u[start:], self._model.substeps, y[start:])
 
     def _pieces(self, u: FloatArray) -> FloatArray:
-        """(T, 4) the input on the way to each sample; nothing moves to the first."""
-        return np.concatenate([np.zeros((1, 4)), self._model.pieces(u)])
+        """(T, degree + 1) the input on the way to each sample; nothing moves to the first."""
+        pieces = self._model.pieces(u)
+        return np.concatenate([np.zeros((1, pieces.shape[1])), pieces])
 
 
 class RegressorFilter(JointFilter):

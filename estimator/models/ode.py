@@ -2,7 +2,7 @@
 
     x'' = g (u - u0) - c x' - k x - b x³ - e x'³,        y = x + y0 + d u + v
 
-The measured input is band-limited, so it must not be held between samples: it is interpolated by a cubic polynomial
+The measured input is band-limited, so it must not be held between samples: it is interpolated by a polynomial
 per sample, whose coefficients say how much of the future is used. The integration is the classical Runge-Kutta
 method of order 4 with exact sensitivities: the derivative of its arithmetic, not finite differences.
 
@@ -11,6 +11,7 @@ Inside, time is counted in samples (δ = 1), so that all parameters are of the o
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -41,6 +42,9 @@ N_MOTION = 8
 #: Direction of the process noise in (x, x'): an acceleration held over a sample, scaled to move x by 1.
 NOISE_DIRECTION = np.array([1.0, 2.0])
 
+#: Of the spline through the inputs: the input has power up to two thirds of the Nyquist frequency.
+SPLINE_DEGREE = 5
+
 INTERPOLATIONS = ("linear", "look_ahead", "spline")
 
 
@@ -51,7 +55,7 @@ class DuffingODE:
     Attributes:
         interpolation: of the input between samples. ``linear``: causal. ``look_ahead``: the cubic through the two
             samples before and the two after, so that a sample is used when the next input is known. ``spline``: the
-            cubic spline through all inputs, for recorded data that is given at once.
+            quintic spline through all inputs, for recorded data that is given at once.
         cubic_damping: whether the damping has the cubic term e x'³; without it e = 0.
         substeps: Runge-Kutta steps per sample.
 
@@ -115,13 +119,10 @@ class DuffingODE:
         return np.array([step**-2, 1 / step, step**-2, step**-2, 1.0, step, 1.0, 1.0])
 
     def pieces(self, u: FloatArray) -> FloatArray:
-        """The input between samples as polynomials: (T - 1, 4) coefficients of 1, τ, τ², τ³ with τ in [0, 1]."""
-        if len(u) < 2:
-            return np.zeros((0, 4))
+        """The input between samples as polynomials of τ in [0, 1]: (T - 1, degree + 1) coefficients of 1, τ, τ², ..."""
         start, stop = u[:-1], u[1:]
         if self.interpolation == "linear":
-            zeros = np.zeros_like(start)
-            return np.column_stack([start, stop - start, zeros, zeros])
+            return np.column_stack([start, stop - start])
         if self.interpolation == "look_ahead":
             before = np.concatenate([u[:1], u[:-2]])
             after = np.concatenate([u[2:], u[-1:]])
@@ -133,9 +134,18 @@ class DuffingODE:
                     (start - stop) / 2 + (after - before) / 6,
                 ]
             )
-        from scipy.interpolate import CubicSpline
+        return _spline_pieces(u)
 
-        return np.ascontiguousarray(CubicSpline(np.arange(len(u)), u).c[::-1].T)
+
+def _spline_pieces(u: FloatArray) -> FloatArray:
+    """(T - 1, 6) coefficients of the quintic spline through all inputs."""
+    from scipy.interpolate import make_interp_spline
+
+    if len(u) <= SPLINE_DEGREE:
+        raise ValueError(f"u must have more than {SPLINE_DEGREE} samples for interpolation 'spline', but has {len(u)}")
+    spline = make_interp_spline(np.arange(len(u)), u, k=SPLINE_DEGREE)
+    starts = np.arange(len(u) - 1)
+    return np.column_stack([spline(starts, nu=n) / math.factorial(n) for n in range(SPLINE_DEGREE + 1)])
 
 
 @jit
@@ -164,7 +174,7 @@ def flow(x, v, p, piece, substeps, J, work):
         x: displacement [V].
         v: its change per sample [V].
         p: (6,) parameters of the motion, per sample.
-        piece: (4,) the input's polynomial.
+        piece: (degree + 1,) the input's polynomial.
         substeps: Runge-Kutta steps.
         J: (2, N_MOTION) receives the sensitivities of the result to x, v and p.
         work: (3, 2, N_MOTION) memory.
@@ -203,7 +213,10 @@ def flow(x, v, p, piece, substeps, J, work):
 
 @jit
 def _polynomial(piece, tau):
-    return piece[0] + tau * (piece[1] + tau * (piece[2] + tau * piece[3]))
+    value = piece[-1]
+    for n in range(len(piece) - 2, -1, -1):
+        value = piece[n] + tau * value
+    return value
 
 
 @kernel
@@ -214,7 +227,7 @@ def run_samples(mean, cov, noises, pieces, u, y, moving, substeps, free_energies
         mean: (N_JOINT,) of (x, x', parameters), per sample; overwritten, as ``cov`` and ``noises``.
         cov: (N_JOINT, N_JOINT).
         noises: (4,) shapes and rates of q(γ) and q(ξ).
-        pieces: (T, 4) the input on the way to each sample.
+        pieces: (T, degree + 1) the input on the way to each sample.
         u: (T,) inputs at the samples [V].
         y: (T,) outputs [V].
         moving: False if the first sample is the first ever, to which nothing has moved.
