@@ -16,12 +16,12 @@ def scalar(name: str, value: npt.ArrayLike) -> float:
     return float(number.reshape(()))
 
 
-def series(name: str, values: npt.ArrayLike) -> FloatArray:
-    """A finite series (T,), copied."""
+def series(name: str, values: npt.ArrayLike, missing: bool = False) -> FloatArray:
+    """A finite series (T,), copied; with ``missing`` it may hold NaN."""
     checked = _numbers(name, values)
     if checked.ndim != 1:
         raise ValueError(f"{name} must have shape (T,), but has {checked.shape}; pass one channel, e.g. {name}.ravel()")
-    finite = np.isfinite(checked)
+    finite = np.isfinite(checked) | (missing & np.isnan(checked))
     if not finite.all():
         bad = int(np.argmin(finite))
         raise ValueError(

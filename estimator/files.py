@@ -50,6 +50,7 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
         "factorisation": estimator.factorisation,
         "iterations": estimator.iterations,
         "as_published": estimator.as_published,
+        "drift": estimator.drift,
     }
     arrays: dict[str, Any] = {**estimator.arrays(), "description": np.array(json.dumps(description))}
     buffer = io.BytesIO()
@@ -82,6 +83,7 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
         factorisation=description["factorisation"],
         iterations=description["iterations"],
         as_published=description["as_published"],
+        drift=description["drift"],
     )
     estimator.restore(arrays)
     return estimator

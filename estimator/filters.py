@@ -29,7 +29,7 @@ _OF_STATES = [i for i, name in enumerate(RECORD) if set(name.split("_")) & set(S
 _CERTAIN = 1e15
 
 #: What a `JointFilter` consists of.
-_JOINT_ARRAYS = ("mean", "cov", "noises", "first_mean", "first_cov", "past", "waiting_u", "waiting_y")
+_JOINT_ARRAYS = ("mean", "cov", "noises", "walk", "first_mean", "first_cov", "past", "waiting_u", "waiting_y")
 
 Self = TypeVar("Self")
 
@@ -144,16 +144,18 @@ class JointFilter(ABC):
 
     Args:
         prior: belief before the first sample.
+        drift: standard deviation of each coefficient's step per sample, in parts of that of its prior.
         scale: (k + K,) factors from the model's units to those of the prior.
         look_ahead: inputs after a sample that must be known before it is used.
     """
 
-    def __init__(self, prior: JointBelief, scale: FloatArray, look_ahead: int) -> None:
+    def __init__(self, prior: JointBelief, drift: float, scale: FloatArray, look_ahead: int) -> None:
         self._names, self._units, self._scale, self._look_ahead = prior.names, prior.units, scale, look_ahead
         self._mean = prior.mean / scale
         self._cov = prior.cov / np.outer(scale, scale)
         self._noises = np.array([prior.gamma_shape, prior.gamma_rate, prior.xi_shape, prior.xi_rate])
         self._states = len(prior.state_mean)
+        self._walk = drift**2 * np.diag(self._cov)[self._states :]
         self._first_mean = self._mean[: self._states].copy()
         self._first_cov = self._cov[: self._states, : self._states].copy()
         self._past: FloatArray = np.zeros(0)
@@ -173,7 +175,9 @@ class JointFilter(ABC):
         outputs = np.concatenate([self._waiting_y, y])
         begun, used = len(self._past), max(0, len(outputs) - self._look_ahead)
         if used:
-            self._take(self._mean, self._cov, self._noises, inputs, begun, outputs[:used], free_energies, forecasts)
+            self._take(
+                self._mean, self._cov, self._noises, self._walk, inputs, begun, outputs[:used], free_energies, forecasts
+            )
         self._past = inputs[: begun + used][-LONGEST_DELAY:]
         self._waiting_u, self._waiting_y = inputs[begun + used :], outputs[used:]
         return used
@@ -184,6 +188,7 @@ class JointFilter(ABC):
         mean: FloatArray,
         cov: FloatArray,
         noises: FloatArray,
+        walk: FloatArray,
         inputs: FloatArray,
         begun: int,
         outputs: FloatArray,
@@ -242,25 +247,27 @@ class JointFilter(ABC):
         mean[:k], cov[:k, :k] = self._first_mean, self._first_cov
         noises = self._noises * np.repeat(_CERTAIN / self._noises[::2], 2)
         forecasts = np.empty((len(y), 2))
-        self._take(mean, cov, noises, u, 0, y, np.empty((len(y), 1)), forecasts)
+        self._take(mean, cov, noises, np.zeros_like(self._walk), u, 0, y, np.empty((len(y), 1)), forecasts)
         return mean[:k], forecasts[:, 0]
 
 
 class ODEFilter(JointFilter):
     """Memory for `DuffingODE`; its own unit of time is the sample."""
 
-    def __init__(self, model: DuffingODE, prior: JointBelief) -> None:
-        super().__init__(prior, np.concatenate([[1.0, 1 / SAMPLING_STEP], model.scales()]), model.look_ahead)
+    def __init__(self, model: DuffingODE, prior: JointBelief, drift: float) -> None:
+        super().__init__(prior, drift, np.concatenate([[1.0, 1 / SAMPLING_STEP], model.scales()]), model.look_ahead)
         self._model = model
         if not model.cubic_damping:
             fixed = self._states + model.names.index("cubic_damping")
             self._mean[fixed] = self._cov[fixed, :] = self._cov[:, fixed] = 0.0
+            self._walk[fixed - self._states] = 0.0
 
     def _take(
         self,
         mean: FloatArray,
         cov: FloatArray,
         noises: FloatArray,
+        walk: FloatArray,
         inputs: FloatArray,
         begun: int,
         outputs: FloatArray,
@@ -270,7 +277,7 @@ class ODEFilter(JointFilter):
         new = slice(begun, begun + len(outputs))
         pieces, substeps = self._pieces(inputs)[new], self._model.substeps
         run_samples(
-            mean, cov, noises, pieces, inputs[new], outputs, begun > 0, substeps, free_energies, forecasts
+            mean, cov, noises, walk, pieces, inputs[new], outputs, begun > 0, substeps, free_energies, forecasts
         )  # fmt: skip
 
     def _free_run(self, state: FloatArray, u: FloatArray, y: FloatArray, start: int) -> None:
@@ -286,8 +293,8 @@ class ODEFilter(JointFilter):
 class RegressorFilter(JointFilter):
     """Memory for an `NLARX` with other regressors than the paper's."""
 
-    def __init__(self, model: NLARX, prior: JointBelief) -> None:
-        super().__init__(prior, np.ones(len(prior.mean)), look_ahead=0)
+    def __init__(self, model: NLARX, prior: JointBelief, drift: float) -> None:
+        super().__init__(prior, drift, np.ones(len(prior.mean)), look_ahead=0)
         self._terms = as_arrays(model.terms)
 
     def _take(
@@ -295,13 +302,14 @@ class RegressorFilter(JointFilter):
         mean: FloatArray,
         cov: FloatArray,
         noises: FloatArray,
+        walk: FloatArray,
         inputs: FloatArray,
         begun: int,
         outputs: FloatArray,
         free_energies: FloatArray,
         forecasts: FloatArray,
     ) -> None:
-        run_regressors(mean, cov, noises, self._terms, inputs, begun, outputs, free_energies, forecasts)
+        run_regressors(mean, cov, noises, walk, self._terms, inputs, begun, outputs, free_energies, forecasts)
 
     def _free_run(self, state: FloatArray, u: FloatArray, y: FloatArray, start: int) -> None:
         given = y[:start].copy()

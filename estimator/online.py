@@ -17,6 +17,7 @@ from estimator.models.ode import DuffingODE
 from estimator.parameters import FloatArray
 
 _SAMPLES_BETWEEN_REPORTS = 5_000
+_AS_TERMS = "pass them as terms, regressors=PRESETS['paper'], for an estimator that can"
 
 
 class OnlineEstimator:
@@ -34,6 +35,9 @@ class OnlineEstimator:
         factorisation: ``structured`` (states and coefficients jointly Gaussian) or ``mean_field`` (the paper's).
         iterations: variational iterations per sample; 3 structured, 10 mean field where it is not given.
         as_published: mean field with the two departures of the published run, to reproduce its numbers.
+        drift: lets the coefficients of a `JointBelief` walk at random, to follow a system that changes: standard
+            deviation of a coefficient's step per sample, in parts of that of its prior. 0.01 forgets in some hundred
+            samples.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -62,6 +66,7 @@ class OnlineEstimator:
         factorisation: str = "structured",
         iterations: int | None = None,
         as_published: bool = False,
+        drift: float = 0.0,
     ) -> None:
         if factorisation not in DEFAULT_ITERATIONS:
             raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {factorisation!r}")
@@ -78,6 +83,9 @@ class OnlineEstimator:
         self.factorisation = factorisation
         self.iterations = int(iterations)
         self.as_published = as_published
+        self.drift = float(drift)
+        if not 0 <= self.drift < np.inf:
+            raise ValueError(f"drift must be at least 0 and finite, but is {drift!r}; 0 is a system that stays")
         self._filter = self._make_filter(prior)
         self._free_energies = np.full(self.iterations, np.nan)
         self._forecasts = np.empty((0, 2))
@@ -94,8 +102,10 @@ class OnlineEstimator:
             if not isinstance(prior, JointBelief) or prior.names != own.names:
                 raise ValueError(f"prior must have the parameters {own.names}, but is {prior!r:.60}; use model.prior()")
             if isinstance(self.model, DuffingODE):
-                return ODEFilter(self.model, prior)
-            return RegressorFilter(self.model, prior)
+                return ODEFilter(self.model, prior, self.drift)
+            return RegressorFilter(self.model, prior, self.drift)
+        if self.drift:
+            raise ValueError(f"drift must be 0 for regressors='paper', but is {self.drift}; {_AS_TERMS}")
         prior = prior if prior is not None else Prior.silverbox_twin()
         if not isinstance(prior, Prior):
             raise ValueError(f"prior must be a Prior for NLARX, but is {prior!r:.60}; use Prior.silverbox_twin(...)")
@@ -132,13 +142,14 @@ class OnlineEstimator:
             raise ValueError("interpolation must not be 'spline' for single samples; use run() or 'look_ahead'")
         self.run(np.array([scalar("u", u)]), np.array([scalar("y", y)]))
 
-    def run(self, u: npt.ArrayLike, y: npt.ArrayLike, progress: bool = False) -> FloatArray:
+    def run(self, u: npt.ArrayLike, y: npt.ArrayLike, progress: bool = False, missing: bool = False) -> FloatArray:
         """Update the posterior with T samples, in order. The same as `update` with each of them.
 
         Args:
             u: (T,) inputs [V].
             y: (T,) outputs [V], paired with u by index.
             progress: show a progress bar.
+            missing: outputs that are NaN are missing: the state moves on, nothing is learned from them.
 
         Returns:
             Free energy (T, iterations) of each sample after each iteration [nats]. A model that looks ahead uses a
@@ -147,7 +158,9 @@ class OnlineEstimator:
         Raises:
             ValueError: as `update`; the estimator is then as it was before the first of the samples.
         """
-        u, y = series("u", u), series("y", y)
+        u, y = series("u", u), series("y", y, missing)
+        if missing and isinstance(self._filter, NLARXFilter):
+            raise ValueError(f"missing must be False for regressors='paper'; {_AS_TERMS}")
         if u.shape != y.shape:
             raise ValueError(f"u and y must have one length, but have {len(u)} and {len(y)}; cut the longer one")
         if not len(u):

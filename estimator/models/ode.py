@@ -220,13 +220,14 @@ def _polynomial(piece, tau):
 
 
 @kernel
-def run_samples(mean, cov, noises, pieces, u, y, moving, substeps, free_energies, forecasts):
+def run_samples(mean, cov, noises, walk, pieces, u, y, moving, substeps, free_energies, forecasts):
     """Update a joint belief with T samples.
 
     Args:
         mean: (N_JOINT,) of (x, x', parameters), per sample; overwritten, as ``cov`` and ``noises``.
         cov: (N_JOINT, N_JOINT).
         noises: (4,) shapes and rates of q(γ) and q(ξ).
+        walk: (K,) variances of the coefficients' random walk per sample.
         pieces: (T, degree + 1) the input on the way to each sample.
         u: (T,) inputs at the samples [V].
         y: (T,) outputs [V].
@@ -250,7 +251,7 @@ def run_samples(mean, cov, noises, pieces, u, y, moving, substeps, free_energies
                 mean[0], mean[1], mean[N_STATES : N_STATES + 6], pieces[t], substeps, sensitivities, work
             )  # fmt: skip
             jacobian[:, :N_MOTION] = sensitivities
-            joint.predict(mean, cov, moved, jacobian, rows)
+            joint.predict(mean, cov, moved, jacobian, walk, rows)
         readout[N_JOINT - 1] = u[t]
         expected = mean[0] + mean[N_JOINT - 2] + mean[N_JOINT - 1] * u[t]
         forecasts[t, 0] = expected

@@ -94,17 +94,18 @@ def _step(x1, x2, u, t, c, terms, regressors):
 
 
 @kernel
-def run_regressors(mean, cov, noises, terms, u, start, y, free_energies, forecasts):
+def run_regressors(mean, cov, noises, walk, terms, u, start, y, free_energies, forecasts):
     """Update a joint belief in (x_t, x_{t-1}, c) with T samples.
 
     Args:
         mean: (2 + K,); overwritten, as ``cov`` and ``noises``.
         cov: (2 + K, 2 + K).
         noises: (4,) shapes and rates of q(γ) and q(ξ).
+        walk: (K,) variances of the coefficients' random walk per sample.
         terms: (K, 3), see `as_arrays`.
         u: (start + T,) inputs [V]; those before the first sample first.
         start: number of inputs before the first sample.
-        y: (T,) outputs [V].
+        y: (T,) outputs [V]; NaN where missing.
         free_energies: (T, iterations) receives the free energies [nats].
         forecasts: (T, 2) receives mean [V] and variance [V²] of each output before it was seen.
     """
@@ -122,7 +123,7 @@ def run_regressors(mean, cov, noises, terms, u, start, y, free_energies, forecas
         moved[0], jacobian[0, 0], jacobian[0, 1] = _step(
             mean[0], mean[1], u, start + t, mean[N_STATES:], terms, jacobian[0, N_STATES:]
         )  # fmt: skip
-        joint.predict(mean, cov, moved, jacobian, rows)
+        joint.predict(mean, cov, moved, jacobian, walk, rows)
         forecasts[t, 0] = mean[0]
         forecasts[t, 1] = joint.correct(
             mean, cov, readout, direction, y[t] - mean[0], noises, free_energies.shape[1], free_energies[t], gain
