@@ -1,0 +1,36 @@
+"""The documents' examples run, and what they point to is there."""
+
+import doctest
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def test_the_examples_of_the_readme_run():
+    failures, examples = doctest.testfile(str(ROOT / "README.md"), module_relative=False, verbose=False)
+    assert examples > 10
+    assert failures == 0
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(document):
+    for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
+        if "://" not in target:
+            assert (document.parent / target).exists(), f"{document.name} points to {target}, which is not there"
+
+
+def test_nothing_else_stands_at_the_top():
+    import subprocess
+
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    top = {line.split("/")[0] for line in listed.stdout.splitlines()}
+    expected = {"estimator", "duffing_env", "agents", "tests", "benchmarks", "docs"}
+    expected |= {"train.py", "evaluate.py", "reproduce.py", "pyproject.toml", "requirements.lock", "Makefile"}
+    expected |= {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE"}
+    assert {name for name in top if not name.startswith(".")} <= expected
