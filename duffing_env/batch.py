@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from duffing_env import kernel
 from duffing_env.experiment import Experiment
-from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OUTCOME, SAVED
+from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OSCILLATOR, OUTCOME, SAVED
 from duffing_env.noise import stream_words
 from estimator.belief import Belief
 from estimator.lanes import LANES
@@ -38,7 +38,8 @@ class Batch:
         self._threads = threads
         self._settings = experiment.settings
         self._prior = experiment.prior_record
-        self._recorded = experiment.recorded
+        # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
+        self._recorded = tuple(series.copy() for series in experiment.recorded)
         n_blocks = -(-size // LANES)
         padded = n_blocks * LANES
         self._blocks = np.zeros((n_blocks, N_ROWS, LANES))
@@ -67,7 +68,8 @@ class Batch:
 
     def step(self, actions: npt.ArrayLike) -> None:
         """Apply actions (n,), in parts of the largest input and clipped to [-1, 1], for one sample."""
-        self._actions[: self.size] = actions
+        with np.errstate(over="ignore"):
+            self._actions[: self.size] = actions
         step = kernel.step_serial
         if self._threads > 1:
             import numba
@@ -103,7 +105,13 @@ class Batch:
 
     def truth(self) -> PhysicalParameters:
         """The true oscillators, a batch of n; where a record is replayed, the twin of its circuit."""
-        return PhysicalParameters(*(self.quantity(name) for name in ("m", "c", "a", "b")))
+        return PhysicalParameters(*(self.quantity(name) for name in OSCILLATOR))
+
+    def oscillator(self, index: int, *, final: bool = False) -> PhysicalParameters:
+        """The true oscillator of environment ``index``; ``final``: that of its last episode, if reset since."""
+        block, lane = divmod(index, LANES)
+        first = LAYOUT["ended_m" if final else "m"]
+        return PhysicalParameters(*self._blocks[block, first : first + len(OSCILLATOR), lane].tolist())
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles must not share memory through the views."""

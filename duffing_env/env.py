@@ -35,7 +35,7 @@ def action_space() -> spaces.Box:
 
 
 class DuffingEnv(gym.Env[Any, Any]):
-    """Choose the input of a Duffing oscillator so that its parameters are identified.
+    r"""Choose the input of a Duffing oscillator so that its parameters are identified.
 
     ## Description
 
@@ -90,7 +90,7 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     ## Episode end
 
-    - Termination: \\|y\\| > ``max_output`` (0.6 V); or a number that is not finite (``info["diverged"]``), which leaves
+    - Termination: \|y\| > ``max_output`` (0.6 V); or a number that is not finite (``info["diverged"]``), which leaves
       the belief as it was before that step.
     - Truncation: after ``horizon`` (256) samples.
 
@@ -169,7 +169,7 @@ class DuffingEnv(gym.Env[Any, Any]):
     @property
     def truth(self) -> PhysicalParameters:
         """The oscillator that is to be identified."""
-        return PhysicalParameters(*(float(self._batch.quantity(name)[0]) for name in ("m", "c", "a", "b")))
+        return self._batch.oscillator(0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -242,7 +242,7 @@ class DuffingEnv(gym.Env[Any, Any]):
 
 
 class SilverboxReplayEnv(DuffingEnv):
-    """The paper's experiment: the recorded Silverbox input, sample by sample, through the environment.
+    r"""The paper's experiment: the recorded Silverbox input, sample by sample, through the environment.
 
     ## Description
 
@@ -262,7 +262,7 @@ class SilverboxReplayEnv(DuffingEnv):
 
     ## Episode end
 
-    - Termination: an action off the record; \\|y\\| > ``max_output``; a number that is not finite.
+    - Termination: an action off the record; \|y\| > ``max_output``; a number that is not finite.
     - Truncation: the end of the regime.
 
     ## Information

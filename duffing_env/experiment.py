@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from duffing_env.layout import SETTINGS
+from duffing_env.layout import OSCILLATOR, SETTINGS
 from duffing_env.rewards import reward_number
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
 from estimator.belief import Prior
@@ -25,14 +25,14 @@ _PRIORS = ("silverbox_twin", "published_run", "paper_text")
 
 @dataclass(frozen=True)
 class Experiment:
-    """What all experiments have.
+    r"""What all experiments have.
 
     Attributes:
         factorisation: of the estimator: ``structured`` or ``mean_field``.
         iterations: variational iterations per sample; 3 structured and 10 mean field where it is None.
         reward: its name, see `duffing_env.rewards`.
         max_input: input of the action 1 [V].
-        max_output: displacement limit [V]: the episode ends at \\|y\\| above it.
+        max_output: displacement limit [V]: the episode ends at \|y\| above it.
     """
 
     factorisation: str = "structured"
@@ -42,7 +42,7 @@ class Experiment:
     max_output: float = 0.6
 
     def __post_init__(self) -> None:
-        if self.factorisation not in DEFAULT_ITERATIONS:
+        if self.factorisation not in list(DEFAULT_ITERATIONS):
             raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {self.factorisation!r}")
         if self.iterations is not None:
             self._check_count("iterations")
@@ -52,7 +52,7 @@ class Experiment:
 
     def _check_positive(self, name: str) -> None:
         value = getattr(self, name)
-        if not (isinstance(value, int | float | np.number) and 0 < value < np.inf):
+        if not (_is_number(value) and 0 < value < np.inf):
             raise ValueError(f"{name} must be a positive, finite number, but is {value!r}; pass a value above 0")
 
     def _check_count(self, name: str) -> None:
@@ -94,7 +94,6 @@ class Experiment:
     def settings(self) -> FloatArray:
         """The experiment as the kernel is told of it, (len(SETTINGS),)."""
         prior = dict(zip(RECORD, self.prior_record, strict=True))
-        center = SILVERBOX_TWIN
         values = {
             "max_input": self.max_input,
             "max_output": self.max_output,
@@ -102,7 +101,7 @@ class Experiment:
             "process_noise": 0.0,
             "measurement_noise": 0.0,
             "spread": 0.0,
-            **dict(zip(("center_m", "center_c", "center_a", "center_b"), (center.m, center.c, center.a, center.b))),
+            **{f"center_{name}": getattr(SILVERBOX_TWIN, name) for name in OSCILLATOR},
             "step": SAMPLING_STEP,
             "reward": reward_number(self.reward),
             "structured": self.factorisation == "structured",
@@ -148,19 +147,22 @@ class SimulatedExperiment(Experiment):
             self._check_positive(name)
         if self.spread >= 1:
             raise ValueError(f"spread must be below 1, but is {self.spread!r}; masses are positive")
-        if self.plant_spread is not None and not 0 <= self.plant_spread < 1:
+        if self.plant_spread is not None and not (_is_number(self.plant_spread) and 0 <= self.plant_spread < 1):
             raise ValueError(f"plant_spread must be in [0, 1), but is {self.plant_spread!r}; 0 is the twin itself")
 
     @property
     def samples(self) -> int:
+        """The horizon."""
         return self.horizon
 
     @cached_property
     def believed(self) -> Prior:
+        """The prior that fits oscillators so drawn, and the noises."""
         return Prior.silverbox_twin(self.spread, self.process_noise, self.measurement_noise, self.noise_shape)
 
     @property
     def plant_settings(self) -> dict[str, float]:
+        """The noises, and the range of the oscillators."""
         return {
             "process_noise": self.process_noise,
             "measurement_noise": self.measurement_noise,
@@ -193,6 +195,9 @@ class ReplayExperiment(Experiment):
         for name, choices in (("regime", REGIME_NAMES), ("prior", _PRIORS), ("input_delay", (0, 1))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {list(choices)}, but is {getattr(self, name)!r}")
+        for name in ("nonlinear", "as_published"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, but is {getattr(self, name)!r}")
         if self.as_published and self.factorisation != "mean_field":
             raise ValueError(
                 f"as_published goes with factorisation='mean_field', but factorisation is {self.factorisation!r}"
@@ -210,23 +215,28 @@ class ReplayExperiment(Experiment):
 
     @property
     def samples(self) -> int:
+        """The samples of the regime that have an output."""
         return len(self._regime.u) - self.input_delay
 
     @cached_property
     def believed(self) -> Prior:
+        """The prior of that name."""
         prior: Prior = getattr(Prior, self.prior)()
         return prior
 
     @property
     def is_nonlinear(self) -> bool:
+        """As asked for."""
         return self.nonlinear
 
     @property
     def recorded(self) -> tuple[FloatArray, FloatArray]:
+        """The regime's input and output [V]."""
         return self._regime.u, self._regime.y
 
     @property
     def plant_settings(self) -> dict[str, float]:
+        """How the record is played, and how the estimator departs from the model."""
         return {"as_published": self.as_published, "replayed": True, "delay": self.input_delay}
 
 
@@ -239,6 +249,10 @@ def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experime
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"{name}={options[name]!r} is no option of this environment, which has {known}{hint}")
     return kind(**options)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
 def _inverse_std(variance: float) -> float:

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import prange
 
-from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, OBSERVATION, SAVED, SETTINGS
+from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, OBSERVATION, OSCILLATOR, SAVED, SETTINGS
 from duffing_env.noise import as_bits, as_word, draw, to_unit
 from duffing_env.plant import draw_noise, move_plant, play_record
 from duffing_env.rewards import REWARDS, appraise_prior, settle
@@ -30,7 +30,10 @@ _RECORDED_U, _RECORDED_Y = LAYOUT["recorded_u"] * LANES, LAYOUT["recorded_y"] * 
 _OUTCOME, _OBS = LAYOUT["reward"] * LANES, LAYOUT["obs_mean_t1"] * LANES
 _TERMINATED, _TRUNCATED = LAYOUT["terminated"] * LANES, LAYOUT["truncated"] * LANES
 _DIVERGED, _OFF_RECORD = LAYOUT["diverged"] * LANES, LAYOUT["off_record"] * LANES
+_SURPRISE = LAYOUT["surprise"] * LANES
 _SAVED_RECORD = LAYOUT[SAVED[0]] * LANES
+_OSCILLATOR, _ENDED_OSCILLATOR = LAYOUT["m"] * LANES, LAYOUT["ended_m"] * LANES
+_N_OSCILLATOR = len(OSCILLATOR)
 
 # Where settings stand.
 _MAX_INPUT, _MAX_OUTPUT, _HORIZON = (SETTINGS[name] for name in ("max_input", "max_output", "horizon"))
@@ -144,13 +147,14 @@ def _integrate_and_infer(W, settings, recorded_u, recorded_y):
         W[_SAVED_RECORD + i] = W[i]
     structured = settings[_STRUCTURED] != 0.0
     update(W, structured, np.int64(settings[_ITERATIONS]), settings[_AS_PUBLISHED] != 0.0, W[:0])
+    if settings[_REWARD] == _FREE_ENERGY:
+        for j in range(LANES):
+            W[_SURPRISE + j] = free_energy(W, j, structured)
     settle(W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR], settings[_REWARD])
     for j in range(LANES):
         if W[_DIVERGED + j] != 0.0 or W[_OFF_RECORD + j] != 0.0:
             for i in range(RECORD_SIZE):
                 W[i * LANES + j] = W[_SAVED_RECORD + i * LANES + j]
-        elif settings[_REWARD] == _FREE_ENERGY:
-            W[_OUTCOME + j] = -free_energy(W, j, structured)
 
 
 @jit
@@ -198,6 +202,8 @@ def _step_block(
                     final_observations[j, k] = observations[j, k]
                 for i in range(RECORD_SIZE):
                     W[_SAVED_RECORD + i * LANES + j] = W[i * LANES + j]
+                for i in range(_N_OSCILLATOR):
+                    W[_ENDED_OSCILLATOR + i * LANES + j] = W[_OSCILLATOR + i * LANES + j]
                 reset_lane(W, j, settings, prior)
         _write_observations(W, settings, observations)
 

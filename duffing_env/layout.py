@@ -36,20 +36,26 @@ SETTINGS = rows(
 OUTCOME = rows("reward information_gain log_posterior_gain terminated truncated diverged off_record")
 N_OUTCOME = len(OUTCOME)
 
-#: The record before the step, to return to where the step came to nothing.
+#: The record before the step, to return to where the step came to nothing; after a reset in the same step, the record
+#: that the episode ended with.
 SAVED = tuple(f"saved_{name}" for name in RECORD)
+
+#: The true oscillator; after a reset in the same step, that of the episode which ended is in the rows ``ended_``.
+OSCILLATOR = ("m", "c", "a", "b")
 
 #: Name of a quantity to its row.
 LAYOUT = {
     **BELIEF_LAYOUT,
     **rows(
         "stream_a stream_b stream_c stream_d noise_w noise_v",
-        "m c a b true_t1 true_t2 true_t3 true_e",
+        " ".join(OSCILLATOR),
+        "true_t1 true_t2 true_t3 true_e",
         "x last_x elapsed waiting recorded_u recorded_y",
-        "log_det log_density error",
+        "log_det log_density error surprise",
         " ".join(OUTCOME),
         " ".join(f"obs_{name}" for name in OBSERVATION),
         " ".join(SAVED),
+        " ".join(f"ended_{name}" for name in OSCILLATOR),
         start=N_BELIEF_ROWS,
     ),
 }

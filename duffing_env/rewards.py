@@ -25,13 +25,16 @@ from duffing_env.layout import LAYOUT, OUTCOME
 from estimator.elementary import log
 from estimator.lanes import at_lane, inlined, lanewise
 
+# Where `log` ends: below, numbers lose digits.
+_SMALLEST, _INFINITE = 2.0**-1022, float("inf")
+
 #: Name of a reward to its number in the kernel.
 REWARDS = {"information_gain": 0, "log_posterior": 1, "parameter_error": 2, "free_energy": 3}
 
 
 def reward_number(name: str) -> int:
     """The kernel's number of a reward; ValueError for an unknown name."""
-    if name not in REWARDS:
+    if name not in list(REWARDS):
         near = difflib.get_close_matches(str(name), REWARDS, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"reward must be one of {list(REWARDS)}, but is {name!r}{hint}")
@@ -43,7 +46,7 @@ def _appraise(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear):
     """Log det of the coefficients' covariance, and log density at the true ones, by an L D Lᵀ factorisation.
 
     The order is θ1, θ3, η, θ2, so that a θ2 known to be zero is left out by leaving out the last pivot. ``sound``
-    says that all pivots are positive.
+    says that all pivots are positive, and their product a number that has a logarithm.
     """
     P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e = P
     d1 = P_t1_t1
@@ -62,8 +65,9 @@ def _appraise(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear):
     z2 = true_t2 - t2 - l21 * z1 - l23 * z3 - l2e * ze
     d2 = d2 if nonlinear else 1.0
     z2 = z2 if nonlinear else 0.0
-    sound = d1 > 0.0 and d3 > 0.0 and de > 0.0 and d2 > 0.0
-    log_det = log(d1 * d3 * de * d2)
+    determinant = d1 * d3 * de * d2
+    sound = d1 > 0.0 and d3 > 0.0 and de > 0.0 and d2 > 0.0 and _SMALLEST < determinant < _INFINITE
+    log_det = log(determinant)
     return log_det, -0.5 * (log_det + z1 * z1 / d1 + z2 * z2 / d2 + z3 * z3 / d3 + ze * ze / de), sound
 
 
@@ -94,18 +98,23 @@ def settle(
     x0, x1, x2, t1, t2, t3, e, P_x0_x0, P_x1_x1, P_x2_x2,
     P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
     g_rate, n_rate, m, c, a, b, true_t1, true_t2, true_t3, true_e,
-    x, y, elapsed, log_det, log_density, error, off_record,
+    x, y, elapsed, log_det, log_density, error, surprise, off_record,
     max_output, horizon, step, nonlinear, reward_kind,
 ):  # fmt: skip
-    """What the step was worth, and whether the episode ends. A number that is not finite ends it, flagged."""
+    """What the step was worth, and whether the episode ends.
+
+    A number that is not finite ends it, flagged, and so does a covariance that is not positive definite any more.
+    ``surprise`` is the free energy of the sample where that is the reward, and 0 elsewhere.
+    """
     P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
     new_log_det, new_log_density, sound = _appraise(
         t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0
     )  # fmt: skip
     new_error = _relative_error(t1, t2, t3, e, m, c, a, b, step)
     total = x + y + x0 + x1 + x2 + t1 + t2 + t3 + e + P_x0_x0 + P_x1_x1 + P_x2_x2 + g_rate + n_rate
-    total += new_log_density + new_error
-    diverged = 0.0 if (total - total == 0.0 and sound and g_rate > 0.0 and n_rate > 0.0) else 1.0
+    total += new_log_density + new_error + surprise
+    sound = sound and P_x0_x0 > 0.0 and P_x1_x1 > 0.0 and g_rate > 0.0 and n_rate > 0.0
+    diverged = 0.0 if (total - total == 0.0 and sound) else 1.0
     void = diverged != 0.0 or off_record != 0.0
     new_log_det = log_det if void else new_log_det
     new_log_density = log_density if void else new_log_density
@@ -118,7 +127,7 @@ def settle(
     if reward_kind == 2.0:
         reward = error - new_error
     if reward_kind == 3.0:
-        reward = 0.0
+        reward = 0.0 if void else -surprise
     terminated = 1.0 if (void or abs(y) > max_output) else 0.0
     elapsed += 1.0
     truncated = 1.0 if (elapsed >= horizon and terminated == 0.0) else 0.0

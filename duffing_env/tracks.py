@@ -1,15 +1,15 @@
-"""The registered environments. Light to import: Gymnasium does so through its plugin hook."""
+"""The registered environments. Importing `duffing_env` registers them; it is light, as every worker process does so."""
 
 from __future__ import annotations
 
 from typing import Any
 
-#: Id of a track to what it is registered with. Any change of numbers or spaces is a new version.
+#: Id of a track to what it is registered with. Any change of numbers or spaces is a new version. None registers
+#: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short, without the belief in the last info.
 TRACKS: dict[str, dict[str, Any]] = {
     "duffing_env/Amplitude-v0": {
         "entry_point": "duffing_env.env:DuffingEnv",
         "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
-        "max_episode_steps": 256,
         "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
     },
     "duffing_env/SilverboxReplay-v0": {

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
+import numba
 import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
@@ -38,17 +39,18 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
 
     Args:
         num_envs: number of rows.
-        max_episode_steps: sets ``horizon`` where that is longer.
+        max_episode_steps: sets ``horizon`` where that is longer; a record's length cannot be set.
         autoreset_mode: when a finished row starts its next episode: in the step after (``NEXT_STEP``, the default),
             in the same step (``SAME_STEP``: ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended
             with), or by ``reset(options={"reset_mask": mask})`` (``DISABLED``).
         copy: give out copies of the observations; without it they are overwritten by the next step.
-        threads: threads that step the rows; results do not depend on it.
+        threads: threads that step the rows, at most Numba's; results do not depend on it.
         render_mode: None; render a single environment to look at one.
         options: those of the single environment.
 
     Infos are arrays with masks under ``_key``: of every step ``information_gain`` and ``log_posterior_gain`` [nats]
-    and the flags; at the end of an episode ``belief`` and ``truth``.
+    and the flags; at the end of an episode ``belief`` and ``truth``. They say what `gymnasium.vector.SyncVectorEnv`
+    says of single environments, so a row's last step is told in ``final_info`` only under ``SAME_STEP``.
 
     >>> import gymnasium as gym
     >>> envs = gym.make_vec("duffing_env/Amplitude-v0", num_envs=4, vectorization_mode="vector_entry_point")
@@ -77,8 +79,9 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
                 raise ValueError(f"{name} must be a whole number of at least 1, but is {value!r}")
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, but is {render_mode!r}; render a single environment")
-        if max_episode_steps is not None and "horizon" in options:
-            options["horizon"] = min(options["horizon"], max_episode_steps)
+        available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+        if threads > available:
+            raise ValueError(f"threads must be at most {available}, but is {threads}; NUMBA_NUM_THREADS allows no more")
         try:
             self._autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -92,9 +95,12 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
+        if max_episode_steps is not None and max_episode_steps < self.experiment.samples:
+            options["horizon"] = max_episode_steps
+            self.experiment = make_experiment(self.single.experiment_kind, options)
         self._batch = Batch(self.experiment, self.num_envs, _RESET_MODES[self._autoreset_mode], int(threads))
         self._copy = copy
-        self._seeded = False
+        self._seeded: Flags = np.zeros(self.num_envs, dtype=np.bool_)
         self._finished: Flags = np.ones(self.num_envs, dtype=np.bool_)
         self._everywhere: Flags = np.ones(self.num_envs, dtype=np.bool_)
 
@@ -123,12 +129,15 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         """Start episodes in all rows, or in those of ``options["reset_mask"]`` (num_envs,).
 
         Args:
-            seed: of the batch, from which `spawn_seeds` makes the rows'; or one seed for each row.
+            seed: of the batch, from which `spawn_seeds` makes the rows'; or one seed for each row. The random numbers
+                of rows that get none go on; at first they come from the operating system.
             options: may hold ``reset_mask``.
+
+        Raises:
+            ValueError: for a mask that is not one, or another number of seeds.
         """
         mask = self._reset_mask(options)
-        if seed is not None or not self._seeded:
-            self._seed(seed, mask)
+        self._seed(seed, mask)
         self._batch.reset(mask)
         self._finished[mask] = False
         return self._observations(), {}
@@ -148,19 +157,16 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         if not np.isfinite(actions).all():
             row = int(np.argmin(np.isfinite(actions)))
             raise ValueError(f"actions must be finite, but row {row} is {actions[row, 0]}; pass values in [-1, 1]")
-        if self._finished.any() and (not self._seeded or self._autoreset_mode == AutoresetMode.DISABLED):
-            rows = np.flatnonzero(self._finished).tolist()
+        due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
+        if due.any():
+            rows = np.flatnonzero(due).tolist()
             raise ResetNeeded(f"rows {rows} have finished or not begun: reset them with options={{'reset_mask': mask}}")
         batch = self._batch
-        being_reset = self._finished if self._autoreset_mode == AutoresetMode.NEXT_STEP else None
         batch.step(actions[:, 0])
         terminated = batch.outcome("terminated") != 0.0
         truncated = batch.outcome("truncated") != 0.0
-        finished = terminated | truncated
-        infos = self._infos(self._everywhere if being_reset is None else ~being_reset)
-        if finished.any():
-            self._add_endings(infos, finished)
-        self._finished = finished
+        infos = self._infos(was_finished=self._finished, finished=terminated | truncated)
+        self._finished = terminated | truncated
         return self._observations(), batch.outcome("reward").copy(), terminated, truncated, infos
 
     def _observations(self) -> Observations:
@@ -178,51 +184,58 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
 
     def _seed(self, seed: int | Sequence[int | None] | None, mask: Flags) -> None:
         """Start the rows' streams of random numbers, each from an ``np_random`` of its own."""
-        if seed is None or isinstance(seed, int | np.integer):
-            super().reset(seed=None if seed is None else int(seed))
-            seeds: Sequence[int | None] = spawn_seeds(seed, self.num_envs)
+        seeds: Sequence[int | None]
+        if seed is None:
+            seeds = [None] * self.num_envs
+        elif isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))
+            seeds = spawn_seeds(int(seed), self.num_envs)
         else:
-            seeds = list(seed)
+            seeds = [None if each is None else int(each) for each in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"seed must hold {self.num_envs} seeds, but holds {len(seeds)}; pass one for each row")
-        for row in np.flatnonzero(mask):
-            generator, _ = gym.utils.seeding.np_random(seeds[int(row)])
-            self._batch.seed(int(row), generator)
-        self._seeded = True
+        for row in np.flatnonzero(mask).tolist():
+            if seeds[row] is not None or not self._seeded[row]:
+                generator, _ = gym.utils.seeding.np_random(seeds[row])
+                self._batch.seed(row, generator)
+        self._seeded |= mask
 
-    def _infos(self, mask: Flags) -> dict[str, Any]:
-        infos: dict[str, Any] = {}
-        for name in self.single._reported:
-            infos[name] = self._batch.outcome(name).copy()
-            infos[f"_{name}"] = mask.copy()
-        for name in self.single._flags:
-            infos[name] = self._batch.outcome(name) != 0.0
-            infos[f"_{name}"] = mask.copy()
-        return infos
-
-    def _add_endings(self, infos: dict[str, Any], finished: Flags) -> None:
-        """Add what the finished rows ended with."""
-        same_step = self._autoreset_mode == AutoresetMode.SAME_STEP
-        beliefs = np.full(self.num_envs, None, dtype=object)
-        for row in np.flatnonzero(finished):
-            beliefs[row] = self._batch.belief(int(row), final=same_step)
-        endings: dict[str, Any] = {"belief": beliefs, "_belief": finished.copy()}
-        if not same_step:
-            infos.update(endings)
-            return
+    def _infos(self, was_finished: Flags, finished: Flags) -> dict[str, Any]:
+        """What is told of a step, by the rows that had finished before it and those that finished in it."""
+        if self._autoreset_mode == AutoresetMode.NEXT_STEP:
+            return self._step_infos(~was_finished) | self._endings(finished)
+        if self._autoreset_mode == AutoresetMode.DISABLED or not finished.any():
+            return self._step_infos(self._everywhere) | self._endings(finished)
         final_observations = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(finished):
             final_observations[row] = self._batch.final_observations[row].copy()
-        infos["final_obs"] = final_observations
-        infos["final_info"] = {**self._masked(infos, finished), **endings}
-        infos["_final_obs"] = infos["_final_info"] = finished.copy()
-
-    @staticmethod
-    def _masked(infos: dict[str, Any], finished: Flags) -> dict[str, Any]:
-        return {
-            key: (finished.copy() if key.startswith("_") else np.where(finished, value, np.zeros_like(value)))
-            for key, value in infos.items()
+        return self._step_infos(~finished) | {
+            "final_obs": final_observations,
+            "_final_obs": finished.copy(),
+            "final_info": self._step_infos(finished) | self._endings(finished),
+            "_final_info": finished.copy(),
         }
+
+    def _step_infos(self, mask: Flags) -> dict[str, Any]:
+        infos: dict[str, Any] = {}
+        for name in self.single._reported:
+            infos[name] = np.where(mask, self._batch.outcome(name), 0.0)
+            infos[f"_{name}"] = mask.copy()
+        for name in self.single._flags:
+            infos[name] = mask & (self._batch.outcome(name) != 0.0)
+            infos[f"_{name}"] = mask.copy()
+        return infos
+
+    def _endings(self, finished: Flags) -> dict[str, Any]:
+        """What the finished rows ended with; no keys where none did."""
+        if not finished.any():
+            return {}
+        same_step = self._autoreset_mode == AutoresetMode.SAME_STEP
+        beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
+        for row in np.flatnonzero(finished).tolist():
+            beliefs[row] = self._batch.belief(row, final=same_step)
+            truths[row] = self._batch.oscillator(row, final=same_step)
+        return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}
 
 
 class SilverboxReplayVectorEnv(DuffingVectorEnv):

@@ -1,0 +1,391 @@
+"""The single environment: Gymnasium's contract, and what the class docstring promises."""
+
+import copy
+import doctest
+import importlib
+import json
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+
+from duffing_env.env import DuffingEnv
+from duffing_env.layout import LAYOUT, N_OBSERVATION
+from duffing_env.rewards import REWARDS
+from estimator import Belief, PhysicalParameters, to_coefficients
+
+TRACK = "duffing_env/Amplitude-v0"
+FACTORISATIONS = ("structured", "mean_field")
+SHORT = {"horizon": 20}
+RESONANT = {"max_output": 0.2, "horizon": 64}  # random inputs end most episodes early
+
+
+def random_actions(seed, steps=10_000):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, 1)).astype(np.float32)
+
+
+def play(env, actions, seed=None, **reset):
+    """One episode: all that `reset` and `step` gave."""
+    told = [env.reset(seed=seed, **reset)]
+    for action in actions:
+        told.append(env.step(action))
+        if told[-1][2] or told[-1][3]:
+            break
+    return told
+
+
+def continue_with(env, actions):
+    told = []
+    for action in actions:
+        told.append(env.step(action))
+        if told[-1][2] or told[-1][3]:
+            told.append(env.reset())
+    return told
+
+
+def same(first, second):
+    """Whether two records of play are the same, bit for bit."""
+    if isinstance(first, Belief):
+        return np.array_equal(first.record, second.record)
+    if isinstance(first, np.ndarray):
+        return first.dtype == second.dtype and np.array_equal(first, second)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(same(a, b) for a, b in zip(first, second, strict=True))
+    return type(first) is type(second) and first == second
+
+
+def overwrite(env, name, value):
+    """Put a value into the plant's or the belief's state."""
+    env.unwrapped._batch._blocks[0, LAYOUT[name], 0] = value
+
+
+@pytest.mark.parametrize("module", ["duffing_env.env", "duffing_env.vector_env", "estimator.online"])
+def test_examples_of_the_docstrings(module):
+    results = doctest.testmod(importlib.import_module(module))
+    assert results.attempted > 3
+    assert results.failed == 0
+
+
+@pytest.mark.parametrize("reward", REWARDS)
+@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(factorisation, reward):
+    from stable_baselines3.common.env_checker import check_env as sb3_check
+
+    env = gym.make(TRACK, factorisation=factorisation, reward=reward).unwrapped
+    gymnasium_check(env, skip_render_check=True)
+    sb3_check(gym.make(TRACK, factorisation=factorisation, reward=reward))
+
+
+def test_spaces_are_bounded_float32_and_each_environment_has_its_own():
+    env = DuffingEnv()
+    assert env.observation_space == gym.spaces.Box(
+        np.float32([-10] * 4 + [-20] * 4 + [-1] * 6 + [-20] * 2 + [-2] * 2 + [-1, -2, 0, 0]),
+        np.float32([10] * 4 + [5] * 4 + [1] * 6 + [20] * 2 + [2] * 2 + [1, 2, 1, 1]),
+        dtype=np.float32,
+    )
+    assert env.action_space == gym.spaces.Box(-1, 1, (1,), np.float32)
+    assert DuffingEnv().observation_space is not env.observation_space
+    assert DuffingEnv().action_space is not env.action_space
+
+
+@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+def test_what_a_step_gives_has_the_types_that_trainers_check(factorisation):
+    env = DuffingEnv(factorisation=factorisation, **SHORT)
+    (first, nothing), *steps = play(env, random_actions(0), seed=0)
+    assert nothing == {}
+    for observation, reward, terminated, truncated, info in [(first, 0.0, False, False, {}), *steps]:
+        assert type(observation) is np.ndarray
+        assert observation.dtype == np.float32
+        assert observation.shape == (N_OBSERVATION,)
+        assert observation.flags.c_contiguous
+        assert type(reward) is float
+        assert type(terminated) is bool
+        assert type(truncated) is bool
+        scalars = {key: value for key, value in info.items() if key not in ("belief", "truth")}
+        assert all(type(value) in (float, bool) for value in scalars.values())
+    for *_, info in steps[:-1]:
+        assert sorted(info) == ["diverged", "information_gain", "log_posterior_gain"]
+    assert sorted(steps[-1][-1]) == ["belief", "diverged", "information_gain", "log_posterior_gain", "truth"]
+
+
+def test_observations_are_given_away():
+    env = DuffingEnv()
+    first, _ = env.reset(seed=0)
+    kept = first.copy()
+    second = env.step([1.0])[0]
+    np.testing.assert_array_equal(first, kept)
+    second[:] = 9.0
+    assert not (env.step([1.0])[0] == 9.0).any()
+
+
+def test_the_first_observation_says_that_nothing_is_known_yet():
+    env = DuffingEnv()
+    for seed in range(3):
+        observation, _ = env.reset(seed=seed)
+        np.testing.assert_allclose(observation[[*range(8), *range(14, 20)]], 0.0, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(observation[20:], 1.0)
+        np.testing.assert_array_equal(observation, DuffingEnv().reset(seed=99)[0])
+
+
+@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+def test_a_seed_repeats_a_whole_episode(factorisation):
+    env = DuffingEnv(factorisation=factorisation, **RESONANT)
+    first = play(env, random_actions(0), seed=7)
+    assert same(first, play(env, random_actions(0), seed=7))
+    assert same(first, play(DuffingEnv(factorisation=factorisation, **RESONANT), random_actions(0), seed=7))
+    assert not same(first, play(env, random_actions(0), seed=8))
+
+
+def test_reset_without_a_seed_goes_on_and_differs():
+    def three_episodes():
+        env = DuffingEnv(**RESONANT)
+        return [play(env, random_actions(0), seed=seed) for seed in (3, None, None)]
+
+    episodes = three_episodes()
+    assert not same(episodes[0], episodes[1])
+    assert not same(episodes[1], episodes[2])
+    assert same(episodes, three_episodes())
+    unseeded = [play(DuffingEnv(**RESONANT), random_actions(0)) for _ in range(2)]
+    assert not same(*unseeded)
+
+
+def test_a_generator_that_is_put_in_is_used_at_the_next_reset():
+    env = DuffingEnv(**SHORT)
+    expected = play(env, random_actions(0), seed=4)
+    env.reset(seed=5)
+    env.np_random = np.random.default_rng(4)
+    assert same(play(env, random_actions(0)), expected)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+def test_copies_made_within_an_episode_continue_alike_and_apart(copied):
+    env = gym.make(TRACK, **RESONANT)
+    env.reset(seed=0)
+    for action in random_actions(0, 5):
+        env.step(action)
+    twin, witness = copied(env), copied(env)
+    expected = continue_with(env, random_actions(1, 200))
+    assert sum(len(step) == 2 for step in expected) > 1  # it went on into further episodes
+    assert same(continue_with(twin, random_actions(1, 200)), expected)
+    assert not same(continue_with(env, random_actions(1, 200)), expected)
+    assert same(continue_with(witness, random_actions(1, 200)), expected)
+
+
+def test_steps_outside_an_episode_are_refused():
+    env = DuffingEnv(**SHORT)
+    with pytest.raises(ResetNeeded, match=r"call reset\(\)"):
+        env.step([0.0])
+    play(env, random_actions(0), seed=0)
+    belief = env.belief
+    with pytest.raises(ResetNeeded, match=r"call reset\(\)"):
+        env.step([0.0])
+    assert same(env.belief, belief)
+    env.reset()
+    env.step([0.0])
+
+
+@pytest.mark.parametrize("action", [[np.nan], [np.inf], -np.inf, [], [0.1, 0.2], np.zeros((2, 1)), None])
+def test_actions_that_are_no_number_are_refused_and_change_nothing(action):
+    env, untouched = DuffingEnv(**SHORT), DuffingEnv(**SHORT)
+    for each in (env, untouched):
+        each.reset(seed=0)
+        each.step([0.5])
+    with pytest.raises(ValueError, match=r"action must be one finite number in \[-1, 1\], but is"):
+        env.step(action)
+    assert same(continue_with(env, random_actions(0, 40)), continue_with(untouched, random_actions(0, 40)))
+
+
+@pytest.mark.parametrize("beyond", [1.5, 1e30, 1e300, np.float32(3), [[7.0]], 2])
+def test_actions_are_clipped(beyond):
+    steps = []
+    for action in (1.0, beyond):
+        env = DuffingEnv(**SHORT)
+        env.reset(seed=0)
+        steps.append([env.step(action), env.step(-np.asarray(action))])
+    assert same(*steps)
+    assert steps[0][0][0][18] == 1.0
+    assert steps[0][1][0][18] == -1.0
+
+
+def test_feedback_at_resonance_reaches_the_limit_and_terminates():
+    env = DuffingEnv()
+    for seed in range(5):
+        env.reset(seed=seed)
+        action, last_y = 1.0, 0.0
+        for _ in range(256):
+            observation, _, terminated, truncated, info = env.step([action])
+            y = 0.6 * observation[19]
+            action, last_y = np.sign(y - last_y) or 1.0, y  # push along the velocity
+            if terminated:
+                break
+        assert terminated
+        assert not truncated
+        assert not info["diverged"]
+        assert abs(y) > 0.6
+        np.testing.assert_allclose(env.unwrapped._batch.quantity("y"), y, rtol=1e-6)
+
+
+def test_episodes_end_at_the_limit_or_at_the_horizon_but_never_at_both():
+    env = gym.make(TRACK, max_output=0.1, horizon=12)
+    endings = {(True, False): 0, (False, True): 0}
+    limit_at_horizon = 0
+    for seed in range(300):
+        episode = play(env, random_actions(seed), seed=seed)
+        *_, terminated, truncated, info = episode[-1]
+        endings[terminated, truncated] += 1
+        assert [step[2] or step[3] for step in episode[1:-1]] == [False] * (len(episode) - 2)
+        assert not info["diverged"]
+        output = abs(env.unwrapped._batch.quantity("y")[0])
+        assert (output > 0.1) == terminated
+        assert truncated == (len(episode) - 1 == 12 and not terminated)
+        limit_at_horizon += terminated and len(episode) - 1 == 12
+    assert min(endings.values()) > 20
+    assert limit_at_horizon > 0
+
+
+def test_no_time_limit_but_the_horizon():
+    env = gym.make(TRACK, horizon=300, max_input=1e-3)
+    episode = play(env, random_actions(0), seed=0)
+    assert len(episode) - 1 == 300
+    assert "belief" in episode[-1][-1]
+    np.testing.assert_allclose([step[0][20] for step in episode], 1 - np.arange(301) / 300, atol=1e-7)
+
+
+@pytest.mark.parametrize("reward", REWARDS)
+@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("x", np.nan), ("x", np.inf), ("x", -np.inf), ("x", 1e200), ("last_x", np.inf), ("x", 1e70), ("t1", 1e300)],
+)
+def test_numbers_that_are_not_finite_end_the_episode_flagged(factorisation, reward, name, value):
+    env = DuffingEnv(factorisation=factorisation, reward=reward)
+    env.reset(seed=0)
+    for action in random_actions(0, 10):
+        env.step(action)
+    overwrite(env, name, value)
+    before = env.belief
+    observation, received, terminated, truncated, info = env.step([0.5])
+    assert (received, terminated, truncated, info["diverged"]) == (0.0, True, False, True)
+    assert info["information_gain"] == info["log_posterior_gain"] == 0.0
+    assert observation in env.observation_space
+    assert same(info["belief"], before)
+    assert isinstance(info["truth"], PhysicalParameters)
+    observation, _ = env.reset()
+    assert observation in env.observation_space
+    assert np.isfinite(env.step([0.5])[1])
+
+
+EXTREMES = [
+    {"max_output": 1e-4},
+    {"max_output": 1e300},
+    {"max_output": 1e6, "max_input": 1e3},
+    {"max_output": 1e250, "max_input": 1e200},
+    {"max_input": 1e-12},
+    {"spread": 0.999},
+    {"spread": 1e-6},
+    {"process_noise": 1e-9},
+    {"process_noise": 1.0},
+    {"measurement_noise": 1e-9},
+    {"measurement_noise": 10.0},
+    {"noise_shape": 1e-3},
+    {"noise_shape": 1e9},
+    {"iterations": 1},
+    {"iterations": 50},
+    {"horizon": 1},
+    # A mean-field covariance of the state loses its determinant to rounding, and the free energy becomes NaN.
+    {"max_output": 4000.0, "max_input": 300.0, "process_noise": 3e-9, "measurement_noise": 3e-9, "spread": 0.999},
+]
+
+
+@pytest.mark.parametrize("options", [{}, *EXTREMES], ids=str)
+@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+def test_observations_stay_in_their_space_and_rewards_finite(factorisation, options):
+    for reward in REWARDS:
+        env = DuffingEnv(factorisation=factorisation, reward=reward, **options)
+        for seed in range(6):
+            rng = np.random.default_rng(seed)
+            actions = rng.uniform(-1, 1, (256, 1)) if seed % 2 else rng.choice([-1.0, 1.0], (256, 1))
+            for step in play(env, actions, seed=seed):
+                assert step[0] in env.observation_space
+                if len(step) == 5:
+                    numbers = step[1], step[4]["information_gain"], step[4]["log_posterior_gain"]
+                    assert np.isfinite(numbers).all(), numbers
+
+
+@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+def test_gains_sum_to_the_change_of_the_belief(factorisation):
+    env = DuffingEnv(factorisation=factorisation, reward="parameter_error")
+    prior = env.belief
+    for seed in range(10):
+        steps = play(env, random_actions(seed), seed=seed)[1:]
+        final, truth = steps[-1][4]["belief"], steps[-1][4]["truth"]
+        gain = sum(step[4]["information_gain"] for step in steps)
+        np.testing.assert_allclose(gain, prior.entropy() - final.entropy(), rtol=1e-9)
+        density = sum(step[4]["log_posterior_gain"] for step in steps)
+        coefficients = to_coefficients(truth)
+        np.testing.assert_allclose(density, final.log_prob(coefficients) - prior.log_prob(coefficients), rtol=1e-7)
+        assert -1 <= sum(step[1] for step in steps) <= 1
+
+
+def test_the_belief_and_truth_of_an_episode_stay_as_they_were():
+    env = DuffingEnv(**SHORT)
+    ending = play(env, random_actions(0), seed=0)[-1][-1]
+    kept = copy.deepcopy(ending)
+    assert same(ending["belief"], env.belief)
+    assert ending["truth"] == env.truth
+    play(env, random_actions(1))
+    assert same(ending, kept)
+    assert ending["truth"] != env.truth
+
+
+def test_structured_beliefs_are_calibrated_and_precise():
+    # 200 episodes: the squared distance of the truth from the mean, in standard deviations, is 4 on average.
+    env = DuffingEnv()
+    distances, errors = [], []
+    for seed in range(200):
+        ending = play(env, random_actions(seed), seed=seed)[-1][-1]
+        belief, truth = ending["belief"], ending["truth"]
+        psi = to_coefficients(truth)
+        deviation = np.array([psi.theta1, psi.theta2, psi.theta3, psi.eta]) - belief.coefficients_mean
+        distances.append(deviation @ np.linalg.solve(belief.coefficients_cov, deviation))
+        errors.append(abs(belief.physical()[0][0] / truth.m - 1))
+    assert 3.2 < np.mean(distances) < 5.2
+    assert np.median(errors) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"horizn": 3}, "horizn=3 is no option .* did you mean 'horizon'"),
+        ({"reward": "informationgain"}, "did you mean 'information_gain'"),
+        ({"factorisation": "meanfield"}, "factorisation must be one of"),
+        ({"max_input": -1}, "max_input must be a positive"),
+        ({"render_mode": "ansi"}, "render_mode must be one of"),
+    ],
+)
+def test_bad_options_are_refused_with_a_remedy(options, message):
+    with pytest.raises(ValueError, match=message):
+        DuffingEnv(**options)
+
+
+def test_specifications_travel_as_json():
+    options = {"reward": "log_posterior", "factorisation": "mean_field", "iterations": 4, "horizon": 30, "spread": 0.2}
+    env = gym.make(TRACK, **options)
+    text = env.spec.to_json()
+    assert json.loads(text)["kwargs"].items() >= options.items()
+    again = gym.make(EnvSpec.from_json(text))
+    assert again.unwrapped.experiment == env.unwrapped.experiment
+    assert same(play(env, random_actions(0), seed=0), play(again, random_actions(0), seed=0))
+    assert gym.make(env.spec).unwrapped.experiment == env.unwrapped.experiment
+
+
+def test_closing_twice_is_fine():
+    env = gym.make(TRACK)
+    env.close()
+    env.close()

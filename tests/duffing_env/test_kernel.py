@@ -1,0 +1,145 @@
+"""The compiled step against its plain NumPy twin, over whole episodes."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from twin import PARAMETERS, TwinEnv
+
+from duffing_env.batch import Batch, spawn_seeds
+from duffing_env.env import DuffingEnv
+from duffing_env.experiment import SimulatedExperiment
+from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
+from duffing_env.layout import OBSERVATION
+from duffing_env.rewards import REWARDS
+from estimator import SILVERBOX_TWIN, PhysicalParameters, to_coefficients
+
+CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
+
+
+def assert_beliefs_agree(actual, expected):
+    """To rounding: the coefficients beside their standard deviations, the state beside a volt."""
+    std = np.sqrt(np.diag(expected.coefficients_cov))
+    np.testing.assert_allclose(actual.coefficients_mean / std, expected.coefficients_mean / std, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(actual.state_mean, expected.state_mean, rtol=0, atol=1e-10)
+    scale = np.outer(std, std)
+    np.testing.assert_allclose(actual.coefficients_cov / scale, expected.coefficients_cov / scale, rtol=0, atol=1e-10)
+    for name in ("gamma_shape", "gamma_rate", "xi_shape", "xi_rate"):
+        np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), rtol=1e-10)
+
+
+def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
+    """Play random inputs, some beyond the limits; gives the flags with which the episodes ended."""
+    rng = np.random.default_rng(seed)
+    endings = []
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=None if episode else seed)
+        np.testing.assert_allclose(observation, twin.reset(), rtol=0, atol=1e-6)
+        for name in PARAMETERS:
+            np.testing.assert_allclose(getattr(env.truth, name), getattr(twin.truth, name), rtol=1e-14)
+        terminated = truncated = False
+        while not (terminated or truncated):
+            action = rng.uniform(-1.2, 1.2, 1).astype(np.float32)
+            observation, received, terminated, truncated, info = env.step(action)
+            expected, rewards, *flags = twin.step(action)
+            np.testing.assert_allclose(observation, expected, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(received, rewards[reward], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(info["information_gain"], rewards["information_gain"], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(info["log_posterior_gain"], rewards["log_posterior"], rtol=1e-9, atol=1e-9)
+            assert [terminated, truncated] == flags
+            assert not info["diverged"]
+        assert_beliefs_agree(info["belief"], twin.belief)
+        endings.append((terminated, truncated))
+    return endings
+
+
+@pytest.mark.parametrize("reward", REWARDS)
+@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+def test_env_follows_its_twin(factorisation, reward):
+    for seed in (0, 1, 2**40):
+        env = DuffingEnv(factorisation=factorisation, reward=reward)
+        endings = assert_env_follows_twin(env, TwinEnv(seed, factorisation=factorisation), reward, seed)
+        assert endings == [(False, True)] * 2
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"horizon": 7, "iterations": 1},
+        {"max_output": 0.2, "horizon": 64},
+        {"max_input": 0.03, "process_noise": 2e-3, "measurement_noise": 1e-5, "horizon": 64},
+        {"spread": 0.8, "iterations": 5, "horizon": 64},
+    ],
+)
+@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+def test_env_follows_its_twin_with_other_options(factorisation, options):
+    options = {"factorisation": factorisation, **options}
+    for seed in range(3):
+        endings = assert_env_follows_twin(DuffingEnv(**options), TwinEnv(seed, **options), "information_gain", seed, 4)
+        if "max_output" in options:
+            assert (True, False) in endings
+
+
+def test_observation_names_its_entries_in_the_order_of_the_documentation():
+    names = "mean_t1 mean_t2 mean_t3 mean_e log_std_t1 log_std_t2 log_std_t3 log_std_e"
+    names += " corr_12 corr_13 corr_1e corr_23 corr_2e corr_3e log_gamma log_xi state_x0 state_x1"
+    assert list(OBSERVATION) == f"{names} last_input last_output time_left budget_left".split()
+
+
+@pytest.mark.parametrize("spread", [0.3, 0.9])
+def test_oscillators_are_log_uniform_about_the_twin(spread):
+    size = 4000
+    batch = Batch(SimulatedExperiment(spread=spread), size, RESET_BY_HAND)
+    for row, seed in enumerate(spawn_seeds(0, size)):
+        batch.seed(row, np.random.default_rng(seed))
+    batch.reset(np.ones(size, dtype=np.bool_))
+    drawn = np.stack([batch.quantity(name) for name in PARAMETERS])
+    low, high = np.log(1 - spread), np.log(1 + spread)
+    quantiles = (np.log(drawn / CENTER[:, None]) - low) / (high - low)
+    assert quantiles.min() > 0
+    assert quantiles.max() < 1
+    for row in quantiles:
+        assert stats.kstest(row, "uniform").pvalue > 0.01
+    assert np.abs(np.corrcoef(quantiles)[np.triu_indices(4, 1)]).max() < 4 / np.sqrt(size)
+
+    expected = to_coefficients(PhysicalParameters(*drawn))
+    for name, values in (
+        ("t1", expected.theta1),
+        ("t2", expected.theta2),
+        ("t3", expected.theta3),
+        ("e", expected.eta),
+    ):
+        np.testing.assert_allclose(batch.quantity(f"true_{name}"), values, rtol=1e-13)
+
+
+def test_prior_has_the_moments_of_the_oscillators():
+    # What makes the first belief calibrated: 4000 draws stand for the quadrature that the prior is made by.
+    size = 4000
+    batch = Batch(SimulatedExperiment(), size, RESET_BY_HAND)
+    for row, seed in enumerate(spawn_seeds(1, size)):
+        batch.seed(row, np.random.default_rng(seed))
+    batch.reset(np.ones(size, dtype=np.bool_))
+    prior = batch.belief(0)
+    drawn = np.stack([batch.quantity(f"true_{name}") for name in ("t1", "t2", "t3", "e")], axis=1)
+    whitened = np.linalg.solve(np.linalg.cholesky(prior.coefficients_cov), (drawn - prior.coefficients_mean).T)
+    assert np.abs(whitened.mean(axis=1)).max() < 4 / np.sqrt(size)
+    np.testing.assert_allclose(np.cov(whitened), np.eye(4), rtol=0, atol=0.1)
+
+
+def test_plant_spread_is_for_the_plant_alone():
+    env = DuffingEnv(plant_spread=0.0)
+    env.reset(seed=0)
+    np.testing.assert_array_equal([getattr(env.truth, name) for name in PARAMETERS], CENTER)
+    np.testing.assert_array_equal(env.belief.record, DuffingEnv().belief.record)
+    assert not np.array_equal(DuffingEnv(spread=0.1).belief.record, env.belief.record)
+
+
+@pytest.mark.parametrize("mode", [RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP])
+def test_lanes_beyond_the_last_environment_keep_within_bounds(mode):
+    batch = Batch(SimulatedExperiment(horizon=50), 1, mode)
+    batch.seed(0, np.random.default_rng(0))
+    for _ in range(2000):
+        if mode == RESET_BY_HAND and batch.outcome("truncated")[0]:
+            batch.reset(np.ones(1, dtype=np.bool_))
+        batch.step(np.zeros(1))
+    assert np.isfinite(batch._observations).all()
+    assert np.abs(batch._observations).max() <= 20

@@ -1,0 +1,434 @@
+"""The vector environment: the same numbers as single environments, under Gymnasium's vector contract."""
+
+import copy
+import pickle
+import warnings
+
+import gymnasium as gym
+import numba
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import (
+    ClipReward,
+    DictInfoToList,
+    NormalizeObservation,
+    NormalizeReward,
+    RecordEpisodeStatistics,
+)
+
+from duffing_env.batch import spawn_seeds
+from duffing_env.env import DuffingEnv
+from duffing_env.vector_env import DuffingVectorEnv
+from estimator import Belief
+
+TRACK = "duffing_env/Amplitude-v0"
+# Random inputs end about half of such episodes at the limit, the others at the horizon.
+BOTH_ENDS = {"horizon": 20, "max_output": 0.17}
+BY_HAND = AutoresetMode.DISABLED
+MODES = list(AutoresetMode)
+PARAMETERS = ("m", "c", "a", "b")
+
+needs_two_threads = pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="Numba has one thread only")
+
+
+def random_actions(steps, rows, seed=0):
+    """Actions (steps, rows, 1), some beyond the limits; those of a row do not depend on the number of rows."""
+    columns = [np.random.default_rng([seed, row]).uniform(-1.2, 1.2, (steps, 1)) for row in range(rows)]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def roll_out(envs, actions, seed=0):
+    """All that `reset` and `step` gave, with finished rows reset by hand where that is the mode."""
+    told = [envs.reset(seed=seed)]
+    for action in actions:
+        told.append(envs.step(action))
+        finished = told[-1][2] | told[-1][3]
+        if envs.metadata["autoreset_mode"] == BY_HAND and finished.any():
+            told.append(envs.reset(options={"reset_mask": finished}))
+    return told
+
+
+def assert_same(first, second):
+    """The same types and numbers, bit for bit."""
+    assert type(first) is type(second)
+    if isinstance(first, Belief):
+        np.testing.assert_array_equal(first.record, second.record)
+    elif isinstance(first, np.ndarray) and first.dtype == object:
+        assert first.shape == second.shape
+        for each, other in zip(first, second, strict=True):
+            assert_same(each, other)
+    elif isinstance(first, np.ndarray):
+        assert first.dtype == second.dtype
+        np.testing.assert_array_equal(first, second)
+    elif isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key, value in first.items():
+            assert_same(value, second[key])
+    elif isinstance(first, list | tuple):
+        assert len(first) == len(second)
+        for each, other in zip(first, second, strict=True):
+            assert_same(each, other)
+    else:
+        assert first == second
+
+
+def without_empty_keys(infos):
+    """Infos less the keys that no row has. Gymnasium leaves those out; we keep the keys of every step."""
+    told = {}
+    for key, value in infos.items():
+        if not key.startswith("_") and infos[f"_{key}"].any():
+            told[key] = without_empty_keys(value) if isinstance(value, dict) else value
+            told[f"_{key}"] = infos[f"_{key}"]
+    return told
+
+
+@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+@pytest.mark.parametrize("mode", MODES)
+def test_rows_are_single_environments(mode, factorisation):
+    rows, options = 5, {**BOTH_ENDS, "factorisation": factorisation, "reward": "log_posterior"}
+    envs = DuffingVectorEnv(rows, autoreset_mode=mode, **options)
+    singles = SyncVectorEnv([lambda: DuffingEnv(**options)] * rows, autoreset_mode=mode)
+    assert envs.single_observation_space == singles.single_observation_space
+    assert envs.observation_space == singles.observation_space
+    assert envs.action_space == singles.action_space
+
+    actions = random_actions(300, rows)
+    ours = roll_out(envs, actions, seed=7)
+    theirs = roll_out(singles, actions, seed=spawn_seeds(7, rows))
+    endings = np.zeros(2, dtype=int)
+    for told, expected in zip(ours, theirs, strict=True):
+        assert_same(told[:-1], expected[:-1])
+        assert_same(without_empty_keys(told[-1]), expected[-1])
+        if len(told) == 5:
+            endings += told[2].sum(), told[3].sum()
+    assert min(endings) > 10
+
+
+def test_diverged_rows_are_single_environments():
+    # The plant runs away, now and then beyond the range of numbers.
+    rows, options = 8, {"max_output": 1e300, "spread": 0.9, "horizon": 60}
+    envs = DuffingVectorEnv(rows, **options)
+    singles = SyncVectorEnv([lambda: DuffingEnv(**options)] * rows)
+    actions = random_actions(200, rows)
+    ours, theirs = roll_out(envs, actions, seed=1), roll_out(singles, actions, seed=spawn_seeds(1, rows))
+    for told, expected in zip(ours, theirs, strict=True):
+        assert_same(told[:-1], expected[:-1])
+        assert_same(without_empty_keys(told[-1]), expected[-1])
+    assert sum(told[-1]["diverged"].sum() for told in ours[1:]) > 3
+    assert np.isfinite([told[0] for told in ours]).all()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rows_do_not_depend_on_their_number(mode):
+    actions = random_actions(60, 1000)
+    reference = roll_out(DuffingVectorEnv(1000, autoreset_mode=mode, **BOTH_ENDS), actions, seed=3)
+    for rows in (1, 7, 33):
+        envs = DuffingVectorEnv(rows, autoreset_mode=mode, **BOTH_ENDS)
+        # By hand, how often something is reset depends on the other rows, so only the steps are compared.
+        steps = [list(told[:4]) for told in roll_out(envs, actions[:, :rows], seed=3) if len(told) == 5]
+        expected = [[part[:rows] for part in told[:4]] for told in reference if len(told) == 5]
+        assert_same(steps, expected)
+
+
+@needs_two_threads
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_threads_change_nothing(mode):
+    actions = random_actions(60, 70)
+    one, two = (DuffingVectorEnv(70, autoreset_mode=mode, threads=n, **BOTH_ENDS) for n in (1, 2))
+    assert_same(roll_out(one, actions, seed=5), roll_out(two, actions, seed=5))
+
+
+def test_rows_that_are_being_reset_wait():
+    envs = DuffingVectorEnv(33, **BOTH_ENDS)
+    first, _ = envs.reset(seed=0)
+    being_reset, waited = np.zeros(33, dtype=bool), 0
+    for action in random_actions(100, 33):
+        observations, rewards, terminated, truncated, infos = envs.step(action)
+        assert not (terminated & truncated).any()
+        np.testing.assert_array_equal(rewards[being_reset], 0.0)
+        assert not (terminated | truncated)[being_reset].any()
+        np.testing.assert_array_equal(observations[being_reset], first[being_reset])
+        for name in ("information_gain", "log_posterior_gain", "diverged"):
+            np.testing.assert_array_equal(infos[f"_{name}"], ~being_reset)
+        waited += being_reset.sum()
+        being_reset = terminated | truncated
+    assert waited > 100
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_episode_ends_with_its_own_belief_and_truth(mode):
+    envs = DuffingVectorEnv(3, autoreset_mode=mode, horizon=4)
+    envs.reset(seed=0)
+    prior, truth = envs.belief(0), envs.truth
+    for action in random_actions(4, 3):
+        observations, _, _, truncated, infos = envs.step(action)
+    assert truncated.all()
+    same_step = mode == AutoresetMode.SAME_STEP
+    endings, final = (infos["final_info"], infos["final_obs"]) if same_step else (infos, observations)
+    for row in range(3):
+        for name in PARAMETERS:
+            assert getattr(endings["truth"][row], name) == getattr(truth, name)[row]
+        belief = endings["belief"][row]
+        np.testing.assert_allclose(final[row][7], 0.5 * np.log(belief.eta_var / prior.eta_var), rtol=1e-6)
+        assert belief.entropy() < prior.entropy()
+        assert final[row][20] == 0.0
+    assert (envs.truth.m == truth.m).all() != same_step
+
+
+def test_copies_are_given_out_unless_told_otherwise():
+    action = np.ones((2, 1), dtype=np.float32)
+    envs = DuffingVectorEnv(2)
+    first, _ = envs.reset(seed=0)
+    kept = first.copy()
+    second = envs.step(action)[0]
+    np.testing.assert_array_equal(first, kept)
+    assert not np.shares_memory(first, second)
+
+    envs = DuffingVectorEnv(2, copy=False)
+    first, _ = envs.reset(seed=0)
+    np.testing.assert_array_equal(first, kept)
+    step = envs.step(action)
+    np.testing.assert_array_equal(step[0], second)
+    assert step[0] is first
+    kept = [part.copy() for part in step[1:4]]
+    envs.step(action)
+    assert_same(list(step[1:4]), kept)
+
+
+def test_metadata_is_each_environments_own():
+    with_modes = [DuffingVectorEnv(1, autoreset_mode=mode) for mode in MODES]
+    assert [envs.metadata["autoreset_mode"] for envs in with_modes] == MODES
+    assert DuffingVectorEnv.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    assert DuffingVectorEnv(1, autoreset_mode="SameStep").metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    with_modes[0].metadata["render_fps"] = 1
+    assert "render_fps" not in DuffingVectorEnv.metadata
+    assert "autoreset_mode" not in DuffingEnv.metadata
+
+
+def test_seeds():
+    def start(seed, rows=3):
+        envs = DuffingVectorEnv(rows)
+        envs.reset(seed=seed)
+        return envs.truth.m
+
+    np.testing.assert_array_equal(start(5), start(spawn_seeds(5, 3)))
+    np.testing.assert_array_equal(start(5), start(np.int64(5)))
+    np.testing.assert_array_equal(start([1, 2, 3]), start(np.array([1, 2, 3])))
+    assert start([1, 2, 3])[1] == start([2, 2, 2])[0]
+    # Neighbouring seeds of a batch share no row, which `seed + i` would make them do.
+    assert len(np.unique(np.concatenate([start(seed, 50) for seed in range(10)]))) == 500
+    assert len(np.unique(np.concatenate([start(None), start(None)]))) == 6
+
+    envs = DuffingVectorEnv(3)
+    envs.reset(seed=5)
+    envs.reset()
+    second = envs.truth.m
+    assert not np.isin(second, start(5)).any()
+    envs.reset(seed=[None, 8, None])
+    third = envs.truth.m
+    assert third[1] == start([8] * 3)[1]
+    envs.reset(seed=5)
+    envs.reset()
+    np.testing.assert_array_equal(envs.truth.m, second)
+    envs.reset()
+    np.testing.assert_array_equal(envs.truth.m[[0, 2]], third[[0, 2]])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_row_must_have_begun(mode):
+    envs = DuffingVectorEnv(3, autoreset_mode=mode)
+    actions = random_actions(1, 3)[0]
+    with pytest.raises(ResetNeeded, match=r"rows \[0, 1, 2\]"):
+        envs.step(actions)
+    envs.reset(seed=4, options={"reset_mask": np.array([True, False, True])})
+    with pytest.raises(ResetNeeded, match=r"rows \[1\]"):
+        envs.step(actions)
+    envs.reset(options={"reset_mask": np.array([False, True, False])})
+    envs.step(actions)
+    assert len(np.unique(envs.truth.m)) == 3
+    expected = DuffingVectorEnv(3)
+    expected.reset(seed=4)
+    np.testing.assert_array_equal(envs.truth.m[[0, 2]], expected.truth.m[[0, 2]])
+
+
+def test_finished_rows_are_reset_by_hand():
+    envs = DuffingVectorEnv(2, autoreset_mode=BY_HAND, horizon=3)
+    envs.reset(seed=0)
+    actions = random_actions(3, 2)
+    envs.step(actions[0])
+    envs.reset(options={"reset_mask": np.array([False, True])})
+    for action in actions[1:]:
+        observations, *_, truncated, _ = envs.step(action)
+    assert truncated.tolist() == [True, False]
+    with pytest.raises(ResetNeeded, match=r"rows \[0\] .*reset_mask"):
+        envs.step(actions[0])
+    options = {"reset_mask": np.array([True, False])}
+    again, infos = envs.reset(options=options)
+    assert infos == {}
+    assert list(options) == ["reset_mask"]
+    np.testing.assert_array_equal(again[1], observations[1])
+    assert again[:, 20].tolist() == [1.0, np.float32(1 / 3)]
+    envs.step(actions[0])
+
+
+@pytest.mark.parametrize(
+    "mask", [np.ones(2, dtype=bool), np.zeros(3, dtype=bool), np.ones(3), [1, 0, 1], np.ones((3, 1), dtype=bool), None]
+)
+def test_bad_reset_masks_are_refused(mask):
+    with pytest.raises(ValueError, match=r"reset_mask must be a bool array of shape \(3,\)"):
+        DuffingVectorEnv(3).reset(options={"reset_mask": mask})
+
+
+def test_bad_seeds_are_refused():
+    with pytest.raises(ValueError, match="seed must hold 3 seeds, but holds 2"):
+        DuffingVectorEnv(3).reset(seed=[1, 2])
+    with pytest.raises(gym.error.Error):
+        DuffingVectorEnv(3).reset(seed=-1)
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.zeros(3), r"actions must have shape \(3, 1\), but have \(3,\)"),
+        (np.zeros((1, 3)), r"actions must have shape \(3, 1\), but have \(1, 3\)"),
+        (np.zeros((2, 1)), r"actions must have shape \(3, 1\), but have \(2, 1\)"),
+        ([[0.0], [np.nan], [0.0]], "actions must be finite, but row 1 is nan"),
+        ([[0.0], [0.0], [-np.inf]], "actions must be finite, but row 2 is -inf"),
+    ],
+)
+def test_bad_actions_are_refused_and_change_nothing(actions, message):
+    envs, untouched = DuffingVectorEnv(3, **BOTH_ENDS), DuffingVectorEnv(3, **BOTH_ENDS)
+    for each in (envs, untouched):
+        each.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        envs.step(actions)
+    for action in random_actions(30, 3):
+        assert_same(envs.step(action), untouched.step(action))
+
+
+def test_actions_are_clipped():
+    one, far = DuffingVectorEnv(2), DuffingVectorEnv(2)
+    for envs in (one, far):
+        envs.reset(seed=0)
+    assert_same(one.step(np.array([[1.0], [-1.0]])), far.step(np.array([[1e300], [-7.0]])))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be a whole number of at least 1"),
+        ({"num_envs": 2.0}, "num_envs must be a whole number of at least 1"),
+        ({"threads": 0}, "threads must be a whole number of at least 1"),
+        ({"threads": 10_000}, "threads must be at most"),
+        ({"autoreset_mode": "later"}, r"autoreset_mode must be one of \['NextStep', 'SameStep', 'Disabled'\]"),
+        ({"render_mode": "rgb_array"}, "render_mode must be None"),
+        ({"horizn": 4}, "did you mean 'horizon'"),
+        ({"max_episode_steps": 0}, "horizon must be a whole number of at least 1"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        DuffingVectorEnv(**options)
+
+
+def test_gymnasium_makes_it_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        envs = gym.make_vec(TRACK, num_envs=3, vectorization_mode="vector_entry_point", reward="free_energy")
+        assert type(gym.make_vec(TRACK, num_envs=3)) is DuffingVectorEnv
+    assert type(envs) is DuffingVectorEnv
+    assert (envs.num_envs, envs.horizon, envs.max_input, envs.experiment.reward) == (3, 256, 0.15, "free_energy")
+    again = gym.make_vec(envs.spec)
+    assert (again.num_envs, again.experiment) == (3, envs.experiment)
+    singles = gym.make_vec(TRACK, num_envs=3, vectorization_mode="sync", reward="free_energy")
+    actions = random_actions(20, 3)
+    for ours, theirs in zip(roll_out(envs, actions, 2), roll_out(singles, actions, spawn_seeds(2, 3)), strict=True):
+        assert_same(ours[:-1], theirs[:-1])
+
+
+def test_a_limit_of_steps_is_the_horizon():
+    assert gym.make_vec(TRACK, num_envs=2, max_episode_steps=9).horizon == 9
+    assert gym.make_vec(TRACK, num_envs=2, max_episode_steps=900).horizon == 256
+    assert gym.make_vec(TRACK, num_envs=2, horizon=400).horizon == 400
+    assert DuffingVectorEnv(2, max_episode_steps=9).horizon == 9
+    envs = DuffingVectorEnv(2, max_episode_steps=9, horizon=7)
+    observations = [told[0] for told in roll_out(envs, random_actions(7, 2))]
+    np.testing.assert_allclose(np.array(observations)[:, 0, 20], 1 - np.arange(8) / 7, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))], ids=["copy", "pickle"]
+)
+def test_copies_continue_alike_and_apart(copied):
+    envs = DuffingVectorEnv(5, **BOTH_ENDS)
+    actions = random_actions(80, 5)
+    roll_out(envs, actions[:30])
+    twin, witness = copied(envs), copied(envs)
+    expected = [envs.step(action) for action in actions[30:]]
+    assert_same([twin.step(action) for action in actions[30:]], expected)
+    assert_same([witness.step(action) for action in actions[30:]], expected)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_episode_statistics_of_gymnasium(mode):
+    envs = RecordEpisodeStatistics(DuffingVectorEnv(4, autoreset_mode=mode, **BOTH_ENDS))
+    reference = DuffingVectorEnv(4, autoreset_mode=mode, **BOTH_ENDS)
+    actions = random_actions(100, 4)
+    returns, lengths, being_reset, ended = np.zeros(4), np.zeros(4, dtype=int), np.zeros(4, dtype=bool), 0
+    for told, (_, rewards, terminated, truncated, _) in zip(
+        roll_out(envs, actions)[1:], roll_out(reference, actions)[1:], strict=True
+    ):
+        returns, lengths = returns + rewards, lengths + ~being_reset
+        finished = terminated | truncated
+        if finished.any():
+            episode = told[-1]["episode"]
+            np.testing.assert_allclose(episode["r"][finished], returns[finished], rtol=1e-12)
+            np.testing.assert_array_equal(episode["l"][finished], lengths[finished])
+        returns, lengths = np.where(finished, 0, returns), np.where(finished, 0, lengths)
+        being_reset = finished & (mode == AutoresetMode.NEXT_STEP)
+        ended += finished.sum()
+    assert ended > 10
+
+
+def test_wrappers_of_gymnasium_compose():
+    envs = gym.make_vec(TRACK, num_envs=6, vectorization_mode="vector_entry_point", **BOTH_ENDS)
+    envs = NormalizeObservation(ClipReward(NormalizeReward(RecordEpisodeStatistics(envs)), -5.0, 5.0))
+    envs = DictInfoToList(envs)
+    envs.reset(seed=0)
+    episodes, beliefs = 0, 0
+    for action in random_actions(120, 6):
+        observations, rewards, terminated, truncated, infos = envs.step(action)
+        assert observations.shape == (6, 22)
+        assert np.isfinite(observations).all()
+        assert np.abs(rewards).max() <= 5.0
+        assert isinstance(infos, list)
+        finished = terminated | truncated
+        assert ["belief" in info for info in infos] == finished.tolist()
+        assert ["episode" in info for info in infos] == finished.tolist()
+        episodes += sum("episode" in info for info in infos)
+        beliefs += sum(isinstance(info.get("belief"), Belief) for info in infos)
+    assert episodes == beliefs > 20
+
+
+def test_final_infos_as_a_list():
+    envs = DictInfoToList(DuffingVectorEnv(4, autoreset_mode="SameStep", **BOTH_ENDS))
+    envs.reset(seed=0)
+    endings = 0
+    for action in random_actions(60, 4):
+        _, _, terminated, truncated, infos = envs.step(action)
+        for info, finished in zip(infos, terminated | truncated, strict=True):
+            assert ("final_obs" in info) == ("final_info" in info) == finished
+            assert ("information_gain" in info) == (not finished)
+            if finished:
+                endings += 1
+                told = sorted(info["final_info"])
+                assert told == ["belief", "diverged", "information_gain", "log_posterior_gain", "truth"]
+    assert endings > 10
+
+
+def test_closing_twice_is_fine():
+    envs = gym.make_vec(TRACK, num_envs=2)
+    envs.close()
+    envs.close()
