@@ -20,6 +20,11 @@ class Config(TrainConfig):
     systems: int = 256
     """Systems to compare on afterwards; 0 to skip the comparison."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.systems != 0 and self.systems < 2:
+            raise ValueError(f"systems must be 0 or at least 2, but is {self.systems}; intervals need more than one")
+
 
 def main(config: Config) -> None:
     """Train, compare, and say where everything is."""

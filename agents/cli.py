@@ -9,7 +9,17 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
+from gymnasium.error import Error as GymnasiumError
 from tyro.constructors import PrimitiveConstructorSpec
+
+
+def _parse_options(words: list[str]) -> dict[str, Any]:
+    """The object that the first of the words holds as JSON; ValueError where it is none."""
+    options = json.loads(words[0])
+    if not isinstance(options, dict):
+        raise ValueError(f"options must be a JSON object, but are {words[0]}; write e.g. '{{\"spread\": 0.2}}'")
+    return options
+
 
 #: A dictionary that is written as JSON on the command line: '{"spread": 0.2}'.
 JsonOptions = Annotated[
@@ -17,7 +27,7 @@ JsonOptions = Annotated[
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="JSON",
-        instance_from_str=lambda words: json.loads(words[0]),
+        instance_from_str=_parse_options,
         is_instance=lambda value: isinstance(value, dict),
         str_from_instance=lambda value: [json.dumps(value)],
     ),
@@ -33,6 +43,6 @@ def run_script(main: Callable[[Config], None], config: type[Config], description
     """
     try:
         main(tyro.cli(config, description=description))
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, OSError, GymnasiumError) as error:
         print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
         sys.exit(2)

@@ -56,13 +56,18 @@ def evaluate(
     real arrow record; it is left out without the record, and on environments that do not simulate a plant.
 
     Args:
-        policies: names or run folders, see `agents.policies.make_policy`.
+        policies: names or run folders, see `agents.policies.make_policy`; at least one.
         env_id: a registered track.
         systems: number of systems, at least 2.
         seed: of systems and noise; and of the policies' own randomness.
         options: of the environment.
         on_policy: called with each policy's name before its turn.
+
+    Raises:
+        ValueError: for no policies, an unknown one, fewer than two systems, or options that the track does not take.
     """
+    if not policies:
+        raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
     if systems < 2:
         raise ValueError(f"systems must be at least 2, but is {systems}; intervals need more than one")
     options = dict(options or {})
@@ -109,6 +114,7 @@ def _roll_out(
         running &= ~finished
         episode_start = terminated | truncated
         if not running.any():
+            curve[t + 2 :] = curve[t + 1]
             break
     envs.close()
     metrics = {

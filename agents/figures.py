@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,8 +47,10 @@ def draw_contraction(path: Path, evaluations: list[Evaluation], title: str) -> N
     """Gain of log posterior of the truth over the samples: median over systems, band from 25 to 75 %."""
     figure = _figure(7.5, 4.5)
     axes = figure.add_subplot()
-    for evaluation, colour in zip(evaluations, _COLOURS, strict=False):
+    lowest = 0.0  # an over-confident posterior may lose
+    for evaluation, colour in zip(evaluations, cycle(_COLOURS), strict=False):
         low, median, high = np.percentile(evaluation.curve, [25, 50, 75], axis=1)
+        lowest = min(lowest, low.min())
         samples = np.arange(len(median))
         axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
         axes.plot(samples, median, color=colour, label=evaluation.policy)
@@ -55,7 +58,7 @@ def draw_contraction(path: Path, evaluations: list[Evaluation], title: str) -> N
     axes.set_ylabel("log posterior gain of the truth / nat")
     axes.set_title(title)
     axes.set_xlim(0, None)
-    axes.set_ylim(0, None)
+    axes.set_ylim(lowest, None)
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
     _save(figure, path)
@@ -65,7 +68,7 @@ def draw_excitations(path: Path, evaluations: list[Evaluation], system: int = 0)
     """Input and output of one system under each policy."""
     figure = _figure(9, 1.6 * len(evaluations) + 0.8)
     grid = figure.subplots(len(evaluations), 2, sharex=True, sharey="col", squeeze=False)
-    for row, evaluation, colour in zip(grid, evaluations, _COLOURS, strict=False):
+    for row, evaluation, colour in zip(grid, evaluations, cycle(_COLOURS), strict=False):
         for axes, signal in zip(row, (evaluation.inputs, evaluation.outputs), strict=True):
             time = _MILLISECONDS * np.arange(len(signal))
             axes.plot(time, signal[:, system], color=colour, linewidth=0.8)

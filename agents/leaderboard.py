@@ -83,26 +83,33 @@ def compare(
     return evaluations
 
 
-def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, float | str]]:
+def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, float]]:
     """The centre of each metric over systems, with a 95 % bootstrap interval (percentile, 2000 resamples)."""
-    summary: dict[str, dict[str, float | str]] = {}
+    summary: dict[str, dict[str, float]] = {}
     for name, values in evaluation.metrics.items():
         kind, statistic = METRICS[name].center
         center = float(statistic(values))
         low = high = center
-        if np.ptp(values) > 0:
-            low, high = stats.bootstrap(
-                (values,), statistic, n_resamples=_RESAMPLES, method="percentile", vectorized=True,
-                rng=np.random.default_rng(seed),
-            ).confidence_interval  # fmt: skip
+        if (values != values[0]).any():
+            with np.errstate(invalid="ignore"):  # values may be infinite, and SciPy takes their standard deviation
+                low, high = stats.bootstrap(
+                    (values,), statistic, n_resamples=_RESAMPLES, method="percentile", vectorized=True,
+                    rng=np.random.default_rng(seed),
+                ).confidence_interval  # fmt: skip
         summary[name] = {kind: center, "low": float(low), "high": float(high)}
     return summary
 
 
 def write_json(path: Path, evaluations: list[Evaluation], settings: dict[str, Any]) -> None:
-    """Write summaries and the settings that they were made with."""
-    results = {evaluation.policy: summarise(evaluation) for evaluation in evaluations}
-    write_atomically(path, json.dumps({"settings": settings, "policies": results}, indent=2, allow_nan=True))
+    """Write summaries and the settings that they were made with; a number that is not finite, as null."""
+    results = {
+        evaluation.policy: {
+            name: {key: value if np.isfinite(value) else None for key, value in entry.items()}
+            for name, entry in summarise(evaluation).items()
+        }
+        for evaluation in evaluations
+    }
+    write_atomically(path, json.dumps({"settings": settings, "policies": results}, indent=2, allow_nan=False))
 
 
 def print_table(evaluations: list[Evaluation], title: str) -> None:
@@ -115,21 +122,21 @@ def print_table(evaluations: list[Evaluation], title: str) -> None:
     table = Table(title=title, caption="means, errors as medians; [95 % bootstrap intervals over systems]")
     table.add_column("", no_wrap=True)
     for policy in order:
-        table.add_column(policy, justify="right")
+        table.add_column(policy, justify="right", overflow="fold")
     for name, metric in METRICS.items():
         if any(name in summary for summary in summaries.values()):
             table.add_row(metric.title, *(_cell(metric, summaries[policy].get(name)) for policy in order))
-    console = Console()
+    console = Console(markup=False)  # the brackets of the intervals are no markup
     console.width = max(console.width, 30 + 20 * len(order))
     console.print(table)
 
 
-def _center(entry: dict[str, float | str]) -> float:
-    return float(next(value for key, value in entry.items() if key in ("mean", "median")))
+def _center(entry: dict[str, float]) -> float:
+    return next(value for key, value in entry.items() if key in ("mean", "median"))
 
 
-def _cell(metric: Metric, entry: dict[str, float | str] | None) -> str:
+def _cell(metric: Metric, entry: dict[str, float] | None) -> str:
     if entry is None:
         return "-"
-    center, low, high = (metric.scale * float(value) for value in (_center(entry), entry["low"], entry["high"]))
+    center, low, high = (metric.scale * value for value in (_center(entry), entry["low"], entry["high"]))
     return f"{center:.{metric.digits}f}\n[{low:.{metric.digits}f}, {high:.{metric.digits}f}]"

@@ -7,6 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -45,6 +46,20 @@ class PPOSettings:
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
 
+    def __post_init__(self) -> None:
+        counts = {name: getattr(self, name) for name in ("num_envs", "n_steps", "batch_size", "n_epochs")}
+        counts |= {f"hidden[{i}]": units for i, units in enumerate(self.hidden)}
+        for name, value in counts.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, but is {value}")
+        if self.batch_size == 1 or self.num_envs * self.n_steps == 1:
+            raise ValueError("batch_size and num_envs * n_steps must be at least 2; PPO normalises over a batch")
+        if self.learning_rate <= 0:
+            raise ValueError(f"learning_rate must be positive, but is {self.learning_rate}")
+        for name in ("gamma", "gae_lambda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in [0, 1], but is {getattr(self, name)}")
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -73,6 +88,8 @@ class TrainConfig:
         for name in ("steps", "checkpoints", "torch_threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")
+        if "reward" in self.options:
+            raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
 
 
 @dataclass(frozen=True)
@@ -112,9 +129,6 @@ def train(config: TrainConfig) -> Run:
     torch.set_num_threads(config.torch_threads)
     ppo = config.ppo
     envs = DuffingVecEnv(config.env, ppo.num_envs, seed=config.seed, reward=config.reward, **config.options)
-    folder = _run_folder(config)
-    description = _describe(config)
-    write_atomically(folder / "config.json", json.dumps(description, indent=2))
     model = PPO(
         "MlpPolicy",
         envs,
@@ -129,7 +143,9 @@ def train(config: TrainConfig) -> Run:
         seed=config.seed,
         device="cpu",
     )
-    model.set_logger(configure(str(folder), ["csv"]))
+    folder = _run_folder(config)
+    description = _describe(config)
+    write_atomically(folder / "config.json", json.dumps(description, indent=2))
     curve: list[tuple[int, float, float]] = []
     checkpoints = 0
 
@@ -143,7 +159,9 @@ def train(config: TrainConfig) -> Run:
             checkpoints += 1
             save(folder / "checkpoints" / f"{steps:09d}")
 
-    _learn(model, config.steps, on_update)
+    with closing(configure(str(folder), ["csv"])) as logger:
+        model.set_logger(logger)
+        _learn(model, config.steps, on_update)
     save(folder)
     draw_learning_curve(folder / "learning_curve.png", curve, config.reward)
     envs.close()

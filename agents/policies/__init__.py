@@ -70,7 +70,7 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0)
     if name in POLICIES:
         return POLICIES[name](env if env is None else env.unwrapped, seed)
     if Path(name).exists():
-        from agents.policies.learned import load_policy  # imports torch
+        from agents.policies.learned import load_policy
 
         return load_policy(name)
     nearest = difflib.get_close_matches(name, POLICIES, n=1)

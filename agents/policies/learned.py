@@ -54,7 +54,7 @@ class LearnedPolicy:
         """The action (n, 1) for observations (n, features), or (1,) for one observation; the state is not used."""
         hidden = np.asarray(observation, dtype=np.float32)
         expected = self.layers[0][0].shape[1]
-        if hidden.shape[-1] != expected:
+        if hidden.shape[-1:] != (expected,):
             raise ValueError(f"observation must have {expected} entries, but has shape {hidden.shape}")
         for weight, bias in self.layers[:-1]:
             hidden = np.tanh(hidden @ weight.T + bias)
@@ -85,20 +85,31 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
     """Read a policy folder.
 
     Raises:
-        ValueError: if the folder holds no policy, or one of a format that this version does not know.
+        ValueError: if the folder holds no policy, one of a format that this version does not know, or damaged files.
     """
+    from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
     folder = Path(folder)
     if not (folder / WEIGHTS).is_file() or not (folder / CARD).is_file():
         raise ValueError(f"policy folder must hold {WEIGHTS} and {CARD}, but {folder} does not; pass a run folder")
-    card = json.loads((folder / CARD).read_text())
-    if card.get("format") != FORMAT:
-        raise ValueError(f"policy card must have format {FORMAT}, but {folder / CARD} has {card.get('format')!r}")
-    tensors = load_file(folder / WEIGHTS)
+    try:
+        card = json.loads((folder / CARD).read_text())
+        tensors = load_file(folder / WEIGHTS)
+    except (ValueError, SafetensorError) as error:
+        raise ValueError(
+            f"policy folder must hold sound files, but {folder} does not: {error}; copy it anew"
+        ) from error
+    found = card.get("format") if isinstance(card, dict) else None
+    if found != FORMAT:
+        raise ValueError(f"policy card must have format {FORMAT}, but {folder / CARD} has {found!r}; train anew")
     hidden = sorted(
-        name for name in tensors if name.startswith("mlp_extractor.policy_net.") and name.endswith(".weight")
+        (name for name in tensors if name.startswith("mlp_extractor.policy_net.") and name.endswith(".weight")),
+        key=lambda name: int(name.split(".")[2]),  # by number: layer 10 comes after layer 2
     )
     names = [name.removesuffix(".weight") for name in hidden] + ["action_net"]
-    layers = [(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
-    return LearnedPolicy(layers, tensors["log_std"], card, seed)
+    try:
+        layers = [(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
+        return LearnedPolicy(layers, tensors["log_std"], card, seed)
+    except KeyError as error:
+        raise ValueError(f"policy must be an actor-critic of PPO, but {folder / WEIGHTS} lacks {error}") from error

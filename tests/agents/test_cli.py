@@ -1,0 +1,222 @@
+"""The command lines of `train.py` and `evaluate.py`, as a user meets them."""
+
+import ast
+import json
+import os
+import runpy
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import tyro
+
+from agents.cli import JsonOptions, run_script
+
+ROOT = Path(__file__).parents[2]
+#: Where the options of each script are declared: file and class.
+DECLARED = {
+    "train.py": [("train.py", "Config", ""), ("agents/training.py", "TrainConfig", ""),
+                 ("agents/training.py", "PPOSettings", "ppo.")],
+    "evaluate.py": [("evaluate.py", "Config", "")],
+}  # fmt: skip
+
+
+@pytest.fixture
+def script(tmp_path, monkeypatch, capsys):
+    """Runs a script as the shell would, in an empty folder, but within this process: returns status and messages."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "400")
+
+    def run(name, *arguments):
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        status = 0
+        try:
+            runpy.run_path(str(ROOT / name), run_name="__main__")
+        except SystemExit as stop:
+            status = stop.code
+        return status, capsys.readouterr().err
+
+    return run
+
+
+def command(script, *arguments, folder=ROOT):
+    """Run a script in a process of its own; lines of its output are not broken."""
+    return subprocess.run(
+        [sys.executable, ROOT / script, *map(str, arguments)],
+        env=os.environ | {"COLUMNS": "400", "OMP_NUM_THREADS": "1"},
+        capture_output=True, text=True, timeout=120, cwd=folder,
+    )  # fmt: skip
+
+
+def declared_options(file, name):
+    """Name and explanation of every field of a configuration class, read from its source."""
+    tree = ast.parse((ROOT / file).read_text())
+    (cls,) = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name]
+    for statement, following in zip(cls.body, [*cls.body[1:], None], strict=True):
+        if isinstance(statement, ast.AnnAssign):
+            assert isinstance(following, ast.Expr), f"{name}.{statement.target.id} has no explanation"
+            yield statement.target.id, following.value.value
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_help_explains_every_option(name):
+    finished = command(name, "--help")
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stderr == ""
+    lines = [line.strip("│ ") for line in finished.stdout.splitlines()]
+    explained = 0
+    for file, cls, prefix in DECLARED[name]:
+        for option, explanation in declared_options(file, cls):
+            if option == "ppo":
+                assert explanation in lines  # the head of its own group
+                continue
+            flag = f"--{prefix}{option}".replace("_", "-")
+            (index,) = [i for i, line in enumerate(lines) if line.split(" ")[0] == flag]
+            here = " ".join(lines[index : index + 2])
+            assert explanation in here, flag
+            assert "(default: " in here, flag
+            explained += 1
+    assert explained == {"train.py": 18, "evaluate.py": 6}[name]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("train.py", ["--steps", "0"], "steps must be at least 1, but is 0"),
+        ("train.py", ["--steps", "many"], "many"),
+        ("train.py", ["--stepps", "5"], "--stepps"),
+        ("train.py", ["--reward", "free_energie"], "did you mean 'free_energy'"),
+        ("train.py", ["--systems", "1"], "systems must be 0 or at least 2, but is 1"),
+        ("train.py", ["--ppo.batch-size", "0"], "batch_size must be at least 1, but is 0"),
+        ("train.py", ["--options", '{"reward": "log_posterior"}'], "options must not hold reward"),
+        ("train.py", ["--options", '{"horizon": 0}'], "horizon must be a whole number of at least 1, but is 0"),
+        ("train.py", ["--env", "duffing_env/Amplitud-v0"], "Amplitud"),
+        ("evaluate.py", ["--systems", "1"], "systems must be at least 2, but is 1"),
+        ("evaluate.py", ["--systems", "a few"], "a few"),
+        ("evaluate.py", ["--policies", "unifrom"], "did you mean 'uniform'"),
+        ("evaluate.py", ["--policies"], "policies must name at least one policy"),
+        ("evaluate.py", ["--options", "[1]"], "options must be a JSON object, but are [1]"),
+        ("evaluate.py", ["--options", '{"horizon"'], "JSON"),
+        ("evaluate.py", ["--options", '{"horizn": 3}'], "did you mean 'horizon'"),
+        ("evaluate.py", ["--env", "duffing_env/Amplitude-v7"], "[ `v0` ]"),
+    ],
+)
+def test_a_bad_value_is_one_message_and_exit_status_2(script, name, arguments, message, tmp_path):
+    status, messages = script(name, *arguments, "--output", "out")
+    assert status == 2
+    assert message in messages
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"), [("train.py", ["--reward", "foo"]), ("evaluate.py", ["--policies", "foo"])]
+)
+def test_a_bad_value_shows_no_traceback(name, arguments, tmp_path):
+    finished = command(name, *arguments, folder=tmp_path)
+    assert finished.returncode == 2
+    assert finished.stdout.strip() == ""
+    (line,) = finished.stderr.splitlines()
+    assert line.startswith(f"{name}: ")
+    assert "'foo'" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_a_file_is_one_message(script, tmp_path):
+    (tmp_path / "out").write_text("precious")
+    arguments = ["--policies", "uniform", "--systems", 2, "--options", '{"horizon": 4}', "--output", "out"]
+    status, messages = script("evaluate.py", *arguments)
+    assert status == 2
+    assert messages.startswith("evaluate.py: ")
+    assert "out" in messages
+    assert (tmp_path / "out").read_text() == "precious"
+
+
+def test_train_then_evaluate(script, tmp_path):
+    """The way through both scripts: a policy that one wrote, the other compares."""
+    finished = command(
+        "train.py", "--steps", 512, "--seed", 4, "--options", '{"horizon": 32}', "--output", "made", "--systems", 4,
+        "--torch-threads", 1, "--ppo.num-envs", 16, "--ppo.n-steps", 16, "--ppo.batch-size", 128, "--ppo.hidden", 6, 5,
+        folder=tmp_path,
+    )  # fmt: skip
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stderr == ""
+    assert "The run is in made" in finished.stdout
+    made = {path.name for path in (tmp_path / "made").iterdir()}
+    pictures = {"contraction.png", "excitations.png", "learning_curve.png"}
+    assert made == pictures | {
+        "checkpoints", "config.json", "evaluation.json", "policy.json", "policy.safetensors", "progress.csv",
+    }  # fmt: skip
+    for name in (*pictures, "evaluation.json"):
+        assert str(Path("made") / name) in finished.stdout.splitlines()
+    description = json.loads((tmp_path / "made" / "config.json").read_text())
+    assert description["config"]["options"] == {"horizon": 32}
+    assert description["config"]["ppo"]["hidden"] == [6, 5]
+    assert description["command"][:5] == ["train.py", "--steps", "512", "--seed", "4"]
+    compared = json.loads((tmp_path / "made" / "evaluation.json").read_text())
+    assert list(compared["policies"]) == ["made", "silverbox-multisine", "silverbox-arrow", "uniform", "prbs"]
+
+    arguments = ["--policies", "made", "prbs", "--options", '{"horizon": 32}', "--systems", 4]
+    assert script("evaluate.py", *arguments) == (0, "")
+    evaluated = json.loads((tmp_path / "runs" / "evaluation" / "evaluation.json").read_text())
+    assert evaluated["settings"] == {
+        "env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 0, "options": {"horizon": 32},
+    }  # fmt: skip
+    assert evaluated["policies"] == {name: compared["policies"][name] for name in ("made", "prbs")}
+
+
+@dataclass(frozen=True)
+class Config:
+    """A script's configuration."""
+
+    options: JsonOptions = field(default_factory=lambda: {"a": 1})
+    """Options."""
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("{}", {}),
+        ('{"spread": 0.2, "horizon": 128}', {"spread": 0.2, "horizon": 128}),
+        ('{"as_published": true, "data": null}', {"as_published": True, "data": None}),
+        ('{"a": {"b": [1, 2]}}', {"a": {"b": [1, 2]}}),
+    ],
+)  # fmt: skip
+def test_options_are_read_as_json(text, expected):
+    options = tyro.cli(Config, args=["--options", text]).options
+    assert options == expected
+    assert [type(value) for value in options.values()] == [type(value) for value in expected.values()]
+
+
+def test_options_keep_their_default():
+    assert tyro.cli(Config, args=[]).options == {"a": 1}
+
+
+@pytest.mark.parametrize("text", ["[1]", "3", '"spread"', "null", "spread=0.2", "{'spread': 0.2}", ""])
+def test_options_that_are_no_json_object_are_refused(text, capsys):
+    with pytest.raises(SystemExit) as caught:
+        tyro.cli(Config, args=["--options", text])
+    assert caught.value.code == 2
+    assert "options" in capsys.readouterr().err
+
+
+def test_errors_of_the_program_are_not_hidden(monkeypatch):
+    def main(config):
+        raise KeyError("a defect")
+
+    monkeypatch.setattr(sys, "argv", ["script.py"])
+    with pytest.raises(KeyError, match="a defect"):
+        run_script(main, Config, "A script.")
+
+
+@pytest.mark.parametrize("error", [ValueError("mend this"), FileNotFoundError("mend this")])
+def test_errors_of_the_user_are_one_line(monkeypatch, capsys, error):
+    def main(config):
+        raise error
+
+    monkeypatch.setattr(sys, "argv", ["folder/script.py"])
+    with pytest.raises(SystemExit) as caught:
+        run_script(main, Config, "A script.")
+    assert caught.value.code == 2
+    assert capsys.readouterr().err == "script.py: mend this\n"

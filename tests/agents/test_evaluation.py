@@ -1,0 +1,269 @@
+"""Evaluation: every metric against a slow computation with single environments and equations by hand."""
+
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+import agents.evaluation
+from agents import make_policy
+from agents.evaluation import evaluate
+from agents.policies.learned import load_policy, save_policy
+from agents.vec_env import DuffingVecEnv
+from duffing_env.batch import spawn_seeds
+from duffing_env.silverbox import Regime
+from estimator import NLARX, SAMPLING_STEP, OnlineEstimator, Prior
+
+TRACK = "duffing_env/Amplitude-v0"
+REPLAY = "duffing_env/SilverboxReplay-v0"
+SEED = 3
+SYSTEMS = 6
+HORIZON = 60
+QUANTILE_95 = 1.6448536269514722  # of the standard normal distribution
+
+
+@pytest.fixture
+def without_record(monkeypatch):
+    monkeypatch.setattr(agents.evaluation, "record_available", lambda: False)
+
+
+def true_coefficients(truth):
+    """Eq. (3)."""
+    eta = SAMPLING_STEP**2 / (truth.m + truth.c * SAMPLING_STEP)
+    ratio = truth.m / (truth.m + truth.c * SAMPLING_STEP)
+    return np.array([1 + ratio - truth.a * eta, -truth.b * eta, -ratio, eta])
+
+
+def estimates(coefficients):
+    """m, c, a, b by Eq. (4)."""
+    theta1, theta2, theta3, eta = coefficients
+    step = SAMPLING_STEP
+    return np.array([-theta3 * step**2 / eta, (1 + theta3) * step / eta, (1 - theta1 - theta3) / eta, -theta2 / eta])
+
+
+def standard_form(belief):
+    """Standard deviations and correlation matrix of the coefficients: their covariance is badly scaled."""
+    std = np.sqrt(np.diag(belief.coefficients_cov))
+    return std, belief.coefficients_cov / np.outer(std, std)
+
+
+def entropy(belief):
+    std, correlation = standard_form(belief)
+    return 2 * np.log(2 * np.pi * np.e) + 0.5 * np.log(np.linalg.det(correlation)) + np.log(std).sum()
+
+
+def log_density(belief, point):
+    std, correlation = standard_form(belief)
+    z = (point - belief.coefficients_mean) / std
+    spread = 0.5 * np.log(np.linalg.det(correlation)) + np.log(std).sum()
+    return -0.5 * z @ np.linalg.inv(correlation) @ z - spread - 2 * np.log(2 * np.pi)
+
+
+def act(name, options):
+    """A function of time, row and observation that acts as the policy does in a batch."""
+    if name.startswith("/"):
+        policy = load_policy(name)
+        return lambda t, row, observation: policy.predict(observation, deterministic=True)[0]
+    # Signals do not look at observations, so that the whole batch is known before the first step.
+    with_limits = SimpleNamespace(unwrapped=SimpleNamespace(max_input=options.get("max_input", 0.15), horizon=HORIZON))
+    policy, state, played = make_policy(name, with_limits, seed=SEED), None, []
+    for _ in range(HORIZON):
+        actions, state = policy.predict(np.zeros((SYSTEMS, 22)), state)
+        played.append(actions)
+    return lambda t, row, observation: played[t][row]
+
+
+def run_single(name, options):
+    """What happens to every system under a policy: a list of one namespace each."""
+    choose = act(name, options)
+    for row, seed in enumerate(spawn_seeds(SEED, SYSTEMS)):
+        env = gym.make(TRACK, **options)
+        observation, _ = env.reset(seed=seed)
+        beliefs, inputs, outputs, done, truth = [env.unwrapped.belief], [], [], False, env.unwrapped.truth
+        while not done:
+            action = choose(len(inputs), row, observation)
+            observation, _, terminated, truncated, _ = env.step(action)
+            beliefs.append(env.unwrapped.belief)
+            inputs.append(options.get("max_input", 0.15) * float(np.clip(action[0], -1, 1)))
+            outputs.append(env.unwrapped._batch.quantity("y")[0])
+            done = terminated or truncated
+        yield SimpleNamespace(truth=truth, beliefs=beliefs, inputs=inputs, outputs=outputs, terminated=terminated)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """A learned policy that nobody trained; its actions are small, and sampled ones would not be."""
+    folder = tmp_path_factory.mktemp("runs") / "untrained"
+    envs = DuffingVecEnv(TRACK, 2)
+    model = PPO("MlpPolicy", envs, n_steps=8, batch_size=16, policy_kwargs={"net_arch": [8]}, seed=0, device="cpu")
+    save_policy(folder, model, {})
+    return str(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "share_ended"),
+    [
+        ("uniform", {"horizon": HORIZON}, "none"),
+        ("uniform", {"horizon": HORIZON, "max_output": 0.25}, "some"),
+        ("prbs", {"horizon": HORIZON, "max_output": 0.05}, "all"),
+        ("silverbox-arrow", {"horizon": HORIZON, "factorisation": "mean_field", "max_input": 0.1}, "none"),
+        ("run_folder", {"horizon": HORIZON, "spread": 0.1}, "none"),
+    ],
+)
+def test_metrics_are_those_of_single_environments(name, options, share_ended, run_folder, without_record):
+    # A network's actions differ in the last float32 digits between a batch and a single observation.
+    slack = 1e-4 if name == "run_folder" else 1e-6
+    name = run_folder if name == "run_folder" else name
+    (evaluation,) = evaluate([name], systems=SYSTEMS, seed=SEED, options=options)
+    assert evaluation.policy == name
+    assert evaluation.curve.shape == (HORIZON + 1, SYSTEMS)
+    assert evaluation.inputs.shape == evaluation.outputs.shape == (HORIZON, SYSTEMS)
+    metrics = {key: values.tolist() for key, values in evaluation.metrics.items()}
+    ended_early = 0
+    for row, single in enumerate(run_single(name, options)):
+        prior, posterior, length = single.beliefs[0], single.beliefs[-1], len(single.inputs)
+        coefficients = true_coefficients(single.truth)
+        measured = {key: values[row] for key, values in metrics.items()}
+        assert measured.pop("information_gain") == pytest.approx(entropy(prior) - entropy(posterior), abs=slack)
+        gains = [log_density(belief, coefficients) - log_density(prior, coefficients) for belief in single.beliefs]
+        assert measured.pop("log_posterior_gain") == pytest.approx(gains[-1], abs=slack)
+        np.testing.assert_allclose(evaluation.curve[: length + 1, row], gains, rtol=0, atol=slack)
+        np.testing.assert_allclose(evaluation.curve[length:, row], gains[-1], rtol=0, atol=slack)
+        true = [single.truth.m, single.truth.c, single.truth.a, single.truth.b]
+        for parameter, estimate, value in zip("mcab", estimates(posterior.coefficients_mean), true, strict=True):
+            assert measured.pop(f"error_{parameter}") == pytest.approx(abs(estimate - value) / value, abs=0.01 * slack)
+        std = np.sqrt(np.diag(posterior.coefficients_cov))
+        inside = np.abs(posterior.coefficients_mean - coefficients) < QUANTILE_95 * std
+        assert measured.pop("coverage") == np.count_nonzero(inside) / 4
+        assert measured.pop("input_power") == pytest.approx(np.mean(np.square(single.inputs)), rel=slack)
+        assert measured.pop("ended_early") == single.terminated
+        assert measured == {}
+        np.testing.assert_allclose(evaluation.inputs[:length, row], single.inputs, rtol=slack)
+        np.testing.assert_allclose(evaluation.outputs[:length, row], single.outputs, rtol=slack)
+        assert np.isnan(evaluation.inputs[length:, row]).all()
+        assert np.isnan(evaluation.outputs[length:, row]).all()
+        ended_early += single.terminated
+    assert ended_early in {"none": [0], "some": range(1, SYSTEMS), "all": [SYSTEMS]}[share_ended]
+
+
+def test_all_policies_meet_the_same_systems_and_the_same_noise(without_record):
+    uniform, prbs = evaluate(["uniform", "prbs"], systems=SYSTEMS, seed=SEED, options={"horizon": HORIZON})
+    assert np.all(np.abs(uniform.inputs[0] - prbs.inputs[0]) > 1e-3)
+    truths = [single.truth for single in run_single("prbs", {"horizon": 1})]
+    gains = np.array([true_coefficients(truth)[3] for truth in truths])
+    # At rest, y_1 = η u_0 + noise.
+    noise = uniform.outputs[0] - gains * uniform.inputs[0]
+    np.testing.assert_allclose(prbs.outputs[0] - gains * prbs.inputs[0], noise, rtol=0, atol=1e-8)
+    assert np.all((np.abs(noise) > 1e-6) & (np.abs(noise) < 5 * np.sqrt(2) * 5e-4))
+    assert len(np.unique(noise)) == SYSTEMS
+
+
+def test_the_same_seed_gives_the_same_and_another_does_not(without_record):
+    first, again = (evaluate(["uniform"], systems=5, seed=1, options={"horizon": HORIZON})[0] for _ in range(2))
+    (fewer,) = evaluate(["uniform"], systems=3, seed=1, options={"horizon": HORIZON})
+    (other,) = evaluate(["uniform"], systems=5, seed=2, options={"horizon": HORIZON})
+    for name, values in first.metrics.items():
+        np.testing.assert_array_equal(values, again.metrics[name])
+        np.testing.assert_array_equal(values[:3], fewer.metrics[name])
+    np.testing.assert_array_equal(first.outputs, again.outputs)
+    for name in ("log_posterior_gain", "error_m", "error_b", "input_power"):
+        assert not set(first.metrics[name]) & set(other.metrics[name])
+
+
+def test_policies_are_told_of_in_turn_and_options_left_alone(without_record):
+    told, options = [], {"horizon": 5}
+    evaluations = evaluate(["prbs", "uniform", "prbs"], systems=2, options=options, on_policy=told.append)
+    assert told == [evaluation.policy for evaluation in evaluations] == ["prbs", "uniform", "prbs"]
+    assert options == {"horizon": 5}
+    np.testing.assert_array_equal(evaluations[0].curve, evaluations[2].curve)
+
+
+def test_the_arrow_is_left_out_without_the_record(without_record):
+    assert "arrow_rmse" not in evaluate(["uniform"], systems=2, options={"horizon": 5})[0].metrics
+
+
+def identified_twins(name, options):
+    """The coefficients that single environments identify on the twin of the circuit."""
+    options = {**options, "plant_spread": 0.0}
+    return [single.beliefs[-1].coefficients_mean for single in run_single(name, options)]
+
+
+def free_run(coefficients, u, y):
+    """Eq. (2) without noise over a record, started by its first two outputs."""
+    theta1, theta2, theta3, eta = coefficients.tolist()
+    x = y[:2].tolist()
+    for u_before in u[1:-1].tolist():
+        x.append(theta1 * x[-1] + theta2 * x[-1] ** 3 + theta3 * x[-2] + eta * u_before)
+    return np.array(x)
+
+
+def test_the_arrow_error_is_that_of_free_runs_over_the_record(record):
+    options = {"horizon": HORIZON}
+    (evaluation,) = evaluate(["prbs"], systems=SYSTEMS, seed=SEED, options=options)
+    u, y = record.arrow.u, record.arrow.y
+    for coefficients, error in zip(identified_twins("prbs", options), evaluation.metrics["arrow_rmse"], strict=True):
+        deviation = free_run(coefficients, u, y)[2:] - y[2:]
+        assert error == pytest.approx(np.sqrt(np.mean(deviation**2)), rel=1e-6)
+        assert 1e-3 < error < 0.05  # the signal itself has 54 mV
+
+
+@pytest.mark.parametrize(("scale", "diverges"), [(0.1, False), (1e3, True)])
+def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverges):
+    rng = np.random.default_rng(0)
+    arrow = Regime("arrow", scale * rng.uniform(-1, 1, 80), 0.01 * rng.normal(size=80))
+    monkeypatch.setattr(agents.evaluation, "record_available", lambda: True)
+    monkeypatch.setattr(agents.evaluation, "load_record", lambda: SimpleNamespace(arrow=arrow))
+    options = {"horizon": HORIZON, "max_output": 2.0}
+    (evaluation,) = evaluate(["uniform"], systems=SYSTEMS, seed=SEED, options=options)
+    if diverges:
+        assert np.all(evaluation.metrics["arrow_rmse"] == np.inf)
+        return
+    expected = [
+        np.sqrt(np.mean((free_run(coefficients, arrow.u, arrow.y) - arrow.y)[2:] ** 2))
+        for coefficients in identified_twins("uniform", options)
+    ]
+    np.testing.assert_allclose(evaluation.metrics["arrow_rmse"], expected, rtol=1e-9)
+
+
+def test_the_replay_environment_is_evaluated(record):
+    limit = 0.05
+    evaluations = evaluate(
+        ["silverbox-arrow", "uniform"], REPLAY, systems=2, options={"regime": "arrow", "max_output": limit}
+    )
+    on_record, off_record = evaluations
+    u, y = record.arrow.u, record.arrow.y
+    samples = int(np.argmax(np.abs(y[1:]) > limit)) + 1  # the episode ends when y, one sample later, is beyond
+    assert samples > 1000
+    estimator = OnlineEstimator(NLARX(input_delay=0), Prior.silverbox_twin())
+    before = entropy(estimator.belief)
+    estimator.run(u[:samples], y[1 : samples + 1])
+    np.testing.assert_allclose(on_record.metrics["information_gain"], before - entropy(estimator.belief), rtol=1e-9)
+    np.testing.assert_allclose(on_record.inputs[:samples, 0], u[:samples], rtol=0, atol=1e-8)
+    assert np.isnan(on_record.inputs[samples:]).all()
+    assert on_record.metrics["ended_early"].tolist() == [1, 1]
+    assert on_record.curve[-1] == pytest.approx(on_record.curve[samples])
+    # A record answers nothing but its own input: the episode is over, and nothing was learned.
+    assert np.isfinite(off_record.inputs).sum(axis=0).tolist() == [1, 1]
+    assert off_record.metrics["information_gain"].tolist() == [0, 0]
+    assert off_record.metrics["ended_early"].tolist() == [1, 1]
+    for evaluation in evaluations:
+        assert "arrow_rmse" not in evaluation.metrics
+
+
+@pytest.mark.parametrize("systems", [1, 0, -3])
+def test_one_system_is_too_few(systems):
+    with pytest.raises(ValueError, match=f"systems must be at least 2, but is {systems}"):
+        evaluate(["uniform"], systems=systems)
+
+
+def test_senseless_arguments_are_refused():
+    with pytest.raises(ValueError, match="policies must name at least one"):
+        evaluate([], systems=2)
+    with pytest.raises(ValueError, match="did you mean 'uniform'"):
+        evaluate(["unifrom"], systems=2)
+    with pytest.raises(ValueError, match="did you mean 'horizon'"):
+        evaluate(["uniform"], systems=2, options={"horizn": 3})
+    with pytest.raises(gym.error.NameNotFound):
+        evaluate(["uniform"], "duffing_env/Ampltude-v0", systems=2)

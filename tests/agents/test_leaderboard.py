@@ -1,0 +1,305 @@
+"""The leaderboard: intervals, table, JSON and figures, from evaluations whose figures are known."""
+
+import json
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+import agents.evaluation
+import agents.figures
+from agents.evaluation import Evaluation
+from agents.figures import draw_contraction, draw_excitations, draw_learning_curve
+from agents.leaderboard import METRICS, compare, print_table, summarise, write_json
+from estimator import SAMPLING_STEP
+
+# What the table must print for these values, by hand: centre, then both ends of an interval of width zero.
+CONSTANTS = {
+    "information_gain": (12.345, "information gained / nat", "12.35"),
+    "log_posterior_gain": (-1.004, "log posterior gain / nat", "-1.00"),
+    "error_m": (0.012344, "error of m / %", "1.234"),
+    "error_c": (0.5, "error of c / %", "50.00"),
+    "error_a": (0.00025, "error of a / %", "0.025"),
+    "error_b": (2.0, "error of b / %", "200.00"),
+    "coverage": (0.75, "90 % intervals that cover / %", "75.0"),
+    "ended_early": (0.0, "episodes ended early / %", "0.0"),
+    "input_power": (0.0225, "input power / mV²", "22500"),
+    "arrow_rmse": (0.00512, "RMSE on the real arrow / mV", "5.12"),
+}
+
+
+def make_evaluation(policy="policy", *, samples=20, systems=30, seed=0, shift=0.0, **metrics):
+    rng = np.random.default_rng(seed)
+    if not metrics:
+        metrics = {name: rng.uniform(0, 1, systems) for name in METRICS}
+        metrics["log_posterior_gain"] = metrics["log_posterior_gain"] + shift
+    curve = np.cumsum(rng.normal(1.0, 0.3, (samples + 1, systems)), axis=0) + shift
+    inputs, outputs = rng.uniform(-0.1, 0.1, (2, samples, systems))
+    return Evaluation(policy, metrics, curve, inputs, outputs)
+
+
+def test_every_metric_of_an_evaluation_has_a_column(monkeypatch):
+    monkeypatch.setattr(agents.evaluation, "record_available", lambda: False)
+    (evaluation,) = agents.evaluation.evaluate(["uniform"], systems=2, options={"horizon": 5})
+    assert [*evaluation.metrics, "arrow_rmse"] == list(METRICS)
+    assert set(CONSTANTS) == set(METRICS)
+
+
+def test_centres_are_means_and_medians():
+    values = np.array([1.0, 2.0, 3.0, 10.0, 100.0])
+    summary = summarise(make_evaluation(**dict.fromkeys(METRICS, values)))
+    medians = {"error_m", "error_c", "error_a", "error_b", "arrow_rmse"}
+    for name, entry in summary.items():
+        kind, expected = ("median", 3.0) if name in medians else ("mean", 23.2)
+        assert set(entry) == {kind, "low", "high"}
+        assert entry[kind] == pytest.approx(expected)
+        assert entry["low"] < entry[kind] < entry["high"]
+        assert values.min() <= entry["low"]
+        assert entry["high"] <= values.max()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_intervals_contain_the_centre(seed):
+    for name, entry in summarise(make_evaluation(seed=seed, systems=12)).items():
+        center = entry.get("mean", entry.get("median"))
+        assert entry["low"] <= center <= entry["high"], name
+        assert entry["low"] < entry["high"]
+
+
+def test_intervals_cover_the_mean_at_about_their_rate():
+    rng = np.random.default_rng(0)
+    repetitions, systems, mean = 400, 60, 2.0
+    covered, widths = 0, []
+    for _ in range(repetitions):
+        entry = summarise(make_evaluation(log_posterior_gain=rng.gamma(4.0, mean / 4.0, systems)))["log_posterior_gain"]
+        covered += entry["low"] <= mean <= entry["high"]
+        widths.append(entry["high"] - entry["low"])
+    # A percentile interval of 60 values covers a little below 95 %; three standard errors are 3.3 %.
+    assert 0.90 < covered / repetitions < 0.985
+    assert np.mean(widths) == pytest.approx(2 * 1.96 * 1.0 / np.sqrt(systems), rel=0.05)  # the gamma's std is 1
+
+
+def test_the_interval_is_a_percentile_bootstrap_and_reproducible():
+    values = np.random.default_rng(1).normal(size=50)
+    evaluation = make_evaluation(coverage=values)
+    first, again, other = (summarise(evaluation, seed)["coverage"] for seed in (0, 0, 1))
+    assert first == again != other
+    rng = np.random.default_rng(2)
+    means = values[rng.integers(0, 50, (20_000, 50))].mean(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    assert (first["low"], first["high"]) == pytest.approx((low, high), abs=0.03)
+
+
+def test_a_constant_metric_has_an_interval_of_width_zero():
+    assert summarise(make_evaluation(ended_early=np.zeros(9), error_m=np.full(9, 0.25))) == {
+        "ended_early": {"mean": 0.0, "low": 0.0, "high": 0.0},
+        "error_m": {"median": 0.25, "low": 0.25, "high": 0.25},
+    }
+
+
+def test_diverged_free_runs_make_the_interval_infinite_not_the_median():
+    values = np.append(np.linspace(1.0, 2.0, 13), [np.inf] * 8)
+    entry = summarise(make_evaluation(arrow_rmse=values))["arrow_rmse"]
+    assert entry["median"] == values[10]
+    assert 1.0 < entry["low"] < entry["median"]
+    assert entry["high"] == np.inf
+    assert summarise(make_evaluation(arrow_rmse=np.full(4, np.inf)))["arrow_rmse"] == {
+        "median": np.inf, "low": np.inf, "high": np.inf,
+    }  # fmt: skip
+
+
+def _rows(lines, border):
+    return [[cell.strip() for cell in line.split(border)[1:-1]] for line in lines if line.startswith(border)]
+
+
+def table_of(capsys, *evaluations):
+    """The printed table: titles to lists of cells (centre, interval), by column; and the column heads."""
+    capsys.readouterr()
+    print_table(list(evaluations), "a title")
+    lines = capsys.readouterr().out.splitlines()
+    assert any("a title" in line for line in lines)
+    head = ["".join(parts) for parts in zip(*_rows(lines, "┃"), strict=True)][1:]  # long names are folded
+    body = _rows(lines, "│")
+    cells = {}
+    for centers, intervals in zip(body[::2], body[1::2], strict=True):
+        assert intervals[0] == ""
+        cells[centers[0]] = list(zip(centers[1:], intervals[1:], strict=True))
+    return head, cells
+
+
+def test_the_table_prints_every_metric_in_its_unit(capsys):
+    metrics = {name: np.full(3, value) for name, (value, _, _) in CONSTANTS.items()}
+    head, cells = table_of(capsys, make_evaluation("constant", **metrics))
+    assert head == ["constant"]
+    assert cells == {title: [(text, f"[{text}, {text}]")] for _, title, text in CONSTANTS.values()}
+    assert list(cells) == [title for _, title, _ in CONSTANTS.values()]
+
+
+def test_the_best_policy_comes_first(capsys):
+    shifts = {"middle": 5.0, "worst": -3.0, "best": 9.0}
+    evaluations = [make_evaluation(policy, shift=shift) for policy, shift in shifts.items()]
+    head, cells = table_of(capsys, *evaluations)
+    assert head == ["best", "middle", "worst"]
+    centers = [float(center) for center, _ in cells["log posterior gain / nat"]]
+    by_name = {evaluation.policy: summarise(evaluation) for evaluation in evaluations}
+    assert centers == pytest.approx([by_name[policy]["log_posterior_gain"]["mean"] for policy in head], abs=0.005)
+    for policy, (center, interval) in zip(head, cells["error of b / %"], strict=True):
+        low, high = map(float, interval.strip("[]").split(", "))
+        entry = by_name[policy]["error_b"]
+        printed = (float(center), low, high)
+        assert printed == pytest.approx((100 * entry["median"], 100 * entry["low"], 100 * entry["high"]), abs=0.005)
+
+
+def test_what_only_some_policies_have_is_a_dash_for_the_others(capsys):
+    gain = np.zeros(3)
+    with_arrow = make_evaluation("with", log_posterior_gain=gain + 1, arrow_rmse=np.full(3, 0.005))
+    _, cells = table_of(capsys, make_evaluation("without", log_posterior_gain=gain), with_arrow)
+    assert set(cells) == {"log posterior gain / nat", "RMSE on the real arrow / mV"}
+    assert cells["RMSE on the real arrow / mV"] == [("5.00", "[5.00, 5.00]"), ("-", "")]
+
+
+def test_infinite_intervals_are_printed(capsys):
+    metrics = {"log_posterior_gain": np.zeros(3), "arrow_rmse": np.full(3, np.inf)}
+    _, cells = table_of(capsys, make_evaluation(**metrics))
+    assert cells["RMSE on the real arrow / mV"] == [("inf", "[inf, inf]")]
+
+
+def test_ten_columns_are_not_cut(capsys):
+    policies = [f"runs/ppo-amplitude-v0-{i}" for i in range(10)]
+    head, cells = table_of(capsys, *(make_evaluation(policy, shift=-i) for i, policy in enumerate(policies)))
+    assert head == policies
+    assert all(text.strip("-0123456789.,[] ") == "" for row in cells.values() for cell in row for text in cell)
+
+
+def load_strictly(path):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def test_json_is_valid_and_complete(tmp_path):
+    evaluations = [make_evaluation("one"), make_evaluation("two", seed=1)]
+    settings = {"env": "duffing_env/Amplitude-v0", "systems": 30, "seed": 0, "options": {"horizon": 20}}
+    write_json(tmp_path / "made" / "evaluation.json", evaluations, settings)
+    written = load_strictly(tmp_path / "made" / "evaluation.json")
+    assert set(written) == {"settings", "policies"}
+    assert written["settings"] == settings
+    assert list(written["policies"]) == ["one", "two"]
+    for evaluation in evaluations:
+        assert written["policies"][evaluation.policy] == summarise(evaluation)
+
+
+def test_json_stays_valid_where_a_figure_is_infinite(tmp_path):
+    evaluation = make_evaluation(log_posterior_gain=np.zeros(3), arrow_rmse=np.array([1.0, np.inf, np.inf]))
+    write_json(tmp_path / "evaluation.json", [evaluation], {})
+    entry = load_strictly(tmp_path / "evaluation.json")["policies"]["policy"]["arrow_rmse"]
+    assert entry == {"median": None, "low": 1.0, "high": None}
+
+
+def check_picture(path, width, height, colours=1):
+    """A PNG of that size [pixel] with that many of the colours of policies."""
+    assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+    picture = np.round(255 * matplotlib.image.imread(path)[:, :, :3]).astype(int)
+    assert picture.shape[:2] == (height, width)
+    found = set(map(tuple, picture.reshape(-1, 3)))
+    lines = [tuple(int(name[i : i + 2], 16) for i in (1, 3, 5)) for name in agents.figures._COLOURS]
+    assert [line in found for line in lines[:colours]] == [True] * colours
+    assert len(found) > 50
+    assert np.mean(np.any(picture != 255, axis=2)) > 0.02
+
+
+def test_compare_writes_what_it_prints(tmp_path, capsys):
+    evaluations = compare(["uniform", "prbs"], "duffing_env/Amplitude-v0", 4, {"horizon": 30}, tmp_path / "out", seed=5)
+    printed = capsys.readouterr().out
+    assert "duffing_env/Amplitude-v0, 4 systems" in printed
+    folder = tmp_path / "out"
+    names = ["contraction.png", "evaluation.json", "excitations.png"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    for name in names:
+        assert str(folder / name) in printed.splitlines()
+    written = load_strictly(folder / "evaluation.json")
+    assert written["settings"] == {
+        "env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 5, "options": {"horizon": 30},
+    }  # fmt: skip
+    again = agents.evaluation.evaluate(["uniform", "prbs"], systems=4, seed=5, options={"horizon": 30})
+    for evaluation, repeated in zip(evaluations, again, strict=True):
+        assert written["policies"][evaluation.policy] == summarise(repeated)
+    check_picture(folder / "contraction.png", 900, 540, colours=2)
+    check_picture(folder / "excitations.png", 1080, 480, colours=2)
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures, which are drawn and then kept instead of written."""
+    figures = []
+
+    def keep(figure, path):
+        figure.draw_without_rendering()
+        figures.append(figure)
+
+    monkeypatch.setattr(agents.figures, "_save", keep)
+    return figures
+
+
+@pytest.mark.parametrize("policies", [1, 10])
+def test_contraction_shows_the_quartiles_of_every_policy(drawn, tmp_path, policies):
+    evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
+    draw_contraction(tmp_path / "figure", evaluations, "title")
+    (axes,) = drawn[0].axes
+    assert axes.get_title() == "title"
+    assert "nat" in axes.get_ylabel()
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [str(i) for i in range(policies)]
+    for line, band, evaluation in zip(axes.lines, axes.collections, evaluations, strict=True):
+        ordered = np.sort(evaluation.curve, axis=1)
+        np.testing.assert_array_equal(line.get_xdata(), np.arange(21))
+        np.testing.assert_allclose(line.get_ydata(), (ordered[:, 14] + ordered[:, 15]) / 2)
+        edges = band.get_paths()[0].vertices[:, 1]
+        assert edges.min() == pytest.approx(ordered[:, 7].min() + 0.25 * np.diff(ordered[0, 7:9])[0])
+        assert edges.max() == pytest.approx(np.percentile(ordered[-1], 75))
+
+
+def test_contraction_shows_losses_too(drawn, tmp_path):
+    draw_contraction(tmp_path / "figure", [make_evaluation()], "gains")
+    draw_contraction(tmp_path / "figure", [make_evaluation(shift=-40.0)], "losses")
+    gains, losses = (figure.axes[0] for figure in drawn)
+    assert gains.get_ylim()[0] == 0.0
+    low, high = losses.get_ylim()
+    assert low < high
+    assert low <= losses.lines[0].get_ydata().min()
+
+
+@pytest.mark.parametrize("policies", [1, 10])
+def test_excitations_shows_one_system_under_every_policy(drawn, tmp_path, policies):
+    evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
+    draw_excitations(tmp_path / "figure", evaluations, system=4)
+    panels = drawn[0].axes
+    assert len(panels) == 2 * policies
+    for left, right, evaluation in zip(panels[::2], panels[1::2], evaluations, strict=True):
+        for axes, signal, label in ((left, evaluation.inputs, "u / V"), (right, evaluation.outputs, "y / V")):
+            (line,) = axes.lines
+            np.testing.assert_array_equal(line.get_ydata(), signal[:, 4])
+            np.testing.assert_allclose(line.get_xdata(), 1e3 * SAMPLING_STEP * np.arange(20))
+            assert axes.get_ylabel() == label
+        assert left.get_title(loc="left") == evaluation.policy
+
+
+@pytest.mark.parametrize("updates", [1, 2, 30])
+def test_learning_curve_shows_returns_over_samples(drawn, tmp_path, updates):
+    curve = [(4096 * (i + 1), 0.5 * i + 0.1, np.nan if i == 0 else float(i)) for i in range(updates)]
+    draw_learning_curve(tmp_path / "figure", curve, "information_gain")
+    axes = drawn[0].axes[0]
+    np.testing.assert_allclose(axes.lines[0].get_xdata(), 4096e-6 * np.arange(1, updates + 1))
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [point[2] for point in curve])
+    assert axes.get_ylabel() == "mean return: information gain"
+
+
+def test_pictures_are_written(tmp_path):
+    curve = [(4096 * (i + 1), 0.5 * i + 0.1, float(i)) for i in range(9)]
+    draw_learning_curve(tmp_path / "curve.png", curve, "information_gain")
+    check_picture(tmp_path / "curve.png", 840, 480)
+    evaluations = [make_evaluation(str(i), seed=i, shift=3.0 * i) for i in range(4)]
+    draw_contraction(tmp_path / "contraction.png", evaluations, "title")
+    check_picture(tmp_path / "contraction.png", 900, 540, colours=4)
+    draw_excitations(tmp_path / "excitations.png", evaluations)
+    check_picture(tmp_path / "excitations.png", 1080, 864, colours=4)

@@ -1,0 +1,270 @@
+"""Learned policies: saved, loaded and acting as they did in Stable-Baselines3, with nothing ever unpickled."""
+
+import ast
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+from stable_baselines3 import PPO, SAC
+
+import agents
+from agents import make_policy
+from agents.policies.learned import CARD, WEIGHTS, load_policy, save_policy
+from agents.vec_env import DuffingVecEnv
+
+FEATURES = 22
+
+
+def make_model(hidden=(16, 8), algorithm=PPO, log_std=-0.5):
+    """A model with random weights, so large that tanh and clipping matter."""
+    envs = DuffingVecEnv("duffing_env/Amplitude-v0", 2)
+    settings = {"n_steps": 8, "batch_size": 16} if algorithm is PPO else {}
+    model = algorithm("MlpPolicy", envs, policy_kwargs={"net_arch": list(hidden)}, device="cpu", **settings)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for name, parameter in model.policy.named_parameters():
+            parameter.normal_(0.0, 0.6, generator=generator) if name != "log_std" else parameter.fill_(log_std)
+    return model
+
+
+def saved(folder, card=None, **settings):
+    """A policy folder, and the model that it was saved from."""
+    model = make_model(**settings)
+    save_policy(folder, model, card or {})
+    return folder, model
+
+
+def random_observations(count=200, seed=0):
+    return np.random.default_rng(seed).normal(0.0, 1.0, (count, FEATURES)).astype(np.float32)
+
+
+@pytest.mark.parametrize("hidden", [(16, 8), (), (4, 5, 6, 7, 8, 9), (8,) * 7])
+def test_loaded_policy_acts_as_the_model(tmp_path, hidden):
+    folder, model = saved(tmp_path / "run", hidden=hidden)
+    policy = load_policy(folder)
+    observations = random_observations()
+    expected, _ = model.predict(observations, deterministic=True)
+    actions, state = policy.predict(observations, deterministic=True)
+    assert actions.shape == (200, 1)
+    assert actions.dtype == np.float32
+    assert state is None
+    assert np.std(expected) > 0.1
+    np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-5)
+    for observation, action in zip(observations[:5], actions, strict=False):
+        single, _ = policy.predict(observation, deterministic=True)
+        assert single.shape == (1,)
+        np.testing.assert_allclose(single, action, rtol=0, atol=1e-6)
+
+
+def test_every_weight_is_saved_as_it_is(tmp_path):
+    folder, model = saved(tmp_path)
+    tensors, expected = load_file(folder / WEIGHTS), model.policy.state_dict()
+    assert tensors.keys() == expected.keys()
+    for name, tensor in tensors.items():
+        np.testing.assert_array_equal(tensor, expected[name].numpy())
+    assert sorted(path.name for path in folder.iterdir()) == [CARD, WEIGHTS]
+
+
+def test_saving_again_replaces_the_policy(tmp_path):
+    saved(tmp_path, hidden=(4,))
+    folder, model = saved(tmp_path, hidden=(5, 6))
+    observations = random_observations()
+    np.testing.assert_allclose(
+        load_policy(folder).predict(observations, deterministic=True)[0],
+        model.predict(observations, deterministic=True)[0],
+        atol=1e-5,
+    )
+
+
+def test_the_card_tells_what_it_was_told(tmp_path):
+    folder, _ = saved(tmp_path, card={"algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}})
+    card = load_policy(folder).card
+    assert card == {"format": 1, "algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}}
+    assert json.loads((folder / CARD).read_text()) == card
+
+
+def test_actions_are_in_range_and_the_state_is_passed_on(tmp_path):
+    folder, model = saved(tmp_path)
+    policy = load_policy(folder)
+    observations = 20 * random_observations()
+    for deterministic in (True, False):
+        actions, state = policy.predict(observations, "state", np.ones(200, dtype=bool), deterministic)
+        assert state == "state"
+        assert np.abs(actions).max() == 1.0
+        assert len(np.unique(actions)) > 10
+    np.testing.assert_allclose(
+        policy.predict(observations, deterministic=True)[0],
+        model.predict(observations, deterministic=True)[0],
+        atol=1e-5,
+    )
+
+
+def test_sampling_is_seeded_and_normal_about_the_mean(tmp_path):
+    folder, _ = saved(tmp_path, log_std=-3.0)
+    inside = next(x for x in random_observations() if abs(load_policy(folder).predict(x, deterministic=True)[0]) < 0.3)
+    many = np.tile(inside, (20_000, 1))
+
+    def samples(seed, times=1):
+        policy = load_policy(folder, seed)
+        return [policy.predict(many)[0][:, 0] for _ in range(times)]
+
+    (first, second), (again,), (other,) = samples(1, times=2), samples(1), samples(2)
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, second)
+    assert not np.array_equal(first, other)
+    mean, std = load_policy(folder).predict(inside, deterministic=True)[0][0], np.exp(-3.0)
+    # five standard errors
+    assert first.mean() == pytest.approx(mean, abs=5 * std / np.sqrt(20_000))
+    assert first.std() == pytest.approx(std, rel=5 / np.sqrt(40_000))
+    assert load_policy(folder, 1).predict(inside)[0].shape == (1,)
+
+
+@pytest.mark.parametrize("shape", [(21,), (3, 23), (22, 3), ()])
+def test_a_wrong_observation_is_refused(tmp_path, shape):
+    folder, _ = saved(tmp_path)
+    with pytest.raises(ValueError, match="observation must have 22 entries, but has shape"):
+        load_policy(folder).predict(np.zeros(shape))
+
+
+@pytest.mark.parametrize("missing", [WEIGHTS, CARD, None])
+def test_a_folder_without_the_files_is_refused(tmp_path, missing):
+    folder = tmp_path / "run"
+    if missing:
+        saved(folder)
+        (folder / missing).unlink()
+    with pytest.raises(ValueError, match=f"must hold {WEIGHTS} and {CARD}, but .*run does not; pass a run folder"):
+        load_policy(folder)
+
+
+class Trap:
+    """Unpickled, it writes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.write_text, (self.path, "sprung")
+
+
+def test_pickles_and_archives_are_refused_unopened(tmp_path):
+    sprung = tmp_path / "sprung"
+    folder = tmp_path / "run"
+    folder.mkdir()
+    make_model().save(folder / "policy.zip")
+    for name in ("policy.pkl", "policy.pth", "data"):
+        (folder / name).write_bytes(pickle.dumps(Trap(sprung)))
+    for path in (folder, folder / "policy.zip", folder / "policy.pkl"):
+        with pytest.raises(ValueError, match="must hold"):
+            make_policy(str(path))
+    (folder / CARD).write_text('{"format": 1}')
+    for content in (pickle.dumps(Trap(sprung)), (folder / "policy.zip").read_bytes()):
+        (folder / WEIGHTS).write_bytes(content)
+        with pytest.raises(ValueError, match=r"must hold sound files, but .*run does not"):
+            load_policy(folder)
+    assert not sprung.exists()
+    pickle.loads((folder / "policy.pkl").read_bytes())  # the trap would have sprung
+    assert sprung.exists()
+
+
+@pytest.mark.parametrize(
+    ("card", "message"),
+    [
+        ('{"format": 2}', "must have format 1, but .*policy.json has 2"),
+        ("{}", "must have format 1, but .*policy.json has None"),
+        ("[1]", "must have format 1, but .*policy.json has None"),
+        ('{"format": 1', "must hold sound files"),
+        ("", "must hold sound files"),
+    ],
+)
+def test_an_unknown_card_is_refused(tmp_path, card, message):
+    folder, _ = saved(tmp_path)
+    (folder / CARD).write_text(card)
+    with pytest.raises(ValueError, match=message):
+        load_policy(folder)
+
+
+def test_cut_off_weights_are_refused(tmp_path):
+    folder, _ = saved(tmp_path)
+    (folder / WEIGHTS).write_bytes((folder / WEIGHTS).read_bytes()[:-10])
+    with pytest.raises(ValueError, match="must hold sound files"):
+        load_policy(folder)
+
+
+def test_weights_of_something_else_are_refused(tmp_path):
+    folder, _ = saved(tmp_path / "sac", algorithm=SAC)
+    with pytest.raises(ValueError, match=r"must be an actor-critic of PPO, but .* lacks 'action_net.weight'"):
+        load_policy(folder)
+    save_file({"weights": np.zeros(3)}, folder / WEIGHTS)
+    with pytest.raises(ValueError, match="must be an actor-critic of PPO"):
+        load_policy(folder)
+
+
+def test_loading_and_acting_needs_no_torch(tmp_path):
+    folder, model = saved(tmp_path)
+    script = (
+        "import sys, json, numpy as np\n"
+        "from agents import make_policy\n"
+        "observations = np.array(json.load(sys.stdin), dtype=np.float32)\n"
+        "actions, _ = make_policy(sys.argv[1]).predict(observations, deterministic=True)\n"
+        "loaded = [name for name in ('torch', 'stable_baselines3', 'matplotlib') if name in sys.modules]\n"
+        "print(json.dumps([actions.tolist(), loaded]))\n"
+    )
+    observations = random_observations(4)
+    finished = subprocess.run(
+        [sys.executable, "-c", script, folder],
+        input=json.dumps(observations.tolist()), capture_output=True, text=True, timeout=60, check=True,
+        cwd=Path(agents.__file__).parents[1],
+    )  # fmt: skip
+    actions, loaded = json.loads(finished.stdout)
+    assert loaded == []
+    np.testing.assert_allclose(actions, model.predict(observations, deterministic=True)[0], atol=1e-5)
+
+
+UNPICKLERS = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal", "zipfile", "copyreg", "pandas"}
+SOURCES = sorted(Path(agents.__file__).parent.rglob("*.py"))
+
+
+def unpickling(source):
+    """The imports and calls in a source that could unpickle or open an archive."""
+    for node in ast.walk(ast.parse(source)):
+        modules = []
+        if isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            modules = [node.module or ""]
+            if any(alias.name == "load" for alias in node.names):
+                yield f"from {node.module} import load"
+        for module in modules:
+            if module.split(".")[0] in UNPICKLERS or "save_util" in module:
+                yield f"import {module}"
+        if isinstance(node, ast.Attribute) and node.attr in ("load", "load_from_zip_file", "set_parameters"):
+            yield ast.unparse(node)
+        if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
+            yield ast.unparse(node)
+
+
+def test_the_search_covers_the_package():
+    assert {"evaluation", "learned", "signals", "training", "vec_env"} <= {path.stem for path in SOURCES}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
+def test_no_source_can_unpickle(path):
+    assert list(unpickling(path.read_text())) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle", "from pickle import loads", "import cloudpickle as c", "torch.load('x')", "PPO.load('x')",
+        "from torch import load", "import zipfile", "np.load('x')", "np.savez('x', allow_pickle=True)",
+        "from stable_baselines3.common.save_util import load_from_zip_file",
+    ],
+)  # fmt: skip
+def test_the_search_for_unpicklers_finds_them(source):
+    assert len(list(unpickling(source))) >= 1

@@ -1,0 +1,233 @@
+"""Training: the run folder, its reproducibility, and whether anything is learned."""
+
+import csv
+import json
+import platform
+import sys
+from dataclasses import asdict, replace
+from importlib.metadata import version
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+
+import agents.vec_env
+from agents import make_policy
+from agents.evaluation import evaluate
+from agents.leaderboard import summarise
+from agents.training import PPOSettings, TrainConfig, train
+
+PNG = b"\x89PNG\r\n\x1a\n"
+SMALL = PPOSettings(num_envs=64, n_steps=64, batch_size=1024, hidden=(16,))
+TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def torch_threads():
+    """Training sets them for the whole process."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Runs of 20,000 samples: twice with seed 0, once with seed 1."""
+    folder = tmp_path_factory.mktemp("runs")
+    seeds = {"first": 0, "again": 0, "other": 1}
+    return {
+        name: train(TrainConfig(steps=20_000, seed=seed, output=folder / name, torch_threads=1, ppo=SMALL))
+        for name, seed in seeds.items()
+    }
+
+
+def tiny(output=None, **settings):
+    return train(TrainConfig(output=output, **{"steps": 256, "torch_threads": 1, "ppo": TINY, **settings}))
+
+
+def test_the_same_seed_gives_the_same_policy_byte_by_byte(runs):
+    first, again = (runs[name].folder for name in ("first", "again"))
+    weights = sorted(path.relative_to(first) for path in first.rglob("policy.safetensors"))
+    assert len(weights) == 6
+    for path in weights:
+        assert (first / path).read_bytes() == (again / path).read_bytes()
+    returns = [[(steps, value) for steps, _, value in runs[name].curve] for name in ("first", "again")]
+    np.testing.assert_array_equal(*returns)
+
+
+def test_another_seed_gives_another_policy(runs):
+    first, other = (load_file(runs[name].folder / "policy.safetensors") for name in ("first", "other"))
+    assert first.keys() == other.keys()
+    for name in first:
+        assert not np.array_equal(first[name], other[name]), name
+
+
+def test_the_run_folder_holds_what_it_promises(runs):
+    folder = runs["first"].folder
+    files = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    checkpoints = [f"checkpoints/{steps:09d}/policy" for steps in (4096, 8192, 12288, 16384, 20480)]
+    assert files == sorted(
+        ["config.json", "learning_curve.png", "policy.json", "policy.safetensors", "progress.csv"]
+        + [f"{checkpoint}.{ending}" for checkpoint in checkpoints for ending in ("json", "safetensors")]
+    )
+    picture = (folder / "learning_curve.png").read_bytes()
+    assert picture.startswith(PNG)
+    assert len(picture) > 5000
+
+
+def test_the_configuration_can_rebuild_the_run(runs, tmp_path):
+    description = json.loads((runs["first"].folder / "config.json").read_text())
+    assert set(description) == {"config", "command", "versions"}
+    settings = description["config"]
+    assert settings.pop("output") == str(runs["first"].folder)
+    settings["ppo"]["hidden"] = tuple(settings["ppo"]["hidden"])
+    settings["ppo"] = PPOSettings(**settings["ppo"])
+    rebuilt = TrainConfig(**settings, output=tmp_path / "rebuilt")
+    assert replace(rebuilt, output=None) == TrainConfig(steps=20_000, seed=0, torch_threads=1, ppo=SMALL)
+    assert description["command"][1:] == sys.argv[1:]
+    versions = description["versions"]
+    assert versions.pop("python") == platform.python_version()
+    assert {"numpy", "numba", "torch", "stable-baselines3", "duffing-env"} <= set(versions)
+    assert versions == {name: version(name) for name in versions}
+
+
+def test_the_card_says_what_the_policy_was_trained_on(runs):
+    folder = runs["first"].folder
+    description = json.loads((folder / "config.json").read_text())
+    card = make_policy(str(folder)).card
+    assert card == {"format": 1, "algorithm": "ppo", "steps": 20_480, **description}
+    assert make_policy(str(folder / "checkpoints" / "000008192")).card["steps"] == 8192
+
+
+def test_checkpoints_are_policies_on_the_way(runs):
+    folders = sorted((runs["first"].folder / "checkpoints").iterdir())
+    observations = np.random.default_rng(0).normal(size=(50, 22))
+    actions = [
+        make_policy(str(folder)).predict(observations, deterministic=True)[0]
+        for folder in [*folders, runs["first"].folder]
+    ]
+    for earlier, later in pairwise(actions):
+        assert not np.array_equal(earlier, later)
+
+
+def test_the_curve_and_the_log_tell_the_same(runs):
+    run = runs["first"]
+    steps, seconds, returns = np.array(run.curve).T
+    np.testing.assert_array_equal(steps, [4096, 8192, 12288, 16384, 20480])
+    assert np.all(np.diff(seconds) > 0)
+    assert 0 < seconds[0] < seconds[-1] < run.seconds
+    # The first episodes end with the fourth update; a few that reach the limit end before.
+    rows = list(csv.DictReader((run.folder / "progress.csv").read_text().splitlines()))
+    assert [int(row["time/total_timesteps"]) for row in rows] == steps.tolist()
+    logged = [float(row["rollout/ep_rew_mean"]) for row in rows if row["rollout/ep_rew_mean"]]
+    np.testing.assert_allclose(returns[np.isfinite(returns)], logged, rtol=1e-6)
+    assert np.isfinite(returns[-2:]).all()
+
+
+def test_reward_and_options_reach_the_environment(tmp_path, monkeypatch):
+    made = []
+
+    class Spy(agents.vec_env.DuffingVecEnv):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            made.append(self)
+
+    monkeypatch.setattr(agents.vec_env, "DuffingVecEnv", Spy)
+    run = tiny(tmp_path / "run", reward="parameter_error", options={"horizon": 8, "max_output": 3.0, "spread": 0.1})
+    (envs,) = made
+    experiment = envs.envs.experiment
+    assert (experiment.reward, experiment.horizon, experiment.max_output) == ("parameter_error", 8, 3.0)
+    assert (experiment.spread, envs.num_envs) == (0.1, 8)
+    rows = list(csv.DictReader((run.folder / "progress.csv").read_text().splitlines()))
+    assert float(rows[-1]["rollout/ep_len_mean"]) == 8
+    assert all(-1 <= mean_return <= 1 for _, _, mean_return in run.curve)
+
+
+def test_hyperparameters_reach_the_algorithm(tmp_path):
+    ppo = replace(TINY, n_steps=32, n_epochs=3, log_std_init=-1.25, hidden=(5, 7), learning_rate=1e-9)
+    run = tiny(tmp_path / "run", steps=512, ppo=ppo)
+    weights = load_file(run.folder / "policy.safetensors")
+    assert weights["mlp_extractor.policy_net.0.weight"].shape == (5, 22)
+    assert weights["mlp_extractor.policy_net.2.weight"].shape == (7, 5)
+    assert weights["action_net.weight"].shape == (1, 7)
+    np.testing.assert_allclose(weights["log_std"], -1.25, atol=1e-5)
+    rows = list(csv.DictReader((run.folder / "progress.csv").read_text().splitlines()))
+    assert [int(row["time/total_timesteps"]) for row in rows] == [256, 512]
+    # The second row tells of the first update: half of the samples are left then.
+    assert float(rows[1]["train/learning_rate"]) == pytest.approx(0.5e-9)
+    assert int(rows[1]["train/n_updates"]) == 3
+
+
+@pytest.mark.parametrize(("checkpoints", "expected"), [(1, [512]), (2, [256, 512]), (4, [128, 256, 384, 512])])
+def test_checkpoints_are_evenly_spaced(tmp_path, checkpoints, expected):
+    run = tiny(tmp_path / "run", steps=512, checkpoints=checkpoints)
+    assert sorted(int(path.name) for path in (run.folder / "checkpoints").iterdir()) == expected
+
+
+def test_a_folder_that_holds_a_run_is_refused_untouched(runs):
+    folder = runs["other"].folder
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(ValueError, match=r"output must be a new folder, but .*other holds a run; remove it or name"):
+        tiny(folder)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = [tiny(seed=seed).folder for seed in (7, 7, 3, 7)]
+    names = ["ppo-amplitude-v0-7", "ppo-amplitude-v0-7-2", "ppo-amplitude-v0-3", "ppo-amplitude-v0-7-3"]
+    assert [str(folder) for folder in folders] == [f"runs/{name}" for name in names]
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == sorted(names)
+    assert json.loads((folders[0] / "config.json").read_text())["config"]["output"] is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"steps": 0}, "steps must be at least 1, but is 0"),
+        ({"checkpoints": 0}, "checkpoints must be at least 1, but is 0"),
+        ({"torch_threads": -1}, "torch_threads must be at least 1, but is -1"),
+        ({"options": {"reward": "log_posterior"}}, "options must not hold reward"),
+        ({"options": {"horizons": 3}}, "did you mean 'horizon'"),
+        ({"reward": "information_gian"}, "did you mean 'information_gain'"),
+        ({"seed": -1}, "[Ss]eed"),
+    ],
+)
+def test_senseless_settings_are_refused_before_anything_is_written(tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        tiny(tmp_path / "run", **settings)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be at least 1, but is 0"),
+        ({"n_steps": 0}, "n_steps must be at least 1, but is 0"),
+        ({"n_epochs": 0}, "n_epochs must be at least 1, but is 0"),
+        ({"batch_size": 0}, "batch_size must be at least 1, but is 0"),
+        ({"batch_size": 1}, "must be at least 2"),
+        ({"num_envs": 1, "n_steps": 1}, "must be at least 2"),
+        ({"hidden": (8, 0)}, r"hidden\[1\] must be at least 1, but is 0"),
+        ({"learning_rate": 0.0}, "learning_rate must be positive, but is 0.0"),
+        ({"gamma": 1.5}, r"gamma must be in \[0, 1\], but is 1.5"),
+        ({"gae_lambda": -0.1}, r"gae_lambda must be in \[0, 1\], but is -0.1"),
+    ],
+)
+def test_senseless_hyperparameters_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        PPOSettings(**{**asdict(TINY), **settings})
+
+
+def test_training_beats_signals_that_do_not_look(tmp_path):
+    """Clearly: on the same systems, 95 % intervals apart, from 400,000 samples on."""
+    ppo = PPOSettings(num_envs=256, n_steps=32, batch_size=2048, learning_rate=3e-3, hidden=(32,))
+    run = train(TrainConfig(steps=400_000, output=tmp_path / "run", torch_threads=1, ppo=ppo))
+    learned, uniform, multisine = (
+        summarise(evaluation)["log_posterior_gain"]
+        for evaluation in evaluate([str(run.folder), "uniform", "silverbox-multisine"], systems=128, seed=1)
+    )
+    assert learned["low"] > uniform["high"] > multisine["high"]
+    assert run.curve[-1][2] > uniform["mean"]
