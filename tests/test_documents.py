@@ -10,8 +10,9 @@ ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def test_the_examples_of_the_readme_run():
-    failures, examples = doctest.testfile(str(ROOT / "README.md"), module_relative=False, verbose=False)
+@pytest.mark.parametrize("document", ["README.md", "docs/estimators.md"])
+def test_examples_run(document):
+    failures, examples = doctest.testfile(str(ROOT / document), module_relative=False, verbose=False)
     assert examples > 10
     assert failures == 0
 
