@@ -15,8 +15,8 @@ test: $(READY)  ## all tests but the slow evidence
 evidence: $(READY)  ## the slow evidence: coverage tables, reproduction
 	$(BIN)/python -m pytest -m slow -s
 
-bench: $(READY)  ## timed comparisons
-	$(BIN)/python -m benchmarks
+bench: $(READY)  ## timed comparisons, with peers in .venv-peers; about 15 minutes
+	$(BIN)/python -m benchmarks --json runs/benchmarks/results.json
 
 lint: $(READY)  ## style, format and types
 	$(BIN)/ruff check .

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.files import write_atomically
 from estimator import SAMPLING_STEP
+from estimator.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

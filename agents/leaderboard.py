@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 
 from agents.evaluation import Evaluation, evaluate
-from agents.files import write_atomically
+from estimator.files import write_atomically
 
 #: What a new policy is compared with: the paper's regimes, and two classical excitations.
 BASELINES = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")
@@ -88,15 +88,12 @@ def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, floa
     summary: dict[str, dict[str, float]] = {}
     for name, values in evaluation.metrics.items():
         kind, statistic = METRICS[name].center
-        center = float(statistic(values))
-        low = high = center
-        if (values != values[0]).any():
-            with np.errstate(invalid="ignore"):  # values may be infinite, and SciPy takes their standard deviation
-                low, high = stats.bootstrap(
-                    (values,), statistic, n_resamples=_RESAMPLES, method="percentile", vectorized=True,
-                    rng=np.random.default_rng(seed),
-                ).confidence_interval  # fmt: skip
-        summary[name] = {kind: center, "low": float(low), "high": float(high)}
+        with np.errstate(invalid="ignore"):  # values may be infinite, and SciPy takes their standard deviation
+            low, high = stats.bootstrap(
+                (values,), statistic, n_resamples=_RESAMPLES, method="percentile", vectorized=True,
+                rng=np.random.default_rng(seed),
+            ).confidence_interval  # fmt: skip
+        summary[name] = {kind: float(statistic(values)), "low": float(low), "high": float(high)}
     return summary
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli import JsonOptions
-from agents.files import write_atomically
 from agents.policies.learned import save_policy
+from estimator.files import write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO

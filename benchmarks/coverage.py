@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from estimator import (
     Prior,
     to_coefficients,
 )
+from estimator.files import write_atomically
 from estimator.parameters import FloatArray
 
 LEVEL = 0.90
@@ -244,10 +244,7 @@ def write(results: dict[str, list[tuple[Case, Coverage]]], path: Path) -> None:
         ]
         for title, rows in results.items()
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(json.dumps(tables, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
-    os.replace(unfinished, path)
+    write_atomically(path, json.dumps(tables, ensure_ascii=False, indent=1) + "\n")
 
 
 def main(config: Config) -> None:

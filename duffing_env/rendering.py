@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-import os
+import io
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
+from estimator.files import write_atomically
 from estimator.parameters import SAMPLING_STEP, FloatArray, PhysicalParameters, propagate_to_physical
 
 Frame = npt.NDArray[np.uint8]
@@ -333,9 +334,9 @@ def main() -> None:
     while not ended:
         _, _, terminated, truncated, _ = env.step(env.action_space.sample())
         ended = terminated or truncated
-    partial = path.with_name(f".{path.name}.partial")
-    matplotlib.image.imsave(partial, np.asarray(env.render()), format="png")
-    os.replace(partial, path)
+    picture = io.BytesIO()
+    matplotlib.image.imsave(picture, np.asarray(env.render()), format="png")
+    write_atomically(path, picture.getvalue())
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 """
 
 from estimator.belief import Belief, Prior
-from estimator.files import load_estimator, save_estimator
 from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE
@@ -18,6 +17,7 @@ from estimator.parameters import (
     to_coefficients,
     to_physical,
 )
+from estimator.saving import load_estimator, save_estimator
 
 __all__ = [
     "NLARX",

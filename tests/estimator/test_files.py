@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.files import write_atomically
+from estimator.files import write_atomically
 
 
 def names(folder):
