@@ -95,7 +95,8 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
         raise ValueError(f"policy folder must hold {WEIGHTS} and {CARD}, but {folder} does not; pass a run folder")
     try:
         card = json.loads((folder / CARD).read_text())
-        tensors = load_file(folder / WEIGHTS)
+        # Copies, because a tensor may lie unaligned in the file, and NumPy then multiplies in another order.
+        tensors = {name: tensor.copy() for name, tensor in load_file(folder / WEIGHTS).items()}
     except (ValueError, SafetensorError) as error:
         raise ValueError(
             f"policy folder must hold sound files, but {folder} does not: {error}; copy it anew"
