@@ -293,9 +293,10 @@ def log_uniform_moments(
     points = np.stack([psi.theta1, psi.theta2, psi.theta3, psi.eta], axis=-1)
     per_axis = weights / 2  # the weights sum to 2, the length of [-1, 1]
     probabilities = np.einsum("i,j,k,l->ijkl", *[per_axis] * 4).ravel()
-    mean = probabilities @ points
+    # Plain sums, because the last digits of a BLAS product depend on its number of threads.
+    mean = (probabilities[:, np.newaxis] * points).sum(axis=0)
     deviations = points - mean
-    cov = (probabilities[:, np.newaxis] * deviations).T @ deviations
+    cov = np.array([[(probabilities * (one * other)).sum() for one in deviations.T] for other in deviations.T])
     return mean, cov
 
 

@@ -1,7 +1,10 @@
 """Parameter maps: against hand calculations, differences, Monte Carlo and closed forms."""
 
 import dataclasses
+import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -378,3 +381,19 @@ MEAN = vector(HAND_COEFFICIENTS, COEFFICIENTS)
 def test_bad_input_is_named(call, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         call()
+
+
+def test_log_uniform_moments_do_not_depend_on_threads():
+    """Environments start from these moments: a last digit that moves would make every episode another one."""
+    program = "from estimator import Prior; print(Prior.silverbox_twin().coefficients_cov.tobytes().hex())"
+    printed = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env=os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2")
+    }
+    assert len(printed) == 1
