@@ -294,7 +294,7 @@ def log_uniform_moments(
     per_axis = weights / 2  # the weights sum to 2, the length of [-1, 1]
     probabilities = np.einsum("i,j,k,l->ijkl", *[per_axis] * 4).ravel()
     # Plain sums, because the last digits of a BLAS product depend on its number of threads.
-    mean = (probabilities[:, np.newaxis] * points).sum(axis=0)
+    mean = np.array([(probabilities * column).sum() for column in points.T])
     deviations = points - mean
     cov = np.array([[(probabilities * (one * other)).sum() for one in deviations.T] for other in deviations.T])
     return mean, cov
