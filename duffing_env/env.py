@@ -303,4 +303,4 @@ def _one_number(action: npt.ArrayLike) -> float:
     value = np.asarray(action, dtype=np.float64)
     if value.size != 1 or not np.isfinite(value).all():
         raise ValueError(f"action must be one finite number in [-1, 1], but is {action!r}")
-    return value.item()
+    return min(max(value.item(), -1.0), 1.0)

@@ -157,6 +157,8 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         if not np.isfinite(actions).all():
             row = int(np.argmin(np.isfinite(actions)))
             raise ValueError(f"actions must be finite, but row {row} is {actions[row, 0]}; pass values in [-1, 1]")
+        if actions.dtype != np.float32:
+            actions = np.clip(actions, -1.0, 1.0)
         due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
         if due.any():
             rows = np.flatnonzero(due).tolist()
@@ -165,8 +167,9 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         batch.step(actions[:, 0])
         terminated = batch.outcome("terminated") != 0.0
         truncated = batch.outcome("truncated") != 0.0
-        infos = self._infos(was_finished=self._finished, finished=terminated | truncated)
-        self._finished = terminated | truncated
+        finished = terminated | truncated
+        infos = self._infos(was_finished=self._finished, finished=finished)
+        self._finished = finished
         return self._observations(), batch.outcome("reward").copy(), terminated, truncated, infos
 
     def _observations(self) -> Observations:
@@ -217,14 +220,13 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         }
 
     def _step_infos(self, mask: Flags) -> dict[str, Any]:
-        infos: dict[str, Any] = {}
-        for name in self.single._reported:
-            infos[name] = np.where(mask, self._batch.outcome(name), 0.0)
-            infos[f"_{name}"] = mask.copy()
-        for name in self.single._flags:
-            infos[name] = mask & (self._batch.outcome(name) != 0.0)
-            infos[f"_{name}"] = mask.copy()
-        return infos
+        """What every step tells, of the rows in ``mask``; zero in the others."""
+        infos: dict[str, Any] = {name: self._batch.outcome(name).copy() for name in self.single._reported}
+        infos |= {name: self._batch.outcome(name) != 0.0 for name in self.single._flags}
+        if not mask.all():
+            for values in infos.values():
+                values[~mask] = 0
+        return infos | {f"_{name}": mask.copy() for name in infos}
 
     def _endings(self, finished: Flags) -> dict[str, Any]:
         """What the finished rows ended with; no keys where none did."""

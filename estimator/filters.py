@@ -14,9 +14,9 @@ from estimator.gaussian import JointBelief
 from estimator.inference import update
 from estimator.lanes import LANES, kernel
 from estimator.models.nlarx import NLARX
-from estimator.models.ode import DuffingODE, run_samples, simulate_samples
+from estimator.models.ode import DuffingODE, from_coordinates, run_samples, simulate_samples, to_coordinates
 from estimator.models.regressors import LONGEST_DELAY, as_arrays, run_regressors, simulate_regressors
-from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.parameters import FloatArray
 from estimator.record import LAYOUT, N_ROWS, RECORD, RECORD_SIZE, STATES
 
 _U, _Y, _PREDICTED = LAYOUT["u"], LAYOUT["y"], LAYOUT["predicted"]
@@ -140,19 +140,17 @@ class NLARXFilter:
 
 
 class JointFilter(ABC):
-    """Memory of a structured estimator with matrices: mean and covariance in the model's own units, and past inputs.
+    """Memory of a structured estimator with matrices: mean and covariance in the model's own coordinates, past inputs.
 
     Args:
         prior: belief before the first sample.
         drift: standard deviation of each coefficient's step per sample, in parts of that of its prior.
-        scale: (k + K,) factors from the model's units to those of the prior.
         look_ahead: inputs after a sample that must be known before it is used.
     """
 
-    def __init__(self, prior: JointBelief, drift: float, scale: FloatArray, look_ahead: int) -> None:
-        self._names, self._units, self._scale, self._look_ahead = prior.names, prior.units, scale, look_ahead
-        self._mean = prior.mean / scale
-        self._cov = prior.cov / np.outer(scale, scale)
+    def __init__(self, prior: JointBelief, drift: float, look_ahead: int) -> None:
+        self._names, self._units, self._look_ahead = prior.names, prior.units, look_ahead
+        self._mean, self._cov = self._to_coordinates(prior.mean, prior.cov)
         self._noises = np.array([prior.gamma_shape, prior.gamma_rate, prior.xi_shape, prior.xi_rate])
         self._states = len(prior.state_mean)
         self._walk = drift**2 * np.diag(self._cov)[self._states :]
@@ -181,6 +179,14 @@ class JointFilter(ABC):
         self._past = inputs[: begun + used][-LONGEST_DELAY:]
         self._waiting_u, self._waiting_y = inputs[begun + used :], outputs[used:]
         return used
+
+    def _to_coordinates(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """From what a `JointBelief` holds to the model's own coordinates; copies."""
+        return mean.copy(), cov.copy()
+
+    def _from_coordinates(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Back from the model's own coordinates."""
+        return mean, cov
 
     @abstractmethod
     def _take(
@@ -225,8 +231,8 @@ class JointFilter(ABC):
 
     @property
     def belief(self) -> JointBelief:
-        """The belief now, in the units of the prior."""
-        mean, cov = self._mean * self._scale, self._cov * np.outer(self._scale, self._scale)
+        """The belief now."""
+        mean, cov = self._from_coordinates(self._mean, self._cov)
         return JointBelief(self._names, self._units, mean, cov, *self._noises.tolist())
 
     def predict(self, u: FloatArray, y: FloatArray) -> FloatArray:
@@ -252,15 +258,21 @@ class JointFilter(ABC):
 
 
 class ODEFilter(JointFilter):
-    """Memory for `DuffingODE`; its own unit of time is the sample."""
+    """Memory for `DuffingODE`."""
 
     def __init__(self, model: DuffingODE, prior: JointBelief, drift: float) -> None:
-        super().__init__(prior, drift, np.concatenate([[1.0, 1 / SAMPLING_STEP], model.scales()]), model.look_ahead)
+        super().__init__(prior, drift, model.look_ahead)
         self._model = model
         if not model.cubic_damping:
             fixed = self._states + model.names.index("cubic_damping")
             self._mean[fixed] = self._cov[fixed, :] = self._cov[:, fixed] = 0.0
             self._walk[fixed - self._states] = 0.0
+
+    def _to_coordinates(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return to_coordinates(mean, cov)
+
+    def _from_coordinates(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return from_coordinates(mean, cov)
 
     def _take(
         self,
@@ -294,7 +306,7 @@ class RegressorFilter(JointFilter):
     """Memory for an `NLARX` with other regressors than the paper's."""
 
     def __init__(self, model: NLARX, prior: JointBelief, drift: float) -> None:
-        super().__init__(prior, drift, np.ones(len(prior.mean)), look_ahead=0)
+        super().__init__(prior, drift, look_ahead=0)
         self._terms = as_arrays(model.terms)
 
     def _take(

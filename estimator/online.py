@@ -99,7 +99,7 @@ class OnlineEstimator:
                 )
             own = self.model.prior()
             prior = prior if prior is not None else own
-            if not isinstance(prior, JointBelief) or prior.names != own.names:
+            if not isinstance(prior, JointBelief) or (prior.names, len(prior.mean)) != (own.names, len(own.mean)):
                 raise ValueError(f"prior must have the parameters {own.names}, but is {prior!r:.60}; use model.prior()")
             if isinstance(self.model, DuffingODE):
                 return ODEFilter(self.model, prior, self.drift)

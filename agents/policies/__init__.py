@@ -58,7 +58,7 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0)
         env: The environment it is for, single or vector, wrapped or not: it gives the amplitude
             limit, the episode's length and, where it replays a record, the recorded input. None:
             the limit is 0.15 V.
-        seed: The seed of the policy's own randomness; a trained policy takes none.
+        seed: The seed of the policy's own randomness; of a trained policy, that of the actions it samples.
 
     Returns:
         The policy.
@@ -72,7 +72,7 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0)
     if Path(name).exists():
         from agents.policies.learned import load_policy
 
-        return load_policy(name)
+        return load_policy(name, seed)
     nearest = difflib.get_close_matches(name, POLICIES, n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     raise ValueError(

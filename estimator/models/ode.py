@@ -6,7 +6,13 @@ The measured input is band-limited, so it must not be held between samples: it i
 per sample, whose coefficients say how much of the future is used. The integration is the classical Runge-Kutta
 method of order 4 with exact sensitivities: the derivative of its arithmetic, not finite differences.
 
-Inside, time is counted in samples (δ = 1), so that all parameters are of the order of one.
+Inside, time is counted in samples (δ = 1), so that all parameters are of the order of one, and the offsets are counted
+as the output shows them: with z = x + y0 and the constant force f = k y0 - g u0,
+
+    z'' = g u + f - c z' - k z - b (z - y0)³ - e z'³,        y = z + d u + v.
+
+Outputs tell z and f at once, but u0 and y0 only together. A filter that linearises in x, u0 and y0 takes the changes of
+its own k and g for news that tells them apart, and its intervals become far too narrow.
 """
 
 from __future__ import annotations
@@ -36,11 +42,17 @@ PARAMETERS = {
 N_STATES = 2
 N_JOINT = N_STATES + len(PARAMETERS)
 
-#: What the motion depends on: the state, and the first six parameters. The last two are of the sensor.
-N_MOTION = 8
+#: What the motion depends on: the state, and all parameters but the feedthrough.
+N_MOTION = N_JOINT - 1
 
-#: Direction of the process noise in (x, x'): an acceleration held over a sample, scaled to move x by 1.
+#: Direction of the process noise in (z, z'): an acceleration held over a sample, scaled to move z by 1.
 NOISE_DIRECTION = np.array([1.0, 2.0])
+
+#: Factors from units per sample to physical ones, of (x, x', parameters).
+_SCALES = SAMPLING_STEP ** np.array([0.0, -1.0, -2.0, -1.0, -2.0, -2.0, 0.0, 1.0, 0.0, 0.0])
+
+#: Places of u0, whose coordinate is f, and of y0.
+_FORCE, _OFFSET = 6, 8
 
 #: Of the spline through the inputs: the input has power up to two thirds of the Nyquist frequency.
 SPLINE_DEGREE = 5
@@ -57,7 +69,8 @@ class DuffingODE:
             samples before and the two after, so that a sample is used when the next input is known. ``spline``: the
             quintic spline through all inputs, for recorded data that is given at once.
         cubic_damping: whether the damping has the cubic term e x'³; without it e = 0.
-        substeps: Runge-Kutta steps per sample.
+        substeps: Runge-Kutta steps per sample. On the Silverbox 2 simulate as well, but shift the stiffness by more
+            than its standard deviation, because the posterior becomes that narrow.
 
     Raises:
         ValueError: for an unknown interpolation, or substeps below 1.
@@ -65,7 +78,7 @@ class DuffingODE:
 
     interpolation: str = "linear"
     cubic_damping: bool = False
-    substeps: int = 2
+    substeps: int = 8
 
     names: ClassVar[tuple[str, ...]] = tuple(PARAMETERS)
     units: ClassVar[tuple[str, ...]] = tuple(PARAMETERS.values())
@@ -113,11 +126,6 @@ class DuffingODE:
         noises = (noise_shape, noise_shape * process_noise**2, noise_shape, noise_shape * measurement_noise**2)
         return JointBelief(self.names, self.units, mean, np.diag(std**2), *noises)
 
-    @staticmethod
-    def scales(step: float = SAMPLING_STEP) -> FloatArray:
-        """(8,) factors from parameters per sample to parameters in physical units."""
-        return np.array([step**-2, 1 / step, step**-2, step**-2, 1.0, step, 1.0, 1.0])
-
     def pieces(self, u: FloatArray) -> FloatArray:
         """The input between samples as polynomials of τ in [0, 1]: (T - 1, degree + 1) coefficients of 1, τ, τ², ..."""
         start, stop = u[:-1], u[1:]
@@ -137,6 +145,43 @@ class DuffingODE:
         return _spline_pieces(u)
 
 
+def to_coordinates(mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of (x, x', parameters) in physical units, as those of (z, z', ..., f, ...) per sample.
+
+    To first order, and the inverse of `from_coordinates`.
+
+    Raises:
+        ValueError: if u0 is known where f is not: f would be tied to k, g and y0 by a line, but the truth is not.
+    """
+    mean, cov = mean / _SCALES, cov / np.outer(_SCALES, _SCALES)
+    k, g, u0, y0 = mean[[2, 4, _FORCE, _OFFSET]]
+    offset_is_known = cov[_FORCE, _FORCE] == 0
+    slopes = np.eye(N_JOINT)
+    slopes[0, _OFFSET] = 1.0
+    slopes[_FORCE, [2, 4, _FORCE, _OFFSET]] = y0, -u0, -g, k
+    mean[0] += y0
+    mean[_FORCE] = k * y0 - g * u0
+    cov = slopes @ cov @ slopes.T
+    if offset_is_known and cov[_FORCE, _FORCE] > 0:
+        raise ValueError(
+            f"prior must leave input_offset free, but fixes it at {u0}; subtract it from u, and fix both offsets at 0"
+        )
+    return mean, cov
+
+
+def from_coordinates(mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of (z, z', ..., f, ...) per sample, as those of (x, x', parameters) in physical units."""
+    k, g, f, y0 = mean[[2, 4, _FORCE, _OFFSET]]
+    u0 = (k * y0 - f) / g
+    slopes = np.eye(N_JOINT)
+    slopes[0, _OFFSET] = -1.0
+    slopes[_FORCE, [2, 4, _FORCE, _OFFSET]] = y0 / g, -u0 / g, -1 / g, k / g
+    mean = mean.copy()
+    mean[0] -= y0
+    mean[_FORCE] = u0
+    return mean * _SCALES, slopes @ cov @ slopes.T * np.outer(_SCALES, _SCALES)
+
+
 def _spline_pieces(u: FloatArray) -> FloatArray:
     """(T - 1, 6) coefficients of the quintic spline through all inputs."""
     from scipy.interpolate import make_interp_spline
@@ -149,34 +194,36 @@ def _spline_pieces(u: FloatArray) -> FloatArray:
 
 
 @jit
-def _derivative(x, v, p, u, J, D):
-    """(x', x'') at a point, and into ``D`` the derivative of the sensitivities ``J`` (2, N_MOTION)."""
-    drive = u - p[4]
-    slope_x = -p[0] - 3.0 * p[3] * x * x
-    slope_v = -p[1] - 3.0 * p[5] * v * v
+def _derivative(z, v, p, u, J, D):
+    """(z', z'') at a point, and into ``D`` the derivative of the sensitivities ``J`` (2, N_MOTION)."""
+    k, c, g, b, f, e, y0 = p[0], p[1], p[2], p[3], p[4], p[5], p[6]
+    x = z - y0
+    slope_z = -k - 3.0 * b * x * x
+    slope_v = -c - 3.0 * e * v * v
     for j in range(N_MOTION):
         D[0, j] = J[1, j]
-        D[1, j] = slope_x * J[0, j] + slope_v * J[1, j]
-    D[1, 2] -= x
+        D[1, j] = slope_z * J[0, j] + slope_v * J[1, j]
+    D[1, 2] -= z
     D[1, 3] -= v
-    D[1, 4] += drive
+    D[1, 4] += u
     D[1, 5] -= x * x * x
-    D[1, 6] -= p[2]
+    D[1, 6] += 1.0
     D[1, 7] -= v * v * v
-    return v, p[2] * drive - p[1] * v - p[0] * x - p[3] * x * x * x - p[5] * v * v * v
+    D[1, 8] += 3.0 * b * x * x
+    return v, g * u + f - c * v - k * z - b * x * x * x - e * v * v * v
 
 
 @jit
-def flow(x, v, p, piece, substeps, J, work):
-    """Move (x, x') over one sample.
+def flow(z, v, p, piece, substeps, J, work):
+    """Move (z, z') over one sample.
 
     Args:
-        x: displacement [V].
+        z: displacement plus output offset [V].
         v: its change per sample [V].
-        p: (6,) parameters of the motion, per sample.
+        p: (7,) parameters of the motion k, c, g, b, f, e, y0, per sample.
         piece: (degree + 1,) the input's polynomial.
         substeps: Runge-Kutta steps.
-        J: (2, N_MOTION) receives the sensitivities of the result to x, v and p.
+        J: (2, N_MOTION) receives the sensitivities of the result to z, v and p.
         work: (3, 2, N_MOTION) memory.
     """
     D, trial, total = work[0], work[1], work[2]
@@ -187,28 +234,28 @@ def flow(x, v, p, piece, substeps, J, work):
         u0 = _polynomial(piece, s * h)
         u1 = _polynomial(piece, (s + 0.5) * h)
         u2 = _polynomial(piece, (s + 1.0) * h)
-        x1, v1 = _derivative(x, v, p, u0, J, D)
+        z1, v1 = _derivative(z, v, p, u0, J, D)
         for i in range(2):
             for j in range(N_MOTION):
                 total[i, j] = D[i, j]
                 trial[i, j] = J[i, j] + 0.5 * h * D[i, j]
-        x2, v2 = _derivative(x + 0.5 * h * x1, v + 0.5 * h * v1, p, u1, trial, D)
+        z2, v2 = _derivative(z + 0.5 * h * z1, v + 0.5 * h * v1, p, u1, trial, D)
         for i in range(2):
             for j in range(N_MOTION):
                 total[i, j] += 2.0 * D[i, j]
                 trial[i, j] = J[i, j] + 0.5 * h * D[i, j]
-        x3, v3 = _derivative(x + 0.5 * h * x2, v + 0.5 * h * v2, p, u1, trial, D)
+        z3, v3 = _derivative(z + 0.5 * h * z2, v + 0.5 * h * v2, p, u1, trial, D)
         for i in range(2):
             for j in range(N_MOTION):
                 total[i, j] += 2.0 * D[i, j]
                 trial[i, j] = J[i, j] + h * D[i, j]
-        x4, v4 = _derivative(x + h * x3, v + h * v3, p, u2, trial, D)
+        z4, v4 = _derivative(z + h * z3, v + h * v3, p, u2, trial, D)
         for i in range(2):
             for j in range(N_MOTION):
                 J[i, j] += h / 6.0 * (total[i, j] + D[i, j])
-        x += h / 6.0 * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
+        z += h / 6.0 * (z1 + 2.0 * z2 + 2.0 * z3 + z4)
         v += h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)
-    return x, v
+    return z, v
 
 
 @jit
@@ -224,7 +271,7 @@ def run_samples(mean, cov, noises, walk, pieces, u, y, moving, substeps, free_en
     """Update a joint belief with T samples.
 
     Args:
-        mean: (N_JOINT,) of (x, x', parameters), per sample; overwritten, as ``cov`` and ``noises``.
+        mean: (N_JOINT,) in the coordinates of `to_coordinates`; overwritten, as ``cov`` and ``noises``.
         cov: (N_JOINT, N_JOINT).
         noises: (4,) shapes and rates of q(γ) and q(ξ).
         walk: (K,) variances of the coefficients' random walk per sample.
@@ -243,17 +290,17 @@ def run_samples(mean, cov, noises, walk, pieces, u, y, moving, substeps, free_en
     work = np.empty((3, N_STATES, N_MOTION))
     gain = np.empty(N_JOINT)
     readout = np.zeros(N_JOINT)
-    readout[0] = readout[N_JOINT - 2] = 1.0
+    readout[0] = 1.0
     direction = NOISE_DIRECTION.copy()
     for t in range(len(y)):
         if moving or t > 0:
             moved[0], moved[1] = flow(
-                mean[0], mean[1], mean[N_STATES : N_STATES + 6], pieces[t], substeps, sensitivities, work
+                mean[0], mean[1], mean[N_STATES:N_MOTION], pieces[t], substeps, sensitivities, work
             )  # fmt: skip
             jacobian[:, :N_MOTION] = sensitivities
             joint.predict(mean, cov, moved, jacobian, walk, rows)
         readout[N_JOINT - 1] = u[t]
-        expected = mean[0] + mean[N_JOINT - 2] + mean[N_JOINT - 1] * u[t]
+        expected = mean[0] + mean[N_JOINT - 1] * u[t]
         forecasts[t, 0] = expected
         forecasts[t, 1] = joint.correct(
             mean, cov, readout, direction, y[t] - expected, noises, free_energies.shape[1], free_energies[t], gain
@@ -261,10 +308,10 @@ def run_samples(mean, cov, noises, walk, pieces, u, y, moving, substeps, free_en
 
 
 @kernel
-def simulate_samples(x, v, p, pieces, u, substeps, y):
-    """Free run from (x, v): the output (T,) after each of the pieces, into ``y``."""
+def simulate_samples(z, v, p, pieces, u, substeps, y):
+    """Free run from (z, z'): the output (T,) after each of the pieces, into ``y``."""
     sensitivities = np.empty((N_STATES, N_MOTION))
     work = np.empty((3, N_STATES, N_MOTION))
     for t in range(len(y)):
-        x, v = flow(x, v, p[:6], pieces[t], substeps, sensitivities, work)
-        y[t] = x + p[6] + p[7] * u[t]
+        z, v = flow(z, v, p[:-1], pieces[t], substeps, sensitivities, work)
+        y[t] = z + p[-1] * u[t]

@@ -222,9 +222,9 @@ def test_senseless_hyperparameters_are_refused(settings, message):
 
 
 def test_training_beats_signals_that_do_not_look(tmp_path):
-    """Clearly: on the same systems, 95 % intervals apart, from 400,000 samples on."""
+    """Clearly: on the same systems, 95 % intervals apart, after 600,000 samples."""
     ppo = PPOSettings(num_envs=256, n_steps=32, batch_size=2048, learning_rate=3e-3, hidden=(32,))
-    run = train(TrainConfig(steps=400_000, output=tmp_path / "run", torch_threads=1, ppo=ppo))
+    run = train(TrainConfig(steps=600_000, output=tmp_path / "run", torch_threads=1, ppo=ppo))
     learned, uniform, multisine = (
         summarise(evaluation)["log_posterior_gain"]
         for evaluation in evaluate([str(run.folder), "uniform", "silverbox-multisine"], systems=128, seed=1)

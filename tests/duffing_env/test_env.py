@@ -21,16 +21,16 @@ from estimator import Belief, PhysicalParameters, to_coefficients
 TRACK = "duffing_env/Amplitude-v0"
 FACTORISATIONS = ("structured", "mean_field")
 SHORT = {"horizon": 20}
-RESONANT = {"max_output": 0.2, "horizon": 64}  # random inputs end most episodes early
+TIGHT = {"max_output": 0.2, "horizon": 64}  # random inputs end most episodes early
 
 
 def random_actions(seed, steps=10_000):
     return np.random.default_rng(seed).uniform(-1, 1, (steps, 1)).astype(np.float32)
 
 
-def play(env, actions, seed=None, **reset):
+def play(env, actions, seed=None):
     """One episode: all that `reset` and `step` gave."""
-    told = [env.reset(seed=seed, **reset)]
+    told = [env.reset(seed=seed)]
     for action in actions:
         told.append(env.step(action))
         if told[-1][2] or told[-1][3]:
@@ -39,6 +39,7 @@ def play(env, actions, seed=None, **reset):
 
 
 def continue_with(env, actions):
+    """All the steps, and the resets after those that end an episode."""
     told = []
     for action in actions:
         told.append(env.step(action))
@@ -135,23 +136,23 @@ def test_the_first_observation_says_that_nothing_is_known_yet():
 
 @pytest.mark.parametrize("factorisation", FACTORISATIONS)
 def test_a_seed_repeats_a_whole_episode(factorisation):
-    env = DuffingEnv(factorisation=factorisation, **RESONANT)
+    env = DuffingEnv(factorisation=factorisation, **TIGHT)
     first = play(env, random_actions(0), seed=7)
     assert same(first, play(env, random_actions(0), seed=7))
-    assert same(first, play(DuffingEnv(factorisation=factorisation, **RESONANT), random_actions(0), seed=7))
+    assert same(first, play(DuffingEnv(factorisation=factorisation, **TIGHT), random_actions(0), seed=7))
     assert not same(first, play(env, random_actions(0), seed=8))
 
 
 def test_reset_without_a_seed_goes_on_and_differs():
     def three_episodes():
-        env = DuffingEnv(**RESONANT)
+        env = DuffingEnv(**TIGHT)
         return [play(env, random_actions(0), seed=seed) for seed in (3, None, None)]
 
     episodes = three_episodes()
     assert not same(episodes[0], episodes[1])
     assert not same(episodes[1], episodes[2])
     assert same(episodes, three_episodes())
-    unseeded = [play(DuffingEnv(**RESONANT), random_actions(0)) for _ in range(2)]
+    unseeded = [play(DuffingEnv(**TIGHT), random_actions(0)) for _ in range(2)]
     assert not same(*unseeded)
 
 
@@ -165,7 +166,7 @@ def test_a_generator_that_is_put_in_is_used_at_the_next_reset():
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_copies_made_within_an_episode_continue_alike_and_apart(copied):
-    env = gym.make(TRACK, **RESONANT)
+    env = gym.make(TRACK, **TIGHT)
     env.reset(seed=0)
     for action in random_actions(0, 5):
         env.step(action)
