@@ -205,33 +205,38 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
 
     def _infos(self, was_finished: Flags, finished: Flags) -> dict[str, Any]:
         """What is told of a step, by the rows that had finished before it and those that finished in it."""
-        if self._autoreset_mode == AutoresetMode.NEXT_STEP:
-            return self._step_infos(~was_finished) | self._endings(finished)
-        if self._autoreset_mode == AutoresetMode.DISABLED or not finished.any():
-            return self._step_infos(self._everywhere) | self._endings(finished)
+        infos = self._step_infos(~was_finished if self._autoreset_mode == AutoresetMode.NEXT_STEP else self._everywhere)
+        if not finished.any():
+            return infos
+        if self._autoreset_mode != AutoresetMode.SAME_STEP:
+            return infos | self._endings(finished)
+        final_infos = self._step_infos(finished)
+        for name in (*self.single._reported, *self.single._flags):
+            final_infos[name][~finished] = 0
+            infos[name][finished] = 0
+            infos[f"_{name}"][finished] = False
         final_observations = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(finished):
             final_observations[row] = self._batch.final_observations[row].copy()
-        return self._step_infos(~finished) | {
+        return infos | {
             "final_obs": final_observations,
             "_final_obs": finished.copy(),
-            "final_info": self._step_infos(finished) | self._endings(finished),
+            "final_info": final_infos | self._endings(finished),
             "_final_info": finished.copy(),
         }
 
     def _step_infos(self, mask: Flags) -> dict[str, Any]:
-        """What every step tells, of the rows in ``mask``; zero in the others."""
-        infos: dict[str, Any] = {name: self._batch.outcome(name).copy() for name in self.single._reported}
-        infos |= {name: self._batch.outcome(name) != 0.0 for name in self.single._flags}
-        if not mask.all():
-            for values in infos.values():
-                values[~mask] = 0
-        return infos | {f"_{name}": mask.copy() for name in infos}
+        infos: dict[str, Any] = {}
+        for name in self.single._reported:
+            infos[name] = self._batch.outcome(name).copy()
+            infos[f"_{name}"] = mask.copy()
+        for name in self.single._flags:
+            infos[name] = self._batch.outcome(name) != 0.0
+            infos[f"_{name}"] = mask.copy()
+        return infos
 
     def _endings(self, finished: Flags) -> dict[str, Any]:
-        """What the finished rows ended with; no keys where none did."""
-        if not finished.any():
-            return {}
+        """What the finished rows ended with."""
         same_step = self._autoreset_mode == AutoresetMode.SAME_STEP
         beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
         for row in np.flatnonzero(finished).tolist():

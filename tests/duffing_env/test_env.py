@@ -356,8 +356,8 @@ def test_structured_beliefs_are_calibrated_and_precise():
         deviation = np.array([psi.theta1, psi.theta2, psi.theta3, psi.eta]) - belief.coefficients_mean
         distances.append(deviation @ np.linalg.solve(belief.coefficients_cov, deviation))
         errors.append(abs(belief.physical()[0][0] / truth.m - 1))
-    assert 3.2 < np.mean(distances) < 5.2
-    assert np.median(errors) < 0.02
+    assert 3.2 < np.mean(distances) < 4.8
+    assert np.median(errors) < 0.003
 
 
 @pytest.mark.parametrize(
