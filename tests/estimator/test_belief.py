@@ -202,9 +202,14 @@ def test_a_prior_is_a_copy_that_nobody_can_change():
 
 
 def test_priors_and_beliefs_can_be_compared_and_kept_in_sets(belief):
-    # By identity: an array has no truth value, so that a comparison of fields would raise.
+    # Priors by identity, beliefs by their numbers; a comparison of arrays as fields would raise.
     assert len({prior(), prior(), belief}) == 3
     assert prior() != prior()
+    same = dataclasses.replace(belief)
+    assert same == belief
+    assert hash(same) == hash(belief)
+    assert dataclasses.replace(belief, record=belief.record + 1e-9) != belief
+    assert belief != "belief"
 
 
 LOPSIDED = np.array([[2e-10, 1e-10], [0.0, 3e-10]])
