@@ -137,6 +137,10 @@ class Prior:
             state_std: standard deviation of x_0 and x_{-1} [V].
             center: the oscillator in the middle of the range.
         """
+        if not 0 < spread < 1:
+            raise ValueError(
+                f"spread must be above 0 and below 1, but is {spread}; pass the range's relative half width"
+            )
         for name, value in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
             if not 0 < value < np.inf:
                 raise ValueError(f"{name} must be positive and finite, but is {value}; pass a standard deviation in V")

@@ -255,8 +255,8 @@ def test_prior_refuses(changes, message):
     [
         ({"process_noise": 0.0}, "process_noise must be positive and finite, but is 0.0; pass a standard deviation"),
         ({"measurement_noise": np.nan}, "measurement_noise must be positive and finite, but is nan"),
-        ({"spread": 1.0}, "spread must be in [0, 1), but is 1.0"),
-        ({"spread": 0.0}, "theta_cov must be positive definite"),
+        ({"spread": 1.0}, "spread must be above 0 and below 1, but is 1.0"),
+        ({"spread": 0.0}, "spread must be above 0 and below 1, but is 0.0"),
         ({"noise_shape": 0.0}, "gamma_shape must be positive, but is 0.0"),
         ({"state_std": 0.0}, "state_cov must be positive definite, but has eigenvalue 0.0"),
     ],
