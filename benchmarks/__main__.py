@@ -1,0 +1,143 @@
+"""Run the benchmarks: `make bench`, or ``python -m benchmarks --help``."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+from agents.cli import run_script
+from benchmarks.peer_process import Peers
+from benchmarks.report import Section, print_section, print_verdicts
+from estimator.files import write_atomically
+
+SectionName = Literal["estimators", "environments", "training", "roofline", "scaling", "startup"]
+_PACKAGES = ("duffing-env", "numpy", "numba", "llvmlite", "scipy", "gymnasium", "stable-baselines3", "torch")
+_SETTINGS = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Timed comparisons of the estimator, the environments and the training, with others and with the machine.
+
+    All rows of a section are timed in turns, in the same run. Needs about 15 minutes and a quiet machine.
+    """
+
+    sections: tuple[SectionName, ...] = ("estimators", "environments", "training", "roofline", "scaling", "startup")
+    """Parts to run."""
+    repetitions: int = 5
+    """Rounds; every row is run once in each. At least 5 for results to be quoted."""
+    peers: bool = True
+    """Install and run the packages to compare with, in .venv-peers."""
+    json: Path | None = None
+    """File for all values."""
+    figure: Path = Path("runs/benchmarks/scaling.png")
+    """File for the figure of the section scaling."""
+
+
+def main(config: Config) -> None:
+    """Run the sections, print each when it is finished, and the targets at the end."""
+    from rich.console import Console
+
+    if config.repetitions < 1:
+        raise ValueError(f"repetitions must be at least 1, but is {config.repetitions}; 5 is the least to quote")
+    started = time.perf_counter()
+    status = Console(stderr=True).status("Starting")
+    sections: dict[str, Section] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        samples = Path(folder) / "samples.npz"
+        with Peers(samples, config.peers) as peers:
+            machine = describe_machine()
+            versions = {"ours": {name: version(name) for name in _PACKAGES}, "peers": peers.versions()}
+            print_head(machine, versions, config.repetitions)
+            with status:
+                on_row: Callable[[str], None] = status.update
+                for name in config.sections:
+                    sections[name] = _run(name, config, peers, samples, on_row)
+                    print_section(sections[name])
+    print_verdicts(list(sections.values()))
+    print(f"\n{(time.perf_counter() - started) / 60:.1f} minutes; load at the end: {_load()}")
+    if config.json is not None:
+        content = {"machine": machine, "versions": versions, "repetitions": config.repetitions}
+        content["sections"] = {name: section.to_dict() for name, section in sections.items()}
+        write_atomically(config.json, json.dumps(content, indent=2))
+        print(config.json)
+
+
+def _run(name: str, config: Config, peers: Peers, samples: Path, on_row: Callable[[str], None]) -> Section:
+    """One section; its modules are imported only now, so that none of them weighs on the others' memory and threads."""
+    if name == "estimators":
+        from benchmarks import estimators
+
+        estimators.write_samples(samples)
+        return estimators.run(peers, config.repetitions, on_row)
+    if name == "environments":
+        from benchmarks import environments
+
+        return environments.run(peers, config.repetitions, on_row)
+    if name == "training":
+        from benchmarks import training
+
+        return training.run(config.repetitions, on_row)
+    if name == "roofline":
+        from benchmarks import roofline
+
+        return roofline.run(config.repetitions, on_row)
+    if name == "scaling":
+        from benchmarks import scaling
+
+        return scaling.run(config.repetitions, on_row, config.figure)
+    from benchmarks import startup
+
+    return startup.run(config.repetitions, on_row)
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor, cores, and the settings that a reader needs to repeat a run."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "processor": _processor(),
+        "cores": cores,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "load_before": _load(),
+        "settings": {name: os.environ[name] for name in _SETTINGS if name in os.environ},
+    }
+
+
+def print_head(machine: dict[str, Any], versions: dict[str, dict[str, str]], repetitions: int) -> None:
+    """Print the machine, the versions, and how to read what follows."""
+    settings = ", ".join(f"{name}={value}" for name, value in machine["settings"].items()) or "none set"
+    print(f"{machine['processor']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']}")
+    print(f"Load before: {machine['load_before']}. Thread settings: {settings}")
+    for name, found in versions.items():
+        print(f"{name}: " + (", ".join(f"{package} {number}" for package, number in found.items()) or "none"))
+    print(f"Median [minimum, maximum] of {repetitions} repetitions, all rows of a section in turns. Ratios of medians.")
+
+
+def _processor() -> str:
+    """The processor's name, as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or "unknown processor"
+    fields: dict[str, str] = {}
+    for line in lines:
+        key, _, value = line.partition(":")
+        fields.setdefault(key.strip(), value.strip())
+    return f"{fields.get('model name', 'unknown processor')} (family {fields.get('cpu family', '?')})"
+
+
+def _load() -> str:
+    return ", ".join(f"{load:.2f}" for load in os.getloadavg()) if hasattr(os, "getloadavg") else "unknown"
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__ or "")

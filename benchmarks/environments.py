@@ -1,0 +1,185 @@
+"""Section 2: environment steps per second, from one environment to thousands, beside environments without inference.
+
+An env-step is one environment's one step of its plant. The steps of ``NEXT_STEP`` autoreset that only start an episode
+are not counted, here or with the peers. Every run covers whole episodes, with their resets and endings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import SyncVectorEnv, VectorEnv
+
+import duffing_env  # noqa: F401  registers the tracks
+from benchmarks.peer_process import Peers
+from benchmarks.pieces import SAMPLES, EstimatorOnly, PlantOnly, play
+from benchmarks.report import Claim, Section, ratio
+from benchmarks.timing import Row, measure, timed
+from estimator.inference import DEFAULT_ITERATIONS
+from estimator.lanes import LANES
+
+TRACK = "duffing_env/Amplitude-v0"
+UNIT = "env-steps/s"
+SIZES = (1, 8, 64, 1024, 16384)
+SYNC_SIZES = (1, 8, 64, 1024)
+EPISODES = {TRACK: 256, "Pendulum-v1": 200, "CartPole-v1": 200}
+POLICY_THREADS = 2
+DRAWN_ACTIONS = 64
+TARGET_SIZE = 1024
+
+
+def run(peers: Peers, repetitions: int, on_row: Callable[[str], None]) -> Section:
+    """Time the environments."""
+    rows = _single_rows() + [row for size in SIZES for row in _batch_rows(size, peers)]
+    results = measure(rows, repetitions, on_row)
+    n = TARGET_SIZE
+    claims = []
+    for rule in ("structured", "mean field"):
+        ours = results[f"{n}: ours, {rule}, 2 threads"]
+        claims += [
+            Claim(f"ours, {rule}, 2 threads over EnvPool's Pendulum, 2 threads, at {n}",
+                  ratio(ours, results[f"{n}: EnvPool Pendulum, 2 threads"]), bar=8),
+            Claim(f"ours, {rule}, 2 threads over Gymnasium's CartPoleVectorEnv, at {n}",
+                  ratio(ours, results[f"{n}: Gymnasium CartPoleVectorEnv"])),
+            Claim(f"ours, {rule}, 2 threads over gymnax's Pendulum called from Python, at {n}",
+                  ratio(ours, results[f"{n}: gymnax Pendulum, calls"])),
+            Claim(f"ours, {rule}, 2 threads over Gymnasium's SyncVectorEnv of Pendulum, at {n}",
+                  ratio(ours, results[f"{n}: Gymnasium SyncVectorEnv Pendulum"])),
+            Claim(f"ours, {rule}, through gym.make over Gymnasium's Pendulum",
+                  ratio(results[f"single: ours, {rule}"], results["single: Gymnasium Pendulum"]), bar=0.6),
+        ]  # fmt: skip
+    notes = [
+        "structured: 3 iterations, mean field: 10. `ours` is the whole step through make_vec: plant, noise, inference, "
+        "reward, observation, autoreset, infos. `plant only` and `estimator only` are the compiled pieces on one "
+        "thread. SB3's policy is an untrained MlpPolicy (64, 64) that samples its actions, through agents' VecEnv.",
+        f"Up to {LANES} environments are one block, which one thread steps. SyncVectorEnv is left out at 16384: its "
+        "rate does not change from 8 environments on.",
+    ]
+    return Section("Environment steps", list(results.values()), claims, notes)
+
+
+def _single_rows() -> list[Row]:
+    return [
+        Row("single: Gymnasium Pendulum", UNIT, timed(_single(gym.make("Pendulum-v1")))),
+        *(
+            Row(f"single: ours, {rule.replace('_', ' ')}", UNIT, timed(_single(gym.make(TRACK, factorisation=rule))))
+            for rule in DEFAULT_ITERATIONS
+        ),
+    ]
+
+
+def _batch_rows(size: int, peers: Peers) -> list[Row]:
+    data = play(size)
+    plant = PlantOnly(size, data)
+    rows = [Row(f"{size}: plant only", UNIT, timed(_piece(plant, size)))]
+    for rule, iterations in DEFAULT_ITERATIONS.items():
+        name = rule.replace("_", " ")
+        alone = EstimatorOnly(data, rule == "structured", iterations)
+        rows.append(Row(f"{size}: estimator only, {name}", UNIT, timed(_piece(alone, size))))
+        for threads, title in ((1, f"{size}: ours, {name}, 1 thread"), (2, f"{size}: ours, {name}, 2 threads")):
+            if threads == 1 or size > LANES:
+                rows.append(Row(title, UNIT, timed(vector_steps(_make_ours(size, rule, threads), EPISODES[TRACK]))))
+    rows.append(Row(f"{size}: ours, structured, SB3 policy", UNIT, timed(_with_policy(size))))
+    if size in SYNC_SIZES:
+        sync = SyncVectorEnv([lambda: gym.make("Pendulum-v1")] * size)
+        one_by_one = timed(vector_steps(sync, EPISODES["Pendulum-v1"]))
+        rows.append(Row(f"{size}: Gymnasium SyncVectorEnv Pendulum", UNIT, one_by_one))
+    poles = gym.make_vec("CartPole-v1", num_envs=size, vectorization_mode="vector_entry_point")
+    rows.append(Row(f"{size}: Gymnasium CartPoleVectorEnv", UNIT, timed(vector_steps(poles, EPISODES["CartPole-v1"]))))
+    rows.append(peers.row(f"envpool {size}", f"{size}: EnvPool Pendulum, 2 threads", UNIT))
+    rows.append(peers.row(f"gymnax {size}", f"{size}: gymnax Pendulum, calls", UNIT))
+    rows.append(peers.row(f"gymnax-scan {size}", f"{size}: gymnax Pendulum, one call an episode", UNIT))
+    return rows
+
+
+def _make_ours(size: int, rule: str, threads: int) -> VectorEnv[Any, Any, Any]:
+    return gym.make_vec(
+        TRACK, num_envs=size, vectorization_mode="vector_entry_point", factorisation=rule, threads=threads
+    )
+
+
+def _single(env: gym.Env[Any, Any]) -> Callable[[int], float]:
+    """Episodes of one environment, actions given."""
+    low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
+    actions = np.random.default_rng(0).uniform(low, high, (DRAWN_ACTIONS, 1)).astype(np.float32)
+    env.reset(seed=1)
+
+    def action(count: int) -> float:
+        steps = 0
+        for _ in range(count):
+            env.reset()
+            ended = False
+            while not ended:
+                _, _, terminated, truncated, _ = env.step(actions[steps % DRAWN_ACTIONS])
+                steps += 1
+                ended = terminated or truncated
+        return steps
+
+    return action
+
+
+def vector_steps(envs: VectorEnv[Any, Any, Any], episode: int) -> Callable[[int], float]:
+    """Episodes of a vector environment with ``NEXT_STEP`` autoreset, actions given."""
+    rng = np.random.default_rng(0)
+    space = envs.single_action_space
+    if isinstance(space, gym.spaces.Discrete):
+        actions = rng.integers(0, int(space.n), (DRAWN_ACTIONS, envs.num_envs))
+    else:
+        assert isinstance(space, gym.spaces.Box)
+        actions = rng.uniform(space.low, space.high, (DRAWN_ACTIONS, envs.num_envs, 1)).astype(np.float32)
+    envs.reset(seed=1)
+
+    def action(count: int) -> float:
+        steps, resets = count * (episode + 1), 0
+        for t in range(steps):
+            _, _, terminated, truncated, _ = envs.step(actions[t % DRAWN_ACTIONS])
+            resets += int(np.count_nonzero(terminated) + np.count_nonzero(truncated))
+        return steps * envs.num_envs - resets
+
+    return action
+
+
+def _piece(piece: PlantOnly | EstimatorOnly, size: int) -> Callable[[int], float]:
+    def action(count: int) -> float:
+        for t in range(count * SAMPLES):
+            piece.step(t)
+        return count * SAMPLES * size
+
+    return action
+
+
+def _with_policy(size: int) -> Callable[[int], float]:
+    """A policy of Stable-Baselines3 in the loop, set up at the first run, because torch takes its time."""
+    loop: Callable[[int], float] | None = None
+
+    def action(count: int) -> float:
+        nonlocal loop
+        if loop is None:
+            loop = _policy_loop(size)
+        return loop(count)
+
+    return action
+
+
+def _policy_loop(size: int) -> Callable[[int], float]:
+    import torch
+    from stable_baselines3 import PPO
+
+    from agents.vec_env import DuffingVecEnv
+
+    torch.set_num_threads(POLICY_THREADS)
+    envs = DuffingVecEnv(TRACK, size, seed=1)
+    model = PPO("MlpPolicy", envs, device="cpu", n_steps=2, batch_size=2 * size, seed=1)
+    observations: Any = envs.reset()
+
+    def action(count: int) -> float:
+        nonlocal observations
+        for _ in range(count * EPISODES[TRACK]):
+            actions, _ = model.predict(observations)
+            observations, _, _, _ = envs.step(actions)
+        return count * EPISODES[TRACK] * size
+
+    return action

@@ -1,0 +1,107 @@
+"""Section 1: the estimator on the Silverbox record, beside the filters that people reach for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.peer_process import Peers
+from benchmarks.report import Claim, Section, ratio
+from benchmarks.timing import Row, measure, timed
+from duffing_env.silverbox import load_record, record_available, synthesise_multisine
+from estimator import NLARX, SILVERBOX_TWIN, OnlineEstimator, Prior, to_coefficients
+from estimator.parameters import FloatArray
+
+SAMPLES = 4096
+UNIT = "µs/sample"
+STRUCTURED, MEAN_FIELD = "ours, structured, 3 iterations", "ours, mean field, 10 iterations"
+PEERS = {"filterpy": "filterpy, UKF", "dynamax": "dynamax, EKF, compiled scan", "padasip": "padasip, RLS"}
+
+
+def samples() -> tuple[FloatArray, FloatArray, str]:
+    """Input and output [V], and where they are from: the record's multisine, or the twin under a synthesised one."""
+    if record_available():
+        regime = load_record().multisine
+        return regime.u[:SAMPLES], regime.y[:SAMPLES], f"first {SAMPLES:,} samples of the record's multisine"
+    rng = np.random.default_rng(0)
+    u = synthesise_multisine(rng, realisations=1)[:SAMPLES]
+    truth, acting = to_coefficients(SILVERBOX_TWIN), NLARX().delayed(u)
+    x = np.zeros(SAMPLES)
+    for t in range(2, SAMPLES):
+        x[t] = truth.theta1 * x[t - 1] + truth.theta2 * x[t - 1] ** 3 + truth.theta3 * x[t - 2] + truth.eta * acting[t]
+        x[t] += 5e-4 * rng.standard_normal()
+    y = x + 5e-4 * rng.standard_normal(SAMPLES)
+    return u, y, f"{SAMPLES:,} samples of the twin under a synthesised multisine (the record is not on this machine)"
+
+
+def write_samples(path: Path) -> None:
+    """What the peers' estimators get: the same samples, our prior, and its expected noises, which they do not learn."""
+    u, y, _ = samples()
+    prior = Prior.silverbox_twin()
+    cov = np.zeros((6, 6))
+    cov[:2, :2] = prior.state_cov
+    cov[2:, 2:] = prior.coefficients_cov
+    np.savez(
+        path,
+        acting=NLARX().delayed(u),
+        y=y,
+        mean=np.concatenate([prior.state_mean, prior.theta_mean, [prior.eta_mean]]),
+        cov=cov,
+        process_cov=np.diag([prior.gamma_rate / prior.gamma_shape, 0, 0, 0, 0, 0]),
+        measurement_cov=np.array([[prior.xi_rate / prior.xi_shape]]),
+    )
+
+
+def run(peers: Peers, repetitions: int, on_row: Callable[[str], None]) -> Section:
+    """Time the estimators, and give the error that each one's coefficients make, so that speed is bought knowingly."""
+    u, y, origin = samples()
+    coefficients: dict[str, Any] = {}
+    rows = [
+        Row(title, UNIT, timed(_passes(title, factorisation, u, y, coefficients)))
+        for title, factorisation in ((STRUCTURED, "structured"), (MEAN_FIELD, "mean_field"))
+    ]
+    rows += [peers.row(name, title, UNIT) for name, title in PEERS.items()]
+    results = measure(rows, repetitions, on_row)
+    coefficients.update({title: np.array(answer["coefficients"]) for title, answer in peers.answers.items()})
+    errors = {title: _errors(values, u, y) for title, values in coefficients.items()}
+    claims = [
+        Claim(f"time per sample: {other} over {ours}", ratio(results[other], results[ours]))
+        for other in PEERS.values()
+        for ours in (STRUCTURED, MEAN_FIELD)
+    ]
+    notes = [
+        f"On the {origin}; one system, sample by sample. All have the same four coefficients; the two Kalman filters "
+        f"have our prior and its expected noise variances.",
+        "RMSE of the coefficients they end with, on these samples [mV]:  one step ahead, free run",
+        *(f"  {title:<34} {one:9.3f} {free:9.2f}" for title, (one, free) in errors.items()),
+    ]
+    data = {"samples": origin, "rmse_mV": {title: {"one_step": e[0], "free_run": e[1]} for title, e in errors.items()}}
+    return Section("Estimators, one system", list(results.values()), claims, ["\n".join(notes)], data)
+
+
+def _passes(
+    title: str, factorisation: str, u: FloatArray, y: FloatArray, coefficients: dict[str, Any]
+) -> Callable[[int], float]:
+    prior = Prior.silverbox_twin()
+
+    def action(count: int) -> float:
+        for _ in range(count):
+            estimator = OnlineEstimator(prior=prior, factorisation=factorisation)
+            estimator.run(u, y)
+        coefficients[title] = estimator.belief.coefficients_mean
+        return count * len(u)
+
+    return action
+
+
+def _errors(coefficients: FloatArray, u: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """RMSE [mV] one step ahead, and in a free run."""
+    model = NLARX()
+    predicted = model.predict(coefficients, u, y)
+    simulated = model.simulate(coefficients, u, y[:2])
+    with np.errstate(over="ignore", invalid="ignore"):
+        one, free = (1e3 * float(np.sqrt(np.mean((series - y)[2:] ** 2))) for series in (predicted, simulated))
+    return one, free

@@ -1,0 +1,116 @@
+"""Section 4b: how the cost of an env-step grows with environments, iterations, horizon and threads; one figure."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from benchmarks.environments import TRACK, vector_steps
+from benchmarks.report import Claim, Section, ratio
+from benchmarks.timing import Result, Row, measure, timed
+from estimator.files import write_atomically
+from estimator.inference import DEFAULT_ITERATIONS
+
+UNIT = "ns/env-step"
+SIZE = 1024
+HORIZON = 256
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+AXES: dict[str, Sequence[int]] = {
+    "num_envs": (1, 4, 16, 64, 256, 1024, 4096, 16384),
+    "iterations": (1, 2, 3, 5, 10, 20),
+    "horizon": (16, 64, 256, 1024),
+    "threads": tuple(range(1, CORES + 1)),
+}
+LABELS = {
+    "num_envs": "environments",
+    "iterations": "iterations",
+    "horizon": "samples of an episode",
+    "threads": "threads",
+}
+_COLOURS = {"structured": "#0072b2", "mean_field": "#d55e00"}
+
+
+def run(repetitions: int, on_row: Callable[[str], None], figure: Path) -> Section:
+    """Time whole steps through ``make_vec`` along each axis, others at their defaults, and draw the figure."""
+    rows = [
+        Row(_name(axis, value, rule), UNIT, _later(axis, value, rule), at_least=0.1)
+        for axis, values in AXES.items()
+        for value in values
+        for rule in DEFAULT_ITERATIONS
+    ]
+    results = measure(rows, repetitions, on_row)
+    draw(results, figure)
+    claims = [
+        Claim(f"cost of an env-step, {rule.replace('_', ' ')}: {text}", ratio(results[first], results[last]))
+        for rule in DEFAULT_ITERATIONS
+        for text, first, last in (
+            (f"1 thread over {CORES}, at {SIZE}", _name("threads", 1, rule), _name("threads", CORES, rule)),
+            ("20 iterations over 1", _name("iterations", 20, rule), _name("iterations", 1, rule)),
+            ("at 16384 over at 1024", _name("num_envs", 16384, rule), _name("num_envs", 1024, rule)),
+        )
+    ]
+    notes = [
+        f"Through make_vec; {SIZE} environments, one thread, {HORIZON} samples, 3 or 10 iterations, where an axis does "
+        "not say otherwise. The ends of episodes, where beliefs are handed out, are in."
+    ]
+    return Section("Scaling", list(results.values()), claims, notes)
+
+
+def _name(axis: str, value: int, rule: str) -> str:
+    return f"{LABELS[axis]} {value}, {rule.replace('_', ' ')}"
+
+
+def _later(axis: str, value: int, rule: str) -> Callable[[int], tuple[float, float]]:
+    """A row's run that makes its environments when it is first called."""
+    loop: Callable[[int], tuple[float, float]] | None = None
+
+    def run(count: int) -> tuple[float, float]:
+        nonlocal loop
+        if loop is None:
+            options: dict[str, Any] = {"num_envs": SIZE, "horizon": HORIZON, axis: value}
+            envs = gym.make_vec(TRACK, vectorization_mode="vector_entry_point", factorisation=rule, **options)
+            loop = timed(vector_steps(envs, options["horizon"]))
+        return loop(count)
+
+    return run
+
+
+def draw(results: dict[str, Result], path: Path) -> None:
+    """One panel per axis: median cost, with a band from minimum to maximum."""
+    import io
+
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure((10, 6.4), layout="constrained", dpi=120)
+    FigureCanvasAgg(figure)
+    for panel, (axis, values) in zip(figure.subplots(2, 2).flat, AXES.items(), strict=True):
+        for rule, colour in _COLOURS.items():
+            found = [(value, results[_name(axis, value, rule)]) for value in values]
+            found = [(value, result) for value, result in found if result.values]
+            x = [value for value, _ in found]
+            panel.fill_between(
+                x, [min(r.values) for _, r in found], [max(r.values) for _, r in found], color=colour, alpha=0.2, lw=0
+            )
+            panel.plot(x, [r.median for _, r in found], "o-", color=colour, ms=4, label=rule.replace("_", " "))
+        if axis == "threads":
+            panel.set_xticks(values)
+        else:
+            panel.set_xscale("log", base=2)
+            panel.set_xticks(values, [f"{value:,}" for value in values])
+        panel.minorticks_off()
+        if axis == "num_envs":
+            panel.set_yscale("log")
+        else:
+            panel.set_ylim(0, None)
+        panel.set_xlabel(LABELS[axis])
+        panel.set_ylabel("ns per env-step")
+        panel.grid(alpha=0.3)
+        panel.legend()
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    write_atomically(path, buffer.getvalue())

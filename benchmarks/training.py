@@ -1,0 +1,167 @@
+"""Section 3: the whole loop of PPO, and the time from starting ``train.py`` to a useful policy.
+
+Useful: the 95 % interval of its log posterior gain over 256 systems lies above that of every fixed excitation.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation import evaluate
+from agents.leaderboard import BASELINES, summarise
+from agents.policies.learned import CARD
+from agents.training import PPOSettings, TrainConfig
+from benchmarks.peer_process import ROOT
+from benchmarks.report import Claim, Section, ratio
+from benchmarks.timing import Row, measure
+
+TRACK = TrainConfig.env
+SYSTEMS = 256
+METRIC = "log_posterior_gain"
+CHECKPOINTS = 50
+ENOUGH = 1_500_000
+PATIENCE = 120.0
+TARGET_SECONDS = 60.0
+OURS = "ours, train.py's settings"
+DEFAULTS = {1: "SB3's defaults, DummyVecEnv of 1", 8: "SB3's defaults, DummyVecEnv of 8"}
+USEFUL = "from starting train.py to a useful policy"
+
+
+def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
+    """Time the loops, then train."""
+    rows = [Row(OURS, "env-steps/s", _loop(_our_model))]
+    rows += [Row(name, "env-steps/s", _loop(partial(_default_model, n))) for n, name in DEFAULTS.items()]
+    results = measure(rows, repetitions, on_row)
+    reached: list[dict[str, float]] = []
+    bars = _bars()
+    seeds = iter(range(repetitions))
+    training = measure(
+        [Row(USEFUL, "s", lambda _: (_time_to_useful(next(seeds), max(bars.values()), reached), 1), at_least=0)],
+        repetitions,
+        on_row,
+    )
+    fastest = max((results[name] for name in DEFAULTS.values()), key=lambda r: -1 if math.isnan(r.median) else r.median)
+    claims = [
+        Claim(f"PPO's whole loop: ours over {fastest.name}", ratio(results[OURS], fastest), bar=15),
+        Claim(f"{USEFUL}, compilation included", training[USEFUL].median, bar=TARGET_SECONDS, at_most=True, unit="s"),
+    ]
+    found = ", ".join(f"{r['samples'] / 1e6:.1f} M samples: [{r['low']:.2f}, {r['high']:.2f}]" for r in reached)
+    notes = [
+        "Loop: roll-outs, updates and everything between, of PPO.learn after its first round; all on torch's default "
+        f"threads. Ours: {PPOSettings().num_envs} environments x {PPOSettings().n_steps} samples an update, batches of "
+        f"{PPOSettings().batch_size}, {PPOSettings().n_epochs} epochs. SB3's: 2048 samples of each environment, "
+        "batches of 64, 10 epochs; seeds its hyperparameters alone, not their merit.",
+        f"Useful: a checkpoint (every {TrainConfig.steps // CHECKPOINTS:,} samples) whose {METRIC.replace('_', ' ')} "
+        f"over {SYSTEMS} systems has its 95 % interval above those of all fixed excitations, whose upper ends are "
+        + ", ".join(f"{name} {high:.2f}" for name, high in bars.items())
+        + f" nat. Each run has another seed and an empty cache of compiled code. Reached at {found}.",
+    ]
+    return Section(
+        "Training", [*results.values(), *training.values()], claims, notes, {"bars": bars, "reached": reached}
+    )
+
+
+def _loop(make: Callable[[], Any]) -> Callable[[int], tuple[float, float]]:
+    """Rounds of roll-out and update of a model that is made at the first call."""
+    model: Any = None
+
+    def run(count: int) -> tuple[float, float]:
+        nonlocal model
+        if model is None:
+            model = make()
+        before = model.num_timesteps
+        started = time.perf_counter()
+        model.learn(count * model.n_steps * model.n_envs, reset_num_timesteps=False)
+        return time.perf_counter() - started, model.num_timesteps - before
+
+    return run
+
+
+def _our_model() -> Any:
+    from stable_baselines3 import PPO
+
+    from agents.vec_env import DuffingVecEnv
+
+    ppo = PPOSettings()
+    return PPO(
+        "MlpPolicy",
+        DuffingVecEnv(TRACK, ppo.num_envs, seed=0),
+        n_steps=ppo.n_steps,
+        batch_size=ppo.batch_size,
+        n_epochs=ppo.n_epochs,
+        learning_rate=ppo.learning_rate,
+        gamma=ppo.gamma,
+        gae_lambda=ppo.gae_lambda,
+        policy_kwargs={"net_arch": list(ppo.hidden), "log_std_init": ppo.log_std_init},
+        stats_window_size=ppo.num_envs,
+        seed=0,
+        device="cpu",
+    )
+
+
+def _default_model(num_envs: int) -> Any:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+
+    return PPO("MlpPolicy", make_vec_env(TRACK, n_envs=num_envs, seed=0), seed=0)
+
+
+def _bars() -> dict[str, float]:
+    """Upper end of each fixed excitation's interval."""
+    return {e.policy: float(summarise(e)[METRIC]["high"]) for e in evaluate(BASELINES, TRACK, SYSTEMS)}
+
+
+def _time_to_useful(seed: int, bar: float, reached: list[dict[str, float]]) -> float:
+    """Run ``train.py``, then evaluate its checkpoints in order; seconds until the first useful one was on disk."""
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "run"
+        started = time.time()
+        for checkpoint in _train_a_while(output, seed, Path(folder) / "cache"):
+            interval = summarise(evaluate([str(checkpoint)], TRACK, SYSTEMS)[0])[METRIC]
+            if float(interval["low"]) > bar:
+                low, high = float(interval["low"]), float(interval["high"])
+                reached.append({"samples": float(checkpoint.name), "low": low, "high": high})
+                return (checkpoint / CARD).stat().st_mtime - started
+    raise RuntimeError(f"seed {seed} is not useful after {ENOUGH:,} samples or {PATIENCE:.0f} s")
+
+
+def _train_a_while(output: Path, seed: int, cache: Path) -> list[Path]:
+    """Run ``train.py`` as it is, up to a checkpoint that must be useful; the checkpoints so far, in order.
+
+    Its schedule is that of a whole run, of which this is the beginning.
+    """
+    command = [
+        sys.executable,
+        "train.py",
+        "--output",
+        str(output),
+        "--seed",
+        str(seed),
+        "--checkpoints",
+        str(CHECKPOINTS),
+    ]
+    with open(output.with_suffix(".log"), "w+") as log:
+        process = subprocess.Popen(
+            command, cwd=ROOT, env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, stdout=log, stderr=log
+        )
+        deadline = time.monotonic() + PATIENCE
+        found: list[Path] = []
+        while process.poll() is None and time.monotonic() < deadline and (not found or int(found[-1].name) < ENOUGH):
+            time.sleep(0.2)
+            found = sorted(card.parent for card in output.glob(f"checkpoints/*/{CARD}"))
+        if process.poll() is None:
+            process.terminate()
+        elif process.returncode:
+            log.seek(0)
+            raise RuntimeError((log.read().strip().splitlines() or ["train.py failed and says nothing"])[-1])
+        process.wait()
+    return found

@@ -1,0 +1,71 @@
+import platform
+
+import pytest
+
+from benchmarks.assembly import NotCounted, Operations, count, count_text
+from benchmarks.roofline import divide, move, multiply_add, take_root
+from estimator.lanes import lanewise, rows
+
+on_x86 = pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="counts x86-64 assembly")
+
+UNROLLED_TWICE = """
+        vmovupd (%rdi,%rax,8), %zmm0
+        vmulpd  256(%rdi,%rax,8), %zmm0, %zmm1
+        vfmadd213pd     512(%rdi,%rax,8), %zmm0, %zmm1
+        vmovupd %zmm1, 768(%rdi,%rax,8) {%k1}
+        vmovups %zmm1, 64(%rsp)
+        vmovupd 64(%rdi,%rax,8), %zmm2
+        vmulpd  320(%rdi,%rax,8), %zmm2, %zmm3
+        vfmadd213pd     576(%rdi,%rax,8), %zmm2, %zmm3
+        vdivpd  %zmm3, %zmm2, %zmm4
+        vsqrtpd %zmm4, %zmm4
+        vmovupd %zmm3, 832(%rdi,%rax,8)
+        vpaddq  %zmm3, %zmm3, %zmm4
+        addq    $128, %rax
+        jne     .LBB0_1
+"""
+
+
+def test_text_is_counted_per_pass() -> None:
+    counted = count_text(UNROLLED_TWICE, outputs=1)
+    assert counted == Operations(
+        simple=1, fused=1, divisions=0.5, roots=0.5, loads=3, stores=1.5, vector_bits=512
+    )  # fmt: skip
+    assert counted.flops == 4
+
+
+def test_scalar_code_is_not_taken_for_vectors() -> None:
+    with pytest.raises(NotCounted, match="not vectorised"):
+        count_text("\tvmulsd\t(%rdi), %xmm0, %xmm0\n\tvmovsd\t%xmm0, 8(%rdi)\n", outputs=1)
+
+
+def test_text_without_stores_is_refused() -> None:
+    with pytest.raises(NotCounted, match="passes are not clear"):
+        count_text("\tvmulpd\t%zmm0, %zmm0, %zmm0\n", outputs=1)
+
+
+@on_x86
+def test_a_function_has_the_operations_that_one_counts_by_hand() -> None:
+    @lanewise(rows("a b c d"), "c d", uniform="x")
+    def example(a, b, x):
+        product = a * b + x
+        return product / (a - b), product * product
+
+    counted = count(example)
+    assert (counted.simple, counted.fused, counted.divisions, counted.roots) == (2, 1, 1, 0)
+    assert counted.flops == 5
+    assert (counted.loads, counted.stores) == (2, 2)
+
+
+@on_x86
+def test_the_yardsticks_do_what_they_say() -> None:
+    assert (count(multiply_add).fused, count(multiply_add).flops) == (64, 128)
+    assert (count(divide).divisions, count(divide).flops) == (4, 4)
+    assert (count(take_root).roots, count(take_root).flops) == (4, 4)
+    assert (count(move).loads, count(move).stores) == (4, 4)
+
+
+def test_operations_add_and_multiply() -> None:
+    total = Operations(simple=1, fused=2, divisions=3, vector_bits=256) * 3 + Operations(roots=1, vector_bits=512)
+    assert total == Operations(simple=3, fused=6, divisions=9, roots=1, vector_bits=512)
+    assert total.flops == 3 + 12 + 9 + 1

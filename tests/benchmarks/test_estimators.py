@@ -1,0 +1,46 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import estimators
+from duffing_env.silverbox import SilverboxRecord
+from estimator import NLARX, SILVERBOX_TWIN, OnlineEstimator, to_coefficients
+
+
+def test_the_record_is_used_where_it_is(record: SilverboxRecord) -> None:
+    u, y, origin = estimators.samples()
+    np.testing.assert_array_equal(y, record.multisine.y[: estimators.SAMPLES])
+    assert "record" in origin
+    assert len(u) == estimators.SAMPLES
+
+
+def test_without_the_record_the_twin_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimators, "record_available", lambda: False)
+    u, y, origin = estimators.samples()
+    assert "synthesised" in origin
+    estimator = OnlineEstimator()
+    estimator.run(u, y)
+    truth = to_coefficients(SILVERBOX_TWIN)
+    assert estimator.belief.eta_mean == pytest.approx(truth.eta, rel=0.02)
+
+
+def test_peers_get_the_inputs_that_act_on_each_output(tmp_path: Path) -> None:
+    estimators.write_samples(tmp_path / "samples.npz")
+    u, y, _ = estimators.samples()
+    with np.load(tmp_path / "samples.npz") as given:
+        np.testing.assert_array_equal(given["acting"][1:], u[:-1])
+        np.testing.assert_array_equal(given["y"], y)
+        assert given["cov"].shape == (6, 6)
+        assert np.linalg.eigvalsh(given["cov"])[0] > 0
+
+
+def test_errors_are_in_millivolts() -> None:
+    truth = to_coefficients(SILVERBOX_TWIN)
+    coefficients = np.array([truth.theta1, truth.theta2, truth.theta3, truth.eta])
+    u = np.random.default_rng(0).uniform(-0.1, 0.1, 500)
+    y = NLARX().simulate(coefficients, u, np.zeros(2))
+    assert estimators._errors(coefficients, u, y) == pytest.approx((0.0, 0.0), abs=1e-9)
+    one_step, _ = estimators._errors(coefficients, u, y + np.where(np.arange(500) == 400, 1e-3, 0.0))
+    weights = 1 + (truth.theta1 + 3 * truth.theta2 * y[400] ** 2) ** 2 + truth.theta3**2
+    assert one_step == pytest.approx(np.sqrt(weights / 498), rel=1e-2)

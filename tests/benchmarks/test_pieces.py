@@ -1,0 +1,39 @@
+"""What is timed apart must be what the environment and the estimator do."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from benchmarks.environments import TRACK, vector_steps
+from benchmarks.pieces import NOISE, SAMPLES, EstimatorOnly, play
+from estimator import NLARX, SILVERBOX_TWIN, OnlineEstimator, Prior, to_coefficients
+from estimator.lanes import LANES
+from estimator.record import RECORD_SIZE
+
+
+@pytest.mark.parametrize(("factorisation", "iterations"), [("structured", 3), ("mean_field", 10)])
+def test_the_estimator_alone_is_the_estimator(factorisation: str, iterations: int) -> None:
+    data = play(LANES + 1)
+    alone = EstimatorOnly(data, factorisation == "structured", iterations)
+    for t in range(SAMPLES):
+        alone.step(t)
+    lane, row = 5, LANES + 5
+    reference = OnlineEstimator(NLARX(input_delay=0), Prior.silverbox_twin(), factorisation)
+    reference.run(data.inputs[:, row], data.outputs[:, row])
+    record = alone._blocks[1].reshape(-1, LANES)[:RECORD_SIZE, lane]
+    np.testing.assert_allclose(record, reference.belief.record, rtol=1e-9, atol=1e-15)
+
+
+def test_the_plant_alone_is_the_twin() -> None:
+    data = play(1)
+    truth = to_coefficients(SILVERBOX_TWIN)
+    x, last, u = data.outputs[1:-1], data.outputs[:-2], data.inputs[2:]
+    residual = data.outputs[2:] - (truth.theta1 * x + truth.theta2 * x**3 + truth.theta3 * last + truth.eta * u)
+    # The process noise, and three measurement noises with their weights.
+    expected = NOISE * np.sqrt(1 + 1 + truth.theta1**2 + truth.theta3**2)
+    assert np.std(residual) == pytest.approx(expected, rel=0.1)
+
+
+def test_steps_that_only_start_an_episode_are_not_counted() -> None:
+    envs = gym.make_vec(TRACK, num_envs=3, vectorization_mode="vector_entry_point", horizon=10)
+    assert vector_steps(envs, episode=10)(2) == 2 * 10 * 3
