@@ -79,8 +79,9 @@ class TrainConfig:
     """Run folder; runs/ppo-TRACK-SEED where it is not given, with a number where that exists."""
     checkpoints: int = 5
     """Checkpoints over the run, evenly spaced."""
-    torch_threads: int = 2
-    """Threads of torch. The policy depends on it in the last digits."""
+    torch_threads: int = 1
+    """Threads of torch. A second one gains a tenth on an idle machine, and loses nine tenths on a busy one, where the
+    threads wait for each other. The policy depends on it in the last digits."""
     ppo: PPOSettings = field(default_factory=PPOSettings)
     """Hyperparameters of PPO."""
 
