@@ -80,8 +80,7 @@ class TrainConfig:
     checkpoints: int = 5
     """Checkpoints over the run, evenly spaced."""
     torch_threads: int = 1
-    """Threads of torch. A second one gains a tenth on an idle machine, and loses nine tenths on a busy one, where the
-    threads wait for each other. The policy depends on it in the last digits."""
+    """Threads of torch; the policy depends on it in the last digits. More gain little, and lose much on a busy machine."""
     ppo: PPOSettings = field(default_factory=PPOSettings)
     """Hyperparameters of PPO."""
 

@@ -283,6 +283,6 @@ def test_unknown_name_is_refused_with_the_names_and_the_nearest():
 
 def test_a_path_loads_the_trained_policy(tmp_path, monkeypatch):
     learned = ModuleType("agents.policies.learned")
-    learned.load_policy = lambda path: ("loaded", Path(path))
+    learned.load_policy = lambda path, seed: ("loaded", Path(path), seed)
     monkeypatch.setitem(sys.modules, "agents.policies.learned", learned)
-    assert make_policy(str(tmp_path)) == ("loaded", tmp_path)
+    assert make_policy(str(tmp_path), seed=3) == ("loaded", tmp_path, 3)
