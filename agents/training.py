@@ -80,7 +80,7 @@ class TrainConfig:
     checkpoints: int = 5
     """Checkpoints over the run, evenly spaced."""
     torch_threads: int = 1
-    """Threads of torch; the policy depends on it in the last digits. More gain little, and lose much on a busy machine."""
+    """Threads of torch; it moves the last digits. More than one gain little, and lose much on a busy machine."""
     ppo: PPOSettings = field(default_factory=PPOSettings)
     """Hyperparameters of PPO."""
 
