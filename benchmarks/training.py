@@ -31,6 +31,8 @@ CHECKPOINTS = 50
 ENOUGH = 1_500_000
 PATIENCE = 120.0
 TARGET_SECONDS = 60.0
+#: Torch's own number of threads: one for each core.
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 OURS = "ours, train.py's settings"
 DEFAULTS = {1: "SB3's defaults, DummyVecEnv of 1", 8: "SB3's defaults, DummyVecEnv of 8"}
 USEFUL = "from starting train.py to a useful policy"
@@ -38,8 +40,8 @@ USEFUL = "from starting train.py to a useful policy"
 
 def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
     """Time the loops, then train."""
-    rows = [Row(OURS, "env-steps/s", _loop(_our_model))]
-    rows += [Row(name, "env-steps/s", _loop(partial(_default_model, n))) for n, name in DEFAULTS.items()]
+    rows = [Row(OURS, "env-steps/s", _loop(_our_model, TrainConfig.torch_threads))]
+    rows += [Row(name, "env-steps/s", _loop(partial(_default_model, n), CORES)) for n, name in DEFAULTS.items()]
     results = measure(rows, repetitions, on_row)
     reached: list[dict[str, float]] = []
     bars = _bars()
@@ -56,10 +58,10 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
     ]
     found = ", ".join(f"{r['samples'] / 1e6:.1f} M samples: [{r['low']:.2f}, {r['high']:.2f}]" for r in reached)
     notes = [
-        "Loop: roll-outs, updates and everything between, of PPO.learn after its first round; all on torch's default "
-        f"threads. Ours: {PPOSettings().num_envs} environments x {PPOSettings().n_steps} samples an update, batches of "
-        f"{PPOSettings().batch_size}, {PPOSettings().n_epochs} epochs. SB3's: 2048 samples of each environment, "
-        "batches of 64, 10 epochs; seeds its hyperparameters alone, not their merit.",
+        "Loop: roll-outs, updates and everything between, of PPO.learn after its first round. Ours: "
+        f"{PPOSettings().num_envs} environments x {PPOSettings().n_steps} samples an update, batches of "
+        f"{PPOSettings().batch_size}, {PPOSettings().n_epochs} epochs, {TrainConfig.torch_threads} thread of torch. "
+        f"SB3's: 2048 samples of each environment, batches of 64, 10 epochs, {CORES} threads.",
         f"Useful: a checkpoint (every {TrainConfig.steps // CHECKPOINTS:,} samples) whose {METRIC.replace('_', ' ')} "
         f"over {SYSTEMS} systems has its 95 % interval above those of all fixed excitations, whose upper ends are "
         + ", ".join(f"{name} {high:.2f}" for name, high in bars.items())
@@ -70,12 +72,15 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
     )
 
 
-def _loop(make: Callable[[], Any]) -> Callable[[int], tuple[float, float]]:
-    """Rounds of roll-out and update of a model that is made at the first call."""
+def _loop(make: Callable[[], Any], threads: int) -> Callable[[int], tuple[float, float]]:
+    """Rounds of roll-out and update of a model that is made at the first call, on as many threads of torch."""
     model: Any = None
 
     def run(count: int) -> tuple[float, float]:
+        import torch
+
         nonlocal model
+        torch.set_num_threads(threads)
         if model is None:
             model = make()
         before = model.num_timesteps
