@@ -19,8 +19,6 @@ from dataclasses import dataclass, field
 import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
-from scipy.special import expit
 
 from estimator.checks import series
 from estimator.parameters import FloatArray
@@ -118,6 +116,8 @@ class PEMNARX:
         Raises:
             ValueError: If u or y is not a finite series, they differ in length, are too short, or do not vary.
         """
+        from scipy.optimize import least_squares
+
         u, y = _pair(u, y)
         n_parameters = 4 + 5 * self.units
         if len(y) - 2 <= n_parameters:
@@ -216,15 +216,22 @@ class PEMNARX:
 def network(parameters: FloatArray, z: FloatArray) -> FloatArray:
     """Outputs f (N,) of the network at N centred regressors z = r - r0 (N, 3)."""
     linear, offset, amplitude, bias, direction = _split(parameters)
-    return z @ linear + offset + expit(z @ direction + bias) @ amplitude
+    return z @ linear + offset + _unit(z @ direction + bias) @ amplitude
 
 
 def network_jacobian(parameters: FloatArray, z: FloatArray) -> FloatArray:
     """Derivatives (N, 4 + 5K) of `network` with respect to its parameters."""
     _, _, amplitude, bias, direction = _split(parameters)
-    unit = expit(z @ direction + bias)
+    unit = _unit(z @ direction + bias)
     slope = amplitude * unit * (1 - unit)
     return np.hstack([z, np.ones((len(z), 1)), unit, slope, *(z[:, i : i + 1] * slope for i in range(3))])
+
+
+def _unit(z: FloatArray) -> FloatArray:
+    """The sigmoid 1 / (1 + exp(-z)) of a unit."""
+    from scipy.special import expit
+
+    return np.asarray(expit(z))
 
 
 def _split(parameters: FloatArray) -> tuple[FloatArray, np.float64, FloatArray, FloatArray, FloatArray]:
