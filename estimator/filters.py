@@ -11,7 +11,7 @@ import numpy as np
 
 from estimator.belief import Belief, Prior
 from estimator.gaussian import JointBelief
-from estimator.inference import update
+from estimator.inference import update, walk
 from estimator.lanes import LANES, kernel
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE, from_coordinates, run_samples, simulate_samples, to_coordinates
@@ -79,11 +79,15 @@ class Filter(Protocol):
 class NLARXFilter:
     """Memory for `NLARX`: a block whose lanes all hold the same belief, and the last input."""
 
-    def __init__(self, model: NLARX, prior: Prior, factorisation: str, as_published: bool) -> None:
+    def __init__(self, model: NLARX, prior: Prior, factorisation: str, as_published: bool, drift: float) -> None:
         self.model = model
         self._factorisation = factorisation
         self._as_published = as_published
         self._prior_record = prior.to_record(factorisation=factorisation, nonlinear=model.nonlinear)
+        assert prior.coefficients_cov is not None
+        self._walk = drift**2 * np.diag(prior.coefficients_cov)
+        if not model.nonlinear:
+            self._walk[1] = 0.0
         self._last_input = 0.0
         self._block = np.zeros((N_ROWS, LANES))
         self._block[:RECORD_SIZE] = self._prior_record[:, None]
@@ -100,7 +104,9 @@ class NLARXFilter:
         if self.model.input_delay:
             acting = np.concatenate(([self._last_input], u[:-1]))
         structured = self._factorisation == "structured"
-        _run_nlarx(self._block.reshape(-1), acting, y, structured, self._as_published, free_energies, forecasts)
+        _run_nlarx(
+            self._block.reshape(-1), acting, y, self._walk, structured, self._as_published, free_energies, forecasts
+        )  # fmt: skip
         self._last_input = float(u[-1])
         return len(u)
 
@@ -112,12 +118,18 @@ class NLARXFilter:
     def arrays(self) -> dict[str, FloatArray]:
         """Everything that the future depends on."""
         last_input = np.array(self._last_input)
-        return {"record": self._block[:RECORD_SIZE, 0], "prior_record": self._prior_record, "last_input": last_input}
+        return {
+            "record": self._block[:RECORD_SIZE, 0],
+            "prior_record": self._prior_record,
+            "walk": self._walk,
+            "last_input": last_input,
+        }
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
         """Become another filter."""
         self._block[:RECORD_SIZE] = arrays["record"][:, None]
         self._prior_record = arrays["prior_record"]
+        self._walk = arrays["walk"]
         self._last_input = float(arrays["last_input"])
 
     @property
@@ -331,9 +343,12 @@ class RegressorFilter(JointFilter):
 
 
 @kernel
-def _run_nlarx(W, u, y, is_structured, as_published, free_energies, forecasts):
+def _run_nlarx(W, u, y, variances, is_structured, as_published, free_energies, forecasts):
     """Update lane 0 with every sample. The other lanes do the same work, so that none of them runs wild."""
+    changes = variances.max() > 0.0
     for t in range(len(u)):
+        if changes:
+            walk(W, variances[0], variances[1], variances[2], variances[3])
         for j in range(LANES):
             W[_U * LANES + j] = u[t]
             W[_Y * LANES + j] = y[t]

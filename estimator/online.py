@@ -35,9 +35,8 @@ class OnlineEstimator:
         factorisation: ``structured`` (states and coefficients jointly Gaussian) or ``mean_field`` (the paper's).
         iterations: variational iterations per sample; 3 structured, 10 mean field where it is not given.
         as_published: mean field with the two departures of the published run, to reproduce its numbers.
-        drift: lets the coefficients of a `JointBelief` walk at random, to follow a system that changes: standard
-            deviation of a coefficient's step per sample, in parts of that of its prior. 0.01 forgets in some hundred
-            samples.
+        drift: lets the coefficients walk at random, to follow a system that changes: standard deviation of a
+            coefficient's step per sample, in parts of that of its prior. 0.01 forgets in some hundred samples.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -86,6 +85,8 @@ class OnlineEstimator:
         self.drift = float(drift)
         if not 0 <= self.drift < np.inf:
             raise ValueError(f"drift must be at least 0 and finite, but is {drift!r}; 0 is a system that stays")
+        if self.drift and factorisation == "mean_field":
+            raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {drift!r}; use structured")
         self._filter = self._make_filter(prior)
         self._free_energies = np.full(self.iterations, np.nan)
         self._forecasts = np.empty((0, 2))
@@ -104,12 +105,10 @@ class OnlineEstimator:
             if isinstance(self.model, DuffingODE):
                 return ODEFilter(self.model, prior, self.drift)
             return RegressorFilter(self.model, prior, self.drift)
-        if self.drift:
-            raise ValueError(f"drift must be 0 for regressors='paper', but is {self.drift}; {_AS_TERMS}")
         prior = prior if prior is not None else Prior.silverbox_twin()
         if not isinstance(prior, Prior):
             raise ValueError(f"prior must be a Prior for NLARX, but is {prior!r:.60}; use Prior.silverbox_twin(...)")
-        return NLARXFilter(self.model, prior, self.factorisation, self.as_published)
+        return NLARXFilter(self.model, prior, self.factorisation, self.as_published, self.drift)
 
     @property
     def belief(self) -> Belief | JointBelief:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from estimator.inference import mean_field, structured
-from estimator.lanes import jit
+from estimator.lanes import jit, lanewise
+from estimator.record import LAYOUT
 
 #: Name of a factorisation to the iterations it uses by default: the paper's 10, and 3 where they are scalars.
 DEFAULT_ITERATIONS = {"structured": 3, "mean_field": 10}
@@ -34,6 +35,12 @@ def update(W, is_structured, iterations, as_published, trace):
             if trace.size:
                 trace[i] = mean_field.free_energy(W, 0)
         mean_field.end(W)
+
+
+@lanewise(LAYOUT, "P_t1_t1 P_t2_t2 P_t3_t3 P_e_e", uniform="walk_t1 walk_t2 walk_t3 walk_e")
+def walk(P_t1_t1, P_t2_t2, P_t3_t3, P_e_e, walk_t1, walk_t2, walk_t3, walk_e):
+    """Let the coefficients walk at random before a sample, by these variances."""
+    return P_t1_t1 + walk_t1, P_t2_t2 + walk_t2, P_t3_t3 + walk_t3, P_e_e + walk_e
 
 
 @jit

@@ -97,17 +97,24 @@ def test_run_is_repeated_update(model):
     np.testing.assert_array_equal(at_once.belief.cov, one_by_one.belief.cov)
 
 
-def test_a_jump_of_the_mass_is_tracked_within_300_samples():
+@pytest.mark.parametrize(
+    ("model", "prior", "drift"),
+    [
+        (PAPER, PAPER.prior(process_noise=1e-4, measurement_noise=3e-4), 0.003),
+        (NLARX(), Prior.silverbox_twin(process_noise=1e-4, measurement_noise=3e-4, noise_shape=2.0), 0.01),
+    ],
+    ids=["terms", "paper"],
+)
+def test_a_jump_of_the_mass_is_tracked_within_300_samples(model, prior, drift):
     u, y = simulate(1800, np.random.default_rng(3), jump=1500)
-    prior = PAPER.prior(process_noise=1e-4, measurement_noise=3e-4)
 
     def mass_error(drift):
-        estimator = OnlineEstimator(PAPER, prior, drift=drift)
+        estimator = OnlineEstimator(model, prior, drift=drift)
         estimator.run(u, y)
         _, _, theta3, eta = estimator.belief.coefficients_mean
         return abs(-theta3 * SAMPLING_STEP**2 / eta / (1.3 * SILVERBOX_TWIN.m) - 1)
 
-    assert mass_error(0.003) < 0.02
+    assert mass_error(drift) < 0.02
     assert mass_error(0.0) > 0.1
 
 
@@ -158,8 +165,10 @@ def test_what_does_not_fit_is_refused():
         OnlineEstimator(NLARX(regressors="cubic"), Prior.silverbox_twin())
     with pytest.raises(ValueError, match="prior must be a Prior"):
         OnlineEstimator(NLARX(), DuffingODE().prior())
-    with pytest.raises(ValueError, match="drift must be 0 for regressors='paper'"):
-        OnlineEstimator(drift=0.1)
+    with pytest.raises(ValueError, match="drift must be 0 in mean field"):
+        OnlineEstimator(factorisation="mean_field", drift=0.1)
+    with pytest.raises(ValueError, match="drift must be at least 0"):
+        OnlineEstimator(drift=-0.1)
     with pytest.raises(ValueError, match="spline"):
         OnlineEstimator(DuffingODE("spline")).update(0.0, 0.0)
 
