@@ -69,7 +69,7 @@ class DuffingEnv(gym.Env[Any, Any]):
     | 18 | last input in parts of ``max_input`` | -1 | 1 |
     | 19 | last output in parts of ``max_output`` | -2 | 2 |
     | 20 | time left, in parts of the horizon | 0 | 1 |
-    | 21 | input energy budget left; 1 on tracks without a budget | 0 | 1 |
+    | 21 | part of the input's energy budget that is left; 1 without a budget (``max_rms``) | 0 | 1 |
 
     ## Reward
 
@@ -80,6 +80,7 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``information_gain`` (default) | ½ log det C_{t-1} - ½ log det C_t | about 20 over an episode, mostly >= 0 |
     | ``log_posterior`` | log q_t(c*) - log q_{t-1}(c*) | unbounded below; its mean is at most the information gain |
     | ``parameter_error`` | e_{t-1} - e_t, e = mean of min(relative error, 1) over m, c, a, b | [-1, 1] |
+    | ``fisher`` | ½ log det(Λ0 + F_t) - ½ log det(Λ0 + F_{t-1}), F the Fisher information at the truth | >= 0 |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
 
     ## Starting state
@@ -115,6 +116,10 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``spread`` | 0.3 | half width of the parameters' range, relative |
     | ``noise_shape`` | 2 | shape of the Gamma priors of γ and ξ |
     | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
+    | ``max_rms`` | None | largest RMS input over a whole episode [V]; see `PowerEnv` |
+    | ``max_slew`` | None | largest change of the input between samples [V]; a larger one is cut |
+    | ``input_cost`` | 0 | taken off the reward for every (u / ``max_input``)² |
+    | ``jump``, ``drift`` | 0 | a mass that jumps, an estimator that expects change; see `DriftEnv` |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
 
     >>> import gymnasium as gym

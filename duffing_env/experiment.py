@@ -18,7 +18,7 @@ from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
 from estimator.belief import Prior
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
-from estimator.record import RECORD
+from estimator.record import COEFFICIENTS, RECORD
 
 _PRIORS = ("silverbox_twin", "published_run", "paper_text")
 
@@ -100,6 +100,11 @@ class Experiment:
             "horizon": self.samples,
             "process_noise": 0.0,
             "measurement_noise": 0.0,
+            "budget": np.inf,
+            "max_slew": np.inf,
+            "input_cost": 0.0,
+            "jump": 0.0,
+            **{f"walk_{c}": 0.0 for c in COEFFICIENTS},
             "spread": 0.0,
             **{f"center_{name}": getattr(SILVERBOX_TWIN, name) for name in OSCILLATOR},
             "step": SAMPLING_STEP,
@@ -131,6 +136,14 @@ class SimulatedExperiment(Experiment):
         noise_shape: shape of the Gamma priors of γ and ξ, which are centred on the true precisions; 2 is weak.
         plant_spread: as ``spread``, for the plant alone, whose range the prior then does not match: with 0 every
             oscillator is the twin itself. That of the prior where it is None.
+        max_rms: the input's root mean square over a whole episode [V]: the energy horizon * max_rms² is a budget, and
+            an input that what is left of it cannot pay for is cut to what it can. No budget where it is None.
+        max_slew: largest change of the input from sample to sample [V]; a larger one is cut. None: no limit.
+        input_cost: taken off the reward for every (u / max_input)².
+        jump: the mass jumps once, at a sample that is uniform over the middle half of the episode, by a factor
+            log-uniform on [1 - jump, 1 + jump]; in [0, 1). 0: it stays.
+        drift: how far the estimator lets each coefficient walk in a sample: standard deviation, in parts of the
+            prior's. 0: it takes the coefficients for constant.
     """
 
     horizon: int = 256
@@ -139,6 +152,11 @@ class SimulatedExperiment(Experiment):
     spread: float = 0.3
     noise_shape: float = 2.0
     plant_spread: float | None = None
+    max_rms: float | None = None
+    max_slew: float | None = None
+    input_cost: float = 0.0
+    jump: float = 0.0
+    drift: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -149,6 +167,15 @@ class SimulatedExperiment(Experiment):
             raise ValueError(f"spread must be below 1, but is {self.spread!r}; masses are positive")
         if self.plant_spread is not None and not (_is_number(self.plant_spread) and 0 <= self.plant_spread < 1):
             raise ValueError(f"plant_spread must be in [0, 1), but is {self.plant_spread!r}; 0 is the twin itself")
+        for name in ("max_rms", "max_slew"):
+            if getattr(self, name) is not None:
+                self._check_positive(name)
+        for name, limit in (("input_cost", np.inf), ("jump", 1.0), ("drift", np.inf)):
+            value = getattr(self, name)
+            if not (_is_number(value) and 0 <= value < limit):
+                raise ValueError(f"{name} must be in [0, {limit}), but is {value!r}; 0 does without it")
+        if self.drift and self.factorisation == "mean_field":
+            raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {self.drift!r}")
 
     @property
     def samples(self) -> int:
@@ -167,7 +194,17 @@ class SimulatedExperiment(Experiment):
             "process_noise": self.process_noise,
             "measurement_noise": self.measurement_noise,
             "spread": self.spread if self.plant_spread is None else self.plant_spread,
+            "budget": np.inf if self.max_rms is None else self.horizon * self.max_rms**2,
+            "max_slew": np.inf if self.max_slew is None else self.max_slew,
+            "input_cost": self.input_cost / self.max_input**2,
+            "jump": self.jump,
+            **{f"walk_{c}": (self.drift * std) ** 2 for c, std in zip(COEFFICIENTS, self._prior_stds, strict=True)},
         }
+
+    @property
+    def _prior_stds(self) -> FloatArray:
+        assert self.believed.coefficients_cov is not None
+        return np.sqrt(np.diag(self.believed.coefficients_cov))
 
 
 @dataclass(frozen=True)
@@ -198,6 +235,8 @@ class ReplayExperiment(Experiment):
         for name in ("nonlinear", "as_published"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, but is {getattr(self, name)!r}")
+        if self.reward == "fisher":
+            raise ValueError("reward must not be 'fisher' for a record, whose true oscillator nobody knows")
         if self.as_published and self.factorisation != "mean_field":
             raise ValueError(
                 f"as_published goes with factorisation='mean_field', but factorisation is {self.factorisation!r}"

@@ -10,12 +10,13 @@ import math
 import numpy as np
 from numba import prange
 
+from duffing_env import fisher
 from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, OBSERVATION, OSCILLATOR, SAVED, SETTINGS
 from duffing_env.noise import as_bits, as_word, draw, to_unit
-from duffing_env.plant import draw_noise, move_plant, play_record
-from duffing_env.rewards import REWARDS, appraise_prior, settle
+from duffing_env.plant import draw_noise, limit_input, move_plant, play_record
+from duffing_env.rewards import REWARDS, appraise, settle
 from estimator.elementary import log
-from estimator.inference import free_energy, update
+from estimator.inference import free_energy, update, walk
 from estimator.lanes import LANES, at_lane, inlined, jit, kernel, lanewise
 from estimator.record import RECORD_SIZE
 
@@ -25,6 +26,7 @@ RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP = 0, 1, 2
 # Where rows that the loops below touch by index begin in a block.
 _RECORD = RECORD_SIZE * LANES
 _U, _Y, _X, _LAST_X = (LAYOUT[name] * LANES for name in ("u", "y", "x", "last_x"))
+_ASKED, _SPENT, _JUMP_AT = (LAYOUT[name] * LANES for name in ("asked", "spent", "jump_at"))
 _ELAPSED, _WAITING = LAYOUT["elapsed"] * LANES, LAYOUT["waiting"] * LANES
 _RECORDED_U, _RECORDED_Y = LAYOUT["recorded_u"] * LANES, LAYOUT["recorded_y"] * LANES
 _OUTCOME, _OBS = LAYOUT["reward"] * LANES, LAYOUT["obs_mean_t1"] * LANES
@@ -38,11 +40,13 @@ _N_OSCILLATOR = len(OSCILLATOR)
 # Where settings stand.
 _MAX_INPUT, _MAX_OUTPUT, _HORIZON = (SETTINGS[name] for name in ("max_input", "max_output", "horizon"))
 _PROCESS_NOISE, _MEASUREMENT_NOISE = SETTINGS["process_noise"], SETTINGS["measurement_noise"]
+_BUDGET, _MAX_SLEW, _INPUT_COST = (SETTINGS[name] for name in ("budget", "max_slew", "input_cost"))
+_JUMP, _WALK = SETTINGS["jump"], SETTINGS["walk_t1"]
 _SPREAD, _CENTER, _STEP = SETTINGS["spread"], SETTINGS["center_m"], SETTINGS["step"]
 _REWARD, _STRUCTURED, _ITERATIONS = SETTINGS["reward"], SETTINGS["structured"], SETTINGS["iterations"]
 _AS_PUBLISHED, _NONLINEAR = SETTINGS["as_published"], SETTINGS["nonlinear"]
 _REPLAYED, _DELAY = SETTINGS["replayed"], SETTINGS["delay"]
-_FREE_ENERGY = REWARDS["free_energy"]
+_FREE_ENERGY, _FISHER = REWARDS["free_energy"], REWARDS["fisher"]
 _PRIOR_T1, _SCALE_T1 = SETTINGS["prior_t1"], SETTINGS["scale_t1"]
 _PRIOR_LOG_GAMMA, _PRIOR_LOG_XI = SETTINGS["prior_log_gamma"], SETTINGS["prior_log_xi"]
 
@@ -52,15 +56,15 @@ _PRIOR_LOG_GAMMA, _PRIOR_LOG_XI = SETTINGS["prior_log_gamma"], SETTINGS["prior_l
     " ".join(f"obs_{name}" for name in OBSERVATION),
     uniform=(
         "center_t1 center_t2 center_t3 center_e scale_t1 scale_t2 scale_t3 scale_e log_gamma_0 log_xi_0 "
-        "max_input max_output horizon"
+        "max_input max_output horizon budget"
     ),
 )
 def observe(
     x0, x1, t1, t2, t3, e,
     P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
-    g_shape, g_rate, n_shape, n_rate, u, y, elapsed,
+    g_shape, g_rate, n_shape, n_rate, u, y, elapsed, spent,
     center_t1, center_t2, center_t3, center_e, scale_t1, scale_t2, scale_t3, scale_e, log_gamma_0, log_xi_0,
-    max_input, max_output, horizon,
+    max_input, max_output, horizon, budget,
 ):  # fmt: skip
     """The observation, in the order of `OBSERVATION`. A scale is 1/std of the prior; 0 for a known θ2."""
     i1 = 1.0 / np.sqrt(P_t1_t1)
@@ -79,7 +83,7 @@ def observe(
         _clip(log(n_shape / n_rate) - log_xi_0, -20.0, 20.0),
         _clip(x0 / max_output, -2.0, 2.0), _clip(x1 / max_output, -2.0, 2.0),
         _clip(u / max_input, -1.0, 1.0), _clip(y / max_output, -2.0, 2.0),
-        _clip(1.0 - elapsed / horizon, 0.0, 1.0), 1.0,
+        _clip(1.0 - elapsed / horizon, 0.0, 1.0), _clip(1.0 - spent / budget, 0.0, 1.0),
     )  # fmt: skip
 
 
@@ -109,11 +113,34 @@ def draw_oscillator(
     c = center_c * math.exp(low + width * to_unit(second))
     a = center_a * math.exp(low + width * to_unit(third))
     b = center_b * math.exp(low + width * to_unit(fourth))
+    t1, t2, t3, e = _coefficients(m, c, a, b, step)
+    return as_bits(i), as_bits(j), as_bits(k), as_bits(n), m, c, a, b, t1, t2, t3, e
+
+
+@at_lane(LAYOUT, "stream_a stream_b stream_c stream_d jump_at jump_factor", uniform="jump horizon")
+def draw_jump(stream_a, stream_b, stream_c, stream_d, jump, horizon):
+    """The sample at which the mass jumps, in the middle half of the episode, and its log-uniform factor."""
+    low = math.log(1.0 - jump)
+    first, a, b, c, d = draw(as_word(stream_a), as_word(stream_b), as_word(stream_c), as_word(stream_d))
+    second, a, b, c, d = draw(a, b, c, d)
+    at = math.floor(horizon * (0.25 + 0.5 * to_unit(first)))
+    factor = math.exp(low + (math.log(1.0 + jump) - low) * to_unit(second))
+    return as_bits(a), as_bits(b), as_bits(c), as_bits(d), at, factor
+
+
+@at_lane(LAYOUT, "m true_t1 true_t2 true_t3 true_e", uniform="step")
+def jump_mass(m, c, a, b, jump_factor, step):
+    """Change the mass, and with it the coefficients, by Eq. (3)."""
+    m = jump_factor * m
+    t1, t2, t3, e = _coefficients(m, c, a, b, step)
+    return m, t1, t2, t3, e
+
+
+@inlined
+def _coefficients(m, c, a, b, step):
+    """θ1, θ2, θ3 and η by Eq. (3)."""
     e = step * step / (m + c * step)
-    return (
-        as_bits(i), as_bits(j), as_bits(k), as_bits(n), m, c, a, b,
-        (2.0 * m + c * step) * e / (step * step) - a * e, -b * e, -m * e / (step * step), e,
-    )  # fmt: skip
+    return (2.0 * m + c * step) * e / (step * step) - a * e, -b * e, -m * e / (step * step), e
 
 
 @jit
@@ -125,15 +152,22 @@ def reset_lane(W, j, settings, prior):
         W, j, settings[_SPREAD], settings[_CENTER], settings[_CENTER + 1], settings[_CENTER + 2],
         settings[_CENTER + 3], settings[_STEP],
     )  # fmt: skip
-    for row in (_U, _Y, _X, _LAST_X, _ELAPSED, _WAITING):
+    W[_JUMP_AT + j] = -1.0
+    if settings[_JUMP] > 0.0:
+        draw_jump(W, j, settings[_JUMP], settings[_HORIZON])
+    for row in (_U, _Y, _X, _LAST_X, _ELAPSED, _WAITING, _SPENT):
         W[row + j] = 0.0
-    appraise_prior(W, j, settings[_STEP], settings[_NONLINEAR])
+    appraise(W, j, settings[_STEP], settings[_NONLINEAR])
+    if settings[_REWARD] == _FISHER:
+        fisher.begin(W, j, prior, settings[_NONLINEAR])
 
 
 @jit
 def _integrate_and_infer(W, settings, recorded_u, recorded_y):
     """Plant, measurement, belief and reward for all lanes of a block; their inputs stand in row ``u``."""
     draw_noise(W)
+    if settings[_REWARD] == _FISHER:
+        fisher.inform(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE], settings[_NONLINEAR])
     if settings[_REPLAYED] != 0.0:
         last = len(recorded_y) - 1
         for j in range(LANES):
@@ -145,12 +179,17 @@ def _integrate_and_infer(W, settings, recorded_u, recorded_y):
         move_plant(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE])
     for i in range(_RECORD):
         W[_SAVED_RECORD + i] = W[i]
+    if settings[_WALK] > 0.0:
+        walk(W, settings[_WALK], settings[_WALK + 1], settings[_WALK + 2], settings[_WALK + 3])
     structured = settings[_STRUCTURED] != 0.0
     update(W, structured, np.int64(settings[_ITERATIONS]), settings[_AS_PUBLISHED] != 0.0, W[:0])
     if settings[_REWARD] == _FREE_ENERGY:
         for j in range(LANES):
             W[_SURPRISE + j] = free_energy(W, j, structured)
-    settle(W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR], settings[_REWARD])
+    settle(
+        W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR], settings[_REWARD],
+        settings[_INPUT_COST],
+    )  # fmt: skip
     for j in range(LANES):
         if W[_DIVERGED + j] != 0.0 or W[_OFF_RECORD + j] != 0.0:
             for i in range(RECORD_SIZE):
@@ -164,7 +203,7 @@ def _write_observations(W, settings, observations):
         W, settings[_PRIOR_T1], settings[_PRIOR_T1 + 1], settings[_PRIOR_T1 + 2], settings[_PRIOR_T1 + 3],
         settings[_SCALE_T1], settings[_SCALE_T1 + 1], settings[_SCALE_T1 + 2], settings[_SCALE_T1 + 3],
         settings[_PRIOR_LOG_GAMMA], settings[_PRIOR_LOG_XI],
-        settings[_MAX_INPUT], settings[_MAX_OUTPUT], settings[_HORIZON],
+        settings[_MAX_INPUT], settings[_MAX_OUTPUT], settings[_HORIZON], settings[_BUDGET],
     )  # fmt: skip
     for j in range(LANES):
         for k in range(N_OBSERVATION):
@@ -179,7 +218,13 @@ def _step_block(
     waiting = 0
     for j in range(LANES):
         waiting += W[_WAITING + j] != 0.0
-        W[_U + j] = settings[_MAX_INPUT] * max(-1.0, min(1.0, actions[j]))
+        W[_ASKED + j] = settings[_MAX_INPUT] * max(-1.0, min(1.0, actions[j]))
+    limit_input(W, settings[_BUDGET], settings[_MAX_SLEW])
+    if settings[_JUMP] > 0.0:
+        for j in range(LANES):
+            if W[_ELAPSED + j] == W[_JUMP_AT + j]:
+                jump_mass(W, j, settings[_STEP])
+                appraise(W, j, settings[_STEP], settings[_NONLINEAR])
     if waiting < LANES:
         _integrate_and_infer(W, settings, recorded_u, recorded_y)
     finished = 0

@@ -28,6 +28,7 @@ N_OBSERVATION = len(OBSERVATION)
 #: What the kernel is told about a track: (len(SETTINGS),) float64, the same for all environments.
 SETTINGS = rows(
     "max_input max_output horizon process_noise measurement_noise spread center_m center_c center_a center_b step",
+    "budget max_slew input_cost jump walk_t1 walk_t2 walk_t3 walk_e",
     "reward structured iterations as_published nonlinear replayed delay",
     "prior_t1 prior_t2 prior_t3 prior_e scale_t1 scale_t2 scale_t3 scale_e prior_log_gamma prior_log_xi",
 )
@@ -40,6 +41,9 @@ N_OUTCOME = len(OUTCOME)
 #: that the episode ended with.
 SAVED = tuple(f"saved_{name}" for name in RECORD)
 
+#: The covariance that one who knows the truth would have, for the reward ``fisher``; the third lag is not needed.
+IDEAL = tuple(name for name in RECORD if name.startswith("P_") and "x2" not in name)
+
 #: The true oscillator; after a reset in the same step, that of the episode which ended is in the rows ``ended_``.
 OSCILLATOR = ("m", "c", "a", "b")
 
@@ -51,7 +55,9 @@ LAYOUT = {
         " ".join(OSCILLATOR),
         "true_t1 true_t2 true_t3 true_e",
         "x last_x elapsed waiting recorded_u recorded_y",
-        "log_det log_density error surprise",
+        "asked spent jump_at jump_factor",
+        "log_det log_density error surprise fisher_gain ideal_log_det",
+        " ".join(f"ideal_{name}" for name in IDEAL),
         " ".join(OUTCOME),
         " ".join(f"obs_{name}" for name in OBSERVATION),
         " ".join(SAVED),

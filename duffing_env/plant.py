@@ -6,6 +6,8 @@ not, so every track ends the episode at a displacement limit. ``replay`` is a re
 
 from __future__ import annotations
 
+import numpy as np
+
 from duffing_env.layout import LAYOUT
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from estimator.lanes import lanewise
@@ -32,6 +34,19 @@ def move_plant(x, last_x, u, true_t1, true_t2, true_t3, true_e, noise_w, noise_v
     """The plant ``difference``: Eq. (2) with Gaussian process noise, and the sensor."""
     moved = true_t1 * x + true_t2 * x * x * x + true_t3 * last_x + true_e * u + process_noise * noise_w
     return moved, x, moved + measurement_noise * noise_v
+
+
+@lanewise(LAYOUT, "u spent", uniform="budget max_slew")
+def limit_input(asked, u, spent, budget, max_slew):
+    """The input that the generator gives when it is asked for one: near enough to the last, and paid for.
+
+    ``spent`` is the energy Σ u² [V²]; what is left of the budget bounds the next input, so it cannot be exceeded.
+    """
+    low, high = u - max_slew, u + max_slew
+    given = min(max(asked, low), high)
+    left = np.sqrt(max(budget - spent, 0.0))
+    given = min(max(given, -left), left)
+    return given, spent + given * given
 
 
 @lanewise(LAYOUT, "u y off_record", uniform="max_input")

@@ -10,11 +10,15 @@
 ``parameter_error``  decrease of the mean relative error of the estimates of m, c, a and b, each error capped at 1;
                      an episode's sum lies in [-1, 1]. Noisy: the error of one estimate is one draw of what its
                      posterior describes.
+``fisher``           increase of ½ log det(Λ0 + F), F the Fisher information of the outputs at the true coefficients
+                     and Λ0 the prior's precision: what an efficient estimator would gain. Needs the truth, so it is for
+                     training and for tests; no estimator can talk it up (`duffing_env.fisher`).
 ``free_energy``      minus the free energy of the sample in nats: how well the output was predicted. Rewards inputs
                      whose outcome is known already, so an agent that maximises it learns nothing; the foil.
 ================== =============================================================================================
 
-Information gain and log posterior telescope: an episode's sum depends on its first and last belief only.
+Information gain, log posterior and parameter error telescope: an episode's sum depends on its first and last belief
+only. So does the Fisher information, on its first and last matrix.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ from estimator.lanes import at_lane, inlined, lanewise
 _SMALLEST, _INFINITE = 2.0**-1022, float("inf")
 
 #: Name of a reward to its number in the kernel.
-REWARDS = {"information_gain": 0, "log_posterior": 1, "parameter_error": 2, "free_energy": 3}
+REWARDS = {"information_gain": 0, "log_posterior": 1, "parameter_error": 2, "free_energy": 3, "fisher": 4}
 
 
 def reward_number(name: str) -> int:
@@ -42,7 +46,7 @@ def reward_number(name: str) -> int:
 
 
 @inlined
-def _appraise(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear):
+def log_det_and_density(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear):
     """Log det of the coefficients' covariance, and log density at the true ones, by an L D Lᵀ factorisation.
 
     The order is θ1, θ3, η, θ2, so that a θ2 known to be zero is left out by leaving out the last pivot. ``sound``
@@ -92,22 +96,22 @@ def _capped(ratio):
 @lanewise(
     LAYOUT,
     " ".join(OUTCOME) + " log_det log_density error elapsed",
-    uniform="max_output horizon step nonlinear reward_kind",
+    uniform="max_output horizon step nonlinear reward_kind input_cost",
 )
 def settle(
     x0, x1, x2, t1, t2, t3, e, P_x0_x0, P_x1_x1, P_x2_x2,
     P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
     g_rate, n_rate, m, c, a, b, true_t1, true_t2, true_t3, true_e,
-    x, y, elapsed, log_det, log_density, error, surprise, off_record,
-    max_output, horizon, step, nonlinear, reward_kind,
+    u, x, y, elapsed, log_det, log_density, error, surprise, fisher_gain, off_record,
+    max_output, horizon, step, nonlinear, reward_kind, input_cost,
 ):  # fmt: skip
     """What the step was worth, and whether the episode ends.
 
     A number that is not finite ends it, flagged, and so does a covariance that is not positive definite any more.
-    ``surprise`` is the free energy of the sample where that is the reward, and 0 elsewhere.
+    ``surprise`` is the free energy of the sample where that is the reward, and 0 elsewhere; so is ``fisher_gain``.
     """
     P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
-    new_log_det, new_log_density, sound = _appraise(
+    new_log_det, new_log_density, sound = log_det_and_density(
         t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0
     )  # fmt: skip
     new_error = _relative_error(t1, t2, t3, e, m, c, a, b, step)
@@ -119,6 +123,7 @@ def settle(
     new_log_det = log_det if void else new_log_det
     new_log_density = log_density if void else new_log_density
     new_error = error if void else new_error
+    fisher_gain = 0.0 if void else fisher_gain
     information_gain = 0.5 * (log_det - new_log_det)
     log_posterior_gain = new_log_density - log_density
     reward = information_gain
@@ -128,6 +133,9 @@ def settle(
         reward = error - new_error
     if reward_kind == 3.0:
         reward = 0.0 if void else -surprise
+    if reward_kind == 4.0:
+        reward = fisher_gain
+    reward -= input_cost * u * u
     terminated = 1.0 if (void or abs(y) > max_output) else 0.0
     elapsed += 1.0
     truncated = 1.0 if (elapsed >= horizon and terminated == 0.0) else 0.0
@@ -138,11 +146,11 @@ def settle(
 
 
 @at_lane(LAYOUT, "log_det log_density error", uniform="step nonlinear")
-def appraise_prior(
+def appraise(
     t1, t2, t3, e, P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
     m, c, a, b, true_t1, true_t2, true_t3, true_e, step, nonlinear,
 ):  # fmt: skip
-    """Log det, log density and error of a lane whose belief is the prior."""
+    """Log det, log density and error of a lane's belief beside its oscillator, where either is new."""
     P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
-    log_det, log_density, _ = _appraise(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0)
+    log_det, log_density, _ = log_det_and_density(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0)
     return log_det, log_density, _relative_error(t1, t2, t3, e, m, c, a, b, step)

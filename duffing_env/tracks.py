@@ -12,6 +12,26 @@ TRACKS: dict[str, dict[str, Any]] = {
         "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
         "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
     },
+    "duffing_env/Short-v0": {
+        "entry_point": "duffing_env.limited:ShortEnv",
+        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
+        "kwargs": {"horizon": 48, "max_input": 0.15, "max_output": 0.6},
+    },
+    "duffing_env/Power-v0": {
+        "entry_point": "duffing_env.limited:PowerEnv",
+        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
+        "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6, "max_rms": 0.0222},
+    },
+    "duffing_env/Output-v0": {
+        "entry_point": "duffing_env.limited:OutputEnv",
+        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
+        "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.3},
+    },
+    "duffing_env/Drift-v0": {
+        "entry_point": "duffing_env.limited:DriftEnv",
+        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
+        "kwargs": {"horizon": 512, "max_input": 0.15, "max_output": 0.6, "jump": 0.3, "drift": 0.01},
+    },
     "duffing_env/SilverboxReplay-v0": {
         "entry_point": "duffing_env.env:SilverboxReplayEnv",
         "vector_entry_point": "duffing_env.vector_env:SilverboxReplayVectorEnv",

@@ -63,9 +63,17 @@ def lanewise(layout: Mapping[str, int], outputs: str, uniform: str = "") -> Call
             f"    for j in range({LANES}):\n"
             f"        {targets} = scalar({arguments})\n"
         )
-        return jit(_define(source, function, scalar=inlined(function)))
+        loop = jit(_define(source, function, scalar=inlined(function)))
+        loop.declaration = (function, outputs, uniform)
+        return loop
 
     return decorate
+
+
+def relaid(loop: Any, layout: Mapping[str, int]) -> Any:
+    """A function of `lanewise` once more, over other rows of the block."""
+    function, outputs, uniform = loop.declaration
+    return lanewise(layout, outputs, uniform)(function)
 
 
 def at_lane(layout: Mapping[str, int], outputs: str = "", uniform: str = "") -> Callable[[Callable[..., Any]], Any]:

@@ -50,6 +50,9 @@ _MEAN_FIELD = """
     e_information theta_information theta_shift residual_power error_power g_increment n_increment
 """
 
+#: Rows that lie idle but during a mean-field update.
+MEAN_FIELD_SCRATCH = tuple(_MEAN_FIELD.split())
+
 #: Rows of an estimator's block. An environment's block has these first, then its own.
 LAYOUT = rows(" ".join(RECORD), "u y", _PRIOR_RATES, _STRUCTURED, _MEAN_FIELD)
 N_ROWS = len(LAYOUT)

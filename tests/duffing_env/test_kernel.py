@@ -43,8 +43,9 @@ def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
             expected, rewards, *flags = twin.step(action)
             np.testing.assert_allclose(observation, expected, rtol=0, atol=1e-6)
             np.testing.assert_allclose(received, rewards[reward], rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(info["information_gain"], rewards["information_gain"], rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(info["log_posterior_gain"], rewards["log_posterior"], rtol=1e-9, atol=1e-9)
+            gains = (twin.reported["information_gain"], twin.reported["log_posterior"])
+            told = (info["information_gain"], info["log_posterior_gain"])
+            np.testing.assert_allclose(told, gains, rtol=1e-9, atol=1e-9)
             assert [terminated, truncated] == flags
             assert not info["diverged"]
         assert_beliefs_agree(info["belief"], twin.belief)
@@ -68,10 +69,17 @@ def test_env_follows_its_twin(factorisation, reward):
         {"max_output": 0.2, "horizon": 64},
         {"max_input": 0.03, "process_noise": 2e-3, "measurement_noise": 1e-5, "horizon": 64},
         {"spread": 0.8, "iterations": 5, "horizon": 64},
+        {"max_rms": 0.03, "horizon": 64},
+        {"max_slew": 0.05, "input_cost": 0.3, "horizon": 64},
+        {"jump": 0.5, "drift": 0.01, "horizon": 64},
     ],
 )
 @pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
 def test_env_follows_its_twin_with_other_options(factorisation, options):
+    if "drift" in options and factorisation == "mean_field":
+        with pytest.raises(ValueError, match="drift must be 0 in mean field"):
+            DuffingEnv(factorisation=factorisation, **options)
+        return
     options = {"factorisation": factorisation, **options}
     for seed in range(3):
         endings = assert_env_follows_twin(DuffingEnv(**options), TwinEnv(seed, **options), "information_gain", seed, 4)

@@ -1,0 +1,146 @@
+"""The tracks that differ from `DuffingEnv` by their limits, or by an oscillator that changes."""
+
+from __future__ import annotations
+
+from duffing_env.env import DuffingEnv
+
+
+class ShortEnv(DuffingEnv):
+    """Identify the oscillator within 48 samples: 79 ms, some five periods of its resonance.
+
+    ## Description
+
+    As `DuffingEnv`, but ``horizon`` is 48: every sample counts, and the posterior is still wide when the best inputs
+    must be chosen.
+
+    ## Action space, observation space, reward, information
+
+    As `DuffingEnv`; the information gained over an episode is about 16 nats.
+
+    ## Starting state
+
+    As `DuffingEnv`.
+
+    ## Episode end
+
+    As `DuffingEnv`, truncated after 48 samples.
+
+    ## Arguments
+
+    As `DuffingEnv`, with ``horizon`` 48.
+
+    >>> import gymnasium as gym
+    >>> env = gym.make("duffing_env/Short-v0")
+    >>> observation, info = env.reset(seed=0)
+    >>> sum(not any(env.step([1.0])[2:4]) for _ in range(47))
+    47
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+
+class PowerEnv(DuffingEnv):
+    """Identify the oscillator with an input of at most 22.2 mV RMS, that of the Silverbox multisine.
+
+    ## Description
+
+    As `DuffingEnv`, but the input has a budget: over an episode its root mean square is at most ``max_rms``, so its
+    energy Σ u² is at most ``horizon * max_rms**2``. An input that what is left of the budget cannot pay for is cut to
+    what it can: |u_t| ≤ sqrt(budget - spent), so the budget is never exceeded, and an input of zero follows when
+    nothing is left. Spent all at once at 0.15 V it lasts for 5 samples; when to spend it is the question.
+
+    ## Action space
+
+    As `DuffingEnv`: the input that is asked for, in parts of ``max_input`` (0.15 V). Observation 18 is the input that
+    was given.
+
+    ## Observation space
+
+    As `DuffingEnv`; observation 21 is the part of the energy that is left.
+
+    ## Reward, starting state, episode end, information
+
+    As `DuffingEnv`; the information gained over an episode is 12 to 17 nats.
+
+    ## Arguments
+
+    As `DuffingEnv`, with ``max_rms`` 0.0222.
+
+    >>> import gymnasium as gym
+    >>> env = gym.make("duffing_env/Power-v0")
+    >>> observation, info = env.reset(seed=0)
+    >>> for _ in range(6):
+    ...     observation, *_ = env.step([1.0])
+    >>> float(observation[18]), float(observation[21])
+    (0.0, 0.0)
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+
+class OutputEnv(DuffingEnv):
+    r"""Identify the oscillator without leaving \|y\| ≤ 0.3 V, the range seen on the real circuit.
+
+    ## Description
+
+    As `DuffingEnv`, but the episode ends at half the displacement: driven at its resonance by the largest input, the
+    oscillator gets there within a period and a half, so the input must feel its way.
+
+    ## Action space, observation space, reward, information
+
+    As `DuffingEnv`; the state and the output are observed in parts of 0.3 V.
+
+    ## Starting state
+
+    As `DuffingEnv`.
+
+    ## Episode end
+
+    As `DuffingEnv`, terminated at \|y\| > 0.3 V.
+
+    ## Arguments
+
+    As `DuffingEnv`, with ``max_output`` 0.3.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+
+class DriftEnv(DuffingEnv):
+    """Follow an oscillator whose mass jumps once, at an unknown sample.
+
+    ## Description
+
+    As `DuffingEnv` over 512 samples, but at a sample that is uniform over the middle half of the episode the mass is
+    multiplied by a factor that is log-uniform on [0.7, 1.3]. The estimator expects change: before every sample each
+    coefficient's standard deviation is widened as by a random walk, ``drift`` (0.01) of that of the prior, so it
+    forgets in some hundred samples. Its intervals are those of a walk; a jump is a large step of it.
+
+    ## Action space, observation space, information
+
+    As `DuffingEnv`. The agent is not told of the jump; it shows in the outputs.
+
+    ## Reward
+
+    As `DuffingEnv`. The posterior widens between samples, so the ``information_gain`` of a step can be negative;
+    ``log_posterior`` and ``parameter_error`` are those of the oscillator as it is at that sample, and what the jump
+    itself does to them is not counted: they are set anew with the new mass.
+
+    ## Starting state, episode end
+
+    As `DuffingEnv`, truncated after 512 samples. ``info["truth"]`` is the oscillator after the jump.
+
+    ## Arguments
+
+    As `DuffingEnv`, with ``horizon`` 512, ``jump`` 0.3 and ``drift`` 0.01.
+
+    ## Version history
+
+    * v0: initial version
+    """
