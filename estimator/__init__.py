@@ -4,6 +4,7 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 """
 
 from estimator.belief import Belief, Prior
+from estimator.fisher import cramer_rao, fisher_information, relative_covariance
 from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE
@@ -31,7 +32,10 @@ __all__ = [
     "OnlineEstimator",
     "PhysicalParameters",
     "Prior",
+    "cramer_rao",
+    "fisher_information",
     "load_estimator",
+    "relative_covariance",
     "save_estimator",
     "to_coefficients",
     "to_physical",
