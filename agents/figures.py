@@ -126,24 +126,23 @@ def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
 
 
 def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
-    """Share of intervals that hold the truth against their nominal level, for every policy and estimator."""
+    """Share of intervals that hold the truth against their nominal level: a panel for each estimator."""
     from agents.metrics import LEVELS
 
-    figure = _figure(7.5, 4.5)
-    axes = figure.add_subplot()
-    nominal = [0.0, *(100 * level for level in LEVELS.values()), 100.0]
-    axes.plot([0, 100], [0, 100], color="#888888", linewidth=1, label="calibrated")
-    markers = {"structured": "o", "mean_field": "s", "auditor": "^"}
-    for evaluation, colour in zip(evaluations, cycle(_COLOURS), strict=False):
-        for estimator, values in (evaluation.estimators or {"": evaluation.metrics}).items():
-            covered = [0.0, *(100 * float(np.mean(values[name])) for name in LEVELS), 100.0]
-            label = f"{evaluation.policy}, {estimator.replace('_', ' ')}".rstrip(", ")
-            marker = markers.get(estimator, "o")
-            axes.plot(nominal, covered, marker=marker, color=colour, linewidth=0.8, markersize=4, label=label)
-    axes.set_xlabel("nominal level / %")
-    axes.set_ylabel("intervals that hold the truth / %")
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside right upper", fontsize=7)
+    found = [evaluation.estimators or {"": evaluation.metrics} for evaluation in evaluations]
+    figure = _figure(9, 3.6)
+    panels = figure.subplots(1, len(found[0]), sharex=True, sharey=True, squeeze=False)[0]
+    nominal = [100 * level for level in LEVELS.values()]
+    for axes, estimator in zip(panels, found[0], strict=True):
+        axes.plot([0, 100], [0, 100], color="#888888", linewidth=1)
+        for evaluation, values, colour in zip(evaluations, found, cycle(_COLOURS), strict=False):
+            covered = [100 * float(np.mean(values[estimator][name])) for name in LEVELS]
+            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=evaluation.policy)
+        axes.set_title(estimator.replace("_", " "), fontsize=9)
+        axes.set_xlabel("nominal level / %")
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("intervals that hold the truth / %")
+    panels[0].legend(fontsize=7)
     return figure
 
 

@@ -76,7 +76,7 @@ def compare(
     seed: int = 0,
     report: bool = False,
 ) -> list[Evaluation]:
-    """Evaluate policies; print the tables, write ``evaluation.json`` and the figures, or the report, into ``folder``."""
+    """Evaluate policies; print the tables, and write ``evaluation.json`` and the figures or the report."""
     from rich.console import Console
 
     from agents.figures import draw_contraction, draw_excitations

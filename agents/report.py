@@ -37,6 +37,7 @@ h1 { font-size: 1.6rem; margin: 0.5rem 0; } h2 { font-size: 1.2rem; margin: 2rem
 table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { border-bottom: 1px solid var(--line); padding: 0.25rem 0.6rem; text-align: right; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper); }
+th, td:first-child { white-space: normal; } td:first-child { min-width: 7rem; }
 tbody tr:nth-child(even) td { background: var(--soft); }
 small { opacity: 0.75; }
 figure { margin: 0.5rem 0; } figure svg { width: 100%; height: auto; } figcaption { font-size: 0.9rem; }
