@@ -11,7 +11,7 @@ import numpy as np
 
 from estimator.belief import Belief, Prior
 from estimator.gaussian import JointBelief
-from estimator.inference import update, walk
+from estimator.inference import update_alone, walk
 from estimator.lanes import LANES, kernel
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE, from_coordinates, run_samples, simulate_samples, to_coordinates
@@ -344,15 +344,14 @@ class RegressorFilter(JointFilter):
 
 @kernel
 def _run_nlarx(W, u, y, variances, is_structured, as_published, free_energies, forecasts):
-    """Update lane 0 with every sample. The other lanes do the same work, so that none of them runs wild."""
+    """Update lane 0 with every sample."""
     changes = variances.max() > 0.0
     for t in range(len(u)):
         if changes:
             walk(W, variances[0], variances[1], variances[2], variances[3])
-        for j in range(LANES):
-            W[_U * LANES + j] = u[t]
-            W[_Y * LANES + j] = y[t]
-        update(W, is_structured, free_energies.shape[1], as_published, free_energies[t])
+        W[_U * LANES] = u[t]
+        W[_Y * LANES] = y[t]
+        update_alone(W, is_structured, free_energies.shape[1], as_published, free_energies[t])
         forecasts[t, 0] = W[_PREDICTED * LANES] if is_structured else np.nan
         forecasts[t, 1] = 0.0 if is_structured else np.nan
         for row in _VARIANCES:

@@ -70,17 +70,15 @@ def test_the_page_is_the_same_for_the_same_evaluations(page, tmp_path):
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [390, 1200])
 def test_a_browser_shows_it_without_overflow(page, tmp_path, width):
-    script = (
-        "<script>addEventListener('load', () => document.title = "
-        "document.documentElement.scrollWidth + ' ' + innerWidth + ' ' + document.querySelectorAll('svg').length)</script>"
-    )
+    measure = "[document.documentElement.scrollWidth, innerWidth, document.querySelectorAll('svg').length].join(' ')"
+    script = f"<script>addEventListener('load', () => document.title = {measure})</script>"
     probed = tmp_path / "probed.html"
     probed.write_text(page.read_text().replace("</head>", script + "</head>"))
     done = subprocess.run(
         [
-            CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
-            "--disable-component-update", "--disable-sync", "--disable-quic", f"--user-data-dir={tmp_path / 'profile'}",
-            f"--window-size={width},900", "--dump-dom", probed.as_uri(),
+            CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync",
+            "--disable-background-networking", "--disable-component-update", "--disable-quic",
+            f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900", "--dump-dom", probed.as_uri(),
         ],
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
