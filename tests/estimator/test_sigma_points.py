@@ -237,17 +237,17 @@ def test_a_narrow_belief_moves_as_to_first_order(model):
     trained = estimate(model)
     trained.run(u, y)
     differences = []
-    for scale in (1.0, 0.1, 0.01):
+    for scale in (0.3, 0.1, 0.03):
         states = []
         for expectations in ("first_order", "sigma_points"):
             estimator = estimate(model, expectations=expectations)
             arrays = {name: array.copy() for name, array in trained.arrays().items()}
-            estimator.restore(arrays | {"cov": 1e4 * scale**2 * arrays["cov"]})
+            estimator.restore(arrays | {"cov": scale**2 * arrays["cov"]})
             estimator.run([0.1], [np.nan], missing=True)
-            states.append(estimator.belief.state_mean[0])
+            states.append(estimator.arrays()["mean"][0])
         differences.append(abs(states[1] - states[0]) / scale**2)
-    assert differences[0] > 1e-9
-    np.testing.assert_allclose(differences, differences[2], rtol=0.05)
+    assert differences[2] > 1e-9
+    np.testing.assert_allclose(differences, differences[2], rtol=0.02)
 
 
 @pytest.mark.parametrize("model", MODELS, ids=str)
@@ -273,7 +273,7 @@ def test_missing_outputs_teach_nothing(model):
     np.testing.assert_array_equal(after.coefficients_mean, before.coefficients_mean)
     np.testing.assert_array_equal(after.coefficients_cov, before.coefficients_cov)
     assert (after.gamma_rate, after.xi_shape) == (before.gamma_rate, before.xi_shape)
-    assert after.state_cov[0, 0] > before.state_cov[0, 0]
+    assert (after.state_mean != before.state_mean).all()
     assert (free_energies == 0).all()
 
 
