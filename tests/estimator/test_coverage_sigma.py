@@ -18,7 +18,7 @@ def identified(expectations, spread, samples):
     rng = np.random.default_rng(0)
     prior = DuffingODE().prior(spread, measurement_noise=MEASUREMENT_NOISE)
     truth = draw(prior, SYSTEMS, rng)
-    return errors(prior, expectations, truth, *simulate(truth, samples, rng))
+    return errors(DuffingODE(), prior, expectations, truth, *simulate(truth, samples, rng))
 
 
 def assert_calibrated(normalised, nees):
