@@ -14,7 +14,8 @@ from scipy import stats
 from agents.policies import make_policy
 from duffing_env.silverbox import load_record, record_available
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator import NLARX, Belief, to_coefficients
+from estimator import NLARX, ContinuousBelief, DuffingODE, OnlineEstimator
+from estimator.belief import RecordBelief
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -85,7 +86,7 @@ def evaluate(
 
 def _roll_out(
     name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]
-) -> tuple[Evaluation, list[Belief]]:
+) -> tuple[Evaluation, list[RecordBelief]]:
     """One episode of every system, and the belief that it ended with."""
     envs = gym.make_vec(env_id, num_envs=systems, vectorization_mode="vector_entry_point", **options)
     assert isinstance(envs, DuffingVectorEnv)
@@ -97,7 +98,7 @@ def _roll_out(
     curve = np.zeros((horizon + 1, systems))
     inputs = np.full((horizon, systems), np.nan)
     outputs = np.full((horizon, systems), np.nan)
-    beliefs: list[Belief] = [prior] * systems
+    beliefs: list[RecordBelief] = [prior] * systems
     ended_early = np.zeros(systems)
     running = np.ones(systems, dtype=np.bool_)
     state, episode_start = None, np.ones(systems, dtype=np.bool_)
@@ -127,13 +128,10 @@ def _roll_out(
     return Evaluation(name, metrics, curve, inputs, outputs), beliefs
 
 
-def _parameter_metrics(beliefs: list[Belief], truth: Any) -> dict[str, FloatArray]:
+def _parameter_metrics(beliefs: list[RecordBelief], truth: Any) -> dict[str, FloatArray]:
     """Relative errors of m, c, a, b, and the share of the four coefficients that their 90 % intervals cover."""
     true_physical = np.stack([truth.m, truth.c, truth.a, truth.b], axis=-1)
-    coefficients = to_coefficients(truth)
-    true_coefficients = np.stack(
-        [coefficients.theta1, coefficients.theta2, coefficients.theta3, coefficients.eta], axis=-1
-    )
+    true_coefficients = beliefs[0].coefficients_of(truth)
     estimates = np.array([belief.physical()[0] for belief in beliefs])
     errors = np.abs(estimates / true_physical - 1)
     means = np.array([belief.coefficients_mean for belief in beliefs])
@@ -145,14 +143,20 @@ def _parameter_metrics(beliefs: list[Belief], truth: Any) -> dict[str, FloatArra
     }
 
 
-def _arrow_errors(beliefs: list[Belief]) -> FloatArray:
+def _arrow_errors(beliefs: list[RecordBelief]) -> FloatArray:
     """Root mean square error [V] of free runs over the real arrow record; inf where a run diverges."""
     arrow = load_record().arrow
-    model = NLARX(input_delay=1)
     errors = np.empty(len(beliefs))
     for i, belief in enumerate(beliefs):
-        simulated = model.simulate(belief.coefficients_mean, arrow.u, arrow.y[:2])
+        simulated = _free_run(belief, arrow.u, arrow.y[:2])
         with np.errstate(invalid="ignore", over="ignore"):
             error = np.sqrt(np.mean((simulated - arrow.y)[2:] ** 2))
         errors[i] = error if np.isfinite(error) else np.inf
     return errors
+
+
+def _free_run(belief: RecordBelief, u: FloatArray, y_init: FloatArray) -> FloatArray:
+    """Outputs (T,) of the belief's mean, started by the first ones."""
+    if isinstance(belief, ContinuousBelief):
+        return OnlineEstimator(DuffingODE("spline"), belief.for_ode()).simulate(u, y_init)
+    return NLARX(input_delay=1).simulate(belief.coefficients_mean, u, y_init)

@@ -10,11 +10,14 @@ import math
 import numpy as np
 from numba import prange
 
-from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, OBSERVATION, OSCILLATOR, SAVED, SETTINGS
+from duffing_env.layout import (
+    ESTIMATORS, LAYOUT, N_OBSERVATION, N_OUTCOME, OBSERVATION, OSCILLATOR, PLANTS, SAVED, SETTINGS,
+)  # fmt: skip
 from duffing_env.noise import as_bits, as_word, draw, to_unit
-from duffing_env.plant import draw_noise, move_plant, play_record
+from duffing_env.plant import draw_noise, integrate_plant, move_plant, play_record
 from duffing_env.rewards import REWARDS, appraise_prior, settle
 from estimator.elementary import log
+from estimator.inference import continuous as ode
 from estimator.inference import free_energy, update
 from estimator.lanes import LANES, at_lane, inlined, jit, kernel, lanewise
 from estimator.record import RECORD_SIZE
@@ -25,6 +28,7 @@ RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP = 0, 1, 2
 # Where rows that the loops below touch by index begin in a block.
 _RECORD = RECORD_SIZE * LANES
 _U, _Y, _X, _LAST_X = (LAYOUT[name] * LANES for name in ("u", "y", "x", "last_x"))
+_LAST_U, _VELOCITY = LAYOUT["last_u"] * LANES, LAYOUT["velocity"] * LANES
 _ELAPSED, _WAITING = LAYOUT["elapsed"] * LANES, LAYOUT["waiting"] * LANES
 _RECORDED_U, _RECORDED_Y = LAYOUT["recorded_u"] * LANES, LAYOUT["recorded_y"] * LANES
 _OUTCOME, _OBS = LAYOUT["reward"] * LANES, LAYOUT["obs_mean_t1"] * LANES
@@ -39,9 +43,11 @@ _N_OSCILLATOR = len(OSCILLATOR)
 _MAX_INPUT, _MAX_OUTPUT, _HORIZON = (SETTINGS[name] for name in ("max_input", "max_output", "horizon"))
 _PROCESS_NOISE, _MEASUREMENT_NOISE = SETTINGS["process_noise"], SETTINGS["measurement_noise"]
 _SPREAD, _CENTER, _STEP = SETTINGS["spread"], SETTINGS["center_m"], SETTINGS["step"]
-_REWARD, _STRUCTURED, _ITERATIONS = SETTINGS["reward"], SETTINGS["structured"], SETTINGS["iterations"]
+_REWARD, _ESTIMATOR, _ITERATIONS = SETTINGS["reward"], SETTINGS["estimator"], SETTINGS["iterations"]
 _AS_PUBLISHED, _NONLINEAR = SETTINGS["as_published"], SETTINGS["nonlinear"]
-_REPLAYED, _DELAY = SETTINGS["replayed"], SETTINGS["delay"]
+_PLANT, _DELAY = SETTINGS["plant"], SETTINGS["delay"]
+_REPLAY, _SDE = PLANTS["replay"], PLANTS["sde"]
+_MEAN_FIELD, _ODE = ESTIMATORS["mean_field"], ESTIMATORS["ode"]
 _FREE_ENERGY = REWARDS["free_energy"]
 _PRIOR_T1, _SCALE_T1 = SETTINGS["prior_t1"], SETTINGS["scale_t1"]
 _PRIOR_LOG_GAMMA, _PRIOR_LOG_XI = SETTINGS["prior_log_gamma"], SETTINGS["prior_log_xi"]
@@ -93,12 +99,15 @@ def _clip(value, low, high):
 @at_lane(
     LAYOUT,
     "stream_a stream_b stream_c stream_d m c a b true_t1 true_t2 true_t3 true_e",
-    uniform="spread center_m center_c center_a center_b step",
+    uniform="spread center_m center_c center_a center_b step continuous",
 )
 def draw_oscillator(
-    stream_a, stream_b, stream_c, stream_d, spread, center_m, center_c, center_a, center_b, step
+    stream_a, stream_b, stream_c, stream_d, spread, center_m, center_c, center_a, center_b, step, continuous
 ):  # fmt: skip
-    """m, c, a and b log-uniform about the centre, and their coefficients by Eq. (3)."""
+    """m, c, a and b log-uniform about the centre, and their coefficients: those of the estimator's equation.
+
+    By Eq. (3); for the physical one stiffness, cubic stiffness, damping and gain per sample.
+    """
     low = math.log(1.0 - spread)
     width = math.log(1.0 + spread) - low
     first, i, j, k, n = draw(as_word(stream_a), as_word(stream_b), as_word(stream_c), as_word(stream_d))
@@ -109,6 +118,9 @@ def draw_oscillator(
     c = center_c * math.exp(low + width * to_unit(second))
     a = center_a * math.exp(low + width * to_unit(third))
     b = center_b * math.exp(low + width * to_unit(fourth))
+    if continuous != 0.0:
+        gain = step * step / m
+        return as_bits(i), as_bits(j), as_bits(k), as_bits(n), m, c, a, b, a * gain, b * gain, c * step / m, gain
     e = step * step / (m + c * step)
     return (
         as_bits(i), as_bits(j), as_bits(k), as_bits(n), m, c, a, b,
@@ -119,38 +131,65 @@ def draw_oscillator(
 @jit
 def reset_lane(W, j, settings, prior):
     """Start an episode in lane j: draw its oscillator, put it at rest, and put the belief to the prior."""
+    continuous = 1.0 if settings[_ESTIMATOR] == _ODE else 0.0
     for i in range(RECORD_SIZE):
         W[i * LANES + j] = prior[i]
     draw_oscillator(
         W, j, settings[_SPREAD], settings[_CENTER], settings[_CENTER + 1], settings[_CENTER + 2],
-        settings[_CENTER + 3], settings[_STEP],
+        settings[_CENTER + 3], settings[_STEP], continuous,
     )  # fmt: skip
-    for row in (_U, _Y, _X, _LAST_X, _ELAPSED, _WAITING):
+    for row in (_U, _LAST_U, _Y, _X, _LAST_X, _VELOCITY, _ELAPSED, _WAITING):
         W[row + j] = 0.0
-    appraise_prior(W, j, settings[_STEP], settings[_NONLINEAR])
+    appraise_prior(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
+
+
+@jit
+def _infer(W, settings):
+    """Update the beliefs of a block with its samples, and tell their free energy where that is the reward."""
+    structured = settings[_ESTIMATOR] != _MEAN_FIELD
+    iterations = np.int64(settings[_ITERATIONS])
+    if settings[_ESTIMATOR] == _ODE:
+        ode.update(W, iterations, ode.SUBSTEPS, ode.CROSS, ode.OWN)
+    else:
+        # Eq. (2) takes the input at x_t. Between two actions of the plant ``sde`` that is the last one.
+        if settings[_PLANT] == _SDE:
+            _swap_inputs(W)
+        update(W, structured, iterations, settings[_AS_PUBLISHED] != 0.0, W[:0])
+        if settings[_PLANT] == _SDE:
+            _swap_inputs(W)
+    if settings[_REWARD] == _FREE_ENERGY:
+        for j in range(LANES):
+            W[_SURPRISE + j] = free_energy(W, j, structured)
+
+
+@jit
+def _swap_inputs(W):
+    for j in range(LANES):
+        W[_U + j], W[_LAST_U + j] = W[_LAST_U + j], W[_U + j]
 
 
 @jit
 def _integrate_and_infer(W, settings, recorded_u, recorded_y):
     """Plant, measurement, belief and reward for all lanes of a block; their inputs stand in row ``u``."""
     draw_noise(W)
-    if settings[_REPLAYED] != 0.0:
+    if settings[_PLANT] == _REPLAY:
         last = len(recorded_y) - 1
         for j in range(LANES):
             t = np.int64(W[_ELAPSED + j])
             W[_RECORDED_U + j] = recorded_u[min(t, last)]
             W[_RECORDED_Y + j] = recorded_y[min(t + np.int64(settings[_DELAY]), last)]
         play_record(W, settings[_MAX_INPUT])
+    elif settings[_PLANT] == _SDE:
+        integrate_plant(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE], settings[_STEP])
     else:
         move_plant(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE])
     for i in range(_RECORD):
         W[_SAVED_RECORD + i] = W[i]
-    structured = settings[_STRUCTURED] != 0.0
-    update(W, structured, np.int64(settings[_ITERATIONS]), settings[_AS_PUBLISHED] != 0.0, W[:0])
-    if settings[_REWARD] == _FREE_ENERGY:
-        for j in range(LANES):
-            W[_SURPRISE + j] = free_energy(W, j, structured)
-    settle(W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR], settings[_REWARD])
+    _infer(W, settings)
+    settle(
+        W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR],
+        1.0 if settings[_ESTIMATOR] == _ODE else 0.0, settings[_REWARD],
+    )  # fmt: skip
     for j in range(LANES):
         if W[_DIVERGED + j] != 0.0 or W[_OFF_RECORD + j] != 0.0:
             for i in range(RECORD_SIZE):
@@ -179,6 +218,7 @@ def _step_block(
     waiting = 0
     for j in range(LANES):
         waiting += W[_WAITING + j] != 0.0
+        W[_LAST_U + j] = W[_U + j]
         W[_U + j] = settings[_MAX_INPUT] * max(-1.0, min(1.0, actions[j]))
     if waiting < LANES:
         _integrate_and_infer(W, settings, recorded_u, recorded_y)
