@@ -149,7 +149,7 @@ def _infer(W, settings):
     structured = settings[_ESTIMATOR] != _MEAN_FIELD
     iterations = np.int64(settings[_ITERATIONS])
     if settings[_ESTIMATOR] == _ODE:
-        ode.update(W, iterations, ode.SUBSTEPS, ode.CROSS, ode.OWN)
+        ode.update(W, iterations, ode.SUBSTEPS)
     else:
         # Eq. (2) takes the input at x_t. Between two actions of the plant ``sde`` that is the last one.
         if settings[_PLANT] == _SDE:

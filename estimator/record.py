@@ -54,9 +54,10 @@ _MEAN_FIELD = """
 """
 
 #: What one update of the physical equation keeps, besides what is in `_STRUCTURED`: the point that moves, with its
-#: sensitivities to the state and the parameters before the sample, and the covariances of the velocity that is reached.
+#: sensitivities to the state and the parameters before the sample, the covariance that process noise brings it, and the
+#: covariances of the velocity that is reached.
 _CONTINUOUS = """
-    moved_x moved_v X_x0 X_x1 X_t1 X_t2 X_t3 X_e V_x0 V_x1 V_t1 V_t2 V_t3 V_e d_x1 d_t1 d_t2 d_t3 d_e
+    moved_x moved_v N_xx N_xv N_vv X_x0 X_x1 X_t1 X_t2 X_t3 X_e V_x0 V_x1 V_t1 V_t2 V_t3 V_e d_x1 d_t1 d_t2 d_t3 d_e
 """
 
 #: Rows of an estimator's block. An environment's block has these first, then its own.
