@@ -28,8 +28,9 @@ from estimator.inference.structured import learn_noise
 from estimator.lanes import inlined, jit, lanewise
 from estimator.record import LAYOUT
 
-#: Runge-Kutta steps per sample.
-SUBSTEPS = 4
+#: Runge-Kutta steps per sample. Four are far below the noise too, but where noises of 0.1 and 0.3 mV leave an interval
+#: of a few parts in 10⁴ after 2,048 samples, their bias raises the mean squared error to 1.3 of what is believed.
+SUBSTEPS = 8
 
 #: Intensity of white noise whose second integral has a variance of 1 after a sample.
 _INTENSITY = 3.0

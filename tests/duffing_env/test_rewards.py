@@ -46,11 +46,11 @@ class Lanes:
 
     def appraise(self):
         for lane in range(LANES):
-            appraise_prior(self.rows.reshape(-1), lane, SAMPLING_STEP, float(self.nonlinear))
+            appraise_prior(self.rows.reshape(-1), lane, SAMPLING_STEP, float(self.nonlinear), 0.0)
 
     def settle(self, reward="information_gain"):
         number = float(REWARDS[reward])
-        settle(self.rows.reshape(-1), MAX_OUTPUT, float(HORIZON), SAMPLING_STEP, float(self.nonlinear), number)
+        settle(self.rows.reshape(-1), MAX_OUTPUT, float(HORIZON), SAMPLING_STEP, float(self.nonlinear), 0.0, number)
 
     @property
     def belief(self):
