@@ -53,8 +53,10 @@ def evaluate(
     """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
 
     Learned policies act by their mean. An episode that a limit ends counts with what was known by then. The arrow
-    error is that of the coefficients identified on the Silverbox twin (``plant_spread=0``) in a free run over the
-    real arrow record; it is left out without the record, and on environments that do not simulate a plant.
+    error is that of the coefficients identified on the track's twin (``plant_spread=0``) in a free run over the
+    real arrow record, of the model that they belong to (`DuffingODE` without offsets, with the spline through the
+    inputs, for the differential equation's); it is left out without the record, and on environments that do not
+    simulate a plant.
 
     Args:
         policies: names or run folders, see `agents.policies.make_policy`; at least one.

@@ -145,8 +145,7 @@ def write(results: dict[str, list[Coverage]], path: Path) -> None:
     """Write the results as JSON, with Wilson's 95 % interval of every coverage."""
     rows = {
         estimator: [
-            dataclasses.asdict(row)
-            | {"wilson": {name: wilson(hits, row.systems) for name, hits in row.hits.items()}}
+            dataclasses.asdict(row) | {"wilson": {name: wilson(hits, row.systems) for name, hits in row.hits.items()}}
             for row in rows
         ]
         for estimator, rows in results.items()

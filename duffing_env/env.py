@@ -300,7 +300,7 @@ class ContinuousEnv(DuffingEnv):
 
     | Name | Reward of a step | Range |
     |------|------------------|-------|
-    | ``information_gain`` (default) | ½ log det C_{t-1} - ½ log det C_t | about INFO over an episode, mostly >= 0 |
+    | ``information_gain`` (default) | ½ log det C_{t-1} - ½ log det C_t | about 16 over an episode, mostly >= 0 |
     | ``log_posterior`` | log q_t(c*) - log q_{t-1}(c*) | unbounded below; its mean is at most the information gain |
     | ``parameter_error`` | e_{t-1} - e_t, e = mean of min(relative error, 1) over m, c, a, b | [-1, 1] |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |

@@ -11,8 +11,16 @@ import numpy as np
 from numba import prange
 
 from duffing_env.layout import (
-    ESTIMATORS, LAYOUT, N_OBSERVATION, N_OUTCOME, OBSERVATION, OSCILLATOR, PLANTS, SAVED, SETTINGS,
-)  # fmt: skip
+    ESTIMATORS,
+    LAYOUT,
+    N_OBSERVATION,
+    N_OUTCOME,
+    OBSERVATION,
+    OSCILLATOR,
+    PLANTS,
+    SAVED,
+    SETTINGS,
+)
 from duffing_env.noise import as_bits, as_word, draw, to_unit
 from duffing_env.plant import draw_noise, integrate_plant, move_plant, play_record
 from duffing_env.rewards import REWARDS, appraise_prior, settle

@@ -20,7 +20,7 @@ from estimator import Belief, ContinuousBelief
 
 TRACK = "duffing_env/Continuous-v0"
 # Random inputs end about half of such episodes at the limit, the others at the horizon.
-BOTH_ENDS = {"horizon": 20, "max_output": 0.12}
+BOTH_ENDS = {"horizon": 20, "max_output": 0.2}
 ESTIMATORS = [
     {"estimator": "ode"},
     {"estimator": "nlarx"},

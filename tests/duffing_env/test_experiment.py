@@ -74,8 +74,8 @@ def test_settings_are_the_options():
         )
     )  # fmt: skip
     expected = {
-        "estimator": ESTIMATORS["mean_field"], "iterations": 4, "reward": 3, "max_input": 0.1, "max_output": 0.5, "horizon": 9,
-        "process_noise": 1e-3, "measurement_noise": 2e-3, "spread": 0.1, "nonlinear": 1,
+        "estimator": ESTIMATORS["mean_field"], "iterations": 4, "reward": 3, "max_input": 0.1, "max_output": 0.5,
+        "horizon": 9, "process_noise": 1e-3, "measurement_noise": 2e-3, "spread": 0.1, "nonlinear": 1,
         "plant": PLANTS["difference"], "delay": 0,
         "as_published": 0, "step": SAMPLING_STEP, "center_m": SILVERBOX_TWIN.m, "center_c": SILVERBOX_TWIN.c,
         "center_a": SILVERBOX_TWIN.a, "center_b": SILVERBOX_TWIN.b,

@@ -176,7 +176,7 @@ class TwinContinuousEnv(TwinEnv):
             return np.array([state[1], force * SAMPLING_STEP**2 / m])
 
         state = np.array([self.x, self.velocity])
-        # The increments of a Wiener process and of its integral, whose intensity moves x by `process_noise` in a sample.
+        # Increments of a Wiener process and of its integral, which moves x by `process_noise` in a sample.
         spread = np.linalg.cholesky(np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]]))
         for s in range(8):
             k1 = slope(s * h, state)
