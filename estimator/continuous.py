@@ -13,21 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.belief import RecordBelief
-from estimator.gaussian import JointBelief
-from estimator.models.ode import N_JOINT
-from estimator.models.ode import PARAMETERS as ODE_PARAMETERS
 from estimator.parameters import SAMPLING_STEP, FloatArray, PhysicalParameters
 from estimator.record import RECORD, RECORD_SIZE
 
 #: Coefficients with their physical units, in the order of the record's rows t1, t2, t3, e.
 COEFFICIENTS = {"stiffness": "s⁻²", "cubic": "V⁻² s⁻²", "damping": "s⁻¹", "gain": "s⁻²"}
 
-#: Factors from units per sample to physical ones, of x, x' and the coefficients.
-_STATE_SCALES = SAMPLING_STEP ** np.array([0.0, -1.0])
+#: Factors from units per sample to physical ones.
 _SCALES = SAMPLING_STEP ** np.array([-2.0, -2.0, -1.0, -2.0])
-
-#: Places of x, x' and the coefficients in the joint state of `estimator.models.ode`.
-_IN_ODE = [0, 1, *(2 + list(ODE_PARAMETERS).index(name) for name in COEFFICIENTS)]
 
 _GAIN_TWIN = 186_015.0  # s⁻²
 
@@ -138,24 +131,6 @@ class ContinuousBelief(RecordBelief):
         stds = np.sqrt(np.diag(self.coefficients_cov)) * _SCALES
         rows = zip(COEFFICIENTS, means, stds, COEFFICIENTS.values(), strict=True)
         return {name: (float(mean), float(std), unit) for name, mean, std, unit in rows}
-
-    def for_ode(self, state_std: float = 0.1) -> JointBelief:
-        """The same knowledge of the oscillator as a prior of `DuffingODE`, to go on with a record.
-
-        Offsets, feedthrough and cubic damping are known to be 0.
-
-        Args:
-            state_std: standard deviation of x [V], and of x' [V per sample], about rest, as a record begins anywhere.
-        """
-        scales = np.concatenate([_STATE_SCALES, _SCALES])
-        mean, cov = np.zeros(N_JOINT), np.zeros((N_JOINT, N_JOINT))
-        own = np.zeros((6, 6))
-        own[:2, :2] = state_std**2 * np.eye(2)
-        own[2:, 2:] = self.coefficients_cov
-        mean[_IN_ODE[2:]] = self.coefficients_mean * _SCALES
-        cov[np.ix_(_IN_ODE, _IN_ODE)] = own * np.outer(scales, scales)
-        noises = self.gamma_shape, self.gamma_rate, self.xi_shape, self.xi_rate
-        return JointBelief(tuple(ODE_PARAMETERS), tuple(ODE_PARAMETERS.values()), mean, cov, *noises)
 
 
 def _per_sample(coefficients: FloatArray) -> FloatArray:

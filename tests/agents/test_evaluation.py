@@ -253,7 +253,7 @@ def test_the_replay_environment_is_evaluated(record):
         assert "arrow_rmse" not in evaluation.metrics
 
 
-def test_the_continuous_track_is_evaluated_in_its_own_coefficients(without_record):
+def test_the_continuous_track_is_evaluated_in_its_own_coefficients():
     options = {"horizon": HORIZON}
     (evaluation,) = evaluate(["uniform"], CONTINUOUS, systems=SYSTEMS, seed=SEED, options=options)
     policy, state = make_policy("uniform", gym.make(CONTINUOUS, **options), seed=SEED), None
@@ -279,12 +279,7 @@ def test_the_continuous_track_is_evaluated_in_its_own_coefficients(without_recor
             "error_b": abs(cubic / gain / truth.b - 1),
         }
         assert {name: evaluation.metrics[name][row] for name in expected} == pytest.approx(expected, abs=1e-6)
-
-
-def test_the_differential_equation_is_run_freely_over_the_arrow(record):
-    (evaluation,) = evaluate(["uniform"], CONTINUOUS, systems=2, seed=SEED, options={"horizon": HORIZON})
-    # Those of an estimator that knows the twin are 0.7 mV without its offsets; the signal itself has 54 mV.
-    assert ((evaluation.metrics["arrow_rmse"] > 5e-4) & (evaluation.metrics["arrow_rmse"] < 5e-3)).all()
+    assert "arrow_rmse" not in evaluation.metrics
 
 
 @pytest.mark.parametrize("systems", [1, 0, -3])

@@ -78,20 +78,6 @@ def test_a_belief_tells_its_parameters_in_physical_units():
     assert told["gain"][1] == pytest.approx(186015 * 1e-5 / np.sqrt(3), rel=1e-3)
 
 
-def test_a_belief_goes_on_as_a_prior_of_the_model_for_records():
-    belief = continuous_prior()
-    joint = belief.for_ode(state_std=0.2)
-    for name, (mean, std, unit) in belief.parameters().items():
-        assert joint.parameters()[name] == (pytest.approx(mean), pytest.approx(std), unit)
-    for name in ("input_offset", "cubic_damping", "output_offset", "feedthrough"):
-        assert joint.parameters()[name][:2] == (0, 0)
-    np.testing.assert_allclose(np.sqrt(np.diag(joint.state_cov)), [0.2, 0.2 / SAMPLING_STEP])
-    # Densities differ by the units only, so the entropies do by a constant.
-    tighter = continuous_prior(spread=0.1)
-    gained = belief.entropy() - tighter.entropy()
-    assert joint.entropy() - tighter.for_ode().entropy() == pytest.approx(gained)
-
-
 def test_beliefs_of_two_kinds_are_not_equal():
     belief = continuous_prior()
     assert belief == continuous_prior()

@@ -64,12 +64,14 @@ def test_without_process_noise_it_is_the_model_for_records():
     samples, iterations = 50, 3
     u = rng.uniform(-0.15, 0.15, samples)
     y = 0.1 * rng.standard_normal(samples)
-    joint = prior.for_ode(state_std=0.05)
-    mean, cov = ode.to_coordinates(joint.mean, joint.cov)
-    noises = np.array([joint.gamma_shape, joint.gamma_rate, joint.xi_shape, joint.xi_rate])
+    theirs = [0, 1, 2, 5, 3, 4]  # x, x', stiffness, cubic, damping, gain
+    moments, known = Moments.of_record(prior.record), [0, 1, 3, 4, 5, 6]
+    mean, cov = np.zeros(ode.N_JOINT), np.zeros((ode.N_JOINT, ode.N_JOINT))
+    mean[theirs], cov[np.ix_(theirs, theirs)] = moments.mean[known], moments.cov[np.ix_(known, known)]
+    noises = np.array([*moments.gamma, *moments.xi])
     pieces = DuffingODE().pieces(np.concatenate([[0.0], u]))
     energies, forecasts = np.empty((samples, iterations)), np.empty((samples, 2))
-    walk = np.zeros(len(joint.names))
+    walk = np.zeros(len(ode.PARAMETERS))
     ode.run_samples(mean, cov, noises, walk, pieces, u, y, True, continuous.SUBSTEPS, energies, forecasts)
 
     rows = block_of([prior.record] * LANES, 0.0, 0.0).reshape(N_ROWS, LANES)
@@ -81,9 +83,7 @@ def test_without_process_noise_it_is_the_model_for_records():
         last_u = u[t]
         assert rows[LAYOUT["predicted"], 0] == pytest.approx(forecasts[t, 0], abs=1e-12)
         assert free_energy(rows.reshape(-1), 0, True) == pytest.approx(energies[t, -1], rel=1e-9, abs=1e-8)
-    theirs = [0, 1, 2, 5, 3, 4]  # x, x', stiffness, cubic, damping, gain
     expected_mean, expected_cov = np.zeros(7), np.zeros((7, 7))
-    known = [0, 1, 3, 4, 5, 6]
     expected_mean[known], expected_cov[np.ix_(known, known)] = mean[theirs], cov[np.ix_(theirs, theirs)]
     expected = Moments(expected_mean, expected_cov, tuple(noises[:2]), tuple(noises[2:]))
     assert_same(Moments.of_record(records_of(rows.reshape(-1))[0]), expected, rtol=1e-8)
