@@ -127,7 +127,7 @@ def show(results: dict[str, list[Coverage]]) -> None:
     console = Console(width=160)
     for estimator, rows in results.items():
         console.print(f"\n{estimator}")
-        errors = (f"|{name}| %" for name in PHYSICAL)
+        errors = (f"{name}, %" for name in PHYSICAL)
         table = Table("σ_w [V]", "σ_v [V]", "T", *rows[0].hits, "NEES/4", "E[γ]/γ", "E[ξ]/ξ", *errors, box=box.MARKDOWN)
         for row in rows:
             table.add_row(*_cells(row))
