@@ -10,8 +10,8 @@ from scipy import stats
 
 from agents.policies.signals import draw_regime
 from duffing_env.silverbox import load_record, regime_input
-from estimator import NLARX, PhysicalParameters, fisher_information, to_coefficients
-from estimator.parameters import propagate_to_physical
+from estimator import NLARX, Belief, PhysicalParameters, fisher_information, to_coefficients
+from estimator.belief import RecordBelief
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -21,19 +21,16 @@ LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}
 _TWIN_ARROW_SAMPLES = 8_192
 
 
-def coefficients_of(truth: PhysicalParameters) -> FloatArray:
-    """(n, 4) the true (θ1, θ2, θ3, η)."""
-    c = to_coefficients(truth)
-    return np.stack([c.theta1, c.theta2, c.theta3, c.eta], axis=-1)
-
-
-def estimate_metrics(means: FloatArray, covs: FloatArray, truth: PhysicalParameters) -> dict[str, FloatArray]:
-    """Posteriors of (θ, η) beside the truth.
+def estimate_metrics(
+    means: FloatArray, covs: FloatArray, truth: PhysicalParameters, kind: type[RecordBelief] = Belief
+) -> dict[str, FloatArray]:
+    """Posteriors of coefficients beside the truth.
 
     Args:
         means: (n, 4).
         covs: (n, 4, 4).
         truth: the systems.
+        kind: whose coefficients they are.
 
     Returns:
         Relative errors ``error_m`` to ``error_b``; the share of the coefficients that their intervals hold, at each of
@@ -41,9 +38,9 @@ def estimate_metrics(means: FloatArray, covs: FloatArray, truth: PhysicalParamet
         posterior is calibrated.
     """
     true_physical = np.stack([truth.m, truth.c, truth.a, truth.b], axis=-1)
-    errors = np.abs(propagate_to_physical(means, covs)[0] / true_physical - 1)
+    errors = np.abs(kind.propagate(means, covs)[0] / true_physical - 1)
     free = np.flatnonzero(np.diagonal(covs, axis1=1, axis2=2).all(axis=0))  # without those that are known, as θ2 = 0
-    deviations, covs = (means - coefficients_of(truth))[:, free], covs[:, free][:, :, free]
+    deviations, covs = (means - kind.coefficients_of(truth))[:, free], covs[:, free][:, :, free]
     stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
     units = covs / (stds[:, :, None] * stds[:, None, :])  # better conditioned than the covariances themselves
     scaled = deviations / stds
@@ -102,7 +99,7 @@ def simulation_errors(means: FloatArray, truth: PhysicalParameters) -> FloatArra
     u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:]
     model, rest = NLARX(input_delay=1), np.zeros(2)
     errors = np.empty(len(means))
-    for i, (mean, true) in enumerate(zip(means, coefficients_of(truth), strict=True)):
+    for i, (mean, true) in enumerate(zip(means, Belief.coefficients_of(truth), strict=True)):
         errors[i] = _rmse(model.simulate(mean, u, rest), model.simulate(true, u, rest))
     return errors
 

@@ -18,6 +18,7 @@ from duffing_env.silverbox import Regime, regime_input
 from estimator import NLARX, SAMPLING_STEP, OnlineEstimator, Prior
 
 TRACK = "duffing_env/Amplitude-v0"
+CONTINUOUS = "duffing_env/Continuous-v0"
 REPLAY = "duffing_env/SilverboxReplay-v0"
 SEED = 3
 SYSTEMS = 6
@@ -296,6 +297,37 @@ def test_the_replay_environment_is_evaluated(record):
     assert off_record.metrics["ended_early"].tolist() == [1, 1]
     for evaluation in evaluations:
         assert "arrow_rmse" not in evaluation.metrics
+
+
+def test_the_continuous_track_is_evaluated_in_its_own_coefficients():
+    options = {"horizon": HORIZON}
+    (evaluation,) = evaluate(["uniform"], CONTINUOUS, systems=SYSTEMS, seed=SEED, options=options)
+    policy, state = make_policy("uniform", gym.make(CONTINUOUS, **options), seed=SEED), None
+    actions = []
+    for _ in range(HORIZON):
+        action, state = policy.predict(np.zeros((SYSTEMS, 22)), state)
+        actions.append(action)
+    for row, seed in enumerate(spawn_seeds(SEED, SYSTEMS)):
+        env = gym.make(CONTINUOUS, **options)
+        env.reset(seed=seed)
+        for t in range(HORIZON):
+            *_, info = env.step(actions[t][row])
+        belief, truth = info["belief"], info["truth"]
+        stiffness, cubic, damping, gain = belief.coefficients_mean
+        per_sample = SAMPLING_STEP**2 / truth.m
+        true = [truth.a * per_sample, truth.b * per_sample, truth.c / truth.m * SAMPLING_STEP, per_sample]
+        inside = np.abs(belief.coefficients_mean - true) < QUANTILES["coverage"] * np.sqrt(
+            np.diag(belief.coefficients_cov)
+        )
+        expected = {
+            "coverage": np.count_nonzero(inside) / 4,
+            "error_m": abs(SAMPLING_STEP**2 / gain / truth.m - 1),
+            "error_c": abs(SAMPLING_STEP * damping / gain / truth.c - 1),
+            "error_a": abs(stiffness / gain / truth.a - 1),
+            "error_b": abs(cubic / gain / truth.b - 1),
+        }
+        assert {name: evaluation.metrics[name][row] for name in expected} == pytest.approx(expected, abs=1e-6)
+    assert "arrow_rmse" not in evaluation.metrics
 
 
 @pytest.mark.parametrize("systems", [1, 0, -3])
