@@ -4,6 +4,7 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 """
 
 from estimator.belief import Belief, Prior
+from estimator.ensemble import NoiseRatio
 from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE
@@ -28,6 +29,7 @@ __all__ = [
     "Coefficients",
     "DuffingODE",
     "JointBelief",
+    "NoiseRatio",
     "OnlineEstimator",
     "PhysicalParameters",
     "Prior",
