@@ -1,7 +1,8 @@
 """Systems for the coverage tables: drawn at random and simulated, with the prior that has the moments of the draw.
 
 Every model has the four parameters of an oscillator near the twin of the Silverbox; what else it has is Gaussian about
-0. All start at rest and get inputs that are independent and uniform.
+0. All get inputs that are independent and uniform. The difference equations start at rest; of the physical equation the
+start tells the offsets apart, and is therefore drawn as the prior has it.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ def _std(term: Term) -> float:
 def draw(
     name: str, systems: int, process_noise: float, measurement_noise: float, samples: int, rng: np.random.Generator
 ) -> Systems:
-    """Draw systems of a population and simulate them from rest.
+    """Draw systems of a population and simulate them.
 
     Args:
         name: one of `MODELS`. ``paper`` and the presets: m, c, a and b are log-uniform, the other coefficients normal
@@ -156,14 +157,15 @@ def simulate_ode(
 ) -> tuple[FloatArray, FloatArray, np.ndarray]:
     """Simulate the physical equation with parameters (N, 8) and an input that is linear between samples.
 
-    Returns as `simulate`; its cubic stiffness hardens, so that all systems stay.
+    It starts at random, with the standard deviations of the prior. Returns as `simulate`; its cubic stiffness hardens,
+    so that all systems stay.
     """
     model = DuffingODE()
     shape = (len(parameters), samples)
     u, w, y = _inputs_and_noises(shape, process_noise, measurement_noise, rng)
+    starts = rng.standard_normal((len(parameters), N_STATES)) * [STATE_STD, STATE_STD / SAMPLING_STEP]
     for i, truth in enumerate(parameters):
-        state = np.concatenate([np.zeros(N_STATES), truth])
-        coordinates = to_coordinates(state, np.zeros((N_JOINT, N_JOINT)))[0]
+        coordinates = to_coordinates(np.concatenate([starts[i], truth]), np.zeros((N_JOINT, N_JOINT)))[0]
         z = np.empty(samples)
         move(coordinates[:N_MOTION], model.pieces(u[i]), w[i], model.substeps, z)
         y[i] += z + truth[-1] * u[i]

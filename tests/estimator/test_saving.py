@@ -16,6 +16,8 @@ ESTIMATORS = {
     "own terms": lambda: OnlineEstimator(NLARX(regressors=(Term(1), Term(0, 1), Term(tap=2), Term(1, 1)))),
     "ode": lambda: OnlineEstimator(DuffingODE(cubic_damping=True)),
     "ode, look-ahead": lambda: OnlineEstimator(DuffingODE("look_ahead", substeps=3)),
+    "ensemble": lambda: OnlineEstimator(NLARX(), noise_hypotheses=3),
+    "ode ensemble": lambda: OnlineEstimator(DuffingODE("look_ahead", substeps=3), noise_hypotheses=3),
 }
 
 
