@@ -54,7 +54,7 @@ class NoiseRatio:
     Attributes:
         mean: of the logarithm.
         std: its standard deviation, with that within a step of the grid. Below 0.5 the ratio of the precisions is known
-            to a factor of 3; near ``prior_std`` the data does not tell.
+            to a factor of 3; near ``prior_std`` the data does not tell. A truth beyond the grid it does not show.
         prior_std: its standard deviation before the first sample.
     """
 
