@@ -55,7 +55,7 @@ class Silverbox:
 
     def run(self) -> None:
         """Runs the protocol, or compares settings."""
-        from agents.silverbox_protocol import run_protocol
+        from agents.silverbox_results import run_protocol
         from agents.silverbox_selection import select
 
         if self.select:
