@@ -325,8 +325,8 @@ def report(
             console.print(f"  not available: {title}")
             continue
         verdict = "PASS" if times >= BAR and no_worse else "MISS"
-        errors = " against ".join(_line(contenders[name]) for name in (ours, title))
-        console.print(f"  {verdict}  {ours} is {times:.1f} times as fast as {title}, at least {BAR:g}: {errors} mV")
+        console.print(f"  {verdict}  {ours} is {times:.1f} times as fast as {title}, at least {BAR:g},")
+        console.print(f"        with {_line(contenders[ours])} mV against {_line(contenders[title])} mV")
 
 
 def _line(contender: Contender) -> str:

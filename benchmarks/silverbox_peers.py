@@ -47,23 +47,14 @@ class Model:
     read: Callable[[Any, Any], Any]
 
 
-def model(given: Given, name: str, substeps: int | None = None) -> Model:
-    """The model of this name; ``substeps`` replaces the Runge-Kutta steps per sample of an ODE."""
-    mean, cov = given[f"{name}_mean"], given[f"{name}_cov"]
-    direction = np.zeros(len(mean))
-    direction[:2] = given[f"{name}_direction"]
-    process_cov = float(given[f"{name}_process_variance"]) * np.outer(direction, direction)
-    measurement_cov = np.array([[float(given[f"{name}_measurement_variance"])]])
-    if f"{name}_terms" in given:
-        terms = given[f"{name}_terms"].tolist()
-        return Model(mean, cov, process_cov, measurement_cov, regression(terms), lambda state, taps: state[0])
-    steps = substeps or int(given[f"{name}_substeps"])
-    return Model(
-        mean, cov, process_cov, measurement_cov, flow(steps), lambda state, taps: state[0] + state[8] * taps[0]
-    )
+def repeat(steps: int, body: Callable[[Any, Any], Any], carry: Any) -> Any:
+    """Python's loop, with the arguments of a compiled one."""
+    for s in range(steps):
+        carry = body(s, carry)
+    return carry
 
 
-def flow(substeps: int) -> Callable[[Any, Any], tuple[Any, Any]]:
+def flow(substeps: int, loop: Callable[..., Any] = repeat) -> Callable[[Any, Any], tuple[Any, Any]]:
     """Moves (z, z') of a state (z, z', k, c, g, b, f, y0, d) over a sample, as `estimator.models.ode.flow` does.
 
     z'' = g u + f - c z' - k z - b (z - y0)³, input interpolated linearly, Runge-Kutta of order 4; time in samples.
@@ -71,21 +62,23 @@ def flow(substeps: int) -> Callable[[Any, Any], tuple[Any, Any]]:
     h = 1.0 / substeps
 
     def move(state: Any, taps: Any) -> tuple[Any, Any]:
-        z, v, k, c, g, b, f, y0 = (state[i] for i in range(8))
+        k, c, g, b, f, y0 = (state[i] for i in range(2, 8))
         last, rise = taps[1], taps[0] - taps[1]
 
-        def change(z: Any, v: Any, tau: float) -> tuple[Any, Any]:
+        def change(z: Any, v: Any, tau: Any) -> tuple[Any, Any]:
             x = z - y0
             return v, g * (last + tau * rise) + f - c * v - k * z - b * x * x * x
 
-        for s in range(substeps):
+        def step(s: Any, motion: tuple[Any, Any]) -> tuple[Any, Any]:
+            z, v = motion
             z1, v1 = change(z, v, s * h)
             z2, v2 = change(z + 0.5 * h * z1, v + 0.5 * h * v1, (s + 0.5) * h)
             z3, v3 = change(z + 0.5 * h * z2, v + 0.5 * h * v2, (s + 0.5) * h)
             z4, v4 = change(z + h * z3, v + h * v3, (s + 1.0) * h)
-            z = z + h / 6.0 * (z1 + 2.0 * z2 + 2.0 * z3 + z4)
-            v = v + h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)
-        return z, v
+            return z + h / 6.0 * (z1 + 2.0 * z2 + 2.0 * z3 + z4), v + h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)
+
+        moved: tuple[Any, Any] = loop(substeps, step, (state[0], state[1]))
+        return moved
 
     return move
 
@@ -106,6 +99,20 @@ def regression(terms: Sequence[tuple[int, int, int]]) -> Callable[[Any, Any], tu
     return move
 
 
+def model(given: Given, name: str, substeps: int | None = None, loop: Callable[..., Any] = repeat) -> Model:
+    """The model of this name; ``substeps`` replaces an ODE's Runge-Kutta steps per sample, ``loop`` repeats them."""
+    mean, cov = given[f"{name}_mean"], given[f"{name}_cov"]
+    direction = np.zeros(len(mean))
+    direction[:2] = given[f"{name}_direction"]
+    process_cov = float(given[f"{name}_process_variance"]) * np.outer(direction, direction)
+    measurement_cov = np.array([[float(given[f"{name}_measurement_variance"])]])
+    noises = (process_cov, measurement_cov)
+    if f"{name}_terms" in given:
+        return Model(mean, cov, *noises, regression(given[f"{name}_terms"].tolist()), lambda state, taps: state[0])
+    move = flow(substeps or int(given[f"{name}_substeps"]), loop)
+    return Model(mean, cov, *noises, move, lambda state, taps: state[0] + state[8] * taps[0])
+
+
 def taps_of(u: Any) -> Any:
     """(T, 3) the inputs u_t, u_{t-1}, u_{t-2} of each sample; 0 before the first."""
     return np.column_stack([u, np.r_[0.0, u[:-1]], np.r_[0.0, 0.0, u[:-2]]])
@@ -114,7 +121,8 @@ def taps_of(u: Any) -> Any:
 def dynamax_ekf(given: Given, name: str) -> Identify:
     """The extended Kalman filter of dynamax: one compiled scan, float64, Jacobians by its automatic differentiation.
 
-    It conditions first, and then predicts with the next sample's taps. It gets the model's own Runge-Kutta steps.
+    It conditions first, and then predicts with the next sample's taps. It gets the model's own Runge-Kutta steps, in a
+    compiled loop: unrolled, they are many times slower.
     """
     from functools import partial
 
@@ -122,7 +130,7 @@ def dynamax_ekf(given: Given, name: str) -> Identify:
     import jax.numpy as jnp
     from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
 
-    ours = model(given, name)
+    ours = model(given, name, loop=partial(jax.lax.fori_loop, 0))
 
     def transition(state: Any, taps: Any) -> Any:
         return jnp.concatenate([jnp.stack(ours.move(state, taps)), state[2:]])
