@@ -2,12 +2,14 @@
 
 | Name | Input | Frequency content |
 |------|-------|-------------------|
-| ``square-believed`` | square wave at the linear resonance of the posterior's mean | a line that moves, odd harmonics |
-| ``velocity-sign`` | ±limit with the sign of the believed velocity x_t - x_{t-1} | at the resonance of that amplitude |
+| ``square-believed`` | square wave at the linear resonance of the posterior's mean | a moving line, odd harmonics |
+| ``velocity-sign`` | ±limit with the sign of the believed velocity x_t - x_{t-1} | the resonance of that amplitude |
 
 Both give ±amplitude: the amplitude limit, or the budget's RMS where that is smaller. Both brake, giving the input
 against the velocity, while the amplitude that the oscillation is believed to have is beyond `TURN` of the displacement
-that ends the episode. Both are deterministic: the seed has no effect.
+that ends the episode. Where the limits allow for an amplitude so large, they spend the rest of the episode about it,
+pumping and braking by turns, which puts most of the power above the resonance. Both are deterministic: the seed has no
+effect.
 """
 
 from __future__ import annotations
