@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from agents.evaluation import Evaluation
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
+_RESONANCES = (49.5, 94.7)
+"""Least and largest linear resonance of oscillators within ±30 % of the twin [Hz]."""
+
 _MILLISECONDS = 1e3 * SAMPLING_STEP
 
 
@@ -144,6 +147,52 @@ def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
     panels[0].set_ylabel("intervals that hold the truth / %")
     panels[0].legend(fontsize=7)
     return figure
+
+
+def draw_policies(path: Path, systems: int = 64, samples: int = 256) -> None:
+    """The inputs of all signals and of the policies with feedback: one in time, and the mean spectrum of many.
+
+    Signals are drawn at a limit of 0.15 V. The policies with feedback act on Amplitude-v0, on systems of
+    their own. Shaded are the linear resonances of oscillators within ±30 % of the twin.
+
+    Args:
+        path: The PNG file that is written.
+        systems: Draws, or systems, that a spectrum is the mean of, at least 2.
+        samples: Length of a signal, and of an episode.
+    """
+    from scipy.signal import periodogram
+
+    from agents.evaluation import evaluate
+    from agents.policies.excitations import EXCITATIONS
+    from agents.policies.export import draw_signal
+    from agents.policies.feedback import FEEDBACK
+
+    inputs = {
+        name: np.stack([draw_signal(name, samples=samples, seed=seed) for seed in range(systems)])
+        for name in EXCITATIONS
+    }
+    for evaluation in evaluate(list(FEEDBACK), systems=systems, options={"horizon": samples}):
+        inputs[evaluation.policy] = evaluation.inputs.T
+    figure = _figure(9, 1.05 * len(inputs) + 0.5)
+    grid = figure.subplots(len(inputs), 2, sharex="col", sharey="col")
+    time = _MILLISECONDS * np.arange(samples)
+    for row, (name, signals), colour in zip(grid, inputs.items(), cycle(_COLOURS), strict=False):
+        row[0].step(time, signals[0], where="post", color=colour, linewidth=0.8)
+        frequency, density = periodogram(signals, 1.0 / SAMPLING_STEP, detrend=False)
+        with np.errstate(divide="ignore"):
+            row[1].plot(frequency, 10 * np.log10(density.mean(axis=0)), color=colour, linewidth=0.9)
+        row[1].axvspan(*_RESONANCES, color="black", alpha=0.08, linewidth=0)
+        row[0].set_title(name, loc="left", fontsize=9)
+        row[0].set_ylabel("u / V")
+        row[1].set_ylabel("dB(V²/Hz)")
+        for axes in row:
+            axes.grid(alpha=0.3)
+    grid[-1, 0].set_xlabel("time / ms")
+    grid[-1, 1].set_xlabel("frequency / Hz")
+    grid[0, 0].set_xlim(0, time[-1])
+    grid[0, 1].set_xlim(0, 0.5 / SAMPLING_STEP)
+    grid[0, 1].set_ylim(-85, -20)
+    _save(figure, path)
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from agents.policies.signals import draw_regime
+from agents.policies.excitations import draw_regime
 from duffing_env.silverbox import load_record, regime_input
 from estimator import NLARX, Belief, PhysicalParameters, fisher_information, to_coefficients
 from estimator.belief import RecordBelief

@@ -14,7 +14,9 @@ from gymnasium import Env
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
-from agents.policies.signals import make_prbs, make_silverbox, make_uniform
+from agents.policies.excitations import EXCITATIONS
+from agents.policies.feedback import FEEDBACK
+from agents.policies.signals import make_signal
 
 
 class Policy(Protocol):
@@ -43,10 +45,8 @@ class Policy(Protocol):
 
 
 POLICIES: dict[str, Callable[[Any, int], Policy]] = {
-    "silverbox-multisine": partial(make_silverbox, "multisine"),
-    "silverbox-arrow": partial(make_silverbox, "arrow"),
-    "uniform": make_uniform,
-    "prbs": make_prbs,
+    **{name: partial(make_signal, name) for name in EXCITATIONS},
+    **FEEDBACK,
 }
 
 

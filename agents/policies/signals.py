@@ -1,25 +1,68 @@
-"""Excitation signals as policies: they choose the input without looking at the observation.
+"""Signals as policies: they choose the input without looking at the observation.
 
-An excitation is drawn by a `Draw`, a function that turns a generator and a number of samples into
-an input in volts. `SignalPolicy` plays such draws through Stable-Baselines3's `predict`, one signal
-for each environment of a batch. The `make_...` functions fit the known excitations to an
-environment's amplitude limit and episode length; `agents.policies.make_policy` calls them by name.
+`SignalPolicy` plays a `Draw` of `agents.policies.excitations` through Stable-Baselines3's `predict`, one signal for
+each environment of a batch. `make_signal` fits an excitation to an environment: to its amplitude limit, to the length
+of its episodes, and to its input budget where it has one. `agents.policies.make_policy` calls it by name.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from duffing_env.silverbox import regime_input
+from agents.policies.excitations import EXCITATIONS, Draw, draw_recorded
 
-Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
 # Samples already played, shape (n,), and actions, shape (n, samples), of each environment's signal.
 SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 DEFAULT_MAX_INPUT = 0.15  # V; the largest input of the Silverbox record is 0.149 V
 DEFAULT_SAMPLES = 1024  # for environments whose episodes have no fixed length
+
+# Float32 rounding of the actions must not bring a signal of exactly the budget above it.
+_WITHIN = 1.0 - 1e-6
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an input must keep to.
+
+    Attributes:
+        max_input: The input at action 1, in volts, positive.
+        max_rms: The largest root mean square over an episode, in volts, positive; None where there is none.
+
+    Raises:
+        ValueError: `max_input` or `max_rms` is not positive and finite.
+    """
+
+    max_input: float = DEFAULT_MAX_INPUT
+    max_rms: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("max_input", self.max_input), ("max_rms", self.max_rms)):
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} must be positive and finite, in volts, but it is {value}")
+
+    def fit(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Turns an input into actions within the limits. This is the one place where signals are scaled.
+
+        The input is clipped at `max_input`. Where its root mean square is then above `max_rms`, it is scaled down
+        to it as a whole, because the environment would otherwise play its beginning at full size and cut the rest
+        to zero. It is never scaled up.
+
+        Args:
+            volts: The input of an episode, or of a part that repeats, shape `(samples,)`.
+
+        Returns:
+            Actions in [-1, 1], shape `(samples,)`.
+        """
+        actions = np.clip(volts / self.max_input, -1.0, 1.0)
+        if self.max_rms is not None:
+            allowed = _WITHIN * self.max_rms / self.max_input
+            rms = np.sqrt(np.mean(actions**2))
+            if rms > allowed:
+                actions *= allowed / rms
+        return actions
 
 
 class SignalPolicy:
@@ -31,7 +74,7 @@ class SignalPolicy:
 
     Attributes:
         name: The name of the excitation.
-        max_input: The input at action 1, in volts.
+        limits: What every signal is fitted to.
         samples: The length of one draw. A signal that runs out before its episode ends is
             continued by the next draw.
         seed: The seed that `reset` starts from.
@@ -43,32 +86,37 @@ class SignalPolicy:
         draw: Draw,
         *,
         max_input: float,
+        max_rms: float | None = None,
         samples: int = DEFAULT_SAMPLES,
         seed: int = 0,
     ) -> None:
-        """Fits an excitation to an amplitude limit.
+        """Fits an excitation to the limits of an environment.
 
         Args:
             name: The name of the excitation.
             draw: Gives one excitation in volts, shape `(samples,)`, from a generator and a number
                 of samples.
             max_input: The input at action 1, in volts, positive; the signal is clipped there.
+            max_rms: The largest root mean square of a draw, in volts; see `Limits.fit`. None: no limit.
             samples: The length of one draw, at least 1.
             seed: The seed of all the signals.
 
         Raises:
-            ValueError: `max_input` is not positive and finite, or `samples` is below 1.
+            ValueError: `max_input` or `max_rms` is not positive and finite, or `samples` is below 1.
         """
-        if not (np.isfinite(max_input) and max_input > 0.0):
-            raise ValueError(f"max_input must be positive and finite, in volts, but it is {max_input}")
         if samples < 1:
             raise ValueError(f"samples must be 1 or more, but it is {samples}")
         self.name = name
-        self.max_input = max_input
+        self.limits = Limits(max_input, max_rms)
         self.samples = samples
         self.seed = seed
         self._draw = draw
         self.reset()
+
+    @property
+    def max_input(self) -> float:
+        """The input at action 1, in volts."""
+        return self.limits.max_input
 
     def reset(self, seed: int | None = None) -> None:
         """Starts over: the next signal of each environment is its first one again.
@@ -101,7 +149,7 @@ class SignalPolicy:
                 and reproducible by its seed.
 
         Returns:
-            The actions, u / max_input clipped to [-1, 1], as float32 of shape `(n, 1)`, or `(1,)`
+            The actions, u / max_input fitted to the limits, as float32 of shape `(n, 1)`, or `(1,)`
             for one environment; and the state for the next call. The state that was passed in is
             left as it was.
 
@@ -140,8 +188,7 @@ class SignalPolicy:
         missing = row + 1 - len(self._generators)
         if missing > 0:
             self._generators += map(np.random.default_rng, self._seeds.spawn(missing))
-        volts = self._draw(self._generators[row], self.samples)
-        return np.clip(volts / self.max_input, -1.0, 1.0)
+        return self.limits.fit(self._draw(self._generators[row], self.samples))
 
 
 def _check_rows(name: str, given: int, expected: int) -> None:
@@ -151,96 +198,40 @@ def _check_rows(name: str, given: int, expected: int) -> None:
         )
 
 
-def draw_regime(name: str) -> Draw:
-    """A stretch of a regime of the Silverbox record, or of its synthesised stand-in.
+def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
+    """The policy that plays an excitation on an unwrapped environment (or None).
 
-    The stretch is contiguous and starts anywhere it fits, gaps and quiet beginning included. One
-    longer than the regime starts at its first sample and repeats it.
-
-    Args:
-        name: `"multisine"` or `"arrow"`; see `duffing_env.silverbox.regime_input`.
-    """
-
-    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        regime = regime_input(name, rng)
-        start = rng.integers(max(regime.size - samples, 0), endpoint=True)
-        return np.resize(regime[start : start + samples], samples)
-
-    return draw
-
-
-def draw_recorded(u: NDArray[np.float64]) -> Draw:
-    """A given input in volts, shape `(samples,)`, from its first sample; repeated if too short."""
-    return lambda rng, samples: np.resize(u, samples)
-
-
-def draw_uniform(max_input: float) -> Draw:
-    """Independent samples, uniform in ±`max_input` volts."""
-    return lambda rng, samples: rng.uniform(-max_input, max_input, samples)
-
-
-def draw_prbs(max_input: float, hold: int = 1) -> Draw:
-    """A random binary signal: +`max_input` or -`max_input` volts with even odds.
-
-    Args:
-        max_input: The amplitude, in volts.
-        hold: For how many samples each value is kept, at least 1.
-
-    Raises:
-        ValueError: `hold` is below 1.
-    """
-    if hold < 1:
-        raise ValueError(f"hold must be 1 sample or more, but it is {hold}")
-
-    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        signs = rng.choice([-1.0, 1.0], size=-(-samples // hold))
-        return max_input * np.repeat(signs, hold)[:samples]
-
-    return draw
-
-
-def make_silverbox(regime: str, env: Any, seed: int) -> SignalPolicy:
-    """The reference policy of a regime.
-
-    On an environment that replays a record (it has `recorded_input`) the policy plays that input
+    On an environment that replays a record (it has `recorded_input`) the regimes ``silverbox-...`` play that input
     from its first sample in every episode; on others, a stretch of the regime.
 
     Args:
-        regime: `"multisine"` or `"arrow"`.
+        name: A name in `EXCITATIONS`.
         env: The unwrapped environment, or None.
         seed: The seed of the signals.
+
+    Raises:
+        ValueError: `env` is not one of duffing_env.
     """
-    max_input, samples = _limits(env)
+    limits, samples = limits_of(env)
+    draw = EXCITATIONS[name](limits.max_input)
     recorded = getattr(env, "recorded_input", None)
-    if recorded is None:
-        draw = draw_regime(regime)
-    else:
+    if recorded is not None and name.startswith("silverbox-"):
         draw, samples = draw_recorded(recorded), len(recorded)
-    name = f"silverbox-{regime}"
-    return SignalPolicy(name, draw, max_input=max_input, samples=samples, seed=seed)
+    return SignalPolicy(name, draw, max_input=limits.max_input, max_rms=limits.max_rms, samples=samples, seed=seed)
 
 
-def make_uniform(env: Any, seed: int) -> SignalPolicy:
-    """Independent inputs, uniform over the whole range of an unwrapped environment (or None)."""
-    max_input, samples = _limits(env)
-    draw = draw_uniform(max_input)
-    return SignalPolicy("uniform", draw, max_input=max_input, samples=samples, seed=seed)
+def limits_of(env: Any) -> tuple[Limits, int]:
+    """The limits of the input, and the length of an episode, of an unwrapped environment (or None).
 
-
-def make_prbs(env: Any, seed: int, hold: int = 1) -> SignalPolicy:
-    """A random binary input at the limits of an unwrapped environment (or None)."""
-    max_input, samples = _limits(env)
-    draw = draw_prbs(max_input, hold)
-    return SignalPolicy("prbs", draw, max_input=max_input, samples=samples, seed=seed)
-
-
-def _limits(env: Any) -> tuple[float, int]:
-    """The input at action 1, in volts, and the length of an episode, of an unwrapped env."""
+    Raises:
+        ValueError: `env` is not one of duffing_env.
+    """
     if env is None:
-        return DEFAULT_MAX_INPUT, DEFAULT_SAMPLES
+        return Limits(), DEFAULT_SAMPLES
     if not hasattr(env, "max_input"):
         raise ValueError(
             f"env must be an environment of duffing_env, which has max_input, but its unwrapped "
             f"type is {type(env).__name__}; pass env=None for a limit of {DEFAULT_MAX_INPUT} V"
         )
-    return env.max_input, getattr(env, "horizon", None) or DEFAULT_SAMPLES
+    max_rms = getattr(getattr(env, "experiment", None), "max_rms", None)
+    return Limits(env.max_input, max_rms), getattr(env, "horizon", None) or DEFAULT_SAMPLES

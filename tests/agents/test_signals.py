@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 
 from agents.policies import POLICIES, make_policy
-from agents.policies.signals import (
-    DEFAULT_SAMPLES,
-    SignalPolicy,
-    draw_prbs,
-    draw_recorded,
-    draw_regime,
-    draw_uniform,
-)
+from agents.policies.excitations import EXCITATIONS, draw_prbs, draw_recorded, draw_regime, draw_uniform
+from agents.policies.signals import DEFAULT_SAMPLES, SignalPolicy
 from duffing_env import silverbox
 
 
@@ -51,7 +45,7 @@ def without_record(monkeypatch):
     monkeypatch.setattr(silverbox, "record_available", lambda: False)
 
 
-@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("name", EXCITATIONS)
 def test_shapes_and_types_of_batch_and_single(name):
     policy = make_policy(name, stand_in(max_input=0.1, horizon=50))
     for rows in (1, 4):
@@ -66,7 +60,7 @@ def test_shapes_and_types_of_batch_and_single(name):
     assert policy.predict(np.zeros(7), state, episode_start=True)[0].shape == (1,)
 
 
-@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("name", EXCITATIONS)
 def test_actions_stay_in_range(name):
     # Both regimes exceed 10 mV, so the limit has to clip them.
     policy = make_policy(name, stand_in(max_input=0.01, horizon=400))
@@ -225,7 +219,7 @@ def test_reference_policies_work_without_the_record(without_record, regime):
 
 
 def test_stretches_start_uniformly_over_the_regime(monkeypatch):
-    monkeypatch.setattr("agents.policies.signals.regime_input", lambda name, rng: np.arange(10.0))
+    monkeypatch.setattr("agents.policies.excitations.regime_input", lambda name, rng: np.arange(10.0))
     rng = np.random.default_rng(5)
     starts = [draw_regime("arrow")(rng, 7)[0] for _ in range(4000)]
     values, counts = np.unique(starts, return_counts=True)
@@ -263,7 +257,7 @@ def test_policies_take_limit_and_length_from_the_environment():
     endless = make_policy("uniform", stand_in(max_input=0.3, horizon=None))
     assert endless.samples == DEFAULT_SAMPLES
     assert make_policy("silverbox-arrow").max_input == 0.15
-    for name in POLICIES:
+    for name in EXCITATIONS:
         assert make_policy(name).name == name
 
 

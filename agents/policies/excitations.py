@@ -1,0 +1,240 @@
+"""Excitations by name: classical test signals, drawn by a generator, in volts.
+
+`EXCITATIONS` makes a `Draw` from an amplitude limit. Every draw is new: what is not random about a signal (its band,
+its levels) is fixed, and its phase, order or start is drawn. The sampling rate is 610.35 Hz (δ = 1.6384 ms); an input
+is held for a sample. `agents.policies.signals.SignalPolicy` plays them, within a track's limits.
+
+| Name | Signal | Frequency content |
+|------|--------|-------------------|
+| ``silverbox-multisine`` | stretch of the record's multisine, 22.3 mV RMS | odd lines every 0.15 Hz up to 200 Hz |
+| ``silverbox-arrow`` | stretch of the record's arrow, up to 39 mV RMS | flat to 200 Hz |
+| ``uniform`` | independent, uniform in ±limit | white |
+| ``gaussian`` | independent, normal, clipped; standard deviation a third of the limit | white |
+| ``prbs`` | ±limit by a fair coin at every sample | white |
+| ``prbs-2``, ``-4``, ``-8`` | the same, each value held for 2, 4, 8 samples | sinc² with nulls at 305, 153, 76 Hz |
+| ``multilevel-prbs`` | one of five levels, -1, -½, 0, ½, 1 of the limit, held for 4 samples | as ``prbs-4`` |
+| ``multisine`` | all lines of the draw, equal amplitudes, random phases, peak at the limit | flat, 10 to 150 Hz |
+| ``schroeder`` | the same with Schroeder's phases, from a random place of its period | flat, 10 to 150 Hz |
+| ``chirp-linear`` | sine at the limit; frequency linear in time, 10 to 150 Hz in a draw | flat, 10 to 150 Hz |
+| ``chirp-log`` | the same, exponential in time: equal time in every octave | falling by 3 dB an octave, 10 to 150 Hz |
+| ``square`` | ±limit at the resonance of the twin, 68.1 Hz | a line and its odd harmonics |
+
+Why 10 to 150 Hz: the linear resonances of oscillators within ±30 % of the twin lie between 49 and 95 Hz, and the cubic
+term lifts them as the displacement grows. Below the resonance an oscillator answers with its stiffness, at it with
+its damping, and above it with its mass: a band with room on both sides tells the three apart. Above 150 Hz the
+response is less than a third of the static one, and what is spent there is hardly seen by the sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duffing_env.silverbox import regime_input
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray, to_coefficients
+
+Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
+
+BAND = (10.0, 150.0)
+"""Of multisines and chirps [Hz]."""
+
+LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+"""Of ``multilevel-prbs``, in parts of the limit; the small ones show the linear term, the large ones the cubic one."""
+
+
+def draw_regime(name: str) -> Draw:
+    """A stretch of a regime of the Silverbox record, or of its synthesised stand-in.
+
+    The stretch is contiguous and starts anywhere it fits, gaps and quiet beginning included. One
+    longer than the regime starts at its first sample and repeats it.
+
+    Args:
+        name: `"multisine"` or `"arrow"`; see `duffing_env.silverbox.regime_input`.
+    """
+
+    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
+        regime = regime_input(name, rng)
+        start = rng.integers(max(regime.size - samples, 0), endpoint=True)
+        return np.resize(regime[start : start + samples], samples)
+
+    return draw
+
+
+def draw_recorded(u: NDArray[np.float64]) -> Draw:
+    """A given input in volts, shape `(samples,)`, from its first sample; repeated if too short."""
+    return lambda rng, samples: np.resize(u, samples)
+
+
+def draw_uniform(max_input: float) -> Draw:
+    """Independent samples, uniform in ±`max_input` volts."""
+    return lambda rng, samples: rng.uniform(-max_input, max_input, samples)
+
+
+def draw_gaussian(max_input: float) -> Draw:
+    """Independent normal samples of standard deviation `max_input` / 3, clipped at ±`max_input` (1 in 370 is)."""
+    return lambda rng, samples: np.clip(rng.normal(0.0, max_input / 3.0, samples), -max_input, max_input)
+
+
+def draw_prbs(max_input: float, hold: int = 1) -> Draw:
+    """A random binary signal: +`max_input` or -`max_input` volts with even odds.
+
+    A coin rather than a shift register: of a maximum length sequence every draw would be the same one, shifted.
+
+    Args:
+        max_input: The amplitude, in volts.
+        hold: For how many samples each value is kept, at least 1.
+
+    Raises:
+        ValueError: `hold` is below 1.
+    """
+    return draw_levels(max_input, hold, levels=(-1.0, 1.0))
+
+
+def draw_levels(max_input: float, hold: int, levels: tuple[float, ...] = LEVELS) -> Draw:
+    """A random signal of a few levels with even odds.
+
+    Args:
+        max_input: The limit, in volts.
+        hold: For how many samples each value is kept, at least 1.
+        levels: The values, in parts of `max_input`.
+
+    Raises:
+        ValueError: `hold` is below 1.
+    """
+    if hold < 1:
+        raise ValueError(f"hold must be 1 sample or more, but it is {hold}")
+
+    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
+        values = rng.choice(levels, size=-(-samples // hold))
+        return max_input * np.repeat(values, hold)[:samples]
+
+    return draw
+
+
+def draw_multisine(max_input: float) -> Draw:
+    """Σ_k cos(2π k t / (samples δ) + φ_k) over all k in `BAND`, φ_k uniform on [0, 2π), its peak at `max_input`.
+
+    A draw is one period, so that its power lies on the lines exactly. Its crest factor is about 3.
+    """
+
+    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
+        lines = band_lines(samples)
+        return _tones(lines, rng.uniform(0.0, 2.0 * np.pi, lines.size), samples, max_input)
+
+    return draw
+
+
+def draw_schroeder(max_input: float) -> Draw:
+    """The multisine with the phases of Schroeder (1970), from a random place of its period.
+
+    The n-th of N lines of equal power has φ_n = -π n (n - 1) / N, which makes the sum a sweep through the band, with
+    a crest factor of about 1.8: at the same peak it has nearly three times the power of random phases.
+    """
+
+    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
+        lines = band_lines(samples)
+        n = np.arange(1, lines.size + 1)
+        period = _tones(lines, -np.pi * n * (n - 1) / lines.size, samples, max_input)
+        return np.roll(period, rng.integers(samples))
+
+    return draw
+
+
+def band_lines(samples: int) -> NDArray[np.int64]:
+    """The harmonics of 1 / (samples δ) that lie in `BAND`, ascending.
+
+    Raises:
+        ValueError: There is none, which is so below 5 samples.
+    """
+    low, high = (edge * samples * SAMPLING_STEP for edge in BAND)
+    lines = np.arange(max(1, int(np.ceil(low))), int(np.floor(high)) + 1)
+    if lines.size == 0:
+        raise ValueError(
+            f"samples must be 5 or more for a line between {BAND[0]:.0f} and {BAND[1]:.0f} Hz, but it is {samples}; "
+            "draw a longer signal, or one that is not a multisine"
+        )
+    return lines
+
+
+def _tones(lines: NDArray[np.int64], phases: FloatArray, samples: int, peak: float) -> NDArray[np.float64]:
+    """Equal cosines at these harmonics, with these phases, scaled to this peak."""
+    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
+    spectrum[lines] = np.exp(1j * phases)
+    volts = np.fft.irfft(spectrum, samples)
+    return volts * (peak / np.abs(volts).max())
+
+
+def draw_chirp(max_input: float, method: str) -> Draw:
+    """A sine of amplitude `max_input` that rises through `BAND` once in a draw, its first phase random.
+
+    It rises because a hardening oscillator follows a rising frequency to larger displacements than a falling one.
+
+    Args:
+        max_input: The amplitude, in volts.
+        method: `"linear"` or `"logarithmic"` in time; see `scipy.signal.chirp`.
+    """
+
+    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
+        from scipy.signal import chirp
+
+        time = SAMPLING_STEP * np.arange(samples)
+        low, high = BAND
+        phase = rng.uniform(0.0, 360.0)
+        return max_input * chirp(time, low, samples * SAMPLING_STEP, high, method=method, phi=phase)
+
+    return draw
+
+
+def draw_square(max_input: float) -> Draw:
+    """A square wave of ±`max_input` at the twin's linear `resonance`, its first phase random.
+
+    The resonance rises with the amplitude A, about as sqrt((a + ¾ b A²) / m): an oscillator that is driven at the
+    linear one falls out of step as it grows, and beats. To stay in step, the frequency must follow what the
+    oscillator does: see ``square-believed`` and ``velocity-sign`` in `agents.policies.feedback`.
+    """
+    twin = to_coefficients(SILVERBOX_TWIN)
+    step = 2.0 * np.pi * SAMPLING_STEP * resonance(np.float64(twin.theta1), np.float64(twin.theta3))
+
+    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
+        from scipy.signal import square
+
+        return max_input * square(rng.uniform(0.0, 2.0 * np.pi) + step * np.arange(samples))
+
+    return draw
+
+
+def resonance(theta1: FloatArray | np.float64, theta3: FloatArray | np.float64) -> FloatArray:
+    """Frequency at which the linear part of Eq. (2) rings [Hz], within `BAND`.
+
+    The poles are those of z² - θ1 z - θ3, of the angle arccos(θ1 / (2 sqrt(-θ3))). It is 68.1 Hz for the twin;
+    sqrt(a / m) / 2π, without damping and samples, is 67.9 Hz.
+
+    Args:
+        theta1: Any shape.
+        theta3: The same shape. Where it is not negative, no oscillator is described, and the lower edge is given.
+    """
+    modulus = np.sqrt(np.maximum(-np.asarray(theta3), 1e-12))
+    angle = np.arccos(np.clip(np.asarray(theta1) / (2.0 * modulus), -1.0, 1.0))
+    return np.clip(angle / (2.0 * np.pi * SAMPLING_STEP), *BAND)
+
+
+EXCITATIONS: dict[str, Callable[[float], Draw]] = {
+    "silverbox-multisine": lambda max_input: draw_regime("multisine"),
+    "silverbox-arrow": lambda max_input: draw_regime("arrow"),
+    "uniform": draw_uniform,
+    "gaussian": draw_gaussian,
+    "prbs": draw_prbs,
+    "prbs-2": partial(draw_prbs, hold=2),
+    "prbs-4": partial(draw_prbs, hold=4),
+    "prbs-8": partial(draw_prbs, hold=8),
+    "multilevel-prbs": partial(draw_levels, hold=4),
+    "multisine": draw_multisine,
+    "schroeder": draw_schroeder,
+    "chirp-linear": partial(draw_chirp, method="linear"),
+    "chirp-log": partial(draw_chirp, method="logarithmic"),
+    "square": draw_square,
+}
+"""Name of an excitation to what makes its draw from the amplitude limit [V]."""
