@@ -1,10 +1,10 @@
-"""Climbing the worth of an input under the limits of an experiment, compiled: gradient first, then sign by sign."""
+"""Climbing the worth of an input under the limits of an experiment, compiled: projected gradient ascent."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from agents.design import climb, half_log_det, roll, worth
+from agents.design import START_SIZE, climb, worth
 from estimator.lanes import jit, kernel
 
 # Adam (Kingma and Ba 2015): decay of the two averages of the gradient.
@@ -18,7 +18,7 @@ _SOFT, _HARD = 1e2, 1e4
 
 
 @kernel
-def improve(theta, precision, q, r, limit, amplitude, energy, rate, iterations, passes, inputs, values):
+def improve(theta, precision, q, r, limit, amplitude, energy, rate, iterations, inputs, values):
     """Improve several inputs of one system, each on its own.
 
     Args:
@@ -31,12 +31,11 @@ def improve(theta, precision, q, r, limit, amplitude, energy, rate, iterations, 
         energy: limit of Σ u² [V²], inf where there is none.
         rate: first step of the gradient in parts of the amplitude; the steps fall linearly to 0.
         iterations: of the gradient.
-        passes: at most, over all samples, sign by sign; only without a limit of energy.
         inputs: (starts, T) [V], overwritten by the best found that keeps all limits.
         values: (starts,) receives their worth [nats], -inf where nothing found keeps them.
     """
-    start = np.zeros(13)
-    tape = np.empty((inputs.shape[1] + 1, 13))
+    start = np.zeros(START_SIZE)
+    tape = np.empty((inputs.shape[1] + 1, START_SIZE))
     F = np.empty((4, 4))
     for i in range(len(inputs)):
         u = inputs[i]
@@ -45,8 +44,6 @@ def improve(theta, precision, q, r, limit, amplitude, energy, rate, iterations, 
         values[i], peak = worth(theta, precision, q, r, limit, 0.0, start, u, tape, F)
         if not peak <= limit:
             values[i] = -np.inf
-        elif energy == np.inf and passes:
-            values[i] = _polish(theta, precision, q, r, limit, amplitude, passes, u, tape, F, values[i])
 
 
 @jit
@@ -88,65 +85,15 @@ def ascend(theta, precision, q, r, limit, amplitude, energy, rate, iterations, s
         u[:] = best
 
 
-@jit
-def _polish(theta, precision, q, r, limit, amplitude, passes, u, tape, F, value):
-    """Turn single inputs and pairs over, as long as that gains; gives the worth reached [nats]."""
-    T = len(u)
-    behind, piece = np.empty((4, 4)), np.empty((4, 4))
-    tail = np.empty((T + 1, 13))
-    tried = np.empty(T)
-    for _ in range(passes):
-        before = value
-        roll(theta, q, r, limit, np.zeros(13), u, tape, F)
-        behind[:] = precision
-        for t in range(T):
-            left = T - t
-            for move in range(5):
-                if (move == 2 and left < 2) or (move == 3 and left < 3):
-                    continue
-                tried[:left] = u[t:]
-                if move == 0:
-                    tried[0] = amplitude
-                elif move == 1:
-                    tried[0] = -amplitude
-                elif move == 2:
-                    tried[0], tried[1] = u[t + 1], u[t]
-                elif move == 3:
-                    tried[0], tried[2] = u[t + 2], u[t]
-                else:
-                    tried[: left - 1] = u[t + 1 :]
-                roll(theta, q, r, limit, tape[t], tried[:left], tail, F)
-                over = False
-                for k in range(1, left + 1):
-                    over |= not abs(tail[k, 0]) <= limit
-                    if over:
-                        break
-                if over:
-                    continue
-                F += behind
-                found = half_log_det(F)
-                if found > value + 1e-9:
-                    value = found
-                    u[t:] = tried[:left]
-                    tape[t : T + 1] = tail[: left + 1]
-            roll(theta, q, r, limit, tape[t], u[t : t + 1], tail, piece)
-            for j in range(4):
-                for k in range(j + 1):
-                    behind[j, k] += piece[j, k]
-        if value - before < 1e-6:
-            break
-    return value
-
-
 @kernel
 def appraise(theta, precision, q, r, limit, inputs, values, peaks):
     """Worth [nats] and peak displacement [V] of an input (n, T) for each system (n, 4), without a penalty.
 
     An input ends before its first value that is not finite.
     """
-    tape = np.empty((inputs.shape[1] + 1, 13))
+    tape = np.empty((inputs.shape[1] + 1, START_SIZE))
     F = np.empty((4, 4))
-    start = np.zeros(13)
+    start = np.zeros(START_SIZE)
     for i in range(len(inputs)):
         used = 0
         while used < inputs.shape[1] and np.isfinite(inputs[i, used]):

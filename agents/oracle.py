@@ -30,15 +30,17 @@ import numpy.typing as npt
 
 from agents.ascent import appraise, improve
 from agents.cli import JsonOptions, run_script
+from agents.policies.planning import play
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.files import write_atomically
 from estimator.fisher import as_rows
 from estimator.parameters import FloatArray, to_coefficients
+from estimator.record import COEFFICIENTS, RECORD
 
 FOLDER = Path(__file__).parent / "oracles"
 
-#: Places of the gradient search, and passes of the sign-by-sign one.
-_ITERATIONS, _PASSES = 300, 20
+#: Steps of the gradient, random starts, and changed copies in a round.
+_ITERATIONS, _STARTS, _COPIES = 300, 24, 16
 
 
 @dataclass(frozen=True)
@@ -192,56 +194,67 @@ def as_stored(scaled: FloatArray) -> npt.NDArray[np.float16]:
 
 
 def search(
-    systems: Systems,
-    row: int,
-    given: FloatArray,
-    rng: np.random.Generator,
-    starts: int = 24,
-    rounds: int = 6,
+    systems: Systems, row: int, given: FloatArray, rng: np.random.Generator, rounds: int = 8
 ) -> tuple[FloatArray, float]:
     """Search the best input of one system.
 
-    First from many starts, then in rounds from changed copies of the best one (iterated local search).
+    Gradient ascent from many starts, then in rounds from changed copies of the best one (iterated local search). Where
+    only amplitudes are limited, copies are planned anew from a random sample on, which finds more than the gradient.
 
     Args:
         systems: of a task.
         row: the system.
         given: (k, samples) inputs to start from besides [V].
         rng: of the random starts and changes.
-        starts: random binary and square-wave starts.
-        rounds: of changed copies, 8 in each.
+        rounds: of changed copies, `_COPIES` in each.
 
     Returns:
         The best input (samples,) [V] that keeps all limits also as it is stored, and its worth [nats]; -inf if none.
     """
     task = systems.task
+    one = Systems(task, np.repeat(systems.theta[row : row + 1], len(given) + _STARTS, axis=0), systems.precision)
     best, best_value = np.zeros(task.samples), -np.inf
-    pool = np.concatenate([given, _signals(task, starts, rng)])
+    words = rng.integers(0, 2**64, 4, dtype=np.uint64)
+    pool = np.concatenate([given, _signals(task, _STARTS, rng)])
     for k in range(rounds + 1):
-        values = np.empty(len(pool))
-        improve(
-            systems.theta[row],
-            systems.precision,
-            task.process_noise**2,
-            task.measurement_noise**2,
-            task.max_output,
-            task.max_input,
-            task.energy,
-            0.3 if k == 0 else 0.1,
-            _ITERATIONS,
-            _PASSES,
-            pool,
-            values,
-        )
+        if k == 0 or task.rms is not None:
+            _climb(one, pool, 0.3 if k == 0 else 0.1)
         # What is stored is rounded; only what keeps the limits as stored counts.
         pool = task.max_input * as_stored(pool / task.max_input).astype(np.float64)
-        one = Systems(task, np.broadcast_to(systems.theta[row], (len(pool), 4)).copy(), systems.precision)
         values, peaks = one.worth(pool)
         values[~(peaks <= task.max_output)] = -np.inf
         if values.max() > best_value:
             best, best_value = pool[values.argmax()].copy(), float(values.max())
-        pool = np.stack([_changed(best, task, rng) for _ in range(8)])
+        if task.rms is None:
+            pool = np.stack([_planned(best, one, rng, words) for _ in range(_COPIES)])
+        else:
+            pool = np.stack([_changed(best, task, rng) for _ in range(_COPIES)])
     return best, best_value
+
+
+def _climb(one: Systems, pool: FloatArray, rate: float) -> None:
+    """Gradient ascent from every input of a pool (k, samples), in place."""
+    task = one.task
+    q, r = task.process_noise**2, task.measurement_noise**2
+    limits = (task.max_output, task.max_input, task.energy)
+    improve(one.theta[0], one.precision, q, r, *limits, rate, _ITERATIONS, pool, np.empty(len(pool)))
+
+
+def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.NDArray[np.uint64]) -> FloatArray:
+    """A copy that the planner, who knows the system, plans anew from a random sample on."""
+    task = one.task
+    planned = u.copy()
+    value = dict.fromkeys(RECORD, 0.0) | dict(zip(COEFFICIENTS, one.theta[0], strict=True))
+    covariance = np.linalg.inv(one.precision)
+    for i, first in enumerate(COEFFICIENTS):
+        value |= {f"P_{first}_{second}": covariance[i, j] for j, second in enumerate(COEFFICIENTS) if j >= i}
+    value |= {"g_shape": 1.0, "g_rate": task.process_noise**2, "n_shape": 1.0, "n_rate": task.measurement_noise**2}
+    record = np.array([value[name] for name in RECORD])
+    first = int(rng.integers(-task.samples // 8, task.samples - 1))
+    horizon, rounds = int(rng.integers(8, 25)), int(rng.integers(4, 17))
+    limit = 0.9999 * task.max_output  # leaves room for the rounding of what is stored
+    play(record, first, horizon, rounds, task.max_input, limit, 0.0, planned, words)
+    return planned
 
 
 def _signals(task: Task, count: int, rng: np.random.Generator) -> FloatArray:
@@ -287,7 +300,7 @@ def design(
     systems: Systems,
     given: FloatArray,
     *,
-    rounds: int = 6,
+    rounds: int = 8,
     seed: int = 0,
     on_row: Callable[[int, float], None] | None = None,
 ) -> Oracle:
@@ -334,7 +347,7 @@ class Config:
     """Limit of the root mean square of the input [V]; none by default."""
     policies: tuple[str, ...] = ("efe",)
     """Policies whose inputs to start from besides."""
-    rounds: int = 6
+    rounds: int = 8
     """Rounds of changed copies of the best input."""
     seed: int = 0
     """Of the search."""

@@ -25,6 +25,7 @@ LAYOUT = rows("x0 x1", _COVARIANCES, "u cost score")
 _LOADED = np.array([(RECORD.index(name), LAYOUT[name]) for name in ("x0", "x1", *_COVARIANCES.split())])
 _COEFFICIENTS = RECORD.index("t1")
 _NOISES = RECORD.index("g_shape")
+_SIZE = len(LAYOUT) * LANES
 _U, _COST, _SCORE = (LAYOUT[name] * LANES for name in ("u", "cost", "score"))
 
 #: Nats that a displacement beyond its limit costs, per limit that it is beyond: more than any plan can teach.
@@ -104,33 +105,65 @@ def plan(
         actions: (n,) receives the first input of the best plan [V].
         scores: (n,) receives the best plan's score [nats].
     """
-    W = np.empty(len(LAYOUT) * LANES)
+    W = np.empty(_SIZE)
     candidates = np.empty((LANES, horizon))
     for i in range(len(records)):
         steps = max(1, min(horizon, left[i]))
-        best = plans[i]
-        best[:-1] = best[1:].copy()
-        best[-1] = -best[-1] if horizon > 1 else best[-1]
-        best_score = -np.inf
-        for k in range(rounds):
-            for j in range(LANES):
-                candidates[j] = best
-                if k == 0 and j > 0:
-                    _compose(candidates[j], j, steps, amplitude, words[i])
-                elif k > 0:
-                    _mutate(candidates[j], steps, amplitude, words[i])
-            _imagine_all(W, records[i], candidates, steps, limit, margin, price, goal, goal_weight)
-            for j in range(LANES):
-                if W[_SCORE + j] > best_score:
-                    best_score = W[_SCORE + j]
-                    best[:] = candidates[j]
-        actions[i] = best[0]
-        scores[i] = best_score
+        scores[i] = _search(
+            W, candidates, records[i], steps, rounds, amplitude, limit, margin, price, goal, goal_weight,
+            plans[i], words[i],
+        )  # fmt: skip
+        actions[i] = plans[i, 0]
+
+
+@kernel
+def play(record, first, horizon, rounds, amplitude, limit, margin, u, words):
+    """Plan the inputs u (T,) from sample ``first`` on, where the means of the belief are the truth.
+
+    The inputs before it are followed as they are. Arguments as `plan`; ``words`` is (4,), the record is overwritten.
+    """
+    W = np.empty(_SIZE)
+    candidates = np.empty((LANES, horizon))
+    best = np.zeros(horizon)
+    lane = np.empty((1, 1))
+    for t in range(len(u)):
+        if t >= first:
+            steps = min(horizon, len(u) - t)
+            _search(W, candidates, record, steps, rounds, amplitude, limit, margin, 0.0, 0.0, 0.0, best, words)
+            u[t] = best[0]
+        lane[0, 0] = u[t]
+        _imagine_all(W, record, lane, 1, limit, margin, 0.0, 0.0, 0.0)
+        for place in range(len(_LOADED)):
+            record[_LOADED[place, 0]] = W[_LOADED[place, 1] * LANES]
+
+
+@jit
+def _search(
+    W, candidates, record, steps, rounds, amplitude, limit, margin, price, goal, goal_weight, best, words
+):  # fmt: skip
+    """Improve the plan ``best``, begun one sample ago; gives its score [nats]."""
+    last = best[0]
+    best[:-1] = best[1:].copy()
+    best[-1] = -last
+    best_score = -np.inf
+    for k in range(rounds):
+        for j in range(LANES):
+            candidates[j] = best
+            if k == 0 and j > 0:
+                _compose(candidates[j], j, steps, amplitude, words)
+            elif k > 0:
+                _mutate(candidates[j], steps, amplitude, words)
+        _imagine_all(W, record, candidates, steps, limit, margin, price, goal, goal_weight)
+        for j in range(LANES):
+            if W[_SCORE + j] > best_score:
+                best_score = W[_SCORE + j]
+                best[:] = candidates[j]
+    return best_score
 
 
 @jit
 def _imagine_all(W, record, candidates, steps, limit, margin, price, goal, goal_weight):
-    """Load the belief into every lane, and follow the candidates (LANES, horizon)."""
+    """Load the belief into every lane, and follow the candidates (LANES, horizon), or one for all lanes."""
     for place in range(len(_LOADED)):
         value = record[_LOADED[place, 0]]
         first = _LOADED[place, 1] * LANES
@@ -143,7 +176,7 @@ def _imagine_all(W, record, candidates, steps, limit, margin, price, goal, goal_
     r = record[_NOISES + 3] / record[_NOISES + 2]
     for h in range(steps):
         for j in range(LANES):
-            W[_U + j] = candidates[j, h]
+            W[_U + j] = candidates[j % len(candidates), h]
         imagine(W, t1, t2, t3, e, q, r, limit, margin, price, goal, goal_weight)
     judge(W)
 
