@@ -1,4 +1,9 @@
-"""Climbing the worth of an input under the limits of an experiment, compiled: projected gradient ascent."""
+"""Climbing the worth of an input under the limits of an experiment, compiled.
+
+The method is a projected gradient with steps of given length: u ← P(u + α R g / |g|), with P the projection on the
+limits and R the radius of what they allow. For long steps it is the generalised power method, which under a limit of
+energy is at a summit within some ten steps: information is about quadratic in the input, as a Rayleigh quotient is.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +12,14 @@ import numpy as np
 from agents.design import START_SIZE, climb, worth
 from estimator.lanes import jit, kernel
 
-# Adam (Kingma and Ba 2015): decay of the two averages of the gradient.
-_MEAN_DECAY, _SQUARE_DECAY = 0.9, 0.99
-
 #: The gradient aims at this much of the displacement limit, so that what it ends with is within the limit itself.
 _AIM = 0.9995
 
-#: Penalty [nats] of displacements beyond the limit, rising from the first to the last iteration.
-_SOFT, _HARD = 1e2, 1e4
+#: Penalty [nats] of displacements beyond that, see `agents.design`.
+PENALTY = 3e3
+
+#: The last step in parts of the first.
+_LAST = 0.05
 
 
 @kernel
@@ -29,7 +34,7 @@ def improve(theta, precision, q, r, limit, amplitude, energy, rate, iterations, 
         limit: of the displacement without noise [V].
         amplitude: limit of the input [V].
         energy: limit of Σ u² [V²], inf where there is none.
-        rate: first step of the gradient in parts of the amplitude; the steps fall linearly to 0.
+        rate: first step α; the steps fall linearly to a twentieth.
         iterations: of the gradient.
         inputs: (starts, T) [V], overwritten by the best found that keeps all limits.
         values: (starts,) receives their worth [nats], -inf where nothing found keeps them.
@@ -40,7 +45,7 @@ def improve(theta, precision, q, r, limit, amplitude, energy, rate, iterations, 
     for i in range(len(inputs)):
         u = inputs[i]
         project(u, amplitude, energy)
-        ascend(theta, precision, q, r, limit, amplitude, energy, rate, iterations, start, u, tape, F)
+        ascend(theta, precision, q, r, _AIM * limit, limit, amplitude, energy, rate, iterations, start, u, tape, F)
         values[i], peak = worth(theta, precision, q, r, limit, 0.0, start, u, tape, F)
         if not peak <= limit:
             values[i] = -np.inf
@@ -59,30 +64,27 @@ def project(u, amplitude, energy):
 
 
 @jit
-def ascend(theta, precision, q, r, limit, amplitude, energy, rate, iterations, start, u, tape, F):
-    """Projected gradient ascent from u (T,), which the best input found within the limits overwrites, if any is."""
-    gradient, mean, square = np.empty(len(u)), np.zeros(len(u)), np.zeros(len(u))
+def ascend(theta, precision, q, r, aim, limit, amplitude, energy, rate, iterations, start, u, tape, F):
+    """Climb from u (T,) with displacements beyond ``aim`` penalised; the best input met overwrites it.
+
+    Best is the most worth of those within ``limit``; of all, less the penalty, where it is inf. Gives that worth [nats].
+    """
+    gradient = np.empty(len(u))
     best = u.copy()
     best_value = -np.inf
-    first, second = 1.0, 1.0
-    for k in range(iterations):
-        penalty = _SOFT * (_HARD / _SOFT) ** (k / iterations)
-        value, peak = climb(theta, precision, q, r, _AIM * limit, penalty, start, u, tape, F, gradient)
+    radius = min(np.sqrt(energy), amplitude * np.sqrt(len(u)))
+    for k in range(iterations + 1):
+        value, peak = climb(theta, precision, q, r, aim, PENALTY, start, u, tape, F, gradient)
         if peak <= limit and value > best_value:
             best_value = value
             best[:] = u
-        first *= _MEAN_DECAY
-        second *= _SQUARE_DECAY
-        step = rate * amplitude * (1.0 - k / iterations)
-        for t in range(len(u)):
-            slope = gradient[t] * amplitude
-            mean[t] += (1.0 - _MEAN_DECAY) * (slope - mean[t])
-            square[t] += (1.0 - _SQUARE_DECAY) * (slope * slope - square[t])
-            u[t] += step * mean[t] / (1.0 - first) / (np.sqrt(square[t] / (1.0 - second)) + 1e-9)
+        length = np.sqrt(np.sum(gradient * gradient))
+        if k == iterations or not length > 0.0:
+            break
+        u += (rate * (1.0 - (1.0 - _LAST) * k / iterations) * radius / length) * gradient
         project(u, amplitude, energy)
-    value, peak = worth(theta, precision, q, r, limit, 0.0, start, u, tape, F)
-    if not (peak <= limit and value > best_value):
-        u[:] = best
+    u[:] = best
+    return best_value
 
 
 @kernel

@@ -31,6 +31,7 @@ import numpy.typing as npt
 from agents.ascent import appraise, improve
 from agents.cli import JsonOptions, run_script
 from agents.policies.planning import play
+from agents.policies.pursuit import swings
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.files import write_atomically
 from estimator.fisher import as_rows
@@ -40,7 +41,7 @@ from estimator.record import COEFFICIENTS, RECORD
 FOLDER = Path(__file__).parent / "oracles"
 
 #: Steps of the gradient, random starts, and changed copies in a round.
-_ITERATIONS, _STARTS, _COPIES = 300, 24, 16
+_ITERATIONS, _STARTS, _COPIES = 100, 24, 16
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Task:
         measurement_noise: standard deviation [V].
         spread: of the prior.
         plant_spread: of the systems.
-        rms: limit of the root mean square of the input over an episode [V]; None where there is none.
+        max_rms: limit of the root mean square of the input over an episode [V]; None where there is none.
     """
 
     max_input: float
@@ -65,23 +66,23 @@ class Task:
     measurement_noise: float
     spread: float
     plant_spread: float
-    rms: float | None = None
+    max_rms: float | None = None
 
     @classmethod
-    def of(cls, envs: DuffingVectorEnv, rms: float | None = None) -> Task:
-        """The task of an environment; ValueError where it does not simulate a plant."""
+    def of(cls, envs: DuffingVectorEnv) -> Task:
+        """The task of an environment; ValueError where it does not simulate a plant that stays as it is."""
         e: Any = envs.experiment
-        if not hasattr(e, "process_noise"):
-            raise ValueError(f"env must simulate a plant, but is {type(envs).__name__}; a record has no other inputs")
+        if not hasattr(e, "process_noise") or e.jump or e.max_slew is not None:
+            raise ValueError(f"env must simulate a plant without jump and slew limit, but is {e}; choose another track")
         spread = e.spread if e.plant_spread is None else e.plant_spread
         return cls(
-            e.max_input, e.max_output, e.samples, e.process_noise, e.measurement_noise, e.spread, spread, rms
+            e.max_input, e.max_output, e.samples, e.process_noise, e.measurement_noise, e.spread, spread, e.max_rms
         )  # fmt: skip
 
     @property
     def energy(self) -> float:
         """Limit of Σ u² [V²]."""
-        return np.inf if self.rms is None else self.rms**2 * self.samples
+        return np.inf if self.max_rms is None else self.max_rms**2 * self.samples
 
     @property
     def path(self) -> Path:
@@ -105,13 +106,13 @@ class Systems:
     precision: FloatArray
 
     @classmethod
-    def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None, rms: float | None = None) -> Systems:
+    def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None) -> Systems:
         """The first systems of a track, as they are evaluated with seed 0."""
         envs = make(env_id, count, options)
         envs.reset(seed=0)
         theta = as_rows(to_coefficients(envs.truth))
         precision = np.linalg.inv(envs.belief(0).coefficients_cov)
-        return cls(Task.of(envs, rms), theta, precision)
+        return cls(Task.of(envs), theta, precision)
 
     def worth(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Worth ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
@@ -215,9 +216,14 @@ def search(
     one = Systems(task, np.repeat(systems.theta[row : row + 1], len(given) + _STARTS, axis=0), systems.precision)
     best, best_value = np.zeros(task.samples), -np.inf
     words = rng.integers(0, 2**64, 4, dtype=np.uint64)
-    pool = np.concatenate([given, _signals(task, _STARTS, rng)])
+    pool = np.empty((_STARTS, task.samples))
+    if task.max_rms is None:
+        pool[:] = _signals(task, _STARTS, rng)
+    else:
+        swings(systems.theta[row], task.energy, pool, words)
+    pool = np.concatenate([given, pool])
     for k in range(rounds + 1):
-        if k == 0 or task.rms is not None:
+        if k == 0 or task.max_rms is not None:
             _climb(one, pool, 0.3 if k == 0 else 0.1)
         # What is stored is rounded; only what keeps the limits as stored counts.
         pool = task.max_input * as_stored(pool / task.max_input).astype(np.float64)
@@ -225,7 +231,7 @@ def search(
         values[~(peaks <= task.max_output)] = -np.inf
         if values.max() > best_value:
             best, best_value = pool[values.argmax()].copy(), float(values.max())
-        if task.rms is None:
+        if task.max_rms is None:
             pool = np.stack([_planned(best, one, rng, words) for _ in range(_COPIES)])
         else:
             pool = np.stack([_changed(best, task, rng) for _ in range(_COPIES)])
@@ -343,8 +349,6 @@ class Config:
     """Further options of the environment, as JSON."""
     systems: int = 256
     """Number of systems: the first rows of a batch that is reset with seed 0."""
-    rms: float | None = None
-    """Limit of the root mean square of the input [V]; none by default."""
     policies: tuple[str, ...] = ("efe",)
     """Policies whose inputs to start from besides."""
     rounds: int = 8
@@ -357,7 +361,7 @@ def main(config: Config) -> None:
     """Search, store, and say how far it is."""
     from agents.evaluation import evaluate
 
-    systems = Systems.of(config.env, config.systems, config.options, config.rms)
+    systems = Systems.of(config.env, config.systems, config.options)
     given = np.empty((0, config.systems, systems.task.samples))
     if config.policies:
         played = evaluate(config.policies, config.env, config.systems, options=config.options)

@@ -26,12 +26,17 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.policies.planning import plan
+from agents.policies.pursuit import pursue
 from estimator.parameters import FloatArray
 
 #: The last plans (n, horizon) in V, and the streams of random numbers (n, 4).
 PlannerState = tuple[FloatArray, npt.NDArray[np.uint64]]
 
-_TIME_LEFT = 20  # place in the observation
+#: Samples to plan for under an amplitude limit: about two periods of the oscillator.
+_HORIZON = 16
+
+# Places in the observation.
+_TIME_LEFT, _BUDGET_LEFT = 20, 21
 
 
 class Planner:
@@ -60,7 +65,7 @@ class Planner:
         env: Any,
         seed: int = 0,
         *,
-        horizon: int = 12,
+        horizon: int | None = None,
         rounds: int = 24,
         margin: float = 4.0,
         goal: float = 0.0,
@@ -72,7 +77,7 @@ class Planner:
                 f"env must be an environment of duffing_env that simulates a plant, but is {type(env).__name__}; "
                 "the planner needs its beliefs: pass it to make_policy"
             )
-        for name, count in (("horizon", horizon), ("rounds", rounds)):
+        for name, count in (("horizon", 1 if horizon is None else horizon), ("rounds", rounds)):
             if not isinstance(count, int | np.integer) or count < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, but is {count!r}")
         for name, value in (("margin", margin), ("input_cost", input_cost)):
@@ -80,6 +85,10 @@ class Planner:
                 raise ValueError(f"{name} must be 0 or more and finite, but is {value!r}")
         if goal_std is not None and not 0 < goal_std < np.inf:
             raise ValueError(f"goal_std must be positive and finite, but is {goal_std!r}; None is no goal")
+        experiment = env.experiment
+        whole = experiment.max_rms is not None and horizon is None
+        horizon = env.horizon if whole else horizon or _HORIZON
+        self._energy = env.horizon * experiment.max_rms**2 if whole else None
         self._env = env
         self.seed = seed
         self.horizon, self.rounds, self.margin = int(horizon), int(rounds), float(margin)
@@ -125,23 +134,14 @@ class Planner:
         time_left = observed.reshape(n, -1)[:, _TIME_LEFT]
         left = np.rint(time_left * self._env.horizon).astype(np.int64)
         experiment = self._env.experiment
+        limits = float(experiment.max_input), float(experiment.max_output), self.margin
         inputs, scores = np.empty((2, n))
-        plan(
-            records,
-            left,
-            self.horizon,
-            self.rounds,
-            float(experiment.max_input),
-            float(experiment.max_output),
-            self.margin,
-            self._price,
-            self._goal,
-            self._goal_weight,
-            plans,
-            words,
-            inputs,
-            scores,
-        )
+        if self._energy is not None:
+            energies = observed.reshape(n, -1)[:, _BUDGET_LEFT] * self._energy
+            pursue(records, left, energies, *limits, plans, words, inputs, scores)
+        else:
+            costs = self._price, self._goal, self._goal_weight
+            plan(records, left, self.horizon, self.rounds, *limits, *costs, plans, words, inputs, scores)
         actions = (inputs / experiment.max_input).astype(np.float32)
         return actions.reshape(*observed.shape[:-1], 1), (plans, words)
 

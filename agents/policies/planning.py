@@ -182,7 +182,7 @@ def _imagine_all(W, record, candidates, steps, limit, margin, price, goal, goal_
 
 
 @jit
-def _uniform(words):
+def uniform(words):
     """A number in (0, 1) from a stream (4,), which moves on."""
     value, words[0], words[1], words[2], words[3] = draw(words[0], words[1], words[2], words[3])
     return to_unit(value)
@@ -197,8 +197,8 @@ def _compose(candidate, j, steps, amplitude, words):
     if j == 2:
         candidate[:] = 0.0
         return
-    half_period = 1.0 + 5.0 * _uniform(words)
-    phase = 2.0 * half_period * _uniform(words)
+    half_period = 1.0 + 5.0 * uniform(words)
+    phase = 2.0 * half_period * uniform(words)
     for h in range(len(candidate)):
         turns = np.int64((h + phase) / half_period)
         candidate[h] = amplitude if turns % 2 == 0 else -amplitude
@@ -207,16 +207,16 @@ def _compose(candidate, j, steps, amplitude, words):
 @jit
 def _mutate(candidate, steps, amplitude, words):
     """Change a candidate a little: turn one, two or a run of inputs over, shift it, or put one anywhere."""
-    kind = _uniform(words)
-    h = np.int64(_uniform(words) * steps)
+    kind = uniform(words)
+    h = np.int64(uniform(words) * steps)
     if kind < 0.35:
         candidate[h] = -amplitude if candidate[h] > 0.0 else amplitude
     elif kind < 0.55:
-        other = np.int64(_uniform(words) * steps)
+        other = np.int64(uniform(words) * steps)
         candidate[h] = -amplitude if candidate[h] > 0.0 else amplitude
         candidate[other] = -amplitude if candidate[other] > 0.0 else amplitude
     elif kind < 0.75:
-        stop = min(steps, h + 2 + np.int64(4.0 * _uniform(words)))
+        stop = min(steps, h + 2 + np.int64(4.0 * uniform(words)))
         for k in range(h, stop):
             candidate[k] = -candidate[k]
     elif kind < 0.85:
@@ -226,4 +226,4 @@ def _mutate(candidate, steps, amplitude, words):
         for k in range(steps - 1, h, -1):
             candidate[k] = candidate[k - 1]
     else:
-        candidate[h] = amplitude * (2.0 * _uniform(words) - 1.0)
+        candidate[h] = amplitude * (2.0 * uniform(words) - 1.0)
