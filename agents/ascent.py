@@ -67,7 +67,7 @@ def project(u, amplitude, energy):
 def ascend(theta, precision, q, r, aim, limit, amplitude, energy, rate, iterations, start, u, tape, F):
     """Climb from u (T,) with displacements beyond ``aim`` penalised; the best input met overwrites it.
 
-    Best is the most worth of those within ``limit``; of all, less the penalty, where it is inf. Gives that worth [nats].
+    Best is the most worth, less the penalty, of those within ``limit``, inf for all. Gives that worth [nats].
     """
     gradient = np.empty(len(u))
     best = u.copy()

@@ -4,9 +4,8 @@
 
 climbs ½ log det(Λ0 + F(u)) of each system from many starts, under the track's limits, and keeps what is better than
 what is stored. F is the Fisher information at the true coefficients along the response without noise, Λ0 the inverse of
-the prior's covariance of the coefficients. Nobody can identify better on average (van Trees), but for the small change
-of F by noise, and for the search: the worth of inputs has many summits, and the best one found is a lower bound of the
-highest. So whoever finds a better input puts it in its place: with
+the prior's covariance of the coefficients. The worth of inputs has many summits, and the best one found is only a lower
+bound of the highest. So whoever finds a better input puts it in its place: with
 `--policies NAME ...` the search starts from those policies' inputs too.
 
 System i is row i of a batch that is reset with seed 0, as `agents.evaluation.evaluate` does it by default; it does not
@@ -34,8 +33,8 @@ from agents.policies.planning import play
 from agents.policies.pursuit import swings
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.files import write_atomically
-from estimator.fisher import as_rows
-from estimator.parameters import FloatArray, to_coefficients
+from estimator.fisher import as_rows, fisher_information
+from estimator.parameters import Coefficients, FloatArray, to_coefficients
 from estimator.record import COEFFICIENTS, RECORD
 
 FOLDER = Path(__file__).parent / "oracles"
@@ -111,7 +110,7 @@ class Systems:
         envs = make(env_id, count, options)
         envs.reset(seed=0)
         theta = as_rows(to_coefficients(envs.truth))
-        precision = np.linalg.inv(envs.belief(0).coefficients_cov)
+        precision = np.linalg.inv(envs.belief(0).coefficients_cov).astype(np.float64)
         return cls(Task.of(envs), theta, precision)
 
     def worth(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -177,21 +176,38 @@ class Oracle:
         write_atomically(self.systems.task.path, content.getvalue())
         return self.systems.task.path
 
-    def efficiency(self, inputs: npt.ArrayLike) -> FloatArray:
-        """D-efficiency (n,) of inputs (n, samples) [V]: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / 4].
+    def efficiency(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike) -> FloatArray:
+        """D-efficiency (n,) of an episode: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / 4].
 
-        Both along the response without noise, at the true coefficients: 0.5 means that about twice the samples would
-        be needed. Inputs after the end of an episode are NaN, and tell nothing.
+        F is taken at the true coefficients along the outputs that were seen, because feedback keeps these within
+        their limit, and not the response without noise to the same inputs, which drifts away from them. 0.5 means that
+        about twice the samples would be needed. Above 1 says that there is a better input than the stored one, or that
+        the noise was kind.
+
+        Args:
+            inputs: (n, samples) [V]; NaN from the end of an episode on.
+            outputs: (n, samples) [V] that followed them.
+
+        Raises:
+            ValueError: for more rows than the oracle has systems, or as `estimator.fisher_information`.
         """
-        values, _ = self.systems.worth(inputs)
-        efficiency: FloatArray = np.exp((values - self.values[: len(values)]) / 2)
+        u = np.asarray(inputs, dtype=np.float64)
+        if u.ndim != 2 or len(u) > len(self.values):
+            raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
+        task = self.systems.task
+        system = Coefficients(*self.systems.theta[: len(u)].T)
+        information = fisher_information(system, u, task.process_noise, task.measurement_noise, y=outputs)
+        values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]
+        efficiency: FloatArray = np.exp((values - self.values[: len(u)]) / 2)
         return efficiency
 
 
 def as_stored(scaled: FloatArray) -> npt.NDArray[np.float16]:
-    """Inputs in parts of the largest as they are stored, never larger than they were."""
+    """Inputs in parts of the largest as they are stored, never larger than they were; what was stored stays so."""
     stored = scaled.astype(np.float16)
-    return np.where(np.abs(stored) > np.abs(scaled), np.nextafter(stored, np.float16(0)), stored)
+    # A little larger is no larger: volts and back again are not exact.
+    larger = np.abs(stored.astype(np.float64)) > np.abs(scaled) * (1 + 1e-12)
+    return np.where(larger, np.nextafter(stored, np.float16(0)), stored)
 
 
 def search(
@@ -252,8 +268,8 @@ def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.N
     planned = u.copy()
     value = dict.fromkeys(RECORD, 0.0) | dict(zip(COEFFICIENTS, one.theta[0], strict=True))
     covariance = np.linalg.inv(one.precision)
-    for i, first in enumerate(COEFFICIENTS):
-        value |= {f"P_{first}_{second}": covariance[i, j] for j, second in enumerate(COEFFICIENTS) if j >= i}
+    for i, one_name in enumerate(COEFFICIENTS):
+        value |= {f"P_{one_name}_{other}": covariance[i, j] for j, other in enumerate(COEFFICIENTS) if j >= i}
     value |= {"g_shape": 1.0, "g_rate": task.process_noise**2, "n_shape": 1.0, "n_rate": task.measurement_noise**2}
     record = np.array([value[name] for name in RECORD])
     first = int(rng.integers(-task.samples // 8, task.samples - 1))

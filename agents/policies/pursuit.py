@@ -1,10 +1,10 @@
 """The planner's search under a limit of energy, compiled: the whole rest of the episode, by gradient.
 
 When energy is short, what matters is when to spend it: the best input rests, and then drives the oscillator up at its
-own frequency in one burst. No short horizon sees that. So the plan is for all samples that are left, and climbs the worth
-`agents.design` of what follows from the belief: its means as the truth, its covariance as Λ⁻¹, and the state's part in
-that as the sensitivities and the filter's covariance to start with. By the Kalman filter's separation of state and
-parameters this is the same belief propagation as that of `agents.policies.planning`.
+own frequency in one burst. No short horizon sees that. So the plan is for all samples that are left, and climbs the
+worth (`agents.design`) of what follows from the belief: its means as the truth, its covariance as Λ⁻¹, and the state's
+part in that as the sensitivities and the filter's covariance to start with. By the Kalman filter's separation of state
+and parameters this is the same belief propagation as that of `agents.policies.planning`.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def begin(record, theta, precision, start, work):
                 total += record[_CROSS[s, k]] * precision[k, j]
             start[5 + 4 * s + j] = total
     for p in range(3):
-        first, second = p // 2, (p + 1) // 2
+        first, second = p // 2, 1 if p > 0 else 0
         value = record[_STATES[p]]
         for k in range(4):
             value -= start[5 + 4 * first + k] * record[_CROSS[second, k]]
@@ -111,8 +111,8 @@ def swing(theta, start, energy, late, u, words):
     ``late`` is the first plan of an episode: not random, and late enough that the burst finds a better belief.
     """
     T = len(u)
-    begun = np.int64(0.35 * T) if late else np.int64(0.6 * T * uniform(words))
-    length = max(1, np.int64(T * 0.4) if late else np.int64(T * (0.2 + 0.6 * uniform(words))))
+    begun = int(T * (0.35 if late else 0.6 * uniform(words)))
+    length = 1 + int(T * (0.4 if late else 0.2 + 0.6 * uniform(words)))
     strength = np.sqrt(energy / length)
     x, last_x = start[0], start[1]
     for t in range(T):
