@@ -95,6 +95,11 @@ class Batch:
         """(n,) current values of a quantity of `LAYOUT`; a copy."""
         return self._blocks[:, LAYOUT[name], :].reshape(-1)[: self.size].copy()
 
+    def records(self) -> FloatArray:
+        """(n, RECORD_SIZE) the beliefs now, as flat records (`estimator.record`); a copy."""
+        records = self._blocks[:, :RECORD_SIZE].swapaxes(1, 2).reshape(-1, RECORD_SIZE)
+        return records[: self.size]
+
     def belief(self, index: int, *, final: bool = False) -> RecordBelief:
         """The belief of environment ``index``; ``final``: the one its last episode ended with, if reset since."""
         block, lane = divmod(index, LANES)

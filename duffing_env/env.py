@@ -178,6 +178,11 @@ class DuffingEnv(gym.Env[Any, Any]):
         return self._batch.belief(0)
 
     @property
+    def records(self) -> FloatArray:
+        """(1, RECORD_SIZE) the posterior now as the flat record of `estimator.record`, as the vector environment's."""
+        return self._batch.records()
+
+    @property
     def truth(self) -> PhysicalParameters:
         """The oscillator that is to be identified."""
         return self._batch.oscillator(0)

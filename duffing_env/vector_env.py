@@ -115,6 +115,11 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         return self.experiment.samples
 
     @property
+    def records(self) -> FloatArray:
+        """(num_envs, RECORD_SIZE) the posteriors now, as the flat records of `estimator.record`; a copy."""
+        return self._batch.records()
+
+    @property
     def truth(self) -> PhysicalParameters:
         """The oscillators that are to be identified, a batch of ``num_envs``."""
         return self._batch.truth()

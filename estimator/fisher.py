@@ -1,7 +1,7 @@
 """What an experiment can tell at best: Fisher information and Cramér-Rao bounds of the coefficients of Eq. (2).
 
 The displacement is latent, so an output tells about the coefficients only what the past outputs did not. With the
-Kalman filter of the model linearised along the trajectory, ν_t the innovation, S_t its variance and s_t = -∂ν_t/∂(θ, η),
+Kalman filter of the model linearised along the trajectory, ν_t the innovation, S_t its variance, s_t = -∂ν_t/∂(θ, η),
 
     F = Σ_t s_t s_tᵀ / S_t.
 
@@ -60,9 +60,7 @@ def fisher_information(
     inputs = np.asarray(u, dtype=np.float64)
     outputs = inputs if y is None else np.asarray(y, dtype=np.float64)
     if inputs.ndim not in (1, 2) or outputs.shape != inputs.shape:
-        raise ValueError(
-            f"u and y must have one shape, (T,) or (n, T), but have {inputs.shape} and {outputs.shape}; pass y_t+1 by u_t"
-        )
+        raise ValueError(f"u and y must have one shape, (T,) or (n, T), but have {inputs.shape} and {outputs.shape}")
     try:
         shape = np.broadcast_shapes(theta.shape[:-1], inputs.shape[:-1])
     except ValueError:
@@ -158,7 +156,7 @@ def accumulate(theta, u, y, observed, q, r, state_variance, information):
                 break
             a = t1 + 3.0 * t2 * x * x
             predicted = t1 * x + t2 * x * x * x + t3 * last_x + e * u[i, t]
-            c0, c1, variance = spread(a, t3, p00, p01, p11, q)
+            c0, _, variance = spread(a, t3, p00, p01, p11, q)
             weight = 1.0 / (variance + r)
             regress(a, t3, s, last_s, x, last_x, u[i, t], moved)
             for j in range(4):

@@ -1,10 +1,11 @@
 """Policies by name: whatever chooses the input, with the `predict` of Stable-Baselines3.
 
 `make_policy("silverbox-multisine", env)` makes a policy that fits `env`. To add one, write a
-function of the unwrapped environment (or None) and the seed, and name it in `POLICIES`.
+function of the unwrapped environment (or None), the seed and its options, and name it in `POLICIES`.
 """
 
 import difflib
+import inspect
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
+from agents.policies.planner import Planner
 from agents.policies.signals import make_signal
 
 
@@ -44,13 +46,15 @@ class Policy(Protocol):
         ...
 
 
-POLICIES: dict[str, Callable[[Any, int], Policy]] = {
+POLICIES: dict[str, Callable[..., Policy]] = {
     **{name: partial(make_signal, name) for name in EXCITATIONS},
     **FEEDBACK,
+    "efe": Planner,
+    "efe-myopic": partial(Planner, horizon=1),
 }
 
 
-def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0) -> Policy:
+def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0, **options: Any) -> Policy:
     """Makes the policy of this name.
 
     Args:
@@ -59,16 +63,25 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0)
             limit, the episode's length and, where it replays a record, the recorded input. None:
             the limit is 0.15 V.
         seed: The seed of the policy's own randomness; of a trained policy, that of the actions it samples.
+        options: Further options of a policy that has some, such as `horizon=8` of `"efe"`; a
+            trained policy has none.
 
     Returns:
         The policy.
 
     Raises:
-        ValueError: There is neither a policy nor a file of this name, or `env` is not one of
-            duffing_env.
+        ValueError: There is neither a policy nor a file of this name, it has no such option, or
+            `env` is not one of duffing_env.
     """
     if name in POLICIES:
-        return POLICIES[name](env if env is None else env.unwrapped, seed)
+        make = POLICIES[name]
+        known = [o for o in inspect.signature(make).parameters if o not in ("regime", "env", "seed")]
+        for option, value in options.items():
+            if option not in known:
+                raise ValueError(f"{option}={value!r} is no option of policy {name!r}, which has {known}")
+        return make(env if env is None else env.unwrapped, seed, **options)
+    if options:
+        raise ValueError(f"options must be none for a trained policy, but are {options}; leave them out")
     if Path(name).exists():
         from agents.policies.learned import load_policy
 

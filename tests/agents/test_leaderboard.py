@@ -42,7 +42,8 @@ CONSTANTS = {
 def make_evaluation(policy="policy", *, samples=20, systems=30, seed=0, shift=0.0, **metrics):
     rng = np.random.default_rng(seed)
     if not metrics:
-        metrics = {name: rng.uniform(0, 1, systems) for name in METRICS}
+        # In units of a hundred at most, so that no cell is wider than its column.
+        metrics = {name: rng.uniform(0, 1, systems) / max(1, metric.scale / 100) for name, metric in METRICS.items()}
         metrics["log_posterior_gain"] = metrics["log_posterior_gain"] + shift
     curve = np.cumsum(rng.normal(1.0, 0.3, (samples + 1, systems)), axis=0) + shift
     inputs, outputs = rng.uniform(-0.1, 0.1, (2, samples, systems))
@@ -249,7 +250,8 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
     }  # fmt: skip
     again = agents.evaluation.evaluate(["uniform", "prbs"], systems=4, seed=5, options={"horizon": 30})
     for evaluation, repeated in zip(evaluations, again, strict=True):
-        assert written["policies"][evaluation.policy] == {**summarise(repeated), "estimators": ANY}
+        timed = {"estimators": ANY, "decision_time": ANY}
+        assert written["policies"][evaluation.policy] == {**summarise(repeated), **timed}
     check_picture(folder / "contraction.png", 900, 540, colours=2)
     check_picture(folder / "excitations.png", 1080, 480, colours=2)
 

@@ -1,0 +1,394 @@
+"""The oracle: D-optimal inputs at the true parameters, stored, and the D-efficiency of other inputs against them.
+
+    python -m agents.oracle --env duffing_env/Amplitude-v0 --systems 64
+
+climbs ½ log det(Λ0 + F(u)) of each system from many starts, under the track's limits, and keeps what is better than
+what is stored. F is the Fisher information at the true coefficients along the response without noise, Λ0 the inverse of
+the prior's covariance of the coefficients. The worth of inputs has many summits, and the best one found is only a lower
+bound of the highest. So whoever finds a better input puts it in its place: with
+`--policies NAME ...` the search starts from those policies' inputs too.
+
+System i is row i of a batch that is reset with seed 0, as `agents.evaluation.evaluate` does it by default; it does not
+depend on the number of systems.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from agents.ascent import appraise, improve
+from agents.cli import JsonOptions, run_script
+from agents.policies.planning import play
+from agents.policies.pursuit import swings
+from duffing_env.vector_env import DuffingVectorEnv
+from estimator.files import write_atomically
+from estimator.fisher import as_rows, fisher_information
+from estimator.parameters import Coefficients, FloatArray, to_coefficients
+from estimator.record import COEFFICIENTS, RECORD
+
+FOLDER = Path(__file__).parent / "oracles"
+
+#: Steps of the gradient, random starts, and changed copies in a round.
+_ITERATIONS, _STARTS, _COPIES = 100, 24, 16
+
+
+@dataclass(frozen=True)
+class Task:
+    """What an oracle is for: everything that the worth of an input, and which inputs are allowed, depend on.
+
+    Attributes:
+        max_input: amplitude limit [V].
+        max_output: limit of the displacement without noise [V].
+        samples: of an episode.
+        process_noise: standard deviation [V].
+        measurement_noise: standard deviation [V].
+        spread: of the prior.
+        plant_spread: of the systems.
+        max_rms: limit of the root mean square of the input over an episode [V]; None where there is none.
+    """
+
+    max_input: float
+    max_output: float
+    samples: int
+    process_noise: float
+    measurement_noise: float
+    spread: float
+    plant_spread: float
+    max_rms: float | None = None
+
+    @classmethod
+    def of(cls, envs: DuffingVectorEnv) -> Task:
+        """The task of an environment; ValueError where it does not simulate a plant that stays as it is."""
+        e: Any = envs.experiment
+        if not hasattr(e, "process_noise") or e.jump or e.max_slew is not None:
+            raise ValueError(f"env must simulate a plant without jump and slew limit, but is {e}; choose another track")
+        spread = e.spread if e.plant_spread is None else e.plant_spread
+        return cls(
+            e.max_input, e.max_output, e.samples, e.process_noise, e.measurement_noise, e.spread, spread, e.max_rms
+        )  # fmt: skip
+
+    @property
+    def energy(self) -> float:
+        """Limit of Σ u² [V²]."""
+        return np.inf if self.max_rms is None else self.max_rms**2 * self.samples
+
+    @property
+    def path(self) -> Path:
+        """The file in the package that holds this task's oracle."""
+        digest = hashlib.sha256(json.dumps(asdict(self)).encode()).hexdigest()[:12]
+        return FOLDER / f"{self.samples}-samples-{digest}.npz"
+
+
+@dataclass(frozen=True)
+class Systems:
+    """The systems of a task, by row.
+
+    Attributes:
+        task: what is asked of them.
+        theta: (n, 4) their coefficients.
+        precision: (4, 4) Λ0.
+    """
+
+    task: Task
+    theta: FloatArray
+    precision: FloatArray
+
+    @classmethod
+    def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None) -> Systems:
+        """The first systems of a track, as they are evaluated with seed 0."""
+        envs = make(env_id, count, options)
+        envs.reset(seed=0)
+        theta = as_rows(to_coefficients(envs.truth))
+        precision = np.linalg.inv(envs.belief(0).coefficients_cov).astype(np.float64)
+        return cls(Task.of(envs), theta, precision)
+
+    def worth(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Worth ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
+
+        Each (n,). Inputs that are not finite, as after the end of an episode, tell nothing from there on.
+        """
+        u = np.array(inputs, dtype=np.float64)
+        if u.ndim != 2 or len(u) > len(self.theta):
+            raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.theta)}, but have {u.shape}")
+        values, peaks = np.empty((2, len(u)))
+        t = self.task
+        appraise(
+            self.theta, self.precision, t.process_noise**2, t.measurement_noise**2, t.max_output, u, values, peaks
+        )  # fmt: skip
+        return values, peaks
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """The best inputs found so far.
+
+    Attributes:
+        systems: that they are for.
+        inputs: (n, samples) [V].
+        values: (n,) their worth [nats].
+    """
+
+    systems: Systems
+    inputs: FloatArray
+    values: FloatArray
+
+    @classmethod
+    def load(cls, systems: Systems) -> Oracle:
+        """The stored oracle, of as many of the systems as it has.
+
+        Raises:
+            FileNotFoundError: if none is stored for this task, saying which command makes one.
+            ValueError: if it is for other systems.
+        """
+        path = systems.task.path
+        if not path.is_file():
+            raise FileNotFoundError(f"no oracle is stored for {systems.task}; run python -m agents.oracle --env ...")
+        with np.load(path, allow_pickle=False) as stored:
+            scaled, theta = stored["inputs"], stored["theta"]
+        n = min(len(theta), len(systems.theta))
+        if not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
+            raise ValueError(f"oracle must be for the systems at hand, but {path.name} is not; make it anew")
+        chosen = Systems(systems.task, systems.theta[:n], systems.precision)
+        inputs = systems.task.max_input * scaled[:n].astype(np.float64)
+        return cls(chosen, inputs, chosen.worth(inputs)[0])
+
+    def save(self) -> Path:
+        """Store it in the package, in one piece."""
+        content = BytesIO()
+        np.savez_compressed(
+            content,
+            inputs=as_stored(self.inputs / self.systems.task.max_input),
+            theta=self.systems.theta,
+            values=self.values,
+            task=np.array(json.dumps(asdict(self.systems.task))),
+        )
+        write_atomically(self.systems.task.path, content.getvalue())
+        return self.systems.task.path
+
+    def efficiency(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike) -> FloatArray:
+        """D-efficiency (n,) of an episode: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / 4].
+
+        F is taken at the true coefficients along the outputs that were seen, because feedback keeps these within
+        their limit, and not the response without noise to the same inputs, which drifts away from them. 0.5 means that
+        about twice the samples would be needed. Above 1 says that there is a better input than the stored one, or that
+        the noise was kind.
+
+        Args:
+            inputs: (n, samples) [V]; NaN from the end of an episode on.
+            outputs: (n, samples) [V] that followed them.
+
+        Raises:
+            ValueError: for more rows than the oracle has systems, or as `estimator.fisher_information`.
+        """
+        u = np.asarray(inputs, dtype=np.float64)
+        if u.ndim != 2 or len(u) > len(self.values):
+            raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
+        task = self.systems.task
+        system = Coefficients(*self.systems.theta[: len(u)].T)
+        information = fisher_information(system, u, task.process_noise, task.measurement_noise, y=outputs)
+        values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]
+        efficiency: FloatArray = np.exp((values - self.values[: len(u)]) / 2)
+        return efficiency
+
+
+def as_stored(scaled: FloatArray) -> npt.NDArray[np.float16]:
+    """Inputs in parts of the largest as they are stored, never larger than they were; what was stored stays so."""
+    stored = scaled.astype(np.float16)
+    # A little larger is no larger: volts and back again are not exact.
+    larger = np.abs(stored.astype(np.float64)) > np.abs(scaled) * (1 + 1e-12)
+    return np.where(larger, np.nextafter(stored, np.float16(0)), stored)
+
+
+def search(
+    systems: Systems, row: int, given: FloatArray, rng: np.random.Generator, rounds: int = 8
+) -> tuple[FloatArray, float]:
+    """Search the best input of one system.
+
+    Gradient ascent from many starts, then in rounds from changed copies of the best one (iterated local search). Where
+    only amplitudes are limited, copies are planned anew from a random sample on, which finds more than the gradient.
+
+    Args:
+        systems: of a task.
+        row: the system.
+        given: (k, samples) inputs to start from besides [V].
+        rng: of the random starts and changes.
+        rounds: of changed copies, `_COPIES` in each.
+
+    Returns:
+        The best input (samples,) [V] that keeps all limits also as it is stored, and its worth [nats]; -inf if none.
+    """
+    task = systems.task
+    one = Systems(task, np.repeat(systems.theta[row : row + 1], len(given) + _STARTS, axis=0), systems.precision)
+    best, best_value = np.zeros(task.samples), -np.inf
+    words = rng.integers(0, 2**64, 4, dtype=np.uint64)
+    pool = np.empty((_STARTS, task.samples))
+    if task.max_rms is None:
+        pool[:] = _signals(task, _STARTS, rng)
+    else:
+        swings(systems.theta[row], task.energy, pool, words)
+    pool = np.concatenate([given, pool])
+    for k in range(rounds + 1):
+        if k == 0 or task.max_rms is not None:
+            _climb(one, pool, 0.3 if k == 0 else 0.1)
+        # What is stored is rounded; only what keeps the limits as stored counts.
+        pool = task.max_input * as_stored(pool / task.max_input).astype(np.float64)
+        values, peaks = one.worth(pool)
+        values[~(peaks <= task.max_output)] = -np.inf
+        if values.max() > best_value:
+            best, best_value = pool[values.argmax()].copy(), float(values.max())
+        if task.max_rms is None:
+            pool = np.stack([_planned(best, one, rng, words) for _ in range(_COPIES)])
+        else:
+            pool = np.stack([_changed(best, task, rng) for _ in range(_COPIES)])
+    return best, best_value
+
+
+def _climb(one: Systems, pool: FloatArray, rate: float) -> None:
+    """Gradient ascent from every input of a pool (k, samples), in place."""
+    task = one.task
+    q, r = task.process_noise**2, task.measurement_noise**2
+    limits = (task.max_output, task.max_input, task.energy)
+    improve(one.theta[0], one.precision, q, r, *limits, rate, _ITERATIONS, pool, np.empty(len(pool)))
+
+
+def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.NDArray[np.uint64]) -> FloatArray:
+    """A copy that the planner, who knows the system, plans anew from a random sample on."""
+    task = one.task
+    planned = u.copy()
+    value = dict.fromkeys(RECORD, 0.0) | dict(zip(COEFFICIENTS, one.theta[0], strict=True))
+    covariance = np.linalg.inv(one.precision)
+    for i, one_name in enumerate(COEFFICIENTS):
+        value |= {f"P_{one_name}_{other}": covariance[i, j] for j, other in enumerate(COEFFICIENTS) if j >= i}
+    value |= {"g_shape": 1.0, "g_rate": task.process_noise**2, "n_shape": 1.0, "n_rate": task.measurement_noise**2}
+    record = np.array([value[name] for name in RECORD])
+    first = int(rng.integers(-task.samples // 8, task.samples - 1))
+    horizon, rounds = int(rng.integers(8, 25)), int(rng.integers(4, 17))
+    limit = 0.9999 * task.max_output  # leaves room for the rounding of what is stored
+    play(record, first, horizon, rounds, task.max_input, limit, 0.0, planned, words)
+    return planned
+
+
+def _signals(task: Task, count: int, rng: np.random.Generator) -> FloatArray:
+    """(count, samples) random binary signals of several holds, and square waves about resonance."""
+    signals = np.empty((count, task.samples))
+    t = np.arange(task.samples)
+    for i in range(count):
+        if i % 2:
+            half_period = rng.uniform(2.5, 6.0)  # of 610 Hz: 50 to 120 Hz
+            signals[i] = np.where(((t + rng.uniform(0, 12)) // half_period) % 2 == 0, 1.0, -1.0)
+        else:
+            hold = rng.integers(1, 9)
+            signals[i] = np.repeat(rng.choice([-1.0, 1.0], -(-task.samples // hold)), hold)[: task.samples]
+        # Weak ones too, because strong ones may begin far beyond the displacement limit.
+        signals[i] *= task.max_input * rng.choice([0.3, 0.6, 1.0])
+    return signals
+
+
+def _changed(u: FloatArray, task: Task, rng: np.random.Generator) -> FloatArray:
+    """A copy with a stretch turned over, shifted, or drawn anew."""
+    changed = u.copy()
+    length = int(rng.integers(4, max(5, task.samples // 4)))
+    first = int(rng.integers(0, task.samples - length + 1))
+    stretch = slice(first, first + length)
+    kind = rng.integers(3)
+    if kind == 0:
+        changed[stretch] = -changed[stretch]
+    elif kind == 1:
+        changed[stretch] = np.roll(changed[stretch], rng.integers(1, length))
+    else:
+        changed[stretch] = np.abs(changed[stretch]) * rng.choice([-1.0, 1.0], length)
+    return changed
+
+
+def make(env_id: str, systems: int, options: dict[str, Any] | None = None) -> DuffingVectorEnv:
+    """A batch of a track."""
+    envs = gym.make_vec(env_id, num_envs=systems, vectorization_mode="vector_entry_point", **(options or {}))
+    assert isinstance(envs, DuffingVectorEnv)
+    return envs
+
+
+def design(
+    systems: Systems,
+    given: FloatArray,
+    *,
+    rounds: int = 8,
+    seed: int = 0,
+    on_row: Callable[[int, float], None] | None = None,
+) -> Oracle:
+    """Search all systems; what is stored is a start, so the result is never worse.
+
+    Args:
+        systems: of a task.
+        given: (k, n, samples) inputs to start from besides [V].
+        rounds: see `search`.
+        seed: of the search.
+        on_row: called with each row and its value.
+    """
+    n = len(systems.theta)
+    inputs, values = np.zeros((n, systems.task.samples)), np.full(n, -np.inf)
+    try:
+        stored = Oracle.load(systems)
+        inputs[: len(stored.values)], values[: len(stored.values)] = stored.inputs, stored.values
+    except FileNotFoundError:
+        pass
+    for row in range(n):
+        starts = given[:, row]
+        if np.isfinite(values[row]):
+            starts = np.concatenate([starts, inputs[row : row + 1]])
+        rng = np.random.default_rng([seed, row])
+        found, value = search(systems, row, np.nan_to_num(starts), rng, rounds=rounds)
+        if value > values[row]:
+            inputs[row], values[row] = found, value
+        if on_row is not None:
+            on_row(row, values[row])
+    return Oracle(systems, inputs, values)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Search D-optimal inputs at the true parameters, and store what is better than what is stored."""
+
+    env: str = "duffing_env/Amplitude-v0"
+    """Id of the track."""
+    options: JsonOptions = field(default_factory=dict)
+    """Further options of the environment, as JSON."""
+    systems: int = 256
+    """Number of systems: the first rows of a batch that is reset with seed 0."""
+    policies: tuple[str, ...] = ("efe",)
+    """Policies whose inputs to start from besides."""
+    rounds: int = 8
+    """Rounds of changed copies of the best input."""
+    seed: int = 0
+    """Of the search."""
+
+
+def main(config: Config) -> None:
+    """Search, store, and say how far it is."""
+    from agents.evaluation import evaluate
+
+    systems = Systems.of(config.env, config.systems, config.options)
+    given = np.empty((0, config.systems, systems.task.samples))
+    if config.policies:
+        played = evaluate(config.policies, config.env, config.systems, options=config.options)
+        given = np.stack([evaluation.inputs.T for evaluation in played])
+    began = time.perf_counter()
+    oracle = design(systems, given, rounds=config.rounds, seed=config.seed)
+    path = oracle.save()
+    gained = oracle.values - 0.5 * np.linalg.slogdet(systems.precision)[1]
+    print(f"{len(oracle.values)} systems in {time.perf_counter() - began:.0f} s: mean gain {gained.mean():.3f} nats")
+    print(f"stored in {path}")
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__ or "")

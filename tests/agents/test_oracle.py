@@ -1,0 +1,125 @@
+"""The oracle: its search, its store, and the D-efficiency against it; and the oracles that are in the package."""
+
+import numpy as np
+import pytest
+
+from agents import oracle as module
+from agents.oracle import Config, Oracle, Systems, as_stored, design, main, search
+
+SHORT, POWER = "duffing_env/Short-v0", "duffing_env/Power-v0"
+STORED = [(SHORT, {}), (POWER, {}), ("duffing_env/Amplitude-v0", {})]
+
+
+@pytest.fixture
+def empty_folder(monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
+    return tmp_path
+
+
+def answers(systems, inputs):
+    """Outputs (n, T) without noise, from rest."""
+    y = np.empty_like(inputs)
+    for theta, u, row in zip(systems.theta, inputs, y, strict=True):
+        x = last = 0.0
+        for t in range(len(u)):
+            x, last = theta @ np.array([x, x**3, last, u[t]]), x
+            row[t] = x
+    return y
+
+
+def gains(systems, values):
+    return values - 0.5 * np.linalg.slogdet(systems.precision)[1]
+
+
+def test_rows_do_not_depend_on_their_number():
+    few, many = Systems.of(SHORT, 2), Systems.of(SHORT, 5)
+    np.testing.assert_array_equal(few.theta, many.theta[:2])
+    assert few.task == many.task
+    assert few.task.path == many.task.path
+
+
+def test_the_search_keeps_the_limits_and_beats_a_random_signal():
+    systems = Systems.of(SHORT, 1)
+    rng = np.random.default_rng(0)
+    given = rng.uniform(-0.15, 0.15, (1, 48))
+    u, value = search(systems, 0, given, rng, rounds=1)
+    values, peaks = systems.worth(u[None])
+    assert np.abs(u).max() <= 0.15
+    assert peaks[0] <= 0.6
+    assert value == values[0]
+    assert value > systems.worth(given)[0][0] + 2.0
+
+
+def test_under_a_budget_the_search_spends_it_in_a_burst():
+    systems = Systems.of(POWER, 1)
+    u, value = search(systems, 0, np.empty((0, 256)), np.random.default_rng(0), rounds=1)
+    energy = (u**2).sum() / systems.task.energy
+    assert 0.99 < energy <= 1
+    # Spread evenly over the episode, the same energy tells 3 nats less.
+    square = 0.0222 * np.sign(np.sin(2 * np.pi * 68 / 610.35 * np.arange(256) + 0.1))
+    assert value > systems.worth(square[None])[0][0] + 3.0
+
+
+def test_what_is_better_takes_its_place_and_nothing_else(empty_folder):
+    systems = Systems.of(SHORT, 2)
+    with pytest.raises(FileNotFoundError, match="no oracle is stored"):
+        Oracle.load(systems)
+    poor = Oracle(systems, np.zeros((2, 48)), systems.worth(np.zeros((2, 48)))[0])
+    poor.save()
+    better = design(systems, np.empty((0, 2, 48)), rounds=1)
+    assert np.all(better.values > poor.values + 5)
+    better.save()
+    loaded = Oracle.load(systems)
+    np.testing.assert_array_equal(loaded.inputs, better.inputs)
+    np.testing.assert_array_equal(loaded.values, better.values)
+    again = design(systems, np.empty((0, 2, 48)), rounds=0, seed=1)
+    assert np.all(again.values >= better.values)
+    # As many systems as are asked for, if so many are stored.
+    assert len(Oracle.load(Systems.of(SHORT, 1)).values) == 1
+    assert len(Oracle.load(Systems.of(SHORT, 3)).values) == 2
+
+
+def test_the_command_stores_and_says_where(empty_folder, capsys):
+    main(Config(env=SHORT, systems=2, policies=("prbs",), rounds=0))
+    assert "2 systems in" in capsys.readouterr().out
+    assert [path.name for path in empty_folder.iterdir()] == [Systems.of(SHORT, 1).task.path.name]
+
+
+def test_efficiency_is_one_for_the_oracle_itself_and_counts_until_the_end():
+    systems = Systems.of(SHORT, 3)
+    oracle = Oracle.load(systems)
+    outputs = answers(systems, oracle.inputs)
+    np.testing.assert_allclose(oracle.efficiency(oracle.inputs, outputs), 1.0, rtol=1e-9)
+    ended, seen = oracle.inputs.copy(), outputs.copy()
+    ended[0, 20:] = seen[0, 20:] = np.nan
+    efficiency = oracle.efficiency(ended, seen)
+    assert efficiency[0] < 0.5
+    np.testing.assert_allclose(efficiency[1:], 1.0, rtol=1e-9)
+    with pytest.raises(ValueError, match="n <= 3"):
+        oracle.efficiency(np.zeros((4, 48)), np.zeros((4, 48)))
+
+
+def test_what_is_stored_is_never_larger_and_stays():
+    scaled = np.random.default_rng(0).uniform(-1, 1, 1000)
+    stored = as_stored(scaled)
+    assert np.all(np.abs(stored.astype(np.float64)) <= np.abs(scaled))
+    np.testing.assert_allclose(stored, scaled, rtol=2e-3, atol=1e-7)
+    np.testing.assert_array_equal(as_stored(0.15 * stored.astype(np.float64) / 0.15), stored)
+
+
+@pytest.mark.parametrize(("track", "options"), STORED)
+def test_stored_oracles_keep_the_limits_of_their_tracks(track, options):
+    oracle = Oracle.load(Systems.of(track, 256, options))
+    task = oracle.systems.task
+    assert len(oracle.values) >= 64
+    assert np.abs(oracle.inputs).max() <= task.max_input
+    assert oracle.systems.worth(oracle.inputs)[1].max() <= task.max_output
+    assert np.all((oracle.inputs**2).sum(axis=1) <= task.energy * (1 + 1e-9))
+    assert gains(oracle.systems, oracle.values).min() > (15.0 if track == POWER else 18.0)
+
+
+def test_tracks_without_an_oracle_say_so():
+    with pytest.raises(ValueError, match="plant without jump"):
+        Systems.of("duffing_env/Drift-v0", 1)
+    with pytest.raises(ValueError, match="inputs must have shape"):
+        Systems.of(SHORT, 1).worth(np.zeros((2, 48)))
