@@ -181,11 +181,14 @@ class JointFilter(ABC):
         expectations: a name of `EXPECTATIONS`.
         movers: how many dimensions of the joint state decide where the state moves; they stand first.
         look_ahead: inputs after a sample that must be known before it is used.
+        reach: inputs before a sample that still act on it.
     """
 
-    def __init__(self, prior: JointBelief, drift: float, expectations: str, movers: int, look_ahead: int) -> None:
+    def __init__(
+        self, prior: JointBelief, drift: float, expectations: str, movers: int, look_ahead: int, reach: int
+    ) -> None:
         self._by_points, self._movers = expectations == "sigma_points", movers
-        self._names, self._units, self._look_ahead = prior.names, prior.units, look_ahead
+        self._names, self._units, self._look_ahead, self._reach = prior.names, prior.units, look_ahead, reach
         self._mean, self._cov = self._to_coordinates(prior.mean, prior.cov)
         self._noises = np.array([prior.gamma_shape, prior.gamma_rate, prior.xi_shape, prior.xi_rate])
         self._states = len(prior.state_mean)
@@ -212,7 +215,7 @@ class JointFilter(ABC):
             self._take(
                 self._mean, self._cov, self._noises, self._walk, inputs, begun, outputs[:used], free_energies, forecasts
             )
-        self._past = inputs[: begun + used][-LONGEST_DELAY:]
+        self._past = inputs[: begun + used][-self._reach :]
         self._waiting_u, self._waiting_y = inputs[begun + used :], outputs[used:]
         return used
 
@@ -313,7 +316,7 @@ class ODEFilter(JointFilter):
     """Memory for `DuffingODE`."""
 
     def __init__(self, model: DuffingODE, prior: JointBelief, drift: float, expectations: str) -> None:
-        super().__init__(prior, drift, expectations, N_MOTION, model.look_ahead)
+        super().__init__(prior, drift, expectations, N_MOTION, model.look_ahead, model.reach)
         self._model = model
         if not model.cubic_damping:
             fixed = self._states + model.names.index("cubic_damping")
@@ -359,7 +362,7 @@ class RegressorFilter(JointFilter):
     """Memory for an `NLARX` with other regressors than the paper's."""
 
     def __init__(self, model: NLARX, prior: JointBelief, drift: float, expectations: str) -> None:
-        super().__init__(prior, drift, expectations, len(prior.mean), look_ahead=0)
+        super().__init__(prior, drift, expectations, len(prior.mean), look_ahead=0, reach=LONGEST_DELAY)
         self._terms = as_arrays(model.terms)
 
     def _take(

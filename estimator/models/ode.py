@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -60,6 +61,9 @@ _FORCE, _OFFSET = 6, 8
 #: Of the spline through the inputs: the input has power up to two thirds of the Nyquist frequency.
 SPLINE_DEGREE = 5
 
+#: Inputs that the look-ahead interpolation passes through: the last nine, and the next.
+_WINDOW = 10
+
 INTERPOLATIONS = ("linear", "look_ahead", "spline")
 
 
@@ -68,8 +72,8 @@ class DuffingODE:
     """Model of the oscillator as an ordinary differential equation.
 
     Attributes:
-        interpolation: of the input between samples. ``linear``: causal. ``look_ahead``: the cubic through the two
-            samples before and the two after, so that a sample is used when the next input is known. ``spline``: the
+        interpolation: of the input between samples. ``linear``: causal. ``look_ahead``: the quintic spline through the
+            last nine inputs and the next one, so that a sample is used when the next input is known. ``spline``: the
             quintic spline through all inputs, for recorded data that is given at once.
         cubic_damping: whether the damping has the cubic term e x'³; without it e = 0.
         substeps: Runge-Kutta steps per sample. On the Silverbox 2 simulate as well, but shift the stiffness by more
@@ -96,6 +100,11 @@ class DuffingODE:
     def look_ahead(self) -> int:
         """Inputs after a sample that must be known before it is used."""
         return 1 if self.interpolation == "look_ahead" else 0
+
+    @property
+    def reach(self) -> int:
+        """Inputs before a sample that still act on the way to it."""
+        return _WINDOW - 2 if self.interpolation == "look_ahead" else 1
 
     @property
     def needs_all_inputs(self) -> bool:
@@ -135,16 +144,7 @@ class DuffingODE:
         if self.interpolation == "linear":
             return np.column_stack([start, stop - start])
         if self.interpolation == "look_ahead":
-            before = np.concatenate([u[:1], u[:-2]])
-            after = np.concatenate([u[2:], u[-1:]])
-            return np.column_stack(
-                [
-                    start,
-                    stop - start / 2 - before / 3 - after / 6,
-                    (before + stop) / 2 - start,
-                    (start - stop) / 2 + (after - before) / 6,
-                ]
-            )
+            return _window_pieces(u)
         return _spline_pieces(u)
 
 
@@ -183,6 +183,29 @@ def from_coordinates(mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, Flo
     mean[0] -= y0
     mean[_FORCE] = u0
     return mean * _SCALES, slopes @ cov @ slopes.T * np.outer(_SCALES, _SCALES)
+
+
+def _window_pieces(u: FloatArray) -> FloatArray:
+    """(T - 1, 6) coefficients, each of the quintic spline through the inputs of its window.
+
+    At the ends an input that is not there is its neighbour.
+    """
+    stencil = _window_stencil()
+    padded = np.concatenate([np.full(_WINDOW - 3, u[0]), u, u[-1:]])
+    # Term by term: a matrix product would round otherwise for another number of samples.
+    pieces = np.zeros((len(u) - 1, SPLINE_DEGREE + 1))
+    for j in range(_WINDOW):
+        pieces += padded[j : j + len(u) - 1, None] * stencil[j]
+    return pieces
+
+
+@cache
+def _window_stencil() -> FloatArray:
+    """(_WINDOW, 6) what each input of a window adds to the polynomial of its last interval but one."""
+    from scipy.interpolate import make_interp_spline
+
+    spline = make_interp_spline(np.arange(_WINDOW), np.eye(_WINDOW), k=SPLINE_DEGREE)
+    return np.stack([spline(_WINDOW - 3, nu=n) / math.factorial(n) for n in range(SPLINE_DEGREE + 1)], axis=1)
 
 
 def _spline_pieces(u: FloatArray) -> FloatArray:

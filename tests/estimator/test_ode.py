@@ -6,6 +6,7 @@ from math import comb
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import make_interp_spline
 
 from estimator import SAMPLING_STEP, SILVERBOX_TWIN, DuffingODE, OnlineEstimator
 from estimator.gaussian import JointBelief
@@ -87,18 +88,29 @@ def test_linear_input_is_a_line_between_two_samples():
     assert DuffingODE("linear").pieces(np.array([1.0])).shape == (0, 2)
 
 
-def test_look_ahead_input_passes_through_four_samples():
-    u = np.random.default_rng(3).standard_normal(12)
+def test_look_ahead_input_is_the_spline_through_a_window():
+    u = np.random.default_rng(3).standard_normal(30)
     pieces = DuffingODE("look_ahead").pieces(u)
-    for tau, samples in ((-1, u[:-3]), (0, u[1:-2]), (1, u[2:-1]), (2, u[3:])):
-        np.testing.assert_allclose(values(pieces[1:-1], tau), samples, atol=1e-14)
-    # At the ends the sample that is not there is its neighbour.
-    np.testing.assert_allclose([values(pieces[:1], tau)[0] for tau in (-1, 0, 1, 2)], u[[0, 0, 1, 2]], atol=1e-14)
-    np.testing.assert_allclose([values(pieces[-1:], tau)[0] for tau in (-1, 0, 1, 2)], u[[-3, -2, -1, -1]], atol=1e-14)
+    np.testing.assert_allclose(values(pieces, 0.0), u[:-1], atol=1e-12)
+    np.testing.assert_allclose(values(pieces, 1.0), u[1:], atol=1e-12)
+    # At the ends an input that is not there is its neighbour.
+    padded = np.concatenate([np.full(7, u[0]), u, u[-1:]])
+    for t in range(len(u) - 1):
+        spline = make_interp_spline(np.arange(10.0), padded[t : t + 10], k=5)
+        np.testing.assert_allclose(values(pieces[t : t + 1], 0.3), spline(7.3), atol=1e-12)
+
+
+def test_look_ahead_input_is_the_same_piece_by_piece():
+    u = np.random.default_rng(3).standard_normal(30)
+    model = DuffingODE("look_ahead")
+    whole = model.pieces(u)
+    for t in range(model.reach, len(u) - 2):
+        # To sample t + 1 from those that reach it, and the next one.
+        np.testing.assert_array_equal(model.pieces(u[t + 1 - model.reach : t + 3])[-2], whole[t])
 
 
 @pytest.mark.parametrize(
-    ("interpolation", "degree", "inner"), [("look_ahead", 3, slice(1, -1)), ("spline", 5, slice(None))]
+    ("interpolation", "degree", "inner"), [("look_ahead", 5, slice(7, -1)), ("spline", 5, slice(None))]
 )
 def test_polynomials_are_reproduced(interpolation, degree, inner):
     """Every polynomial up to the degree, between the samples too: by its binomial expansion about each sample."""
