@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/estimators.md"])
+@pytest.mark.parametrize("document", ["README.md", "docs/estimators.md", "docs/own_plant.md"])
 def test_examples_run(document):
     failures, examples = doctest.testfile(str(ROOT / document), module_relative=False, verbose=False)
     assert examples > 10
