@@ -119,9 +119,8 @@ def _track(track: str) -> str:
         if other != track:
             text = text.replace(f"`{name}`", f"[`{name}`]({_title(other)}.md)")
     options = ", ".join(f"{name}={value!r}" for name, value in TRACKS[track]["kwargs"].items())
-    return (
-        f'# {_title(track)}\n\n`gymnasium.make("{track}")`: class `{_environment(track).__name__}`, {options}\n\n{text}'
-    )
+    made = f'`gymnasium.make("{track}")`: class `{_environment(track).__name__}`, `{options}`'
+    return f"# {_title(track)}\n\n{made}\n\n{text}"
 
 
 def _policies() -> str:
@@ -129,7 +128,7 @@ def _policies() -> str:
     for name, made in POLICIES.items():
         arguments = made.args if isinstance(made, functools.partial) else ()
         function = made.func if isinstance(made, functools.partial) else made
-        call = ", ".join(map(repr, arguments))
+        call = ", ".join(arguments)
         rows.append(f"| `{name}` | {_first_line(function)}{f' ({call})' if call else ''} |")
     return "\n".join(
         [
