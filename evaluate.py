@@ -2,6 +2,7 @@
 
 python evaluate.py                                        the reference and baseline policies
 python evaluate.py --policies runs/demo prbs              a trained policy beside PRBS
+python evaluate.py --report runs/report                   all of it on one HTML page
 python evaluate.py --options '{"max_output": 0.3}'        under another limit
 """
 
@@ -29,13 +30,19 @@ class Config:
     """Seed of systems and noise."""
     output: Path = Path("runs/evaluation")
     """Folder for evaluation.json and the figures."""
+    report: Path | None = None
+    """Folder for a report instead: one HTML page, and evaluation.json."""
 
 
 def main(config: Config) -> None:
     """Compare, and say where everything is."""
     from agents.leaderboard import compare
 
-    compare(config.policies, config.env, config.systems, config.options, config.output, seed=config.seed)
+    folder = config.report if config.report is not None else config.output
+    compare(
+        config.policies, config.env, config.systems, config.options, folder,
+        seed=config.seed, report=config.report is not None,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

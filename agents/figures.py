@@ -44,6 +44,11 @@ def draw_learning_curve(path: Path, curve: list[tuple[int, float, float]], rewar
 
 
 def draw_contraction(path: Path, evaluations: list[Evaluation], title: str) -> None:
+    """Write `figure_of_contraction` to a PNG file."""
+    _save(figure_of_contraction(evaluations, title), path)
+
+
+def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Figure:
     """Gain of log posterior of the truth over the samples: median over systems, band from 25 to 75 %."""
     figure = _figure(7.5, 4.5)
     axes = figure.add_subplot()
@@ -61,7 +66,7 @@ def draw_contraction(path: Path, evaluations: list[Evaluation], title: str) -> N
     axes.set_ylim(lowest, None)
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
-    _save(figure, path)
+    return figure
 
 
 def draw_excitations(path: Path, evaluations: list[Evaluation], system: int = 0) -> None:
@@ -79,6 +84,66 @@ def draw_excitations(path: Path, evaluations: list[Evaluation], system: int = 0)
     for axes in grid[-1]:
         axes.set_xlabel("time / ms")
     _save(figure, path)
+
+
+def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
+    """Input of one system in time, and the spectrum of the inputs: root of the mean power over systems."""
+    figure = _figure(9, 1.6 * len(evaluations) + 0.8)
+    grid = figure.subplots(len(evaluations), 2, sharex="col", sharey="col", squeeze=False)
+    for (left, right), evaluation, colour in zip(grid, evaluations, cycle(_COLOURS), strict=False):
+        time = _MILLISECONDS * np.arange(len(evaluation.inputs))
+        left.plot(time, evaluation.inputs[:, system], color=colour, linewidth=0.8)
+        left.set_ylabel("u / V")
+        left.set_title(evaluation.policy, loc="left", fontsize=9)
+        inputs = np.nan_to_num(evaluation.inputs)  # an episode that ended is silent
+        spectrum = np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
+        right.plot(np.fft.rfftfreq(len(inputs), SAMPLING_STEP), 1e3 * spectrum, color=colour, linewidth=0.8)
+        right.set_ylabel("|U| / mV")
+        for axes in (left, right):
+            axes.grid(alpha=0.3)
+    grid[-1][0].set_xlabel("time / ms")
+    grid[-1][1].set_xlabel("frequency / Hz")
+    return figure
+
+
+def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
+    """Mean relative error of m, c, a, b against the information in the outputs, system by system."""
+    if not all("fisher_gain" in evaluation.metrics for evaluation in evaluations):
+        return None
+    figure = _figure(7.5, 4.5)
+    axes = figure.add_subplot()
+    for evaluation, colour in zip(evaluations, cycle(_COLOURS), strict=False):
+        errors = np.mean([evaluation.metrics[f"error_{name}"] for name in "mcab"], axis=0)
+        axes.semilogy(
+            evaluation.metrics["fisher_gain"], 100 * errors, ".", color=colour, alpha=0.5, markersize=4,
+            label=evaluation.policy,
+        )  # fmt: skip
+    axes.set_xlabel("Fisher information / nat")
+    axes.set_ylabel("mean error of m, c, a, b / %")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure
+
+
+def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
+    """Share of intervals that hold the truth against their nominal level: a panel for each estimator."""
+    from agents.metrics import LEVELS
+
+    found = [evaluation.estimators or {"": evaluation.metrics} for evaluation in evaluations]
+    figure = _figure(9, 3.6)
+    panels = figure.subplots(1, len(found[0]), sharex=True, sharey=True, squeeze=False)[0]
+    nominal = [100 * level for level in LEVELS.values()]
+    for axes, estimator in zip(panels, found[0], strict=True):
+        axes.plot([0, 100], [0, 100], color="#888888", linewidth=1)
+        for evaluation, values, colour in zip(evaluations, found, cycle(_COLOURS), strict=False):
+            covered = [100 * float(np.mean(values[estimator][name])) for name in LEVELS]
+            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=evaluation.policy)
+        axes.set_title(estimator.replace("_", " "), fontsize=9)
+        axes.set_xlabel("nominal level / %")
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("intervals that hold the truth / %")
+    panels[0].legend(fontsize=7)
+    return figure
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +47,23 @@ METRICS = {
     "error_c": Metric("error of c / %", 2, 100, _MEDIAN),
     "error_a": Metric("error of a / %", 3, 100, _MEDIAN),
     "error_b": Metric("error of b / %", 2, 100, _MEDIAN),
+    "coverage_50": Metric("50 % intervals that cover / %", 1, 100),
     "coverage": Metric("90 % intervals that cover / %", 1, 100),
+    "coverage_95": Metric("95 % intervals that cover / %", 1, 100),
+    "nees": Metric("NEES per coefficient", 2),
     "ended_early": Metric("episodes ended early / %", 1, 100),
     "input_power": Metric("input power / mV²", 0, 1e6),
+    "input_peak": Metric("input peak / mV", 1, 1e3),
+    "crest_factor": Metric("crest factor", 2),
+    "decision_time": Metric("time per decision / µs", 2, 1e6),
+    "fisher_gain": Metric("Fisher information / nat", 2),
+    "silverbox_equivalent": Metric("Silverbox equivalent / samples", 0, 1.0, _MEDIAN),
+    "simulation_rmse": Metric("RMSE on the twin's arrow / mV", 3, 1e3, _MEDIAN),
     "arrow_rmse": Metric("RMSE on the real arrow / mV", 2, 1e3, _MEDIAN),
 }
+
+#: What the table of estimators shows.
+ESTIMATOR_METRICS = ("error_m", "error_c", "error_a", "error_b", "coverage", "nees")
 
 
 def compare(
@@ -61,8 +74,9 @@ def compare(
     folder: Path,
     *,
     seed: int = 0,
+    report: bool = False,
 ) -> list[Evaluation]:
-    """Evaluate policies; print the table, write ``evaluation.json`` and the figures into ``folder``."""
+    """Evaluate policies; print the tables, and write ``evaluation.json`` and the figures or the report."""
     from rich.console import Console
 
     from agents.figures import draw_contraction, draw_excitations
@@ -74,11 +88,20 @@ def compare(
         )
     title = f"{env_id}, {systems} systems"
     print_table(evaluations, title)
+    print_estimators(evaluations)
     settings = {"env": env_id, "systems": systems, "seed": seed, "options": options}
     write_json(folder / "evaluation.json", evaluations, settings)
-    draw_contraction(folder / "contraction.png", evaluations, title)
-    draw_excitations(folder / "excitations.png", evaluations)
-    for name in ("evaluation.json", "contraction.png", "excitations.png"):
+    written = ["evaluation.json"]
+    if report:
+        from agents.report import write_report
+
+        write_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
+        written += ["report.html"]
+    else:
+        draw_contraction(folder / "contraction.png", evaluations, title)
+        draw_excitations(folder / "excitations.png", evaluations)
+        written += ["contraction.png", "excitations.png"]
+    for name in written:
         print(folder / name)
     return evaluations
 
@@ -101,12 +124,22 @@ def write_json(path: Path, evaluations: list[Evaluation], settings: dict[str, An
     """Write summaries and the settings that they were made with; a number that is not finite, as null."""
     results = {
         evaluation.policy: {
-            name: {key: value if np.isfinite(value) else None for key, value in entry.items()}
-            for name, entry in summarise(evaluation).items()
+            **_finite(summarise(evaluation)),
+            "estimators": {
+                estimator: _finite(summarise(replace(evaluation, metrics=values)))
+                for estimator, values in evaluation.estimators.items()
+            },
         }
         for evaluation in evaluations
     }
     write_atomically(path, json.dumps({"settings": settings, "policies": results}, indent=2, allow_nan=False))
+
+
+def _finite(summary: dict[str, dict[str, float]]) -> dict[str, dict[str, float | None]]:
+    return {
+        name: {key: value if np.isfinite(value) else None for key, value in entry.items()}
+        for name, entry in summary.items()
+    }
 
 
 def print_table(evaluations: list[Evaluation], title: str) -> None:
@@ -115,24 +148,51 @@ def print_table(evaluations: list[Evaluation], title: str) -> None:
     from rich.table import Table
 
     summaries = {evaluation.policy: summarise(evaluation) for evaluation in evaluations}
-    order = sorted(summaries, key=lambda policy: -_center(summaries[policy]["log_posterior_gain"]))
+    order = [evaluation.policy for evaluation in in_order(evaluations)]
     table = Table(title=title, caption="means, errors as medians; [95 % bootstrap intervals over systems]")
     table.add_column("", no_wrap=True)
     for policy in order:
         table.add_column(policy, justify="right", overflow="fold")
     for name, metric in METRICS.items():
         if any(name in summary for summary in summaries.values()):
-            table.add_row(metric.title, *(_cell(metric, summaries[policy].get(name)) for policy in order))
+            table.add_row(metric.title, *(cell_of(metric, summaries[policy].get(name)) for policy in order))
     console = Console(markup=False)  # the brackets of the intervals are no markup
     console.width = max(console.width, 30 + 20 * len(order))
     console.print(table)
+
+
+def print_estimators(evaluations: list[Evaluation]) -> None:
+    """Print the two-way table, policies by estimators: who identified what from the same inputs and outputs."""
+    from rich.console import Console
+    from rich.table import Table
+
+    titles = [METRICS[name].title for name in ESTIMATOR_METRICS]
+    table = Table("policy", "estimator", *titles, title="the same inputs and outputs in other hands")
+    for evaluation in evaluations:
+        for estimator, values in evaluation.estimators.items():
+            cells = []
+            for name in ESTIMATOR_METRICS:
+                metric = METRICS[name]
+                cells.append(f"{metric.scale * float(metric.center[1](values[name])):.{metric.digits}f}")
+            table.add_row(evaluation.policy, estimator.replace("_", " "), *cells)
+        table.add_section()
+    if table.rows:
+        console = Console(markup=False)
+        console.width = max(console.width, 110)
+        console.print(table)
+
+
+def in_order(evaluations: list[Evaluation]) -> list[Evaluation]:
+    """The best log posterior gain first."""
+    return sorted(evaluations, key=lambda evaluation: -float(evaluation.metrics["log_posterior_gain"].mean()))
 
 
 def _center(entry: dict[str, float]) -> float:
     return next(value for key, value in entry.items() if key in ("mean", "median"))
 
 
-def _cell(metric: Metric, entry: dict[str, float] | None) -> str:
+def cell_of(metric: Metric, entry: dict[str, float] | None) -> str:
+    """What a table says of a metric: its centre, and its interval on the next line; a dash where there is none."""
     if entry is None:
         return "-"
     center, low, high = (metric.scale * value for value in (_center(entry), entry["low"], entry["high"]))

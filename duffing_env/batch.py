@@ -11,7 +11,7 @@ from duffing_env import kernel
 from duffing_env.experiment import Experiment
 from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OSCILLATOR, OUTCOME, SAVED
 from duffing_env.noise import stream_words
-from estimator.belief import Belief
+from estimator.belief import RecordBelief
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, PhysicalParameters
 from estimator.record import RECORD_SIZE
@@ -37,8 +37,8 @@ class Batch:
         self._reset_mode = reset_mode
         self._threads = threads
         self._settings = experiment.settings
-        self._prior = experiment.prior_record
         # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
+        self._prior = experiment.prior_record.copy()
         self._recorded = tuple(series.copy() for series in experiment.recorded)
         n_blocks = -(-size // LANES)
         padded = n_blocks * LANES
@@ -100,12 +100,12 @@ class Batch:
         """(n,) current values of a quantity of `LAYOUT`; a copy."""
         return self._blocks[:, LAYOUT[name], :].reshape(-1)[: self.size].copy()
 
-    def belief(self, index: int, *, final: bool = False) -> Belief:
+    def belief(self, index: int, *, final: bool = False) -> RecordBelief:
         """The belief of environment ``index``; ``final``: the one its last episode ended with, if reset since."""
         block, lane = divmod(index, LANES)
         first = LAYOUT[SAVED[0]] if final else 0
         record = self._blocks[block, first : first + RECORD_SIZE, lane]
-        return Belief(record, self.experiment.factorisation, self.experiment.is_nonlinear)
+        return self.experiment.to_belief(record)
 
     def truth(self) -> PhysicalParameters:
         """The true oscillators, a batch of n; where a record is replayed, the twin of its circuit."""

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from duffing_env.layout import OSCILLATOR, SETTINGS
+from duffing_env.layout import ESTIMATORS, OSCILLATOR, PLANTS, SETTINGS
 from duffing_env.rewards import reward_number
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
-from estimator.belief import Prior
+from estimator.belief import Belief, Prior, RecordBelief
+from estimator.continuous import CONTINUOUS_TWIN, ContinuousBelief, continuous_prior
 from estimator.inference import DEFAULT_ITERATIONS
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray, PhysicalParameters
 from estimator.record import COEFFICIENTS, RECORD
 
 _PRIORS = ("silverbox_twin", "published_run", "paper_text")
@@ -71,6 +72,16 @@ class Experiment:
         raise NotImplementedError
 
     @property
+    def twin(self) -> PhysicalParameters:
+        """The oscillator in the middle of the range."""
+        return SILVERBOX_TWIN
+
+    @property
+    def estimator_kind(self) -> str:
+        """The estimator's name in `ESTIMATORS`."""
+        return self.factorisation
+
+    @property
     def is_nonlinear(self) -> bool:
         """Whether the estimator's model has the cubic term."""
         return True
@@ -90,6 +101,10 @@ class Experiment:
         """The prior as the record (RECORD_SIZE,) that the kernel copies at a reset."""
         return self.believed.to_record(factorisation=self.factorisation, nonlinear=self.is_nonlinear)
 
+    def to_belief(self, record: FloatArray) -> RecordBelief:
+        """The readable face of a record (RECORD_SIZE,)."""
+        return Belief(record, self.factorisation, self.is_nonlinear)
+
     @property
     def settings(self) -> FloatArray:
         """The experiment as the kernel is told of it, (len(SETTINGS),)."""
@@ -106,14 +121,14 @@ class Experiment:
             "jump": 0.0,
             **{f"walk_{c}": 0.0 for c in COEFFICIENTS},
             "spread": 0.0,
-            **{f"center_{name}": getattr(SILVERBOX_TWIN, name) for name in OSCILLATOR},
+            **{f"center_{name}": getattr(self.twin, name) for name in OSCILLATOR},
             "step": SAMPLING_STEP,
             "reward": reward_number(self.reward),
-            "structured": self.factorisation == "structured",
+            "estimator": ESTIMATORS[self.estimator_kind],
             "iterations": self.iterations or DEFAULT_ITERATIONS[self.factorisation],
             "as_published": False,
             "nonlinear": self.is_nonlinear,
-            "replayed": False,
+            "plant": PLANTS["difference"],
             "delay": 0,
             **{f"prior_{c}": prior[c] for c in ("t1", "t2", "t3", "e")},
             **{f"scale_{c}": _inverse_std(prior[f"P_{c}_{c}"]) for c in ("t1", "t2", "t3", "e")},
@@ -203,8 +218,68 @@ class SimulatedExperiment(Experiment):
 
     @property
     def _prior_stds(self) -> FloatArray:
-        assert self.believed.coefficients_cov is not None
-        return np.sqrt(np.diag(self.believed.coefficients_cov))
+        prior = dict(zip(RECORD, self.prior_record, strict=True))
+        return np.sqrt([prior[f"P_{c}_{c}"] for c in COEFFICIENTS])
+
+
+@dataclass(frozen=True)
+class ContinuousExperiment(SimulatedExperiment):
+    """An experiment on the plant ``sde``, with a new oscillator in every episode.
+
+    The fields of `SimulatedExperiment` are the same, but for ``process_noise``: the standard deviation of what one
+    sample's process noise alone does to x [V]. Oscillators are drawn about `CONTINUOUS_TWIN`.
+
+    Attributes:
+        estimator: ``ode``, the plant's own equation, structured; or ``nlarx``, the paper's difference equation, which
+            no plant of this kind obeys.
+    """
+
+    estimator: str = "ode"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.estimator not in ["ode", "nlarx"]:
+            raise ValueError(f"estimator must be one of ['ode', 'nlarx'], but is {self.estimator!r}")
+        if self.reward == "fisher":
+            raise ValueError("reward must not be 'fisher' here: it is that of the difference equation, not the plant's")
+        if self.estimator == "ode" and self.factorisation != "structured":
+            raise ValueError(
+                f"factorisation must be 'structured' for estimator='ode', but is {self.factorisation!r}; mean field "
+                f"is for estimator='nlarx'"
+            )
+
+    @property
+    def twin(self) -> PhysicalParameters:
+        """The circuit as the differential equation sees it."""
+        return CONTINUOUS_TWIN
+
+    @property
+    def estimator_kind(self) -> str:
+        """The plant's equation, or the factorisation of the paper's."""
+        return "ode" if self.estimator == "ode" else self.factorisation
+
+    @cached_property
+    def believed(self) -> Prior:
+        """The prior of ``nlarx`` that fits oscillators so drawn, by Eq. (3)."""
+        noises = self.process_noise, self.measurement_noise, self.noise_shape
+        return Prior.silverbox_twin(self.spread, *noises, center=self.twin)
+
+    @property
+    def prior_record(self) -> FloatArray:
+        """The prior that fits oscillators so drawn, and the noises."""
+        if self.estimator == "nlarx":
+            return super().prior_record
+        noises = self.process_noise, self.measurement_noise, self.noise_shape
+        return continuous_prior(self.twin, self.spread, *noises).record
+
+    def to_belief(self, record: FloatArray) -> RecordBelief:
+        """The readable face of a record (RECORD_SIZE,)."""
+        return ContinuousBelief(record) if self.estimator == "ode" else super().to_belief(record)
+
+    @property
+    def plant_settings(self) -> dict[str, float]:
+        """The plant, its noises, and the range of the oscillators."""
+        return {**super().plant_settings, "plant": PLANTS["sde"]}
 
 
 @dataclass(frozen=True)
@@ -276,7 +351,7 @@ class ReplayExperiment(Experiment):
     @property
     def plant_settings(self) -> dict[str, float]:
         """How the record is played, and how the estimator departs from the model."""
-        return {"as_published": self.as_published, "replayed": True, "delay": self.input_delay}
+        return {"as_published": self.as_published, "plant": PLANTS["replay"], "delay": self.input_delay}
 
 
 def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:

@@ -11,11 +11,22 @@ import numpy as np
 from numba import prange
 
 from duffing_env import fisher
-from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, OBSERVATION, OSCILLATOR, SAVED, SETTINGS
+from duffing_env.layout import (
+    ESTIMATORS,
+    LAYOUT,
+    N_OBSERVATION,
+    N_OUTCOME,
+    OBSERVATION,
+    OSCILLATOR,
+    PLANTS,
+    SAVED,
+    SETTINGS,
+)
 from duffing_env.noise import as_bits, as_word, draw, to_unit
-from duffing_env.plant import draw_noise, limit_input, move_plant, play_record
+from duffing_env.plant import draw_noise, integrate_plant, limit_input, move_plant, play_record
 from duffing_env.rewards import REWARDS, appraise, settle
 from estimator.elementary import log
+from estimator.inference import continuous as ode
 from estimator.inference import free_energy, update, walk
 from estimator.lanes import LANES, at_lane, inlined, jit, kernel, lanewise
 from estimator.record import RECORD_SIZE
@@ -27,6 +38,7 @@ RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP = 0, 1, 2
 _RECORD = RECORD_SIZE * LANES
 _U, _Y, _X, _LAST_X = (LAYOUT[name] * LANES for name in ("u", "y", "x", "last_x"))
 _ASKED, _SPENT, _JUMP_AT = (LAYOUT[name] * LANES for name in ("asked", "spent", "jump_at"))
+_LAST_U, _VELOCITY = LAYOUT["last_u"] * LANES, LAYOUT["velocity"] * LANES
 _ELAPSED, _WAITING = LAYOUT["elapsed"] * LANES, LAYOUT["waiting"] * LANES
 _RECORDED_U, _RECORDED_Y = LAYOUT["recorded_u"] * LANES, LAYOUT["recorded_y"] * LANES
 _OUTCOME, _OBS = LAYOUT["reward"] * LANES, LAYOUT["obs_mean_t1"] * LANES
@@ -43,9 +55,11 @@ _PROCESS_NOISE, _MEASUREMENT_NOISE = SETTINGS["process_noise"], SETTINGS["measur
 _BUDGET, _MAX_SLEW, _INPUT_COST = (SETTINGS[name] for name in ("budget", "max_slew", "input_cost"))
 _JUMP, _WALK = SETTINGS["jump"], SETTINGS["walk_t1"]
 _SPREAD, _CENTER, _STEP = SETTINGS["spread"], SETTINGS["center_m"], SETTINGS["step"]
-_REWARD, _STRUCTURED, _ITERATIONS = SETTINGS["reward"], SETTINGS["structured"], SETTINGS["iterations"]
+_REWARD, _ESTIMATOR, _ITERATIONS = SETTINGS["reward"], SETTINGS["estimator"], SETTINGS["iterations"]
 _AS_PUBLISHED, _NONLINEAR = SETTINGS["as_published"], SETTINGS["nonlinear"]
-_REPLAYED, _DELAY = SETTINGS["replayed"], SETTINGS["delay"]
+_PLANT, _DELAY = SETTINGS["plant"], SETTINGS["delay"]
+_REPLAY, _SDE = PLANTS["replay"], PLANTS["sde"]
+_MEAN_FIELD, _ODE = ESTIMATORS["mean_field"], ESTIMATORS["ode"]
 _FREE_ENERGY, _FISHER = REWARDS["free_energy"], REWARDS["fisher"]
 _PRIOR_T1, _SCALE_T1 = SETTINGS["prior_t1"], SETTINGS["scale_t1"]
 _PRIOR_LOG_GAMMA, _PRIOR_LOG_XI = SETTINGS["prior_log_gamma"], SETTINGS["prior_log_xi"]
@@ -97,12 +111,15 @@ def _clip(value, low, high):
 @at_lane(
     LAYOUT,
     "stream_a stream_b stream_c stream_d m c a b true_t1 true_t2 true_t3 true_e",
-    uniform="spread center_m center_c center_a center_b step",
+    uniform="spread center_m center_c center_a center_b step continuous",
 )
 def draw_oscillator(
-    stream_a, stream_b, stream_c, stream_d, spread, center_m, center_c, center_a, center_b, step
+    stream_a, stream_b, stream_c, stream_d, spread, center_m, center_c, center_a, center_b, step, continuous
 ):  # fmt: skip
-    """m, c, a and b log-uniform about the centre, and their coefficients by Eq. (3)."""
+    """m, c, a and b log-uniform about the centre, and their coefficients: those of the estimator's equation.
+
+    By Eq. (3); for the physical one stiffness, cubic stiffness, damping and gain per sample.
+    """
     low = math.log(1.0 - spread)
     width = math.log(1.0 + spread) - low
     first, i, j, k, n = draw(as_word(stream_a), as_word(stream_b), as_word(stream_c), as_word(stream_d))
@@ -113,7 +130,7 @@ def draw_oscillator(
     c = center_c * math.exp(low + width * to_unit(second))
     a = center_a * math.exp(low + width * to_unit(third))
     b = center_b * math.exp(low + width * to_unit(fourth))
-    t1, t2, t3, e = _coefficients(m, c, a, b, step)
+    t1, t2, t3, e = _coefficients(m, c, a, b, step, continuous)
     return as_bits(i), as_bits(j), as_bits(k), as_bits(n), m, c, a, b, t1, t2, t3, e
 
 
@@ -128,17 +145,20 @@ def draw_jump(stream_a, stream_b, stream_c, stream_d, jump, horizon):
     return as_bits(a), as_bits(b), as_bits(c), as_bits(d), at, factor
 
 
-@at_lane(LAYOUT, "m true_t1 true_t2 true_t3 true_e", uniform="step")
-def jump_mass(m, c, a, b, jump_factor, step):
-    """Change the mass, and with it the coefficients, by Eq. (3)."""
+@at_lane(LAYOUT, "m true_t1 true_t2 true_t3 true_e", uniform="step continuous")
+def jump_mass(m, c, a, b, jump_factor, step, continuous):
+    """Change the mass, and with it the coefficients, by Eq. (3) or per sample of Eq. (1)."""
     m = jump_factor * m
-    t1, t2, t3, e = _coefficients(m, c, a, b, step)
+    t1, t2, t3, e = _coefficients(m, c, a, b, step, continuous)
     return m, t1, t2, t3, e
 
 
 @inlined
-def _coefficients(m, c, a, b, step):
-    """θ1, θ2, θ3 and η by Eq. (3)."""
+def _coefficients(m, c, a, b, step, continuous):
+    """θ1, θ2, θ3 and η by Eq. (3); or stiffness, cubic stiffness, damping and gain per sample."""
+    if continuous != 0.0:
+        gain = step * step / m
+        return a * gain, b * gain, c * step / m, gain
     e = step * step / (m + c * step)
     return (2.0 * m + c * step) * e / (step * step) - a * e, -b * e, -m * e / (step * step), e
 
@@ -146,20 +166,48 @@ def _coefficients(m, c, a, b, step):
 @jit
 def reset_lane(W, j, settings, prior):
     """Start an episode in lane j: draw its oscillator, put it at rest, and put the belief to the prior."""
+    continuous = 1.0 if settings[_ESTIMATOR] == _ODE else 0.0
     for i in range(RECORD_SIZE):
         W[i * LANES + j] = prior[i]
     draw_oscillator(
         W, j, settings[_SPREAD], settings[_CENTER], settings[_CENTER + 1], settings[_CENTER + 2],
-        settings[_CENTER + 3], settings[_STEP],
+        settings[_CENTER + 3], settings[_STEP], continuous,
     )  # fmt: skip
     W[_JUMP_AT + j] = -1.0
     if settings[_JUMP] > 0.0:
         draw_jump(W, j, settings[_JUMP], settings[_HORIZON])
-    for row in (_U, _Y, _X, _LAST_X, _ELAPSED, _WAITING, _SPENT):
+    for row in (_U, _LAST_U, _Y, _X, _LAST_X, _VELOCITY, _ELAPSED, _WAITING, _SPENT):
         W[row + j] = 0.0
-    appraise(W, j, settings[_STEP], settings[_NONLINEAR])
+    appraise(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
     if settings[_REWARD] == _FISHER:
         fisher.begin(W, j, prior, settings[_NONLINEAR])
+
+
+@jit
+def _infer(W, settings):
+    """Update the beliefs of a block with its samples, and tell their free energy where that is the reward."""
+    if settings[_WALK] > 0.0:
+        walk(W, settings[_WALK], settings[_WALK + 1], settings[_WALK + 2], settings[_WALK + 3])
+    structured = settings[_ESTIMATOR] != _MEAN_FIELD
+    iterations = np.int64(settings[_ITERATIONS])
+    if settings[_ESTIMATOR] == _ODE:
+        ode.update(W, iterations, ode.SUBSTEPS)
+    else:
+        # Eq. (2) takes the input at x_t. Between two actions of the plant ``sde`` that is the last one.
+        if settings[_PLANT] == _SDE:
+            _swap_inputs(W)
+        update(W, structured, iterations, settings[_AS_PUBLISHED] != 0.0, W[:0])
+        if settings[_PLANT] == _SDE:
+            _swap_inputs(W)
+    if settings[_REWARD] == _FREE_ENERGY:
+        for j in range(LANES):
+            W[_SURPRISE + j] = free_energy(W, j, structured)
+
+
+@jit
+def _swap_inputs(W):
+    for j in range(LANES):
+        W[_U + j], W[_LAST_U + j] = W[_LAST_U + j], W[_U + j]
 
 
 @jit
@@ -168,26 +216,23 @@ def _integrate_and_infer(W, settings, recorded_u, recorded_y):
     draw_noise(W)
     if settings[_REWARD] == _FISHER:
         fisher.inform(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE], settings[_NONLINEAR])
-    if settings[_REPLAYED] != 0.0:
+    if settings[_PLANT] == _REPLAY:
         last = len(recorded_y) - 1
         for j in range(LANES):
             t = np.int64(W[_ELAPSED + j])
             W[_RECORDED_U + j] = recorded_u[min(t, last)]
             W[_RECORDED_Y + j] = recorded_y[min(t + np.int64(settings[_DELAY]), last)]
         play_record(W, settings[_MAX_INPUT])
+    elif settings[_PLANT] == _SDE:
+        integrate_plant(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE], settings[_STEP])
     else:
         move_plant(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE])
     for i in range(_RECORD):
         W[_SAVED_RECORD + i] = W[i]
-    if settings[_WALK] > 0.0:
-        walk(W, settings[_WALK], settings[_WALK + 1], settings[_WALK + 2], settings[_WALK + 3])
-    structured = settings[_STRUCTURED] != 0.0
-    update(W, structured, np.int64(settings[_ITERATIONS]), settings[_AS_PUBLISHED] != 0.0, W[:0])
-    if settings[_REWARD] == _FREE_ENERGY:
-        for j in range(LANES):
-            W[_SURPRISE + j] = free_energy(W, j, structured)
+    _infer(W, settings)
     settle(
-        W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR], settings[_REWARD],
+        W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR],
+        1.0 if settings[_ESTIMATOR] == _ODE else 0.0, settings[_REWARD],
         settings[_INPUT_COST],
     )  # fmt: skip
     for j in range(LANES):
@@ -218,13 +263,15 @@ def _step_block(
     waiting = 0
     for j in range(LANES):
         waiting += W[_WAITING + j] != 0.0
+        W[_LAST_U + j] = W[_U + j]
         W[_ASKED + j] = settings[_MAX_INPUT] * max(-1.0, min(1.0, actions[j]))
     limit_input(W, settings[_BUDGET], settings[_MAX_SLEW])
     if settings[_JUMP] > 0.0:
+        continuous = 1.0 if settings[_ESTIMATOR] == _ODE else 0.0
         for j in range(LANES):
             if W[_ELAPSED + j] == W[_JUMP_AT + j]:
-                jump_mass(W, j, settings[_STEP])
-                appraise(W, j, settings[_STEP], settings[_NONLINEAR])
+                jump_mass(W, j, settings[_STEP], continuous)
+                appraise(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
     if waiting < LANES:
         _integrate_and_infer(W, settings, recorded_u, recorded_y)
     finished = 0

@@ -29,9 +29,13 @@ N_OBSERVATION = len(OBSERVATION)
 SETTINGS = rows(
     "max_input max_output horizon process_noise measurement_noise spread center_m center_c center_a center_b step",
     "budget max_slew input_cost jump walk_t1 walk_t2 walk_t3 walk_e",
-    "reward structured iterations as_published nonlinear replayed delay",
+    "reward estimator iterations as_published nonlinear plant delay",
     "prior_t1 prior_t2 prior_t3 prior_e scale_t1 scale_t2 scale_t3 scale_e prior_log_gamma prior_log_xi",
 )
+
+#: Numbers of the plants, and of the estimators, in the settings.
+PLANTS = {"difference": 0, "replay": 1, "sde": 2}
+ESTIMATORS = {"mean_field": 0, "structured": 1, "ode": 2}
 
 #: What a step leaves for an environment's face: rows of (len(OUTCOME), n) float64.
 OUTCOME = rows("reward information_gain log_posterior_gain terminated truncated diverged off_record")
@@ -54,7 +58,7 @@ LAYOUT = {
         "stream_a stream_b stream_c stream_d noise_w noise_v",
         " ".join(OSCILLATOR),
         "true_t1 true_t2 true_t3 true_e",
-        "x last_x elapsed waiting recorded_u recorded_y",
+        "x last_x velocity elapsed waiting recorded_u recorded_y",
         "asked spent jump_at jump_factor",
         "log_det log_density error surprise fisher_gain ideal_log_det",
         " ".join(f"ideal_{name}" for name in IDEAL),

@@ -73,14 +73,21 @@ def log_det_and_density(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, non
 
 
 @inlined
-def _relative_error(t1, t2, t3, e, m, c, a, b, step):
-    """Mean relative error of the estimates of m, c, a, b by Eq. (4), each capped at 1."""
+def _relative_error(t1, t2, t3, e, m, c, a, b, step, continuous):
+    """Mean relative error of the estimates of m, c, a, b, each capped at 1.
+
+    By Eq. (4); for the physical equation m = δ²/gain, c = δ damping/gain, a = stiffness/gain, b = cubic/gain.
+    """
     weight = 1.0 / e
+    inertia = 1.0 if continuous else -t3
+    damping = t3 if continuous else 1.0 + t3
+    stiffness = t1 if continuous else 1.0 - t1 - t3
+    cubic = t2 if continuous else -t2
     return 0.25 * (
-        _capped(-t3 * step * step * weight / m)
-        + _capped((1.0 + t3) * step * weight / c)
-        + _capped((1.0 - t1 - t3) * weight / a)
-        + _capped(-t2 * weight / b)
+        _capped(inertia * step * step * weight / m)
+        + _capped(damping * step * weight / c)
+        + _capped(stiffness * weight / a)
+        + _capped(cubic * weight / b)
     )
 
 
@@ -93,14 +100,14 @@ def _capped(ratio):
 @lanewise(
     LAYOUT,
     " ".join(OUTCOME) + " log_det log_density error elapsed",
-    uniform="max_output horizon step nonlinear reward_kind input_cost",
+    uniform="max_output horizon step nonlinear continuous reward_kind input_cost",
 )
 def settle(
     x0, x1, x2, t1, t2, t3, e, P_x0_x0, P_x1_x1, P_x2_x2,
     P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
     g_rate, n_rate, m, c, a, b, true_t1, true_t2, true_t3, true_e,
     u, x, y, elapsed, log_det, log_density, error, surprise, fisher_gain, off_record,
-    max_output, horizon, step, nonlinear, reward_kind, input_cost,
+    max_output, horizon, step, nonlinear, continuous, reward_kind, input_cost,
 ):  # fmt: skip
     """What the step was worth, and whether the episode ends.
 
@@ -111,7 +118,7 @@ def settle(
     new_log_det, new_log_density, sound = log_det_and_density(
         t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0
     )  # fmt: skip
-    new_error = _relative_error(t1, t2, t3, e, m, c, a, b, step)
+    new_error = _relative_error(t1, t2, t3, e, m, c, a, b, step, continuous != 0.0)
     total = x + y + x0 + x1 + x2 + t1 + t2 + t3 + e + P_x0_x0 + P_x1_x1 + P_x2_x2 + g_rate + n_rate
     total += new_log_density + new_error + surprise
     sound = sound and P_x0_x0 > 0.0 and P_x1_x1 > 0.0 and g_rate > 0.0 and n_rate > 0.0
@@ -142,12 +149,12 @@ def settle(
     )  # fmt: skip
 
 
-@at_lane(LAYOUT, "log_det log_density error", uniform="step nonlinear")
+@at_lane(LAYOUT, "log_det log_density error", uniform="step nonlinear continuous")
 def appraise(
     t1, t2, t3, e, P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
-    m, c, a, b, true_t1, true_t2, true_t3, true_e, step, nonlinear,
+    m, c, a, b, true_t1, true_t2, true_t3, true_e, step, nonlinear, continuous,
 ):  # fmt: skip
     """Log det, log density and error of a lane's belief beside its oscillator, where either is new."""
     P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
     log_det, log_density, _ = log_det_and_density(t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0)
-    return log_det, log_density, _relative_error(t1, t2, t3, e, m, c, a, b, step)
+    return log_det, log_density, _relative_error(t1, t2, t3, e, m, c, a, b, step, continuous != 0.0)

@@ -1,7 +1,7 @@
 """The twin: the oscillator nearest to the Silverbox circuit, identified from its record.
 
 Run ``python -m duffing_env.twin`` with the record at hand to print the constants of
-`estimator.parameters.SILVERBOX_TWIN`.
+`estimator.parameters.SILVERBOX_TWIN` and of `estimator.continuous.CONTINUOUS_TWIN`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from duffing_env.silverbox import SilverboxRecord, load_record
+from estimator import DuffingODE, OnlineEstimator
 from estimator.parameters import Coefficients, PhysicalParameters, to_physical
 
 
@@ -24,11 +25,24 @@ def identify_twin(record: SilverboxRecord) -> tuple[PhysicalParameters, float]:
     return to_physical(Coefficients(*coefficients)), float(np.sqrt(squares[0] / len(regressors)))
 
 
+def identify_continuous_twin(record: SilverboxRecord) -> dict[str, float]:
+    """Stiffness, damping, gain and cubic stiffness of the differential equation, from the record's multisine part.
+
+    By `DuffingODE` with the spline through all inputs. Its offsets and feedthrough are identified along, and left away:
+    they are the circuit's and the sensor's, not the oscillator's.
+    """
+    estimator = OnlineEstimator(DuffingODE("spline"))
+    estimator.run(record.multisine.u, record.multisine.y)
+    return dict(zip(DuffingODE.names, estimator.belief.coefficients_mean.tolist(), strict=True))
+
+
 def main() -> None:
-    """Print the twin."""
+    """Print both twins."""
     twin, residual = identify_twin(load_record())
     print(f"m = {twin.m:.4e} s², c = {twin.c:.4e} s, a = {twin.a:.4f}, b = {twin.b:.4f} V⁻²")
     print(f"one-step residual {1e3 * residual:.3f} mV root mean square")
+    continuous = identify_continuous_twin(load_record())
+    print(", ".join(f"{name} {continuous[name]:.6g}" for name in ("stiffness", "damping", "gain", "cubic")))
 
 
 if __name__ == "__main__":

@@ -14,10 +14,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from duffing_env.batch import Batch, spawn_seeds
-from duffing_env.env import DuffingEnv, SilverboxReplayEnv, action_space, observation_space
+from duffing_env.env import ContinuousEnv, DuffingEnv, SilverboxReplayEnv, action_space, observation_space
 from duffing_env.experiment import Experiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
-from estimator.belief import Belief
+from estimator.belief import RecordBelief
 from estimator.parameters import FloatArray, PhysicalParameters
 
 _RESET_MODES = {
@@ -119,7 +119,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         """The oscillators that are to be identified, a batch of ``num_envs``."""
         return self._batch.truth()
 
-    def belief(self, index: int) -> Belief:
+    def belief(self, index: int) -> RecordBelief:
         """The posterior of row ``index`` now."""
         return self._batch.belief(index)
 
@@ -243,6 +243,12 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
             beliefs[row] = self._batch.belief(row, final=same_step)
             truths[row] = self._batch.oscillator(row, final=same_step)
         return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}
+
+
+class ContinuousVectorEnv(DuffingVectorEnv):
+    """Many `ContinuousEnv` at once."""
+
+    single: ClassVar[type[DuffingEnv]] = ContinuousEnv
 
 
 class SilverboxReplayVectorEnv(DuffingVectorEnv):

@@ -4,6 +4,8 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 """
 
 from estimator.belief import Belief, Prior
+from estimator.continuous import CONTINUOUS_TWIN, ContinuousBelief, continuous_prior
+from estimator.fisher import cramer_rao, fisher_information, relative_covariance
 from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE
@@ -20,18 +22,24 @@ from estimator.parameters import (
 from estimator.saving import load_estimator, save_estimator
 
 __all__ = [
+    "CONTINUOUS_TWIN",
     "NLARX",
     "PEMNARX",
     "SAMPLING_STEP",
     "SILVERBOX_TWIN",
     "Belief",
     "Coefficients",
+    "ContinuousBelief",
     "DuffingODE",
     "JointBelief",
     "OnlineEstimator",
     "PhysicalParameters",
     "Prior",
+    "continuous_prior",
+    "cramer_rao",
+    "fisher_information",
     "load_estimator",
+    "relative_covariance",
     "save_estimator",
     "to_coefficients",
     "to_physical",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ from estimator.parameters import (
     PhysicalParameters,
     log_uniform_moments,
     propagate_to_physical,
+    to_coefficients,
 )
 from estimator.record import RECORD, RECORD_SIZE
 
@@ -186,19 +188,16 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
-class Belief(GaussianCoefficients):
-    """A posterior: q(x, θ, η) Gaussian, q(γ) and q(ξ) Gamma. A copy; later updates do not change it.
+class RecordBelief(GaussianCoefficients):
+    """A posterior as the kernels hold it: state and coefficients Gaussian, q(γ) and q(ξ) Gamma.
+
+    A copy; later updates do not change it.
 
     Attributes:
         record: (RECORD_SIZE,) the flat record.
-        factorisation: ``structured`` (three lags of the state, jointly with θ and η) or ``mean_field`` (two lags,
-            θ and η independent of them and of each other).
-        nonlinear: False where θ2 is fixed at 0; densities are then over (θ1, θ3, η).
     """
 
     record: FloatArray
-    factorisation: str = "structured"
-    nonlinear: bool = True
 
     def __post_init__(self) -> None:
         record = np.array(self.record, dtype=np.float64)
@@ -207,57 +206,52 @@ class Belief(GaussianCoefficients):
 
     def __eq__(self, other: object) -> bool:
         """Whether all numbers are the same, as Gymnasium's checker asks of two episodes of one seed."""
-        if not isinstance(other, Belief):
+        if not isinstance(other, RecordBelief):
             return NotImplemented
-        mine, theirs = (self.factorisation, self.nonlinear), (other.factorisation, other.nonlinear)
-        return mine == theirs and np.array_equal(self.record, other.record)
+        return self._kind == other._kind and np.array_equal(self.record, other.record)
 
     def __hash__(self) -> int:
-        return hash((self.factorisation, self.nonlinear, self.record.tobytes()))
+        return hash((self._kind, self.record.tobytes()))
+
+    @property
+    def _kind(self) -> tuple[Any, ...]:
+        """What tells beliefs of the same numbers apart."""
+        return (type(self),)
 
     @property
     def _lags(self) -> int:
-        return 3 if self.factorisation == "structured" else 2
+        """Numbers of the record that are the state's."""
+        return 2
+
+    @staticmethod
+    def propagate(coefficients_mean: FloatArray, coefficients_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Moments (..., 4) and (..., 4, 4) of (m, c, a, b) from those of the coefficients, to first order."""
+        raise NotImplementedError
+
+    @staticmethod
+    def coefficients_of(parameters: PhysicalParameters) -> FloatArray:
+        """(..., 4) the coefficients of one oscillator or a batch of shape (...)."""
+        raise NotImplementedError
 
     @property
     def state_mean(self) -> FloatArray:
-        """(lags,) means of x_t, x_{t-1}, (x_{t-2})  [V]."""
+        """(k,) means of the state."""
         return self.record[: self._lags].copy()
 
     @property
     def state_cov(self) -> FloatArray:
-        """(lags, lags) covariance of the lags [V²]."""
+        """(k, k) covariance of the state."""
         return self.record[_COVARIANCE[: self._lags, : self._lags]]
 
     @property
     def coefficients_mean(self) -> FloatArray:
-        """(4,) means of θ1, θ2, θ3, η."""
+        """(4,) means of the coefficients."""
         return self.record[_STATES:7].copy()
 
     @property
     def coefficients_cov(self) -> FloatArray:
-        """(4, 4) covariance of θ1, θ2, θ3, η."""
+        """(4, 4) covariance of the coefficients."""
         return self.record[_COVARIANCE[_STATES:, _STATES:]]
-
-    @property
-    def theta_mean(self) -> FloatArray:
-        """(3,) means of θ1 [1], θ2 [1/V²], θ3 [1]."""
-        return self.coefficients_mean[:3]
-
-    @property
-    def theta_cov(self) -> FloatArray:
-        """(3, 3) covariance of θ."""
-        return self.coefficients_cov[:3, :3]
-
-    @property
-    def eta_mean(self) -> float:
-        """Mean of η [1]."""
-        return float(self.record[_INDEX["e"]])
-
-    @property
-    def eta_var(self) -> float:
-        """Variance of η."""
-        return float(self.record[_INDEX["P_e_e"]])
 
     @property
     def gamma_shape(self) -> float:
@@ -289,14 +283,70 @@ class Belief(GaussianCoefficients):
         """E[ξ] [1/V²]."""
         return self.xi_shape / self.xi_rate
 
+    def physical(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (4,) and covariance (4, 4) of (m, c, a, b), first order."""
+        return self.propagate(self.coefficients_mean, self.coefficients_cov)
+
+
+@dataclass(frozen=True, eq=False)
+class Belief(RecordBelief):
+    """A posterior: q(x, θ, η) Gaussian, q(γ) and q(ξ) Gamma. A copy; later updates do not change it.
+
+    The coefficients are θ1 [1], θ2 [1/V²], θ3 [1] and η [1], the state is x_t, x_{t-1}, (x_{t-2})  [V].
+
+    Attributes:
+        record: (RECORD_SIZE,) the flat record.
+        factorisation: ``structured`` (three lags of the state, jointly with θ and η) or ``mean_field`` (two lags,
+            θ and η independent of them and of each other).
+        nonlinear: False where θ2 is fixed at 0; densities are then over (θ1, θ3, η).
+    """
+
+    factorisation: str = "structured"
+    nonlinear: bool = True
+
+    @property
+    def _kind(self) -> tuple[Any, ...]:
+        return (Belief, self.factorisation, self.nonlinear)
+
+    @property
+    def _lags(self) -> int:
+        return 3 if self.factorisation == "structured" else 2
+
+    @staticmethod
+    def propagate(coefficients_mean: FloatArray, coefficients_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Moments (..., 4) and (..., 4, 4) of (m, c, a, b) from those of θ and η, Eq. (4), to first order."""
+        return propagate_to_physical(coefficients_mean, coefficients_cov)
+
+    @staticmethod
+    def coefficients_of(parameters: PhysicalParameters) -> FloatArray:
+        """(..., 4) θ1, θ2, θ3, η of one oscillator or a batch, Eq. (3)."""
+        psi = to_coefficients(parameters)
+        return np.stack([psi.theta1, psi.theta2, psi.theta3, psi.eta], axis=-1)
+
+    @property
+    def theta_mean(self) -> FloatArray:
+        """(3,) means of θ1 [1], θ2 [1/V²], θ3 [1]."""
+        return self.coefficients_mean[:3]
+
+    @property
+    def theta_cov(self) -> FloatArray:
+        """(3, 3) covariance of θ."""
+        return self.coefficients_cov[:3, :3]
+
+    @property
+    def eta_mean(self) -> float:
+        """Mean of η [1]."""
+        return float(self.record[_INDEX["e"]])
+
+    @property
+    def eta_var(self) -> float:
+        """Variance of η."""
+        return float(self.record[_INDEX["P_e_e"]])
+
     def coefficients(self) -> Coefficients:
         """The posterior means as coefficients."""
         theta1, theta2, theta3, eta = self.coefficients_mean.tolist()
         return Coefficients(theta1, theta2, theta3, eta, self.gamma_mean, self.xi_mean)
-
-    def physical(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (4,) and covariance (4, 4) of (m, c, a, b), first order, Eq. (4)."""
-        return propagate_to_physical(self.coefficients_mean, self.coefficients_cov)
 
     def log_prob(self, coefficients: Coefficients | npt.ArrayLike) -> float | FloatArray:
         """Log density of q(θ, η) at given coefficients.

@@ -11,10 +11,17 @@ import numpy as np
 
 from estimator.belief import Belief, Prior
 from estimator.gaussian import JointBelief
-from estimator.inference import update, walk
+from estimator.inference import sigma_points, update_alone, walk
 from estimator.lanes import LANES, kernel
 from estimator.models.nlarx import NLARX
-from estimator.models.ode import DuffingODE, from_coordinates, run_samples, simulate_samples, to_coordinates
+from estimator.models.ode import (
+    N_MOTION,
+    DuffingODE,
+    from_coordinates,
+    run_samples,
+    simulate_samples,
+    to_coordinates,
+)
 from estimator.models.regressors import LONGEST_DELAY, as_arrays, run_regressors, simulate_regressors
 from estimator.parameters import FloatArray
 from estimator.record import LAYOUT, N_ROWS, RECORD, RECORD_SIZE, STATES
@@ -24,6 +31,9 @@ _VARIANCES = (LAYOUT["predicted_variance"], LAYOUT["process_variance"], LAYOUT["
 
 #: Rows of a record that are about the state.
 _OF_STATES = [i for i, name in enumerate(RECORD) if set(name.split("_")) & set(STATES)]
+
+#: How a `JointFilter` finds out what a step does to its Gaussian belief.
+EXPECTATIONS = ("first_order", "sigma_points")
 
 #: Shape of a Gamma belief that further samples do not move.
 _CERTAIN = 1e15
@@ -157,10 +167,13 @@ class JointFilter(ABC):
     Args:
         prior: belief before the first sample.
         drift: standard deviation of each coefficient's step per sample, in parts of that of its prior.
+        expectations: a name of `EXPECTATIONS`.
+        movers: how many dimensions of the joint state decide where the state moves; they stand first.
         look_ahead: inputs after a sample that must be known before it is used.
     """
 
-    def __init__(self, prior: JointBelief, drift: float, look_ahead: int) -> None:
+    def __init__(self, prior: JointBelief, drift: float, expectations: str, movers: int, look_ahead: int) -> None:
+        self._by_points, self._movers = expectations == "sigma_points", movers
         self._names, self._units, self._look_ahead = prior.names, prior.units, look_ahead
         self._mean, self._cov = self._to_coordinates(prior.mean, prior.cov)
         self._noises = np.array([prior.gamma_shape, prior.gamma_rate, prior.xi_shape, prior.xi_rate])
@@ -191,6 +204,10 @@ class JointFilter(ABC):
         self._past = inputs[: begun + used][-LONGEST_DELAY:]
         self._waiting_u, self._waiting_y = inputs[begun + used :], outputs[used:]
         return used
+
+    def _memory(self) -> tuple[FloatArray, FloatArray] | None:
+        """What the kernels need for sigma points; None to first order."""
+        return sigma_points.memory(len(self._mean), self._movers) if self._by_points else None
 
     def _to_coordinates(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
         """From what a `JointBelief` holds to the model's own coordinates; copies."""
@@ -272,8 +289,8 @@ class JointFilter(ABC):
 class ODEFilter(JointFilter):
     """Memory for `DuffingODE`."""
 
-    def __init__(self, model: DuffingODE, prior: JointBelief, drift: float) -> None:
-        super().__init__(prior, drift, model.look_ahead)
+    def __init__(self, model: DuffingODE, prior: JointBelief, drift: float, expectations: str) -> None:
+        super().__init__(prior, drift, expectations, N_MOTION, model.look_ahead)
         self._model = model
         if not model.cubic_damping:
             fixed = self._states + model.names.index("cubic_damping")
@@ -299,9 +316,10 @@ class ODEFilter(JointFilter):
         forecasts: FloatArray,
     ) -> None:
         new = slice(begun, begun + len(outputs))
-        pieces, substeps = self._pieces(inputs)[new], self._model.substeps
+        pieces, moving, substeps = self._pieces(inputs)[new], begun > 0, self._model.substeps
         run_samples(
-            mean, cov, noises, walk, pieces, inputs[new], outputs, begun > 0, substeps, free_energies, forecasts
+            mean, cov, noises, walk, pieces, inputs[new], outputs, moving, substeps, free_energies, forecasts,
+            self._memory(),
         )  # fmt: skip
 
     def _free_run(self, state: FloatArray, u: FloatArray, y: FloatArray, start: int) -> None:
@@ -317,8 +335,8 @@ class ODEFilter(JointFilter):
 class RegressorFilter(JointFilter):
     """Memory for an `NLARX` with other regressors than the paper's."""
 
-    def __init__(self, model: NLARX, prior: JointBelief, drift: float) -> None:
-        super().__init__(prior, drift, look_ahead=0)
+    def __init__(self, model: NLARX, prior: JointBelief, drift: float, expectations: str) -> None:
+        super().__init__(prior, drift, expectations, len(prior.mean), look_ahead=0)
         self._terms = as_arrays(model.terms)
 
     def _take(
@@ -333,7 +351,9 @@ class RegressorFilter(JointFilter):
         free_energies: FloatArray,
         forecasts: FloatArray,
     ) -> None:
-        run_regressors(mean, cov, noises, walk, self._terms, inputs, begun, outputs, free_energies, forecasts)
+        run_regressors(
+            mean, cov, noises, walk, self._terms, inputs, begun, outputs, free_energies, forecasts, self._memory()
+        )  # fmt: skip
 
     def _free_run(self, state: FloatArray, u: FloatArray, y: FloatArray, start: int) -> None:
         given = y[:start].copy()
@@ -344,15 +364,14 @@ class RegressorFilter(JointFilter):
 
 @kernel
 def _run_nlarx(W, u, y, variances, is_structured, as_published, free_energies, forecasts):
-    """Update lane 0 with every sample. The other lanes do the same work, so that none of them runs wild."""
+    """Update lane 0 with every sample."""
     changes = variances.max() > 0.0
     for t in range(len(u)):
         if changes:
             walk(W, variances[0], variances[1], variances[2], variances[3])
-        for j in range(LANES):
-            W[_U * LANES + j] = u[t]
-            W[_Y * LANES + j] = y[t]
-        update(W, is_structured, free_energies.shape[1], as_published, free_energies[t])
+        W[_U * LANES] = u[t]
+        W[_Y * LANES] = y[t]
+        update_alone(W, is_structured, free_energies.shape[1], as_published, free_energies[t])
         forecasts[t, 0] = W[_PREDICTED * LANES] if is_structured else np.nan
         forecasts[t, 1] = 0.0 if is_structured else np.nan
         for row in _VARIANCES:

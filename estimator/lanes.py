@@ -64,7 +64,7 @@ def lanewise(layout: Mapping[str, int], outputs: str, uniform: str = "") -> Call
             f"        {targets} = scalar({arguments})\n"
         )
         loop = jit(_define(source, function, scalar=inlined(function)))
-        loop.declaration = (function, outputs, uniform)
+        loop.declaration = (function, layout, outputs, uniform)
         return loop
 
     return decorate
@@ -72,8 +72,17 @@ def lanewise(layout: Mapping[str, int], outputs: str, uniform: str = "") -> Call
 
 def relaid(loop: Any, layout: Mapping[str, int]) -> Any:
     """A function of `lanewise` once more, over other rows of the block."""
-    function, outputs, uniform = loop.declaration
+    function, _, outputs, uniform = loop.declaration
     return lanewise(layout, outputs, uniform)(function)
+
+
+def alone(loop: Any) -> Any:
+    """A function of `lanewise` for the first lane only, with the same arguments: for a single system."""
+    function, layout, outputs, uniform = loop.declaration
+    first = at_lane(layout, outputs, uniform)(function)
+    arguments = ", ".join(uniform.split())
+    source = f"def {function.__name__}(W{', ' * bool(arguments)}{arguments}):\n    first(W, 0, {arguments})\n"
+    return jit(_define(source, function, first=first))
 
 
 def at_lane(layout: Mapping[str, int], outputs: str = "", uniform: str = "") -> Callable[[Callable[..., Any]], Any]:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief, Prior
 from estimator.checks import scalar, series
-from estimator.filters import Filter, NLARXFilter, ODEFilter, RegressorFilter
+from estimator.filters import EXPECTATIONS, Filter, NLARXFilter, ODEFilter, RegressorFilter
 from estimator.gaussian import JointBelief
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.nlarx import NLARX
@@ -37,6 +37,8 @@ class OnlineEstimator:
         as_published: mean field with the two departures of the published run, to reproduce its numbers.
         drift: lets the coefficients walk at random, to follow a system that changes: standard deviation of a
             coefficient's step per sample, in parts of that of its prior. 0.01 forgets in some hundred samples.
+        expectations: what a step does to a `JointBelief`: ``first_order``, by the derivative at its mean; or
+            ``sigma_points``, by points that spread as the belief does, for beliefs that are wide.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -66,6 +68,7 @@ class OnlineEstimator:
         iterations: int | None = None,
         as_published: bool = False,
         drift: float = 0.0,
+        expectations: str = "first_order",
     ) -> None:
         if factorisation not in DEFAULT_ITERATIONS:
             raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {factorisation!r}")
@@ -87,6 +90,9 @@ class OnlineEstimator:
             raise ValueError(f"drift must be at least 0 and finite, but is {drift!r}; 0 is a system that stays")
         if self.drift and factorisation == "mean_field":
             raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {drift!r}; use structured")
+        if expectations not in EXPECTATIONS:
+            raise ValueError(f"expectations must be one of {list(EXPECTATIONS)}, but is {expectations!r}")
+        self.expectations = expectations
         self._filter = self._make_filter(prior)
         self._free_energies = np.full(self.iterations, np.nan)
         self._forecasts = np.empty((0, 2))
@@ -103,8 +109,12 @@ class OnlineEstimator:
             if not isinstance(prior, JointBelief) or (prior.names, len(prior.mean)) != (own.names, len(own.mean)):
                 raise ValueError(f"prior must have the parameters {own.names}, but is {prior!r:.60}; use model.prior()")
             if isinstance(self.model, DuffingODE):
-                return ODEFilter(self.model, prior, self.drift)
-            return RegressorFilter(self.model, prior, self.drift)
+                return ODEFilter(self.model, prior, self.drift, self.expectations)
+            return RegressorFilter(self.model, prior, self.drift, self.expectations)
+        if self.expectations != "first_order":
+            raise ValueError(
+                f"expectations must be 'first_order' for regressors='paper', but is {self.expectations!r}; {_AS_TERMS}"
+            )
         prior = prior if prior is not None else Prior.silverbox_twin()
         if not isinstance(prior, Prior):
             raise ValueError(f"prior must be a Prior for NLARX, but is {prior!r:.60}; use Prior.silverbox_twin(...)")

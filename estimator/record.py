@@ -3,6 +3,8 @@
 A belief is one flat float64 record of `RECORD_SIZE` numbers: the means of (x_t, x_{t-1}, x_{t-2}, θ1, θ2, θ3, η), the
 upper triangle of their covariance, and the Gamma shapes and rates of γ (process precision) and ξ (measurement
 precision). Both factorisations use the same record; mean field leaves the cross-covariances and the third lag zero.
+The belief of the physical equation (`estimator.continuous`) uses it too: x0 and x1 are x and x', t1, t2, t3 and e are
+stiffness, cubic stiffness, damping and gain, all counted in samples, and x2 is zero.
 
 Names of rows, as they appear as parameters of the scalar functions:
 
@@ -13,6 +15,7 @@ Names of rows, as they appear as parameters of the scalar functions:
 ``g_shape g_rate``   γ ~ Gamma(shape, rate), rate in V²
 ``n_shape n_rate``   ξ ~ Gamma(shape, rate), rate in V²
 ``u y``              the sample: input that acted on x_{t-1}, and output of x_t  [V]
+``last_u``           the input before ``u`` [V], for those who interpolate between the two
 ===================  ==================================================================
 """
 
@@ -52,7 +55,13 @@ _MEAN_FIELD = """
 
 #: Rows that lie idle but during a mean-field update.
 MEAN_FIELD_SCRATCH = tuple(_MEAN_FIELD.split())
+#: What one update of the physical equation keeps, besides what is in `_STRUCTURED`: the point that moves, with its
+#: sensitivities to the state and the parameters before the sample, the covariance that process noise brings it, and the
+#: covariances of the velocity that is reached.
+_CONTINUOUS = """
+    moved_x moved_v N_xx N_xv N_vv X_x0 X_x1 X_t1 X_t2 X_t3 X_e V_x0 V_x1 V_t1 V_t2 V_t3 V_e d_x1 d_t1 d_t2 d_t3 d_e
+"""
 
 #: Rows of an estimator's block. An environment's block has these first, then its own.
-LAYOUT = rows(" ".join(RECORD), "u y", _PRIOR_RATES, _STRUCTURED, _MEAN_FIELD)
+LAYOUT = rows(" ".join(RECORD), "u y last_u", _PRIOR_RATES, _STRUCTURED, _MEAN_FIELD, _CONTINUOUS)
 N_ROWS = len(LAYOUT)

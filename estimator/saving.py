@@ -35,6 +35,7 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
         "iterations": estimator.iterations,
         "as_published": estimator.as_published,
         "drift": estimator.drift,
+        "expectations": estimator.expectations,
     }
     arrays: dict[str, Any] = {**estimator.arrays(), "description": np.array(json.dumps(description))}
     buffer = io.BytesIO()
@@ -68,6 +69,7 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
         iterations=description["iterations"],
         as_published=description["as_published"],
         drift=description["drift"],
+        expectations=description.get("expectations", "first_order"),  # files from before it was an option
     )
     estimator.restore(arrays)
     return estimator

@@ -51,7 +51,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "tracks/index.md": _tracks(),
         **{_page(track): _track(track) for track in TRACKS},
         "rewards.md": f"# Rewards\n\n{_fenced(inspect.getdoc(rewards) or '')}",
-        "policies.md": _policies(),
+        "reference/policies.md": _policies(),
         **{f"reference/{name}.md": _reference(name, objects) for name, objects in REFERENCE.items()},
     }
     for path, text in pages.items():
@@ -139,7 +139,7 @@ def _policies() -> str:
             "| Name | |",
             "|---|---|",
             *rows,
-            "| a run folder | A trained policy; see [Training](training.md). |",
+            "| a run folder | A trained policy; see [Training](../training.md). |",
             "",
             *(
                 f"::: agents.policies.{name}\n"

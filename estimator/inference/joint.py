@@ -3,6 +3,7 @@
 The same equations as `estimator.inference.structured`, with matrices of the model's size: a model says where it moves
 the state, with which Jacobian, and how the output reads off the joint state. Coefficients do not move, so only the
 state's rows of the covariance change in a prediction; unless they are let walk, to follow a system that changes.
+`estimator.inference.sigma_points` has another `predict`, without the Jacobian.
 """
 
 from __future__ import annotations

@@ -24,8 +24,8 @@ from typing import ClassVar
 import numpy as np
 
 from estimator.gaussian import JointBelief
-from estimator.inference import joint
-from estimator.lanes import jit, kernel
+from estimator.inference import joint, sigma_points
+from estimator.lanes import inlined, jit, kernel
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 
 #: Parameters with their units, in the order of the joint state after (x, x').
@@ -44,6 +44,9 @@ N_JOINT = N_STATES + len(PARAMETERS)
 
 #: What the motion depends on: the state, and all parameters but the feedthrough.
 N_MOTION = N_JOINT - 1
+
+#: Length of a row of sigma points.
+_ROW = 2 * N_MOTION
 
 #: Direction of the process noise in (z, z'): an acceleration held over a sample, scaled to move z by 1.
 NOISE_DIRECTION = np.array([1.0, 2.0])
@@ -193,6 +196,12 @@ def _spline_pieces(u: FloatArray) -> FloatArray:
     return np.column_stack([spline(starts, nu=n) / math.factorial(n) for n in range(SPLINE_DEGREE + 1)])
 
 
+@inlined
+def _acceleration(z, v, u, k, c, g, b, f, e, y0):
+    x = z - y0
+    return g * u + f - c * v - k * z - b * x * x * x - e * v * v * v
+
+
 @jit
 def _derivative(z, v, p, u, J, D):
     """(z', z'') at a point, and into ``D`` the derivative of the sensitivities ``J`` (2, N_MOTION)."""
@@ -210,7 +219,7 @@ def _derivative(z, v, p, u, J, D):
     D[1, 6] += 1.0
     D[1, 7] -= v * v * v
     D[1, 8] += 3.0 * b * x * x
-    return v, g * u + f - c * v - k * z - b * x * x * x - e * v * v * v
+    return v, _acceleration(z, v, u, k, c, g, b, f, e, y0)
 
 
 @jit
@@ -259,6 +268,38 @@ def flow(z, v, p, piece, substeps, J, work):
 
 
 @jit
+def flow_points(points, count, piece, substeps):
+    """Move (z, z') over one sample at many points at once, as `flow` does, without sensitivities.
+
+    Args:
+        points: (N_MOTION, 2 N_MOTION), a point in each of its first ``count`` columns: z, v and the parameters as
+            `flow` has them; the first two rows are overwritten.
+        count: number of points.
+        piece: (degree + 1,) the input's polynomial.
+        substeps: Runge-Kutta steps.
+    """
+    W = points.reshape(-1)  # with rows of constant length, for the compiler to take several points at once
+    h = 1.0 / substeps
+    for s in range(substeps):
+        u0 = _polynomial(piece, s * h)
+        u1 = _polynomial(piece, (s + 0.5) * h)
+        u2 = _polynomial(piece, (s + 1.0) * h)
+        for i in range(count):
+            z, v = W[i], W[_ROW + i]
+            k, c, g, b = W[2 * _ROW + i], W[3 * _ROW + i], W[4 * _ROW + i], W[5 * _ROW + i]
+            f, e, y0 = W[6 * _ROW + i], W[7 * _ROW + i], W[8 * _ROW + i]
+            a1 = _acceleration(z, v, u0, k, c, g, b, f, e, y0)
+            v2 = v + 0.5 * h * a1
+            a2 = _acceleration(z + 0.5 * h * v, v2, u1, k, c, g, b, f, e, y0)
+            v3 = v + 0.5 * h * a2
+            a3 = _acceleration(z + 0.5 * h * v2, v3, u1, k, c, g, b, f, e, y0)
+            v4 = v + h * a3
+            a4 = _acceleration(z + h * v3, v4, u2, k, c, g, b, f, e, y0)
+            W[i] = z + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+            W[_ROW + i] = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+
+
+@jit
 def _polynomial(piece, tau):
     value = piece[-1]
     for n in range(len(piece) - 2, -1, -1):
@@ -267,7 +308,7 @@ def _polynomial(piece, tau):
 
 
 @kernel
-def run_samples(mean, cov, noises, walk, pieces, u, y, moving, substeps, free_energies, forecasts):
+def run_samples(mean, cov, noises, walk, pieces, u, y, moving, substeps, free_energies, forecasts, memory):
     """Update a joint belief with T samples.
 
     Args:
@@ -282,6 +323,7 @@ def run_samples(mean, cov, noises, walk, pieces, u, y, moving, substeps, free_en
         substeps: Runge-Kutta steps per sample.
         free_energies: (T, iterations) receives the free energies [nats].
         forecasts: (T, 2) receives mean [V] and variance [V²] of each output before it was seen.
+        memory: of `sigma_points.memory`, for expectations by sigma points; None for expectations to first order.
     """
     moved = np.empty(N_STATES)
     jacobian = np.zeros((N_STATES, N_JOINT))
@@ -294,11 +336,17 @@ def run_samples(mean, cov, noises, walk, pieces, u, y, moving, substeps, free_en
     direction = NOISE_DIRECTION.copy()
     for t in range(len(y)):
         if moving or t > 0:
-            moved[0], moved[1] = flow(
-                mean[0], mean[1], mean[N_STATES:N_MOTION], pieces[t], substeps, sensitivities, work
-            )  # fmt: skip
-            jacobian[:, :N_MOTION] = sensitivities
-            joint.predict(mean, cov, moved, jacobian, walk, rows)
+            if memory is None:
+                moved[0], moved[1] = flow(
+                    mean[0], mean[1], mean[N_STATES:N_MOTION], pieces[t], substeps, sensitivities, work
+                )  # fmt: skip
+                jacobian[:, :N_MOTION] = sensitivities
+                joint.predict(mean, cov, moved, jacobian, walk, rows)
+            else:
+                columns, points = memory
+                pairs = sigma_points.spread(mean, cov, columns, points)
+                flow_points(points, 2 * pairs, pieces[t], substeps)
+                sigma_points.predict(mean, cov, points[:N_STATES], columns, pairs, walk)
         readout[N_JOINT - 1] = u[t]
         expected = mean[0] + mean[N_JOINT - 1] * u[t]
         forecasts[t, 0] = expected

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from estimator.inference import joint
+from estimator.inference import joint, sigma_points
 from estimator.lanes import jit, kernel
 
 N_STATES = 2
@@ -94,7 +94,7 @@ def _step(x1, x2, u, t, c, terms, regressors):
 
 
 @kernel
-def run_regressors(mean, cov, noises, walk, terms, u, start, y, free_energies, forecasts):
+def run_regressors(mean, cov, noises, walk, terms, u, start, y, free_energies, forecasts, memory):
     """Update a joint belief in (x_t, x_{t-1}, c) with T samples.
 
     Args:
@@ -108,6 +108,7 @@ def run_regressors(mean, cov, noises, walk, terms, u, start, y, free_energies, f
         y: (T,) outputs [V]; NaN where missing.
         free_energies: (T, iterations) receives the free energies [nats].
         forecasts: (T, 2) receives mean [V] and variance [V²] of each output before it was seen.
+        memory: of `sigma_points.memory`, for expectations by sigma points; None for expectations to first order.
     """
     n = len(mean)
     moved = np.empty(N_STATES)
@@ -119,11 +120,19 @@ def run_regressors(mean, cov, noises, walk, terms, u, start, y, free_energies, f
     readout[0] = 1.0
     direction = np.array([1.0, 0.0])
     for t in range(len(y)):
-        moved[1] = mean[0]
-        moved[0], jacobian[0, 0], jacobian[0, 1] = _step(
-            mean[0], mean[1], u, start + t, mean[N_STATES:], terms, jacobian[0, N_STATES:]
-        )  # fmt: skip
-        joint.predict(mean, cov, moved, jacobian, walk, rows)
+        if memory is None:
+            moved[1] = mean[0]
+            moved[0], jacobian[0, 0], jacobian[0, 1] = _step(
+                mean[0], mean[1], u, start + t, mean[N_STATES:], terms, jacobian[0, N_STATES:]
+            )  # fmt: skip
+            joint.predict(mean, cov, moved, jacobian, walk, rows)
+        else:
+            columns, points = memory
+            pairs = sigma_points.spread(mean, cov, columns, points)
+            for i in range(2 * pairs):
+                x1, x2, c = points[0, i], points[1, i], points[N_STATES:, i]
+                points[0, i], points[1, i] = _step(x1, x2, u, start + t, c, terms, jacobian[0, N_STATES:])[0], x1
+            sigma_points.predict(mean, cov, points[:N_STATES], columns, pairs, walk)
         forecasts[t, 0] = mean[0]
         forecasts[t, 1] = joint.correct(
             mean, cov, readout, direction, y[t] - mean[0], noises, free_energies.shape[1], free_energies[t], gain

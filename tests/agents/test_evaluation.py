@@ -8,20 +8,22 @@ import pytest
 from stable_baselines3 import PPO
 
 import agents.evaluation
+import agents.metrics
 from agents import make_policy
 from agents.evaluation import evaluate
 from agents.policies.learned import load_policy, save_policy
 from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
-from duffing_env.silverbox import Regime
+from duffing_env.silverbox import Regime, regime_input
 from estimator import NLARX, SAMPLING_STEP, OnlineEstimator, Prior
 
 TRACK = "duffing_env/Amplitude-v0"
+CONTINUOUS = "duffing_env/Continuous-v0"
 REPLAY = "duffing_env/SilverboxReplay-v0"
 SEED = 3
 SYSTEMS = 6
 HORIZON = 60
-QUANTILE_95 = 1.6448536269514722  # of the standard normal distribution
+QUANTILES = {"coverage_50": 0.6744897501960817, "coverage": 1.6448536269514722, "coverage_95": 1.959963984540054}
 
 
 @pytest.fixture
@@ -59,6 +61,23 @@ def log_density(belief, point):
     z = (point - belief.coefficients_mean) / std
     spread = 0.5 * np.log(np.linalg.det(correlation)) + np.log(std).sum()
     return -0.5 * z @ np.linalg.inv(correlation) @ z - spread - 2 * np.log(2 * np.pi)
+
+
+def fisher_gain(coefficients, inputs, prior):
+    """½ log det of a Kalman filter's covariance of (θ, η), linearised at the truth without noise: before and after."""
+    theta1, theta2, theta3, eta = coefficients
+    x = last_x = 0.0
+    cov = np.zeros((6, 6))
+    cov[2:, 2:] = prior.coefficients_cov
+    for u in inputs:
+        jacobian = np.eye(6)
+        jacobian[0] = [theta1 + 3 * theta2 * x**2, theta3, x, x**3, last_x, u]
+        jacobian[1] = [1, 0, 0, 0, 0, 0]
+        cov = jacobian @ cov @ jacobian.T
+        cov[0, 0] += 5e-4**2
+        cov = cov - np.outer(cov[:, 0], cov[0]) / (cov[0, 0] + 5e-4**2)
+        x, last_x = theta1 * x + theta2 * x**3 + theta3 * last_x + eta * u, x
+    return 0.5 * (np.linalg.slogdet(prior.coefficients_cov)[1] - np.linalg.slogdet(cov[2:, 2:])[1])
 
 
 def act(name, options):
@@ -135,9 +154,25 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
         for parameter, estimate, value in zip("mcab", estimates(posterior.coefficients_mean), true, strict=True):
             assert measured.pop(f"error_{parameter}") == pytest.approx(abs(estimate - value) / value, abs=0.01 * slack)
         std = np.sqrt(np.diag(posterior.coefficients_cov))
-        inside = np.abs(posterior.coefficients_mean - coefficients) < QUANTILE_95 * std
-        assert measured.pop("coverage") == np.count_nonzero(inside) / 4
-        assert measured.pop("input_power") == pytest.approx(np.mean(np.square(single.inputs)), rel=slack)
+        deviation = posterior.coefficients_mean - coefficients
+        for metric, quantile in QUANTILES.items():
+            assert measured.pop(metric) == np.count_nonzero(np.abs(deviation) < quantile * std) / 4
+        correlation = posterior.coefficients_cov / np.outer(std, std)
+        nees = (deviation / std) @ np.linalg.inv(correlation) @ (deviation / std) / 4
+        assert measured.pop("nees") == pytest.approx(nees, rel=100 * slack)
+        power, peak = np.mean(np.square(single.inputs)), np.abs(single.inputs).max()
+        assert measured.pop("input_power") == pytest.approx(power, rel=slack)
+        assert measured.pop("input_peak") == pytest.approx(peak, rel=slack)
+        assert measured.pop("crest_factor") == pytest.approx(peak / np.sqrt(power), rel=slack)
+        assert 0 < measured.pop("decision_time") < 1
+        full_prior = Prior.silverbox_twin(options.get("spread", 0.3))  # mean field leaves out its cross-covariances
+        gain = fisher_gain(coefficients, single.inputs, full_prior)
+        assert measured.pop("fisher_gain") == pytest.approx(gain, abs=1e-3)
+        assert measured.pop("silverbox_equivalent") > 0
+        u = regime_input("arrow", np.random.default_rng(0))[-8192:]
+        believed, true_run = (free_run(c, u, np.zeros(2)) for c in (posterior.coefficients_mean, coefficients))
+        error = np.sqrt(np.mean((believed - true_run) ** 2))
+        assert measured.pop("simulation_rmse") == pytest.approx(error, rel=1000 * slack)
         assert measured.pop("ended_early") == single.terminated
         assert measured == {}
         np.testing.assert_allclose(evaluation.inputs[:length, row], single.inputs, rtol=slack)
@@ -165,8 +200,9 @@ def test_the_same_seed_gives_the_same_and_another_does_not(without_record):
     (fewer,) = evaluate(["uniform"], systems=3, seed=1, options={"horizon": HORIZON})
     (other,) = evaluate(["uniform"], systems=5, seed=2, options={"horizon": HORIZON})
     for name, values in first.metrics.items():
-        np.testing.assert_array_equal(values, again.metrics[name])
-        np.testing.assert_array_equal(values[:3], fewer.metrics[name])
+        if name != "decision_time":
+            np.testing.assert_array_equal(values, again.metrics[name])
+            np.testing.assert_array_equal(values[:3], fewer.metrics[name])
     np.testing.assert_array_equal(first.outputs, again.outputs)
     for name in ("log_posterior_gain", "error_m", "error_b", "input_power"):
         assert not set(first.metrics[name]) & set(other.metrics[name])
@@ -214,7 +250,7 @@ def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverge
     rng = np.random.default_rng(0)
     arrow = Regime("arrow", scale * rng.uniform(-1, 1, 80), 0.01 * rng.normal(size=80))
     monkeypatch.setattr(agents.evaluation, "record_available", lambda: True)
-    monkeypatch.setattr(agents.evaluation, "load_record", lambda: SimpleNamespace(arrow=arrow))
+    monkeypatch.setattr(agents.metrics, "load_record", lambda: SimpleNamespace(arrow=arrow))
     options = {"horizon": HORIZON, "max_output": 2.0}
     (evaluation,) = evaluate(["uniform"], systems=SYSTEMS, seed=SEED, options=options)
     if diverges:
@@ -225,6 +261,17 @@ def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverge
         for coefficients in identified_twins("uniform", options)
     ]
     np.testing.assert_allclose(evaluation.metrics["arrow_rmse"], expected, rtol=1e-9)
+
+
+def test_others_identify_from_the_same_inputs_and_outputs(without_record):
+    (evaluation,) = evaluate(["uniform"], systems=SYSTEMS, seed=SEED)
+    own, others = evaluation.metrics, evaluation.estimators
+    assert list(others) == ["structured", "mean_field", "auditor"]
+    for name, values in others["structured"].items():  # the environment's own, but for the float32 of its inputs
+        np.testing.assert_allclose(values, own[name], rtol=1e-2, atol=1e-6)
+    assert np.median(others["auditor"]["error_b"]) < 1.5 * np.median(own["error_b"])
+    assert others["mean_field"]["nees"].mean() > 5 * others["auditor"]["nees"].mean()
+    assert 0.3 < others["auditor"]["nees"].mean() < 2
 
 
 def test_the_replay_environment_is_evaluated(record):
@@ -250,6 +297,37 @@ def test_the_replay_environment_is_evaluated(record):
     assert off_record.metrics["ended_early"].tolist() == [1, 1]
     for evaluation in evaluations:
         assert "arrow_rmse" not in evaluation.metrics
+
+
+def test_the_continuous_track_is_evaluated_in_its_own_coefficients():
+    options = {"horizon": HORIZON}
+    (evaluation,) = evaluate(["uniform"], CONTINUOUS, systems=SYSTEMS, seed=SEED, options=options)
+    policy, state = make_policy("uniform", gym.make(CONTINUOUS, **options), seed=SEED), None
+    actions = []
+    for _ in range(HORIZON):
+        action, state = policy.predict(np.zeros((SYSTEMS, 22)), state)
+        actions.append(action)
+    for row, seed in enumerate(spawn_seeds(SEED, SYSTEMS)):
+        env = gym.make(CONTINUOUS, **options)
+        env.reset(seed=seed)
+        for t in range(HORIZON):
+            *_, info = env.step(actions[t][row])
+        belief, truth = info["belief"], info["truth"]
+        stiffness, cubic, damping, gain = belief.coefficients_mean
+        per_sample = SAMPLING_STEP**2 / truth.m
+        true = [truth.a * per_sample, truth.b * per_sample, truth.c / truth.m * SAMPLING_STEP, per_sample]
+        inside = np.abs(belief.coefficients_mean - true) < QUANTILES["coverage"] * np.sqrt(
+            np.diag(belief.coefficients_cov)
+        )
+        expected = {
+            "coverage": np.count_nonzero(inside) / 4,
+            "error_m": abs(SAMPLING_STEP**2 / gain / truth.m - 1),
+            "error_c": abs(SAMPLING_STEP * damping / gain / truth.c - 1),
+            "error_a": abs(stiffness / gain / truth.a - 1),
+            "error_b": abs(cubic / gain / truth.b - 1),
+        }
+        assert {name: evaluation.metrics[name][row] for name in expected} == pytest.approx(expected, abs=1e-6)
+    assert "arrow_rmse" not in evaluation.metrics
 
 
 @pytest.mark.parametrize("systems", [1, 0, -3])

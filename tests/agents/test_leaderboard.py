@@ -1,6 +1,8 @@
 """The leaderboard: intervals, table, JSON and figures, from evaluations whose figures are known."""
 
 import json
+from dataclasses import replace
+from unittest.mock import ANY
 
 import matplotlib.image
 import numpy as np
@@ -10,7 +12,7 @@ import agents.evaluation
 import agents.figures
 from agents.evaluation import Evaluation
 from agents.figures import draw_contraction, draw_excitations, draw_learning_curve
-from agents.leaderboard import METRICS, compare, print_table, summarise, write_json
+from agents.leaderboard import ESTIMATOR_METRICS, METRICS, compare, print_estimators, print_table, summarise, write_json
 from estimator import SAMPLING_STEP
 
 # What the table must print for these values, by hand: centre, then both ends of an interval of width zero.
@@ -21,9 +23,18 @@ CONSTANTS = {
     "error_c": (0.5, "error of c / %", "50.00"),
     "error_a": (0.00025, "error of a / %", "0.025"),
     "error_b": (2.0, "error of b / %", "200.00"),
+    "coverage_50": (0.501, "50 % intervals that cover / %", "50.1"),
     "coverage": (0.75, "90 % intervals that cover / %", "75.0"),
+    "coverage_95": (0.9444, "95 % intervals that cover / %", "94.4"),
+    "nees": (1.0049, "NEES per coefficient", "1.00"),
     "ended_early": (0.0, "episodes ended early / %", "0.0"),
     "input_power": (0.0225, "input power / mV²", "22500"),
+    "input_peak": (0.14996, "input peak / mV", "150.0"),
+    "crest_factor": (2.987, "crest factor", "2.99"),
+    "decision_time": (3.14e-6, "time per decision / µs", "3.14"),
+    "fisher_gain": (19.394, "Fisher information / nat", "19.39"),
+    "silverbox_equivalent": (10707.6, "Silverbox equivalent / samples", "10708"),
+    "simulation_rmse": (0.0004216, "RMSE on the twin's arrow / mV", "0.422"),
     "arrow_rmse": (0.00512, "RMSE on the real arrow / mV", "5.12"),
 }
 
@@ -48,7 +59,7 @@ def test_every_metric_of_an_evaluation_has_a_column(monkeypatch):
 def test_centres_are_means_and_medians():
     values = np.array([1.0, 2.0, 3.0, 10.0, 100.0])
     summary = summarise(make_evaluation(**dict.fromkeys(METRICS, values)))
-    medians = {"error_m", "error_c", "error_a", "error_b", "arrow_rmse"}
+    medians = {"error_m", "error_c", "error_a", "error_b", "silverbox_equivalent", "simulation_rmse", "arrow_rmse"}
     for name, entry in summary.items():
         kind, expected = ("median", 3.0) if name in medians else ("mean", 23.2)
         assert set(entry) == {kind, "low", "high"}
@@ -135,6 +146,20 @@ def test_the_table_prints_every_metric_in_its_unit(capsys):
     assert list(cells) == [title for _, title, _ in CONSTANTS.values()]
 
 
+def test_the_two_way_table_has_a_row_for_each_policy_and_estimator(capsys):
+    found = {name: np.array([0.01, 0.02, 0.06]) for name in ESTIMATOR_METRICS}
+    evaluations = [
+        replace(make_evaluation(policy), estimators={"structured": found, "mean_field": found})
+        for policy in ("one", "two")
+    ]
+    print_estimators(evaluations)
+    rows = _rows(capsys.readouterr().out.splitlines(), "│")
+    assert [row[:2] for row in rows] == [[p, e] for p in ("one", "two") for e in ("structured", "mean field")]
+    assert {tuple(row[2:]) for row in rows} == {("2.000", "2.00", "2.000", "2.00", "3.0", "0.03")}
+    print_estimators([make_evaluation("without")])
+    assert capsys.readouterr().out == ""
+
+
 def test_the_best_policy_comes_first(capsys):
     shifts = {"middle": 5.0, "worst": -3.0, "best": 9.0}
     evaluations = [make_evaluation(policy, shift=shift) for policy, shift in shifts.items()]
@@ -187,7 +212,7 @@ def test_json_is_valid_and_complete(tmp_path):
     assert written["settings"] == settings
     assert list(written["policies"]) == ["one", "two"]
     for evaluation in evaluations:
-        assert written["policies"][evaluation.policy] == summarise(evaluation)
+        assert written["policies"][evaluation.policy] == {**summarise(evaluation), "estimators": {}}
 
 
 def test_json_stays_valid_where_a_figure_is_infinite(tmp_path):
@@ -224,7 +249,7 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
     }  # fmt: skip
     again = agents.evaluation.evaluate(["uniform", "prbs"], systems=4, seed=5, options={"horizon": 30})
     for evaluation, repeated in zip(evaluations, again, strict=True):
-        assert written["policies"][evaluation.policy] == summarise(repeated)
+        assert written["policies"][evaluation.policy] == {**summarise(repeated), "estimators": ANY}
     check_picture(folder / "contraction.png", 900, 540, colours=2)
     check_picture(folder / "excitations.png", 1080, 480, colours=2)
 

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from duffing_env.experiment import ReplayExperiment, SimulatedExperiment, make_experiment
-from duffing_env.layout import SETTINGS
-from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Prior
+from duffing_env.experiment import ContinuousExperiment, ReplayExperiment, SimulatedExperiment, make_experiment
+from duffing_env.layout import ESTIMATORS, PLANTS, SETTINGS
+from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Belief, ContinuousBelief, Prior, continuous_prior
 
 BAD = [
     ("factorisation", ["meanfield", None, [], 1]),
@@ -74,8 +74,9 @@ def test_settings_are_the_options():
         )
     )  # fmt: skip
     expected = {
-        "structured": 0, "iterations": 4, "reward": 3, "max_input": 0.1, "max_output": 0.5, "horizon": 9,
-        "process_noise": 1e-3, "measurement_noise": 2e-3, "spread": 0.1, "nonlinear": 1, "replayed": 0, "delay": 0,
+        "estimator": ESTIMATORS["mean_field"], "iterations": 4, "reward": 3, "max_input": 0.1, "max_output": 0.5,
+        "horizon": 9, "process_noise": 1e-3, "measurement_noise": 2e-3, "spread": 0.1, "nonlinear": 1,
+        "plant": PLANTS["difference"], "delay": 0,
         "as_published": 0, "step": SAMPLING_STEP, "center_m": SILVERBOX_TWIN.m, "center_c": SILVERBOX_TWIN.c,
         "center_a": SILVERBOX_TWIN.a, "center_b": SILVERBOX_TWIN.b,
     }  # fmt: skip
@@ -86,7 +87,7 @@ def test_settings_are_the_options():
 
 def test_defaults_are_those_of_the_documentation():
     settings = told(SimulatedExperiment())
-    assert (settings["structured"], settings["iterations"], settings["reward"]) == (1, 3, 0)
+    assert (settings["estimator"], settings["iterations"], settings["reward"]) == (1, 3, 0)
     assert told(SimulatedExperiment(factorisation="mean_field"))["iterations"] == 10
     assert (settings["max_input"], settings["max_output"], settings["horizon"]) == (0.15, 0.6, 256)
     assert (settings["process_noise"], settings["measurement_noise"], settings["spread"]) == (5e-4, 5e-4, 0.3)
@@ -102,10 +103,41 @@ def test_the_first_belief_is_the_prior(factorisation):
     np.testing.assert_allclose(settings["scale_t3"], prior.theta_cov[2, 2] ** -0.5, rtol=1e-14)
 
 
+def test_a_continuous_experiment_is_told_of_its_estimator():
+    options = {"spread": 0.2, "process_noise": 1e-3, "measurement_noise": 2e-3, "noise_shape": 5.0}
+    ode = ContinuousExperiment(**options)
+    settings = told(ode)
+    assert (settings["plant"], settings["estimator"]) == (PLANTS["sde"], ESTIMATORS["ode"])
+    assert (settings["center_m"], settings["center_b"]) == (CONTINUOUS_TWIN.m, CONTINUOUS_TWIN.b)
+    prior = continuous_prior(CONTINUOUS_TWIN, 0.2, 1e-3, 2e-3, 5.0)
+    assert ode.to_belief(ode.prior_record) == prior
+    assert isinstance(ode.to_belief(ode.prior_record), ContinuousBelief)
+    assert settings["prior_t2"] == prior.coefficients_mean[1]
+    for factorisation in ("structured", "mean_field"):
+        nlarx = ContinuousExperiment(estimator="nlarx", factorisation=factorisation, **options)
+        settings = told(nlarx)
+        assert (settings["plant"], settings["estimator"]) == (PLANTS["sde"], ESTIMATORS[factorisation])
+        expected = Prior.silverbox_twin(0.2, 1e-3, 2e-3, 5.0, center=CONTINUOUS_TWIN)
+        np.testing.assert_array_equal(nlarx.prior_record, expected.to_record(factorisation=factorisation))
+        assert isinstance(nlarx.to_belief(nlarx.prior_record), Belief)
+
+
+@pytest.mark.parametrize("value", ["ODE", None, [], 1])
+def test_an_unknown_estimator_is_named(value):
+    with pytest.raises(ValueError, match=r"^estimator must be one of \['ode', 'nlarx'\], but is"):
+        ContinuousExperiment(estimator=value)
+
+
+def test_mean_field_is_for_the_difference_equation():
+    with pytest.raises(ValueError, match=r"^factorisation must be 'structured' for estimator='ode'"):
+        ContinuousExperiment(factorisation="mean_field")
+
+
 def test_a_replay_is_told_of_the_record(record):
     experiment = ReplayExperiment(input_delay=1, nonlinear=False, prior="published_run")
     settings = told(experiment)
-    assert (settings["replayed"], settings["delay"], settings["nonlinear"], settings["spread"]) == (1, 1, 0, 0)
+    assert (settings["plant"], settings["delay"]) == (PLANTS["replay"], 1)
+    assert (settings["nonlinear"], settings["spread"]) == (0, 0)
     assert settings["scale_t2"] == 0.0
     assert settings["horizon"] == experiment.samples == len(record.multisine.u) - 1
     assert ReplayExperiment(input_delay=0, regime="arrow").samples == len(record.arrow.u)

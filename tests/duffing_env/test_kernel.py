@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy import stats
-from twin import PARAMETERS, TwinEnv
+from twin import PARAMETERS, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.env import DuffingEnv
@@ -14,43 +14,6 @@ from duffing_env.rewards import REWARDS
 from estimator import SILVERBOX_TWIN, PhysicalParameters, to_coefficients
 
 CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
-
-
-def assert_beliefs_agree(actual, expected):
-    """To rounding: the coefficients beside their standard deviations, the state beside a volt."""
-    std = np.sqrt(np.diag(expected.coefficients_cov))
-    np.testing.assert_allclose(actual.coefficients_mean / std, expected.coefficients_mean / std, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(actual.state_mean, expected.state_mean, rtol=0, atol=1e-10)
-    scale = np.outer(std, std)
-    np.testing.assert_allclose(actual.coefficients_cov / scale, expected.coefficients_cov / scale, rtol=0, atol=1e-10)
-    for name in ("gamma_shape", "gamma_rate", "xi_shape", "xi_rate"):
-        np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), rtol=1e-10)
-
-
-def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
-    """Play random inputs, some beyond the limits; gives the flags with which the episodes ended."""
-    rng = np.random.default_rng(seed)
-    endings = []
-    for episode in range(episodes):
-        observation, _ = env.reset(seed=None if episode else seed)
-        np.testing.assert_allclose(observation, twin.reset(), rtol=0, atol=1e-6)
-        for name in PARAMETERS:
-            np.testing.assert_allclose(getattr(env.truth, name), getattr(twin.truth, name), rtol=1e-14)
-        terminated = truncated = False
-        while not (terminated or truncated):
-            action = rng.uniform(-1.2, 1.2, 1).astype(np.float32)
-            observation, received, terminated, truncated, info = env.step(action)
-            expected, rewards, *flags = twin.step(action)
-            np.testing.assert_allclose(observation, expected, rtol=0, atol=1e-6)
-            np.testing.assert_allclose(received, rewards[reward], rtol=1e-9, atol=1e-9)
-            gains = (twin.reported["information_gain"], twin.reported["log_posterior"])
-            told = (info["information_gain"], info["log_posterior_gain"])
-            np.testing.assert_allclose(told, gains, rtol=1e-9, atol=1e-9)
-            assert [terminated, truncated] == flags
-            assert not info["diverged"]
-        assert_beliefs_agree(info["belief"], twin.belief)
-        endings.append((terminated, truncated))
-    return endings
 
 
 @pytest.mark.parametrize("reward", REWARDS)

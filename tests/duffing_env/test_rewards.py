@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from duffing_env.layout import LAYOUT, N_ROWS
-from duffing_env.rewards import REWARDS, appraise_prior, reward_number, settle
+from duffing_env.rewards import REWARDS, appraise, reward_number, settle
 from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Belief, PhysicalParameters, Prior, to_coefficients
 from estimator.lanes import LANES
 from estimator.record import COEFFICIENTS, COVARIANCES, QUANTITIES, RECORD_SIZE
@@ -46,11 +46,11 @@ class Lanes:
 
     def appraise(self):
         for lane in range(LANES):
-            appraise_prior(self.rows.reshape(-1), lane, SAMPLING_STEP, float(self.nonlinear))
+            appraise(self.rows.reshape(-1), lane, SAMPLING_STEP, float(self.nonlinear), 0.0)
 
-    def settle(self, reward="information_gain"):
-        number = float(REWARDS[reward])
-        settle(self.rows.reshape(-1), MAX_OUTPUT, float(HORIZON), SAMPLING_STEP, float(self.nonlinear), number)
+    def settle(self, reward="information_gain", input_cost=0.0):
+        settings = float(self.nonlinear), 0.0, float(REWARDS[reward]), input_cost
+        settle(self.rows.reshape(-1), MAX_OUTPUT, float(HORIZON), SAMPLING_STEP, *settings)
 
     @property
     def belief(self):
@@ -109,6 +109,7 @@ def test_a_step_is_worth_the_increase_by_the_named_measure(reward):
     before = lanes.belief
     lanes.set_coefficients(*random_belief(np.random.default_rng(1)))
     lanes["surprise"][:] = 1.25
+    lanes["fisher_gain"][:] = 0.75
     after, truth = lanes.belief, lanes.truth
 
     def error(belief):
@@ -120,11 +121,20 @@ def test_a_step_is_worth_the_increase_by_the_named_measure(reward):
         "log_posterior": after.log_prob(truth) - before.log_prob(truth),
         "parameter_error": (error(before) - error(after)).mean(),
         "free_energy": -1.25,
+        "fisher": 0.75,
     }
     lanes.settle(reward)
     np.testing.assert_allclose(lanes["reward"], worth[reward], rtol=1e-8)
     np.testing.assert_allclose(lanes["information_gain"], worth["information_gain"], rtol=1e-8)
     np.testing.assert_allclose(lanes["log_posterior_gain"], worth["log_posterior"], rtol=1e-8)
+
+
+def test_an_input_costs_what_is_asked_for_it():
+    lanes = Lanes()
+    lanes["u"][:] = np.linspace(-0.15, 0.15, LANES)
+    lanes.settle(input_cost=2.0)
+    np.testing.assert_allclose(lanes["reward"], -2.0 * lanes["u"] ** 2, rtol=1e-12)
+    assert not lanes["information_gain"].any()
 
 
 def test_the_error_of_each_parameter_is_capped():
@@ -203,7 +213,7 @@ def test_an_action_off_the_record_ends_the_episode_and_is_worth_nothing():
 
 
 def test_rewards_by_name():
-    assert [reward_number(name) for name in REWARDS] == [0, 1, 2, 3]
+    assert [reward_number(name) for name in REWARDS] == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match="did you mean 'information_gain'"):
         reward_number("infomation_gain")
     for unknown in ("entropy!", None, 0, []):

@@ -1,13 +1,27 @@
-"""A plain NumPy twin of `DuffingEnv`: a step written from the paper and the environment's docstring.
+"""Plain NumPy twins of `DuffingEnv` and `ContinuousEnv`: steps written from the paper and the docstrings.
 
-It shares no code with the kernel but the estimator, which has twins of its own under tests/estimator.
+They share no code with the kernel but the estimators, which have twins of its own under tests/estimator.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from estimator import NLARX, SILVERBOX_TWIN, OnlineEstimator, PhysicalParameters, Prior, to_coefficients
+from estimator import (
+    CONTINUOUS_TWIN,
+    NLARX,
+    SAMPLING_STEP,
+    SILVERBOX_TWIN,
+    ContinuousBelief,
+    OnlineEstimator,
+    PhysicalParameters,
+    Prior,
+    continuous_prior,
+    to_coefficients,
+)
+from estimator.inference import continuous, free_energy
+from estimator.lanes import LANES
+from estimator.record import LAYOUT, N_ROWS
 
 PARAMETERS = ("m", "c", "a", "b")
 
@@ -58,28 +72,35 @@ class TwinEnv:
         self.budget, self.max_slew, self.input_cost = horizon * max_rms**2, max_slew, input_cost
         self.jump, self.drift = jump, drift
         self.prior = Prior.silverbox_twin(spread, process_noise, measurement_noise)
+        self.center = SILVERBOX_TWIN
 
     def reset(self):
         """Draw an oscillator, put it at rest, and return the first observation."""
         low, high = 1.0 - self.spread, 1.0 + self.spread
         factors = [low * (high / low) ** self.stream.uniform() for _ in PARAMETERS]
-        drawn = [getattr(SILVERBOX_TWIN, name) * f for name, f in zip(PARAMETERS, factors, strict=True)]
+        drawn = [getattr(self.center, name) * f for name, f in zip(PARAMETERS, factors, strict=True)]
         self.truth = PhysicalParameters(*drawn)
-        self.coefficients = to_coefficients(self.truth)
         self.x = self.last_x = self.u = self.y = self.spent = 0.0
         self.elapsed = 0
         if self.jump:
             self.jump_at = int(self.horizon * (0.25 + 0.5 * self.stream.uniform()))
             self.jump_factor = (1.0 - self.jump) * ((1.0 + self.jump) / (1.0 - self.jump)) ** self.stream.uniform()
-        self.estimator = OnlineEstimator(
-            NLARX(input_delay=0), self.prior, self.factorisation, self.iterations, drift=self.drift
-        )
+        self._start()
         self.first_belief = self.belief
         self.ideal_cov = np.zeros((6, 6))  # of (x_t, x_{t-1}, θ, η), for one who knows the truth
         self.ideal_cov[:2, :2] = self.first_belief.state_cov[:2, :2]
         self.ideal_cov[2:, 2:] = self.first_belief.coefficients_cov
         self._worth = self._appraise()
         return self.observation()
+
+    def _start(self):
+        self._know()
+        self.estimator = OnlineEstimator(
+            NLARX(input_delay=0), self.prior, self.factorisation, self.iterations, drift=self.drift
+        )
+
+    def _know(self):
+        self.coefficients = to_coefficients(self.truth)
 
     @property
     def belief(self):
@@ -94,25 +115,32 @@ class TwinEnv:
         self.spent += self.u**2
         if self.jump and self.elapsed == self.jump_at:
             self.truth = replace(self.truth, m=self.truth.m * self.jump_factor)
-            self.coefficients = to_coefficients(self.truth)
+            self._know()
             self._worth = self._appraise()
         fisher = self._fisher_gain()
+        self._move()
+        self._update()
+        self.elapsed += 1
+        before, self._worth = self._worth, self._appraise()
+        rewards = {name: self._worth[name] - before[name] for name in before}
+        rewards["free_energy"] = -self.free_energy
+        rewards["fisher"] = fisher
+        self.reported = dict(rewards)
+        cost = self.input_cost * (self.u / self.max_input) ** 2
+        rewards = {name: reward - cost for name, reward in rewards.items()}
+        terminated = abs(self.y) > self.max_output
+        return self.observation(), rewards, terminated, self.elapsed == self.horizon and not terminated
+
+    def _move(self):
         w, v = self.stream.normal_pair()
         psi = self.coefficients
         moved = psi.theta1 * self.x + psi.theta2 * self.x**3 + psi.theta3 * self.last_x + psi.eta * self.u
         self.x, self.last_x = moved + self.process_noise * w, self.x
         self.y = self.x + self.measurement_noise * v
+
+    def _update(self):
         self.estimator.update(self.u, self.y)
-        self.elapsed += 1
-        before, self._worth = self._worth, self._appraise()
-        rewards = {name: self._worth[name] - before[name] for name in before}
-        rewards["free_energy"] = -self.estimator.free_energy
-        rewards["fisher"] = fisher
-        cost = self.input_cost * (self.u / self.max_input) ** 2
-        terminated = abs(self.y) > self.max_output
-        self.reported = dict(rewards)
-        rewards = {name: reward - cost for name, reward in rewards.items()}
-        return self.observation(), rewards, terminated, self.elapsed == self.horizon and not terminated
+        self.free_energy = self.estimator.free_energy
 
     def _fisher_gain(self):
         """Increase of ½ log det(Λ0 + F): a Kalman filter for states and coefficients, linearised at the truth."""
@@ -152,3 +180,111 @@ class TwinEnv:
                 [1.0 - self.elapsed / self.horizon, 1.0 - self.spent / self.budget],
             ]
         )
+
+
+class TwinContinuousEnv(TwinEnv):
+    """One experiment on the differential equation, from the docstring of `ContinuousEnv`."""
+
+    def __init__(self, seed, *, estimator="ode", **options):
+        super().__init__(seed, **options)
+        self.kind = estimator
+        noises = self.process_noise, self.measurement_noise
+        if estimator == "ode":
+            self.prior = continuous_prior(CONTINUOUS_TWIN, self.spread, *noises)
+        else:
+            self.prior = Prior.silverbox_twin(self.spread, *noises, center=CONTINUOUS_TWIN)
+        self.center = CONTINUOUS_TWIN
+
+    def _start(self):
+        self.velocity = self.last_u = 0.0
+        if self.kind != "ode":
+            super()._start()
+            return
+        self._know()
+        self.block = np.zeros((N_ROWS, LANES))
+        self.block[: len(self.prior.record)] = self.prior.record[:, None]
+
+    def _know(self):
+        super()._know()
+        if self.kind == "ode":
+            m, c, a, b = (getattr(self.truth, name) for name in PARAMETERS)
+            # Time in samples.
+            self.coefficients = np.array([a, b, c / SAMPLING_STEP, 1.0]) * SAMPLING_STEP**2 / m
+
+    def _fisher_gain(self):
+        return np.nan  # refused on this plant
+
+    @property
+    def belief(self):
+        return ContinuousBelief(self.block[: len(self.prior.record), 0]) if self.kind == "ode" else super().belief
+
+    def _move(self):
+        # A pair of numbers for each of eight sub-steps, and one for the sensor.
+        m, c, a, b = (getattr(self.truth, name) for name in PARAMETERS)
+        h = 1 / 8
+
+        def slope(tau, state):
+            force = self.last_u + tau * (self.u - self.last_u) - a * state[0] - b * state[0] ** 3
+            force -= c * state[1] / SAMPLING_STEP
+            return np.array([state[1], force * SAMPLING_STEP**2 / m])
+
+        state = np.array([self.x, self.velocity])
+        # Increments of a Wiener process and of its integral, which moves x by `process_noise` in a sample.
+        spread = np.linalg.cholesky(np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]]))
+        for s in range(8):
+            k1 = slope(s * h, state)
+            k2 = slope((s + 0.5) * h, state + h / 2 * k1)
+            k3 = slope((s + 0.5) * h, state + h / 2 * k2)
+            k4 = slope((s + 1) * h, state + h * k3)
+            increments = np.sqrt(3) * self.process_noise * spread @ self.stream.normal_pair()
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4) + increments[::-1]
+        self.x, self.velocity = state
+        self.y = self.x + self.measurement_noise * self.stream.normal_pair()[1]
+
+    def _update(self):
+        if self.kind == "ode":
+            for name, value in (("last_u", self.last_u), ("u", self.u), ("y", self.y)):
+                self.block[LAYOUT[name]] = value
+            continuous.update(self.block.reshape(-1), self.iterations or 3, continuous.SUBSTEPS)
+            self.free_energy = free_energy(self.block.reshape(-1), 0, True)
+        else:
+            self.estimator.update(self.last_u, self.y)  # the input at x_t, as in Eq. (2)
+            self.free_energy = self.estimator.free_energy
+        self.last_u = self.u
+
+
+def assert_beliefs_agree(actual, expected):
+    """To rounding: the coefficients beside their standard deviations, the state beside a volt."""
+    std = np.sqrt(np.diag(expected.coefficients_cov))
+    np.testing.assert_allclose(actual.coefficients_mean / std, expected.coefficients_mean / std, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(actual.state_mean, expected.state_mean, rtol=0, atol=1e-10)
+    scale = np.outer(std, std)
+    np.testing.assert_allclose(actual.coefficients_cov / scale, expected.coefficients_cov / scale, rtol=0, atol=1e-10)
+    for name in ("gamma_shape", "gamma_rate", "xi_shape", "xi_rate"):
+        np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), rtol=1e-10)
+
+
+def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
+    """Play random inputs, some beyond the limits; gives the flags with which the episodes ended."""
+    rng = np.random.default_rng(seed)
+    endings = []
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=None if episode else seed)
+        np.testing.assert_allclose(observation, twin.reset(), rtol=0, atol=1e-6)
+        for name in PARAMETERS:
+            np.testing.assert_allclose(getattr(env.truth, name), getattr(twin.truth, name), rtol=1e-14)
+        terminated = truncated = False
+        while not (terminated or truncated):
+            action = rng.uniform(-1.2, 1.2, 1).astype(np.float32)
+            observation, received, terminated, truncated, info = env.step(action)
+            expected, rewards, *flags = twin.step(action)
+            np.testing.assert_allclose(observation, expected, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(received, rewards[reward], rtol=1e-9, atol=1e-9)
+            gains = (twin.reported["information_gain"], twin.reported["log_posterior"])
+            told = (info["information_gain"], info["log_posterior_gain"])
+            np.testing.assert_allclose(told, gains, rtol=1e-9, atol=1e-9)
+            assert [terminated, truncated] == flags
+            assert not info["diverged"]
+        assert_beliefs_agree(info["belief"], twin.belief)
+        endings.append((terminated, truncated))
+    return endings

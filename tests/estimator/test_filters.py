@@ -10,13 +10,14 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import binom, chi2, norm
 
+from benchmarks import coverage_sigma
+from benchmarks.coverage_sigma import FREE, simulate
 from duffing_env.silverbox import synthesise_multisine
 from estimator import NLARX, SAMPLING_STEP, DuffingODE, JointBelief, OnlineEstimator, Prior
 
 ONLINE = ("linear", "look_ahead")
 PRIOR = DuffingODE().prior()
 PRIOR_STD = np.sqrt(np.diag(PRIOR.coefficients_cov))
-FREE = [i for i, name in enumerate(DuffingODE.names) if name != "cubic_damping"]
 
 #: An oscillator well off the prior's mean: stiffness, damping, gain, cubic, u0, cubic damping, y0, feedthrough.
 TRUTH = PRIOR.coefficients_mean * [0.8, 1.2, 1.25, 0.85, 1, 1, 1, 1] + [0, 0, 0, 0, 8e-3, 0, -5e-3, 0.03]
@@ -271,67 +272,27 @@ def test_a_known_system_is_found_in_physical_units(samples):
 
 SYSTEMS = 100
 SAMPLES = 1500
-PROCESS_NOISE = 5e-6  # V
 TAIL = 1e-4  # chance that a calibrated posterior misses one bound
-
-
-def simulated_systems(rng):
-    """Oscillators drawn around the prior, all at once by Runge-Kutta steps of a twelfth of a sample.
-
-    Returns:
-        Parameters (SYSTEMS, 8), inputs and outputs (SYSTEMS, SAMPLES). Stiffness, damping, gain and cubic stiffness
-        are log-uniform within 30 %, the offsets and the feedthrough as the prior says.
-    """
-    truth = PRIOR.coefficients_mean * np.exp(rng.uniform(np.log(0.7), np.log(1.3), (SYSTEMS, 8)))
-    truth[:, 4:] = PRIOR_STD[4:] * rng.standard_normal((SYSTEMS, 4))
-    truth[:, 5] = 0.0
-    k, c, g, b, u0, _, y0, d = truth.T
-    u = np.array([multisine(SAMPLES, rng) for _ in range(SYSTEMS)])
-    x = np.empty((SYSTEMS, SAMPLES))
-    steps = 12
-    h = SAMPLING_STEP / steps
-
-    def acceleration(x, v, force):
-        return g * force - c * v - k * x - b * x**3
-
-    position, velocity = np.zeros(SYSTEMS), np.zeros(SYSTEMS)
-    for t in range(SAMPLES):
-        for i in range(steps if t else 0):
-            before, after = u[:, t - 1] - u0, u[:, t] - u0
-            f0, f1, f2 = (before + (after - before) * (i + part) / steps for part in (0.0, 0.5, 1.0))
-            v1, a1 = velocity, acceleration(position, velocity, f0)
-            v2 = velocity + h / 2 * a1
-            a2 = acceleration(position + h / 2 * v1, v2, f1)
-            v3 = velocity + h / 2 * a2
-            a3 = acceleration(position + h / 2 * v2, v3, f1)
-            v4 = velocity + h * a3
-            a4 = acceleration(position + h * v3, v4, f2)
-            position = position + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
-            velocity = velocity + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-        w = PROCESS_NOISE * rng.standard_normal(SYSTEMS)  # an acceleration over a sample: w in x, 2 w / δ in x'
-        position, velocity = position + w, velocity + 2 / SAMPLING_STEP * w
-        x[:, t] = position
-    return truth, u, x + y0[:, None] + d[:, None] * u + NOISE * rng.standard_normal(u.shape)
 
 
 @pytest.fixture(scope="module")
 def systems():
-    return simulated_systems(np.random.default_rng(1))
+    """Parameters (SYSTEMS, 8), inputs and outputs (SYSTEMS, SAMPLES) of oscillators drawn around the prior.
+
+    Stiffness, damping, gain and cubic stiffness are log-uniform within 30 %, the offsets and the feedthrough as the
+    prior says.
+    """
+    rng = np.random.default_rng(1)
+    truth = PRIOR.coefficients_mean * np.exp(rng.uniform(np.log(0.7), np.log(1.3), (SYSTEMS, 8)))
+    truth[:, 4:] = PRIOR_STD[4:] * rng.standard_normal((SYSTEMS, 4))
+    truth[:, 5] = 0.0
+    return truth, *simulate(truth, SAMPLES, rng)
 
 
 def errors(systems, substeps):
     """Errors of the free parameters in standard deviations (SYSTEMS, 7), and their NEES (SYSTEMS,)."""
-    normalised, nees = [], []
-    for truth, u, y in zip(*systems, strict=True):
-        estimator = OnlineEstimator(DuffingODE(substeps=substeps))
-        estimator.run(u, y)
-        belief = estimator.belief
-        cov = belief.coefficients_cov[np.ix_(FREE, FREE)]
-        std = np.sqrt(np.diag(cov))
-        error = (belief.coefficients_mean - truth)[FREE] / std
-        normalised.append(error)
-        nees.append(error @ np.linalg.solve(cov / np.outer(std, std), error))
-    return np.array(normalised), np.array(nees)
+    normalised, nees = coverage_sigma.errors(DuffingODE(substeps=substeps), PRIOR, "first_order", *systems)
+    return normalised, len(FREE) * nees
 
 
 def test_intervals_hold_the_truth(systems):

@@ -16,6 +16,8 @@ ESTIMATORS = {
     "own terms": lambda: OnlineEstimator(NLARX(regressors=(Term(1), Term(0, 1), Term(tap=2), Term(1, 1)))),
     "ode": lambda: OnlineEstimator(DuffingODE(cubic_damping=True)),
     "ode, look-ahead": lambda: OnlineEstimator(DuffingODE("look_ahead", substeps=3)),
+    "ode, sigma points": lambda: OnlineEstimator(DuffingODE("look_ahead"), expectations="sigma_points", drift=1e-3),
+    "three-tap, sigma points": lambda: OnlineEstimator(NLARX(regressors="three-tap"), expectations="sigma_points"),
 }
 
 

@@ -168,6 +168,86 @@ def structured_step(prior, u, y, iterations, nonlinear=True):
     return Moments(new_mean, new_cov, gamma, xi), np.array(free_energies)
 
 
+def runge_kutta(state, parameters, last_u, u, substeps):
+    """(x, x') after a sample of x'' = g u - c x' - k x - b x³, and the covariance that noise of γ = 1 brings it.
+
+    Time is counted in samples. Also of complex numbers.
+
+    Args:
+        state: (2,) before it.
+        parameters: (4,) k, b, c, g.
+        last_u, u: input at both ends; it goes linearly from one to the other.
+        substeps: steps of Runge and Kutta's method of order 4.
+
+    Returns:
+        (2,), and (2, 2): N of N' = A N + N Aᵀ + diag(0, 3), A the Jacobian of the right-hand side.
+    """
+    k, b, c, g = parameters
+
+    def slope(tau, whole):
+        (x, v), N = whole[0], whole[1:]
+        A = np.array([[0.0, 1.0], [-k - 3 * b * x**2, -c]])
+        force = g * (last_u + tau * (u - last_u))
+        return np.vstack([[v, force - c * v - k * x - b * x**3], A @ N + N @ A.T + np.diag([0.0, 3.0])])
+
+    whole, h = np.vstack([state, np.zeros((2, 2))]), 1 / substeps
+    for n in range(substeps):
+        k1 = slope(n * h, whole)
+        k2 = slope((n + 0.5) * h, whole + h / 2 * k1)
+        k3 = slope((n + 0.5) * h, whole + h / 2 * k2)
+        k4 = slope((n + 1) * h, whole + h * k3)
+        whole = whole + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return whole[0], whole[1:]
+
+
+def continuous_step(prior, last_u, u, y, iterations, substeps):
+    """A Kalman step on the joint Gaussian of (x, x', k, b, c, g), in turn with the updates of γ and ξ.
+
+    The joint Gaussian has the sample's process noise (w, w') beside the state before it. The Jacobian is the imaginary
+    part of a complex step, exact to rounding.
+
+    Returns:
+        The posterior, and the free energy after each iteration.
+    """
+    known = [0, 1, 3, 4, 5, 6]
+    mean, cov = prior.mean[known], prior.cov[np.ix_(known, known)]
+    moved, noise = runge_kutta(mean[:2], mean[2:], last_u, u, substeps)
+    jacobian = np.eye(6)
+    for i in range(6):
+        nudged = mean + 1e-30j * np.eye(6)[i]
+        jacobian[:2, i] = runge_kutta(nudged[:2], nudged[2:], last_u, u, substeps)[0].imag / 1e-30
+    T = np.hstack([jacobian, np.eye(6)[:, :2]])  # from (state and parameters before, w, w') to those after
+    gamma, xi = prior.gamma, prior.xi
+    free_energies = []
+    for _ in range(iterations):
+        q, r = gamma[1] / gamma[0], xi[1] / xi[0]
+        P = np.zeros((8, 8))
+        P[:6, :6], P[6:, 6:] = cov, q * noise
+        S = T[0] @ P @ T[0] + r
+        gain = P @ T[0] / S
+        deviation = gain * (y - moved[0])
+        posterior = P - np.outer(gain, T[0] @ P)
+        w_power = (deviation[6] ** 2 + posterior[6, 6]) / noise[0, 0]
+        v_power = (y - moved[0] - T[0] @ deviation) ** 2 + T[0] @ posterior @ T[0]
+        gamma = prior.gamma[0] + 0.5, prior.gamma[1] + w_power / 2
+        xi = prior.xi[0] + 0.5, prior.xi[1] + v_power / 2
+        # w' given w is as before the sample, and falls out.
+        q_known, p_known = posterior[:7, :7], P[:6, :6]
+        free_energies.append(
+            -gaussian_entropy(q_known)
+            - expected_log_gaussian((deviation[:6], q_known[:6, :6]), (np.zeros(6), p_known))
+            - expected_log_normal(w_power, gamma)
+            + 0.5 * np.log(noise[0, 0])
+            - expected_log_normal(v_power, xi)
+            + gamma_divergence(gamma, prior.gamma)
+            + gamma_divergence(xi, prior.xi)
+        )
+    new_mean, new_cov = np.zeros(7), np.zeros((7, 7))
+    new_mean[known] = [*moved, *mean[2:]] + T @ deviation
+    new_cov[np.ix_(known, known)] = T @ posterior @ T.T
+    return Moments(new_mean, new_cov, gamma, xi), np.array(free_energies)
+
+
 def gaussian_entropy(cov):
     return 0.5 * (len(cov) * (LOG_2PI + 1) + np.linalg.slogdet(cov)[1])
 
@@ -221,11 +301,11 @@ def draw_variances(rng, precision, draws):
     return 1 / rng.gamma(shape, 1 / rate, draws)
 
 
-def block_of(records, u, y):
+def block_of(records, u, y, last_u=0.0):
     """A block (N_ROWS * LANES,) of LANES records (LANES, RECORD_SIZE), inputs (LANES,) and outputs (LANES,)."""
     block = np.zeros((N_ROWS, LANES))
     block[: len(RECORD)] = np.transpose(records)
-    block[LAYOUT["u"]], block[LAYOUT["y"]] = u, y
+    block[LAYOUT["u"]], block[LAYOUT["y"]], block[LAYOUT["last_u"]] = u, y, last_u
     return block.reshape(-1)
 
 

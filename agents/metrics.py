@@ -1,0 +1,117 @@
+"""What an experiment was worth, system by system: errors, calibration, information, and what the input was like."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from agents.policies.signals import draw_regime
+from duffing_env.silverbox import load_record, regime_input
+from estimator import NLARX, Belief, PhysicalParameters, fisher_information, to_coefficients
+from estimator.belief import RecordBelief
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Nominal levels of the intervals whose coverage is reported, by their metric.
+LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}
+
+_TWIN_ARROW_SAMPLES = 8_192
+
+
+def estimate_metrics(
+    means: FloatArray, covs: FloatArray, truth: PhysicalParameters, kind: type[RecordBelief] = Belief
+) -> dict[str, FloatArray]:
+    """Posteriors of coefficients beside the truth.
+
+    Args:
+        means: (n, 4).
+        covs: (n, 4, 4).
+        truth: the systems.
+        kind: whose coefficients they are.
+
+    Returns:
+        Relative errors ``error_m`` to ``error_b``; the share of the coefficients that their intervals hold, at each of
+        `LEVELS`; ``nees``, the normalised estimation error squared dᵀ C⁻¹ d per coefficient, whose mean is 1 where the
+        posterior is calibrated.
+    """
+    true_physical = np.stack([truth.m, truth.c, truth.a, truth.b], axis=-1)
+    errors = np.abs(kind.propagate(means, covs)[0] / true_physical - 1)
+    free = np.flatnonzero(np.diagonal(covs, axis1=1, axis2=2).all(axis=0))  # without those that are known, as θ2 = 0
+    deviations, covs = (means - kind.coefficients_of(truth))[:, free], covs[:, free][:, :, free]
+    stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
+    units = covs / (stds[:, :, None] * stds[:, None, :])  # better conditioned than the covariances themselves
+    scaled = deviations / stds
+    nees = np.einsum("ni,ni->n", scaled, np.linalg.solve(units, scaled[:, :, None])[:, :, 0]) / len(free)
+    return {
+        **{f"error_{name}": errors[:, i] for i, name in enumerate("mcab")},
+        **{
+            name: (np.abs(scaled) <= stats.norm.ppf(0.5 + level / 2)).mean(axis=1) for name, level in LEVELS.items()
+        },
+        "nees": nees,
+    }  # fmt: skip
+
+
+def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
+    """Mean square [V²], largest value [V] and crest factor (that over the RMS) of inputs (T, n), NaN where ended."""
+    power, peak = np.nanmean(inputs**2, axis=0), np.nanmax(np.abs(inputs), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crest = np.where(power > 0, peak / np.sqrt(power), np.nan)
+    return {"input_power": power, "input_peak": peak, "crest_factor": crest}
+
+
+def information(inputs: FloatArray, truth: PhysicalParameters, experiment: Any) -> FloatArray:
+    """(n,) ½ log det(Λ0 + F) - ½ log det Λ0 [nats] of inputs (T, n): what an efficient estimator gains from them.
+
+    F is the Fisher information at the true coefficients, along the response without noise; Λ0 the inverse covariance
+    of the environment's prior.
+    """
+    F = fisher_information(
+        to_coefficients(truth), inputs.T, experiment.process_noise, experiment.measurement_noise
+    )  # fmt: skip
+    cov = experiment.believed.coefficients_cov
+    std = np.sqrt(np.diag(cov))
+    prior = np.linalg.inv(cov / np.outer(std, std))
+    return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])
+
+
+def silverbox_equivalents(gains: FloatArray, truth: PhysicalParameters, experiment: Any, seed: int) -> FloatArray:
+    """(n,) samples of the Silverbox multisine regime that tell as much as ``gains`` (n,) of `information`.
+
+    Each system is given a stretch of the regime as recorded, at its own power. Interpolated between powers of √2; inf
+    where even the longest stretch, 46,340 samples, tells less.
+    """
+    lengths = np.unique(np.round(2 ** np.arange(4, 15.6, 0.5)).astype(int))
+    rng, draw = np.random.default_rng(seed), draw_regime("multisine")
+    inputs = np.stack([draw(rng, lengths[-1]) for _ in gains], axis=1)
+    told = np.array([information(inputs[:length], truth, experiment) for length in lengths])
+    equivalents = np.empty(len(gains))
+    for i, gain in enumerate(gains):
+        curve = np.maximum.accumulate(told[:, i])
+        equivalents[i] = np.exp(np.interp(gain, curve, np.log(lengths))) if gain <= curve[-1] else np.inf
+    return equivalents
+
+
+def simulation_errors(means: FloatArray, truth: PhysicalParameters) -> FloatArray:
+    """(n,) RMSE [V] of free runs with estimated coefficients, beside the true system's, over the arrow's input."""
+    u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:]
+    model, rest = NLARX(input_delay=1), np.zeros(2)
+    errors = np.empty(len(means))
+    for i, (mean, true) in enumerate(zip(means, Belief.coefficients_of(truth), strict=True)):
+        errors[i] = _rmse(model.simulate(mean, u, rest), model.simulate(true, u, rest))
+    return errors
+
+
+def arrow_errors(means: FloatArray) -> FloatArray:
+    """(n,) RMSE [V] of free runs over the real arrow record; inf where a run diverges."""
+    arrow = load_record().arrow
+    model = NLARX(input_delay=1)
+    return np.array([_rmse(model.simulate(mean, arrow.u, arrow.y[:2])[2:], arrow.y[2:]) for mean in means])
+
+
+def _rmse(simulated: FloatArray, output: FloatArray) -> float:
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = float(np.sqrt(np.mean((simulated - output) ** 2)))
+    return error if np.isfinite(error) else np.inf

@@ -1,0 +1,86 @@
+"""The auditor: against a general optimiser on a likelihood by hand, and calibrated on simulated truth."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from estimator import SILVERBOX_TWIN, PhysicalParameters, Prior, to_coefficients
+from estimator.maximum_a_posteriori import maximum_a_posteriori
+
+NOISES = (5e-4, 5e-4)
+PRIOR = Prior.silverbox_twin(0.3, *NOISES)
+
+
+def simulate(systems, samples, rng):
+    """Systems from rest under uniform inputs: true coefficients (n, 4), u and y (n, T)."""
+    center = np.array([SILVERBOX_TWIN.m, SILVERBOX_TWIN.c, SILVERBOX_TWIN.a, SILVERBOX_TWIN.b])
+    drawn = center * np.exp(rng.uniform(np.log(0.7), np.log(1.3), (systems, 4)))
+    c = to_coefficients(PhysicalParameters(*drawn.T))
+    psi = np.stack([c.theta1, c.theta2, c.theta3, c.eta], axis=-1)
+    u, y = rng.uniform(-0.15, 0.15, (systems, samples)), np.empty((systems, samples))
+    x = last = np.zeros(systems)
+    for t in range(samples):
+        w, v = rng.standard_normal((2, systems))
+        x, last = psi[:, 0] * x + psi[:, 1] * x**3 + psi[:, 2] * last + psi[:, 3] * u[:, t] + NOISES[0] * w, x
+        y[:, t] = x + NOISES[1] * v
+    return psi, u, y
+
+
+def objective(psi, u, y):
+    """L(ψ) of the module's docstring, with matrices."""
+    q, r = NOISES[0] ** 2, NOISES[1] ** 2
+    mean, cov, loss = np.zeros(2), np.array(PRIOR.state_cov), 0.0
+    for u_t, y_t in zip(u, y, strict=True):
+        transition = np.array([[psi[0] + 3 * psi[1] * mean[0] ** 2, psi[2]], [1.0, 0.0]])
+        mean = np.array([psi[0] * mean[0] + psi[1] * mean[0] ** 3 + psi[2] * mean[1] + psi[3] * u_t, mean[0]])
+        cov = transition @ cov @ transition.T + np.diag([q, 0.0])
+        variance, innovation = cov[0, 0] + r, y_t - mean[0]
+        loss += 0.5 * (innovation**2 / variance + np.log(variance))
+        gain = cov[:, 0] / variance
+        mean, cov = mean + gain * innovation, cov - np.outer(gain, cov[0])
+    pull = psi - np.append(PRIOR.theta_mean, PRIOR.eta_mean)
+    return loss + 0.5 * pull @ np.linalg.solve(PRIOR.coefficients_cov, pull)
+
+
+def test_the_mode_is_that_of_the_posterior():
+    _, u, y = simulate(3, 150, np.random.default_rng(0))
+    fit = maximum_a_posteriori(u, y, PRIOR, *NOISES)
+    assert fit.converged.all()
+    for row in range(3):
+        std = np.sqrt(np.diag(fit.cov[row]))
+        found = minimize(lambda z: objective(fit.mean[row] + std * z, u[row], y[row]), np.zeros(4), method="Powell")  # noqa: B023
+        # Gauss-Newton takes the innovations' variance for constant, which moves the mode by a hundredth.
+        assert np.abs(found.x).max() < 0.02
+        assert found.fun > objective(fit.mean[row], u[row], y[row]) - 1e-3
+
+
+def test_it_is_calibrated():
+    psi, u, y = simulate(200, 256, np.random.default_rng(1))
+    fit = maximum_a_posteriori(u, y, PRIOR, *NOISES)
+    std = np.sqrt(np.diagonal(fit.cov, axis1=1, axis2=2))
+    covered = (np.abs(fit.mean - psi) < 1.645 * std).mean(axis=0)
+    assert fit.converged.all()
+    assert (covered > 0.84).all()
+    assert (covered < 0.96).all()
+
+
+def test_episodes_of_different_lengths_fit_into_one_array():
+    _, u, y = simulate(2, 100, np.random.default_rng(2))
+    short = maximum_a_posteriori(u[:, :40], y[:, :40], PRIOR, *NOISES)
+    u[:, 40:] = y[:, 40:] = np.nan
+    padded = maximum_a_posteriori(u, y, PRIOR, *NOISES)
+    np.testing.assert_array_equal(padded.mean, short.mean)
+    np.testing.assert_array_equal(padded.cov, short.cov)
+
+
+def test_without_samples_it_is_the_prior():
+    fit = maximum_a_posteriori(np.full((1, 3), np.nan), np.full((1, 3), np.nan), PRIOR, *NOISES)
+    np.testing.assert_allclose(fit.mean[0], np.append(PRIOR.theta_mean, PRIOR.eta_mean), rtol=1e-14)
+    np.testing.assert_allclose(fit.cov[0], PRIOR.coefficients_cov, rtol=1e-9)
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match="u and y must have one shape"):
+        maximum_a_posteriori(np.zeros((2, 3)), np.zeros((2, 4)), PRIOR, *NOISES)
+    with pytest.raises(ValueError, match="process_noise must be positive"):
+        maximum_a_posteriori(np.zeros((2, 3)), np.zeros((2, 3)), PRIOR, 0.0, 1e-4)
