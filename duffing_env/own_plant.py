@@ -10,6 +10,7 @@ import numpy as np
 
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
+from duffing_env.layout import PLANTS
 from estimator.belief import Prior
 from estimator.parameters import PhysicalParameters
 
@@ -64,7 +65,7 @@ class PlantExperiment(Experiment):
     @property
     def plant_settings(self) -> dict[str, float]:
         """A record of one sample, which is written anew before every step."""
-        return {"replayed": True}
+        return {"plant": PLANTS["replay"]}
 
 
 class PlantEnv(DuffingEnv):
