@@ -1,13 +1,14 @@
 """Repeats the experiment of Kouw (2020) on the Silverbox record, or runs the Silverbox benchmark's official protocol.
 
 python reproduce.py                     the paper's experiment, against its published numbers
-python reproduce.py silverbox           the official protocol, for every estimator
+python reproduce.py silverbox           the official protocol, for every estimator and other packages
 python reproduce.py silverbox --select  other settings, compared without test data
 """
 
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -39,7 +40,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Silverbox:
-    """Run the official protocol of the Silverbox benchmark, for every estimator of this project."""
+    """Run the official protocol of the Silverbox benchmark, for every estimator of this project and for peers."""
 
     json: Path | None = None
     """File for the results, machine-readable."""
@@ -53,15 +54,20 @@ class Silverbox:
     select: bool = False
     """Print what other settings give on the last quarter of the training section, and do nothing else."""
 
+    peers: bool = True
+    """Put other packages beside ours, installed into .venv-peers; what cannot be installed is reported as missing."""
+
     def run(self) -> None:
         """Runs the protocol, or compares settings."""
-        from agents.silverbox_protocol import run_protocol
+        from agents.silverbox_results import run_protocol
         from agents.silverbox_selection import select
 
         if self.select:
             select(data=self.data)
-        else:
-            run_protocol(data=self.data, json=self.json, figures=self.figures)
+            return
+        from benchmarks.silverbox import compare
+
+        run_protocol(self.data, self.json, self.figures, partial(compare, wanted=self.peers))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

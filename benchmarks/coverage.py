@@ -1,4 +1,4 @@
-"""Coverage: how often the posterior's 90 % intervals hold the truth, on oscillators drawn from the prior.
+"""Coverage: how often the posterior's 90 % intervals hold the truth, on systems drawn from the prior.
 
 ``python -m benchmarks.coverage`` prints the tables of docs/coverage.md.
 """
@@ -10,35 +10,26 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest, norm
 
-from estimator import (
-    NLARX,
-    SILVERBOX_TWIN,
-    Belief,
-    Coefficients,
-    OnlineEstimator,
-    PhysicalParameters,
-    Prior,
-    to_coefficients,
-)
+from benchmarks.systems import draw, make_model, make_prior
+from estimator import Belief, JointBelief, OnlineEstimator, Prior
 from estimator.files import write_atomically
-from estimator.parameters import FloatArray
 
 LEVEL = 0.90
-SPREAD = 0.3  # m, c, a and b are log-uniform on the twin's value * [1 - SPREAD, 1 + SPREAD]
-MAX_INPUT = 0.15  # V; inputs are independent and uniform on ± this
-MAX_DISPLACEMENT = 0.75  # V; above it the difference equation blows up, where the circuit does not
+NOISE_SHAPE = 2.0  # of both Gamma priors: weak
+HYPOTHESES = 9  # noise ratios of an ensemble
 
 NOISES = ((2e-3, 1e-3), (2e-3, 1e-4), (5e-4, 5e-4), (1e-4, 3e-4))
 LENGTHS = (256, 2048)
-# Where the last three tables centre the noise priors wrongly: both at a multiple of the truth, or both at one value.
-FACTORS = (3.0, 1 / 3)
+# Where tables centre the noise priors wrongly: at these multiples of the true process and measurement noise, or both at
+# one value.
+FACTORS = ((3.0, 3.0), (1 / 3, 1 / 3), (2.0, 1 / 4))
 EQUAL_CENTER = 5e-4  # V
 
-QUANTITIES = ("θ1", "θ2", "θ3", "η", "m", "c", "a", "b")
 QUANTILE = float(norm.ppf(0.5 + LEVEL / 2))
 
 
@@ -52,6 +43,8 @@ class Case:
         measurement_noise: standard deviation of v [V].
         samples: length of each record.
         noise_centers: standard deviations [V] at which the priors of γ and of ξ are centred.
+        model: one of `benchmarks.systems.MODELS`.
+        hypotheses: noise ratios that the estimator weighs.
     """
 
     factorisation: str
@@ -59,15 +52,12 @@ class Case:
     measurement_noise: float
     samples: int
     noise_centers: tuple[float, float]
+    model: str = "paper"
+    hypotheses: int = 1
 
-    def prior(self) -> Prior:
-        """The prior of the environments, with a weak noise prior (shape 2)."""
-        return Prior.silverbox_twin(
-            spread=SPREAD,
-            process_noise=self.noise_centers[0],
-            measurement_noise=self.noise_centers[1],
-            noise_shape=2.0,
-        )
+    def prior(self) -> Prior | JointBelief:
+        """The prior that describes the population, with a weak noise prior."""
+        return make_prior(self.model, *self.noise_centers, NOISE_SHAPE)
 
 
 @dataclass(frozen=True)
@@ -75,11 +65,13 @@ class Coverage:
     """What came out.
 
     Attributes:
-        kept: systems whose displacement stayed below `MAX_DISPLACEMENT`; the others are left out.
-        hits: of the kept, those whose interval holds the truth, for each of `QUANTITIES`.
-        nees: mean over systems of dᵀ P⁻¹ d / 4 with d the error of (θ, η) and P its posterior covariance; 1 where the
-            posterior is calibrated.
+        kept: systems whose displacement stayed in range; the others are left out.
+        hits: of the kept, those whose interval holds the truth, for each coefficient (and m, c, a, b for ``paper``).
+        nees: mean over systems of dᵀ P⁻¹ d / K with d the error of the K coefficients and P its posterior covariance; 1
+            where the posterior is calibrated.
         gamma, xi: median of E[γ] and of E[ξ], divided by the true precision.
+        gamma_range, xi_range: 5 % and 95 % quantiles of the same.
+        ratio_std: median standard deviation of log(σ_w/σ_v), for an ensemble.
     """
 
     kept: int
@@ -87,6 +79,9 @@ class Coverage:
     nees: float
     gamma: float
     xi: float
+    gamma_range: tuple[float, float]
+    xi_range: tuple[float, float]
+    ratio_std: float | None
 
 
 @dataclass(frozen=True)
@@ -95,11 +90,13 @@ class Config:
 
     Attributes:
         systems: oscillators simulated for each row.
+        only: beginnings of the titles of the tables to make; all without.
         seed: of all draws.
         json: file to write the results to, too.
     """
 
     systems: int = 500
+    only: tuple[str, ...] = ("",)
     seed: int = 0
     json: Path | None = None
 
@@ -108,84 +105,73 @@ def tables() -> dict[str, list[Case]]:
     """The cases of each table, by its title."""
     settings = [(*noises, samples) for noises in NOISES for samples in LENGTHS]
     equal = (EQUAL_CENTER, EQUAL_CENTER)
-    scaled = {
-        f"structured, both noise priors centred at {factor:.3g} times the truth": [
-            Case("structured", w, v, samples, (factor * w, factor * v)) for w, v, samples in settings
+    right = [Case("structured", w, v, samples, (w, v)) for w, v, samples in settings]
+    wrong = {
+        f"noise priors centred at {a:.3g} σ_w and {b:.3g} σ_v": [
+            Case("structured", w, v, samples, (a * w, b * v)) for w, v, samples in settings
         ]
-        for factor in FACTORS
+        for a, b in FACTORS
     }
+    wrong[f"noise priors centred at {EQUAL_CENTER:g} V"] = [
+        Case("structured", w, v, samples, equal) for w, v, samples in settings if (w, v) != equal
+    ]
+    alone_and_ensemble = {}
+    for title, cases in wrong.items():
+        alone_and_ensemble[f"structured, {title}"] = cases
+        alone_and_ensemble[f"ensemble, {title}"] = _with(cases, hypotheses=HYPOTHESES)
     return {
-        "structured": [Case("structured", w, v, samples, (w, v)) for w, v, samples in settings],
-        "mean field": [Case("mean_field", w, v, samples, (w, v)) for w, v, samples in settings],
-        **scaled,
-        f"structured, both noise priors centred at {EQUAL_CENTER:g} V": [
-            Case("structured", w, v, samples, equal) for w, v, samples in settings if (w, v) != equal
-        ],
+        "structured": right,
+        "mean field": _with(right, factorisation="mean_field"),
+        **{name: _with(right, model=name) for name in ("offset", "three-tap", "cubic", "ode")},
+        "ensemble": _with(right, hypotheses=HYPOTHESES),
+        **alone_and_ensemble,
     }
 
 
-def simulate(
-    psi: Coefficients, process_noise: float, measurement_noise: float, samples: int, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Simulate a batch of difference equations from rest, Eq. (2), each with its own input.
-
-    Args:
-        psi: coefficients of N systems, of shape (N,).
-        process_noise: standard deviation of w̃ [V].
-        measurement_noise: standard deviation of v [V].
-        samples: number of samples T.
-        rng: draws inputs and noises.
-
-    Returns:
-        Inputs and outputs (N, T), where ``u[:, t]`` leads to ``y[:, t]``, and whether the displacement stayed below
-        `MAX_DISPLACEMENT` (N,).
-    """
-    shape = (np.size(psi.eta), samples)
-    u = rng.uniform(-MAX_INPUT, MAX_INPUT, shape)
-    w = process_noise * rng.standard_normal(shape)
-    y = measurement_noise * rng.standard_normal(shape)
-    stayed = np.ones(shape[0], dtype=bool)
-    x = x_last = np.zeros(shape[0])
-    for t in range(samples):
-        x, x_last = psi.theta1 * x + psi.theta2 * x**3 + psi.theta3 * x_last + psi.eta * u[:, t] + w[:, t], x
-        stayed &= np.abs(x) < MAX_DISPLACEMENT
-        x = np.where(stayed, x, 0.0)  # so that those that left do not overflow
-        y[:, t] += x
-    return u, y, stayed
+def _with(cases: list[Case], **changes: Any) -> list[Case]:
+    return [dataclasses.replace(case, **changes) for case in cases]
 
 
 def evaluate(case: Case, systems: int, rng: np.random.Generator) -> Coverage:
     """Draw systems, identify each, and compare its posterior with the truth."""
-    low, high = np.log(1 - SPREAD), np.log(1 + SPREAD)
-    center = np.array([SILVERBOX_TWIN.m, SILVERBOX_TWIN.c, SILVERBOX_TWIN.a, SILVERBOX_TWIN.b])
-    physical = center * np.exp(rng.uniform(low, high, (systems, 4)))
-    psi = to_coefficients(PhysicalParameters(*physical.T))
-    truth = np.column_stack([psi.theta1, psi.theta2, psi.theta3, psi.eta, physical])
-    u, y, stayed = simulate(psi, case.process_noise, case.measurement_noise, case.samples, rng)
-
-    prior = case.prior()
-    kept = np.flatnonzero(stayed)
-    hits = np.zeros((len(kept), len(QUANTITIES)), dtype=bool)
-    nees, gamma, xi = np.empty((3, len(kept)))
-    for i, system in enumerate(kept):
-        estimator = OnlineEstimator(NLARX(input_delay=0), prior, case.factorisation)
-        estimator.run(u[system], y[system])
+    drawn = draw(case.model, systems, case.process_noise, case.measurement_noise, case.samples, rng)
+    model, prior = make_model(case.model), case.prior()
+    kept = np.flatnonzero(drawn.stayed)
+    hits, nees, gamma, xi, ratio = [], [], [], [], []
+    for i in kept:
+        estimator = OnlineEstimator(model, prior, case.factorisation, noise_hypotheses=case.hypotheses)
+        estimator.run(drawn.u[i], drawn.y[i])
         belief = estimator.belief
-        assert isinstance(belief, Belief)
-        physical_mean, physical_cov = belief.physical()
-        error = truth[system] - np.concatenate([belief.coefficients_mean, physical_mean])
-        std = np.sqrt(np.concatenate([np.diag(belief.coefficients_cov), np.diag(physical_cov)]))
-        hits[i] = np.abs(error) <= QUANTILE * std
-        nees[i] = error[:4] @ np.linalg.solve(belief.coefficients_cov, error[:4]) / 4
-        gamma[i] = belief.gamma_mean * case.process_noise**2
-        xi[i] = belief.xi_mean * case.measurement_noise**2
+        mean, cov = belief.coefficients_mean, belief.coefficients_cov
+        std, error = np.sqrt(np.diag(cov)), drawn.truth[i, : len(mean)] - mean
+        free = std > 0  # the cubic damping is known to be 0
+        names = [name for name, is_free in zip(drawn.names, free, strict=False) if is_free]
+        std, error, cov = std[free], error[free], cov[np.ix_(free, free)]
+        nees.append((error / std) @ np.linalg.solve(cov / np.outer(std, std), error / std) / len(std))
+        if isinstance(belief, Belief):
+            physical_mean, physical_cov = belief.physical()
+            error = drawn.truth[i] - np.concatenate([mean, physical_mean])
+            std, names = np.concatenate([std, np.sqrt(np.diag(physical_cov))]), list(drawn.names)
+        hits.append(np.abs(error) <= QUANTILE * std)
+        gamma.append(belief.gamma_mean * case.process_noise**2)
+        xi.append(belief.xi_mean * case.measurement_noise**2)
+        if case.hypotheses > 1:
+            ratio.append(estimator.noise_ratio.std)
     return Coverage(
         kept=len(kept),
-        hits=dict(zip(QUANTITIES, hits.sum(axis=0).tolist(), strict=True)),
-        nees=float(nees.mean()),
+        hits=dict(zip(names, np.sum(hits, axis=0).tolist(), strict=True)),
+        nees=float(np.mean(nees)),
         gamma=float(np.median(gamma)),
         xi=float(np.median(xi)),
+        gamma_range=_range(gamma),
+        xi_range=_range(xi),
+        ratio_std=float(np.median(ratio)) if ratio else None,
     )
+
+
+def _range(values: list[float]) -> tuple[float, float]:
+    low, high = np.quantile(values, [0.05, 0.95])
+    return float(low), float(high)
 
 
 def wilson(hits: int, trials: int) -> tuple[float, float]:
@@ -195,35 +181,42 @@ def wilson(hits: int, trials: int) -> tuple[float, float]:
 
 
 def run(config: Config) -> dict[str, list[tuple[Case, Coverage]]]:
-    """Evaluate all tables. Cases of one noise pair and length share their systems and data, whatever the estimator."""
+    """Evaluate all tables, and print each. Cases of one model, noise pair and length share their systems and data."""
     from rich.progress import track
 
-    all_tables = tables()
-    results: dict[str, list[tuple[Case, Coverage]]] = {title: [] for title in all_tables}
-    cases = [(title, case) for title, rows in all_tables.items() for case in rows]
-    for title, case in track(cases, description="Identifying"):
-        setting = (NOISES.index((case.process_noise, case.measurement_noise)), case.samples)
-        rng = np.random.default_rng([config.seed, *setting])
-        results[title].append((case, evaluate(case, config.systems, rng)))
+    results: dict[str, list[tuple[Case, Coverage]]] = {}
+    chosen = {title: cases for title, cases in tables().items() if title.startswith(config.only)}
+    for title, cases in chosen.items():
+        rows = []
+        for case in track(cases, description=f"Identifying: {title}"):
+            setting = (NOISES.index((case.process_noise, case.measurement_noise)), case.samples)
+            rows.append((case, evaluate(case, config.systems, np.random.default_rng([config.seed, *setting]))))
+        results[title] = rows
+        show(title, rows)
     return results
 
 
-def show(results: dict[str, list[tuple[Case, Coverage]]]) -> None:
-    """Print the tables, in the format of docs/coverage.md."""
+def show(title: str, rows: list[tuple[Case, Coverage]]) -> None:
+    """Print a table, in the format of docs/coverage.md; and for an ensemble one of the noises."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(width=140)
-    for title, rows in results.items():
-        console.print(f"\n{title}")
-        table = Table(*_HEADER, box=box.MARKDOWN)
+    console = Console(width=160)
+    console.print(f"\n{title}")
+    table = Table(*_HEADER, *rows[0][1].hits, "NEES/K", "E[γ]/γ", "E[ξ]/ξ", box=box.MARKDOWN)
+    for case, coverage in rows:
+        table.add_row(*_cells(case, coverage))
+    console.print(table)
+    if rows[0][0].hypotheses > 1:
+        noises = Table(*_NOISE_HEADER, box=box.MARKDOWN)
         for case, coverage in rows:
-            table.add_row(*_cells(case, coverage))
-        console.print(table)
+            noises.add_row(*_noise_cells(case, coverage))
+        console.print(noises)
 
 
-_HEADER = ("σ_w [V]", "σ_v [V]", "T", "kept", *QUANTITIES, "NEES/4", "E[γ]/γ", "E[ξ]/ξ")
+_HEADER = ("σ_w [V]", "σ_v [V]", "T", "kept")
+_NOISE_HEADER = (*_HEADER[:3], "E[γ]/γ", "5 %", "95 %", "E[ξ]/ξ", "5 %", "95 %", "std of log(σ_w/σ_v)")
 
 
 def _cells(case: Case, coverage: Coverage) -> Iterator[str]:
@@ -231,6 +224,13 @@ def _cells(case: Case, coverage: Coverage) -> Iterator[str]:
     for hits in coverage.hits.values():
         yield f"{hits / coverage.kept:.2f}"
     yield from (f"{value:.3g}" for value in (coverage.nees, coverage.gamma, coverage.xi))
+
+
+def _noise_cells(case: Case, coverage: Coverage) -> Iterator[str]:
+    yield from (f"{case.process_noise:g}", f"{case.measurement_noise:g}", str(case.samples))
+    for median, around in ((coverage.gamma, coverage.gamma_range), (coverage.xi, coverage.xi_range)):
+        yield from (f"{value:.2g}" for value in (median, *around))
+    yield f"{coverage.ratio_std:.2f}"
 
 
 def write(results: dict[str, list[tuple[Case, Coverage]]], path: Path) -> None:
@@ -250,7 +250,6 @@ def write(results: dict[str, list[tuple[Case, Coverage]]], path: Path) -> None:
 def main(config: Config) -> None:
     """Evaluate, print, and write where a file is named."""
     results = run(config)
-    show(results)
     if config.json is not None:
         write(results, config.json)
 

@@ -21,13 +21,17 @@ import time
 from collections.abc import Callable
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 Run = Callable[[int], dict[str, Any]]
 
-PACKAGES = ("envpool", "gymnax", "jax", "jaxlib", "gymnasium", "filterpy", "dynamax", "padasip", "numpy", "scipy")
+PACKAGES = (
+    *("envpool", "gymnax", "jax", "jaxlib", "gymnasium", "filterpy", "dynamax", "padasip", "fastcan", "scikit-learn"),
+    *("numpy", "scipy"),
+)
 EPISODE = 200
 POOL_THREADS = 2
 DRAWN_ACTIONS = 64
@@ -110,7 +114,7 @@ def gymnax_pendulum(num_envs: int, scanned: bool) -> Run:
 
 @cache
 def samples() -> dict[str, Any]:
-    """The samples, the prior and the noises that the estimators get, as `benchmarks.estimators` wrote them."""
+    """What the estimators get, as `benchmarks.estimators` or `benchmarks.silverbox` wrote it."""
     with np.load(sys.argv[1]) as file:
         return {name: file[name] for name in file.files}
 
@@ -209,7 +213,11 @@ def padasip_rls() -> Run:
 
 @cache
 def row(name: str) -> Run:
-    """The row of this name, set up: ``filterpy``, ``dynamax``, ``padasip``, or a name and a number of environments."""
+    """The row of this name, set up.
+
+    ``filterpy``, ``dynamax``, ``padasip``; a name and a number of environments; or ``silverbox`` and what
+    `benchmarks.silverbox_peers.row` takes.
+    """
     estimators = {"filterpy": filterpy_ukf, "dynamax": dynamax_ekf, "padasip": padasip_rls}
     if name in estimators:
         return estimators[name]()
@@ -218,8 +226,13 @@ def row(name: str) -> Run:
         "gymnax": partial(gymnax_pendulum, scanned=False),
         "gymnax-scan": partial(gymnax_pendulum, scanned=True),
     }
-    kind, _, num_envs = name.partition(" ")
-    return environments[kind](int(num_envs))
+    kind, _, rest = name.partition(" ")
+    if kind == "silverbox":
+        sys.path.append(str(Path(__file__).parent))
+        from silverbox_peers import row as silverbox_row
+
+        return silverbox_row(samples(), *rest.split())
+    return environments[kind](int(rest))
 
 
 def versions() -> dict[str, str]:

@@ -5,6 +5,7 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 
 from estimator.belief import Belief, Prior
 from estimator.continuous import CONTINUOUS_TWIN, ContinuousBelief, continuous_prior
+from estimator.ensemble import NoiseRatio
 from estimator.fisher import cramer_rao, fisher_information, relative_covariance
 from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
@@ -32,6 +33,7 @@ __all__ = [
     "ContinuousBelief",
     "DuffingODE",
     "JointBelief",
+    "NoiseRatio",
     "OnlineEstimator",
     "PhysicalParameters",
     "Prior",

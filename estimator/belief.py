@@ -34,6 +34,21 @@ def _covariance_index() -> npt.NDArray[np.intp]:
 
 
 _COVARIANCE = _covariance_index()
+_NOISES = slice(_INDEX["g_shape"], RECORD_SIZE)
+
+
+def to_moments(record: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean (7,), covariance (7, 7), and shapes and rates of γ and ξ (4,) of a flat record; copies."""
+    return record[_MEANS].copy(), record[_COVARIANCE], record[_NOISES].copy()
+
+
+def from_moments(mean: FloatArray, cov: FloatArray, noises: FloatArray) -> FloatArray:
+    """The flat record (RECORD_SIZE,) with these moments."""
+    record = np.empty(RECORD_SIZE)
+    record[_MEANS] = mean
+    record[_COVARIANCE] = cov
+    record[_NOISES] = noises
+    return record
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,11 +195,7 @@ class Prior:
         if not nonlinear:
             mean[4] = 0.0
             cov[4, :] = cov[:, 4] = 0.0
-        record = np.empty(RECORD_SIZE)
-        record[_MEANS] = mean
-        record[_COVARIANCE] = cov
-        record[_INDEX["g_shape"] :] = [self.gamma_shape, self.gamma_rate, self.xi_shape, self.xi_rate]
-        return record
+        return from_moments(mean, cov, np.array([self.gamma_shape, self.gamma_rate, self.xi_shape, self.xi_rate]))
 
 
 @dataclass(frozen=True, eq=False)

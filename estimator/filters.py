@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from estimator.belief import Belief, Prior
+from estimator.belief import Belief, Prior, from_moments, to_moments
 from estimator.gaussian import JointBelief
 from estimator.inference import sigma_points, update_alone, walk
 from estimator.lanes import LANES, kernel
@@ -143,6 +143,17 @@ class NLARXFilter:
         self._last_input = float(arrays["last_input"])
 
     @property
+    def moments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean (7,), covariance (7, 7), and the noises' shapes and rates (4,) of the record."""
+        return to_moments(self._block[:RECORD_SIZE, 0])
+
+    def with_moments(self, mean: FloatArray, cov: FloatArray, noises: FloatArray) -> NLARXFilter:
+        """A copy with another belief."""
+        other = self.copy()
+        other._block[:RECORD_SIZE] = from_moments(mean, cov, noises)[:, None]
+        return other
+
+    @property
     def is_finite(self) -> bool:
         """Whether all numbers of the record are."""
         return bool(np.isfinite(self._block[:RECORD_SIZE, 0]).all())
@@ -252,6 +263,18 @@ class JointFilter(ABC):
         """Become another filter."""
         for name in _JOINT_ARRAYS:
             setattr(self, f"_{name}", arrays[name])
+
+    @property
+    def moments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean (n,), covariance (n, n), and the noises' shapes and rates (4,), in the model's own coordinates."""
+        return self._mean.copy(), self._cov.copy(), self._noises.copy()
+
+    def with_moments(self: Self, mean: FloatArray, cov: FloatArray, noises: FloatArray) -> Self:
+        """A copy with another belief."""
+        other = copy(self)
+        for name, array in (("_mean", mean), ("_cov", cov), ("_noises", noises)):
+            setattr(other, name, array.copy())
+        return other
 
     @property
     def is_finite(self) -> bool:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief, Prior
 from estimator.checks import scalar, series
+from estimator.ensemble import EnsembleFilter, Member, NoiseRatio
 from estimator.filters import EXPECTATIONS, Filter, NLARXFilter, ODEFilter, RegressorFilter
 from estimator.gaussian import JointBelief
 from estimator.inference import DEFAULT_ITERATIONS
@@ -39,6 +40,9 @@ class OnlineEstimator:
             coefficient's step per sample, in parts of that of its prior. 0.01 forgets in some hundred samples.
         expectations: what a step does to a `JointBelief`: ``first_order``, by the derivative at its mean; or
             ``sigma_points``, by points that spread as the belief does, for beliefs that are wide.
+        noise_hypotheses: number of ratios σ_w/σ_v to weigh by their evidence (`estimator.ensemble`), structured only.
+            With 1 the ratio stays nearly what the priors of γ and ξ say. 9 resolve it; an odd number has the priors'
+            own ratio among them. Each is there at three levels, so that a sample costs three updates a hypothesis.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -69,6 +73,7 @@ class OnlineEstimator:
         as_published: bool = False,
         drift: float = 0.0,
         expectations: str = "first_order",
+        noise_hypotheses: int = 1,
     ) -> None:
         if factorisation not in DEFAULT_ITERATIONS:
             raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {factorisation!r}")
@@ -93,11 +98,20 @@ class OnlineEstimator:
         if expectations not in EXPECTATIONS:
             raise ValueError(f"expectations must be one of {list(EXPECTATIONS)}, but is {expectations!r}")
         self.expectations = expectations
-        self._filter = self._make_filter(prior)
+        if not isinstance(noise_hypotheses, int | np.integer) or noise_hypotheses < 1:
+            raise ValueError(f"noise_hypotheses must be a whole number of at least 1, but is {noise_hypotheses!r}")
+        if noise_hypotheses > 1 and factorisation != "structured":
+            raise ValueError(
+                f"noise_hypotheses must be 1 for factorisation={factorisation!r}, but is {noise_hypotheses}; use "
+                f"factorisation='structured'"
+            )
+        self.noise_hypotheses = int(noise_hypotheses)
+        single = self._make_filter(prior)
+        self._filter: Filter = single if noise_hypotheses == 1 else EnsembleFilter(single, self.noise_hypotheses)
         self._free_energies = np.full(self.iterations, np.nan)
         self._forecasts = np.empty((0, 2))
 
-    def _make_filter(self, prior: Prior | JointBelief | None) -> Filter:
+    def _make_filter(self, prior: Prior | JointBelief | None) -> Member:
         if isinstance(self.model, DuffingODE) or not self.model.is_paper:
             if self.factorisation != "structured":
                 raise ValueError(
@@ -140,6 +154,17 @@ class OnlineEstimator:
         """(T, 2) mean [V] and variance [V²] of each output of the last `run` before it was seen; NaN in mean field."""
         return self._forecasts.copy()
 
+    @property
+    def noise_ratio(self) -> NoiseRatio:
+        """Posterior of the noises' ratio over the hypotheses, which says whether the data tells γ from ξ.
+
+        Raises:
+            ValueError: if ``noise_hypotheses`` is 1.
+        """
+        if not isinstance(self._filter, EnsembleFilter):
+            raise ValueError("noise_hypotheses must be above 1 for noise_ratio, but is 1; pass noise_hypotheses=9")
+        return self._filter.noise_ratio
+
     def update(self, u: float, y: float) -> None:
         """Update the posterior with the sample (u, y), both in volts.
 
@@ -168,7 +193,7 @@ class OnlineEstimator:
             ValueError: as `update`; the estimator is then as it was before the first of the samples.
         """
         u, y = series("u", u), series("y", y, missing)
-        if missing and isinstance(self._filter, NLARXFilter):
+        if missing and isinstance(self.model, NLARX) and self.model.is_paper:
             raise ValueError(f"missing must be False for regressors='paper'; {_AS_TERMS}")
         if u.shape != y.shape:
             raise ValueError(f"u and y must have one length, but have {len(u)} and {len(y)}; cut the longer one")

@@ -36,6 +36,7 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
         "as_published": estimator.as_published,
         "drift": estimator.drift,
         "expectations": estimator.expectations,
+        "noise_hypotheses": estimator.noise_hypotheses,
     }
     arrays: dict[str, Any] = {**estimator.arrays(), "description": np.array(json.dumps(description))}
     buffer = io.BytesIO()
@@ -70,6 +71,7 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
         as_published=description["as_published"],
         drift=description["drift"],
         expectations=description.get("expectations", "first_order"),  # files from before it was an option
+        noise_hypotheses=description.get("noise_hypotheses", 1),  # older files do not name it
     )
     estimator.restore(arrays)
     return estimator

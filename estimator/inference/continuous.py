@@ -14,8 +14,8 @@ with covariance N/γ,
 
     N' = A N + N Aᵀ + diag(0, 3),        N = 0 at the begin of the sample,
 
-which is integrated along: without A it would be [[1, 3/2], [3/2, 3]], but the spring holds back 10 % of N_xx and 20 %
-of N_vv of the Silverbox's oscillator at rest, and more where the cubic term stiffens it.
+which is integrated along: without A it would be [[1, 3/2], [3/2, 3]], but spring and damper hold back 14 % of N_xx and
+20 % of N_vv of the Silverbox's oscillator at rest, and more where the cubic term stiffens it.
 
 From there it is a Kalman step, and γ and ξ are learned as in `estimator.inference.structured` with N_xx/E[γ] in the
 place of 1/E[γ]: for the update the rate of γ is counted as the output shows it, times N_xx. The part of x' that is

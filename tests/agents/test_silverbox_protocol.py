@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from agents import silverbox_protocol as module
+from agents import silverbox_results as reporting
 from agents import silverbox_selection as selection
 from agents.silverbox_protocol import GIVEN, SETTINGS, TESTS, Outcome, Setting
 from duffing_env.silverbox import Regime, SilverboxRecord, synthesise_multisine
@@ -76,15 +77,15 @@ def test_samples_until_the_error_stays_close(errors, samples):
 
 def test_targets_say_what_was_missed():
     good = {name: outcome() for name in SETTINGS}
-    for name, bounds in module.TARGETS.items():
+    for name, bounds in reporting.TARGETS.items():
         good[name] = outcome(rmse={test: 0.999e-3 * bound for test, bound in zip(TESTS, bounds, strict=True)})
-    for name, error in zip(module.RANKED, (4e-3, 3e-3, 4e-4, 3e-4), strict=True):
+    for name, error in zip(reporting.RANKED, (4e-3, 3e-3, 4e-4, 3e-4), strict=True):
         good[name] = outcome(rmse=dict.fromkeys(TESTS, error), free_energy=1e6 * error)
-    assert all(reached for _, reached in module.targets(good))
+    assert all(reached for _, reached in reporting.targets(good))
 
     def missed(name, **changes):
         changed = {**good, name: outcome(**{**vars(good[name]), **changes})}
-        return [text for text, reached in module.targets(changed) if not reached]
+        return [text for text, reached in reporting.targets(changed) if not reached]
 
     assert missed("ODE look-ahead", rmse=dict(zip(TESTS, (0.33e-3, 0.4001e-3, 0.33e-3), strict=True))) == [
         "ODE look-ahead: [0.330; 0.400; 0.330] mV, at most [0.33; 0.40; 0.33]"
@@ -100,7 +101,7 @@ def test_targets_say_what_was_missed():
 
 
 def test_the_submission_line():
-    assert module.submission([0.25149, 0.3, 1.0]) == "[0.251; 0.300; 1.000]"
+    assert reporting.submission([0.25149, 0.3, 1.0]) == "[0.251; 0.300; 1.000]"
 
 
 # --- The rules, on a simulated oscillator --------------------------------------------------------------------------
@@ -187,7 +188,7 @@ def test_selection_uses_the_training_section_only(record, monkeypatch, capsys):
 
 # --- On the record -------------------------------------------------------------------------------------------------
 
-FEW = ("paper as published", "paper structured", "NLARX offset", *module.TARGETS)
+FEW = ("paper as published", "paper structured", "NLARX offset", *reporting.TARGETS)
 
 
 @pytest.fixture(scope="module")
@@ -195,13 +196,13 @@ def results(record, tmp_path_factory):
     """The protocol with the settings that its targets need: (results, folder, what was printed)."""
     folder = tmp_path_factory.mktemp("silverbox")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "SETTINGS", {name: SETTINGS[name] for name in FEW})
+        patch.setattr(reporting, "SETTINGS", {name: SETTINGS[name] for name in FEW})
         patch.setattr(module, "LENGTHS", (100, 500, module.TRAINING_SAMPLES))
         patch.setattr(module, "TIMINGS", 1)
         with patch.context() as output:
             printed = []
-            output.setattr(module.Console, "print", lambda self, *parts: printed.extend(parts))
-            found = module.run_protocol(json=folder / "new" / "results.json", figures=folder / "figures")
+            output.setattr(reporting.Console, "print", lambda self, *parts: printed.extend(parts))
+            found = reporting.run_protocol(json=folder / "new" / "results.json", figures=folder / "figures")
     return found, folder, printed
 
 
@@ -266,8 +267,8 @@ def test_the_manual_shows_what_is_printed(results):
         row = next(line for line in manual.splitlines() if line.startswith(f"{name}  "))
         assert row.removeprefix(name).split()[:3] == [f"{error:.3f}" for error in triple(results[0], name)]
     printed = [str(part) for part in results[2]]
-    for name in module.TARGETS:
-        line = f"  {name:24} {module.submission(triple(results[0], name))}"
+    for name in reporting.TARGETS:
+        line = f"  {name:24} {reporting.submission(triple(results[0], name))}"
         assert line in printed
         assert line in manual
 
@@ -284,7 +285,7 @@ def command(*arguments):
 def test_command_explains_itself():
     finished = command("silverbox", "--help")
     assert finished.returncode == 0
-    for word in ("reproduce.py silverbox", "--json", "--figures", "--data", "--select", "SNLS80mV.csv"):
+    for word in ("reproduce.py silverbox", "--json", "--figures", "--data", "--select", "--no-peers", "SNLS80mV.csv"):
         assert word in finished.stdout
     assert "reproduce.py silverbox" in command("--help").stdout
 
@@ -300,4 +301,4 @@ def test_command_without_a_record(tmp_path, option):
 
 def test_nowhere_to_write(record, tmp_path):
     with pytest.raises(IsADirectoryError, match="json must be a file, but is the folder"):
-        module.run_protocol(json=tmp_path, figures=tmp_path / "figures")
+        reporting.run_protocol(json=tmp_path, figures=tmp_path / "figures")

@@ -13,15 +13,16 @@ from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
 
 TRACK = "duffing_env/Amplitude-v0"
+CONTINUOUS = "duffing_env/Continuous-v0"
 HORIZON = 24
 # A limit that about half of the episodes reach before their horizon.
 OPTIONS = {"horizon": HORIZON, "max_output": 0.22}
 TIME_LEFT = 20  # entry of the observation
 
 
-def reference(rows, seed, **options):
+def reference(rows, seed, track=TRACK, **options):
     """A `DummyVecEnv` whose environments are seeded as the rows of a batch."""
-    envs = DummyVecEnv([lambda: Monitor(gym.make(TRACK, **options)) for _ in range(rows)])
+    envs = DummyVecEnv([lambda: Monitor(gym.make(track, **options)) for _ in range(rows)])
     envs._seeds = spawn_seeds(seed, rows)
     return envs
 
@@ -30,10 +31,13 @@ def random_actions(rows, steps, seed=0):
     return np.random.default_rng(seed).uniform(-1.2, 1.2, (steps, rows, 1)).astype(np.float32)
 
 
-@pytest.mark.parametrize(("rows", "reward"), [(3, "information_gain"), (37, "log_posterior")])
-def test_steps_are_those_of_single_environments(rows, reward):
-    ours = DuffingVecEnv(TRACK, rows, seed=5, reward=reward, **OPTIONS)
-    theirs = reference(rows, 5, reward=reward, **OPTIONS)
+@pytest.mark.parametrize(
+    ("track", "rows", "reward"),
+    [(TRACK, 3, "information_gain"), (TRACK, 37, "log_posterior"), (CONTINUOUS, 6, "information_gain")],
+)
+def test_steps_are_those_of_single_environments(track, rows, reward):
+    ours = DuffingVecEnv(track, rows, seed=5, reward=reward, **OPTIONS)
+    theirs = reference(rows, 5, track, reward=reward, **OPTIONS)
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
     limits_reached, times_up = 0, 0
     for actions in random_actions(rows, 3 * HORIZON):

@@ -72,7 +72,7 @@ def test_without_process_noise_it_is_the_model_for_records():
     pieces = DuffingODE().pieces(np.concatenate([[0.0], u]))
     energies, forecasts = np.empty((samples, iterations)), np.empty((samples, 2))
     walk = np.zeros(len(ode.PARAMETERS))
-    ode.run_samples(mean, cov, noises, walk, pieces, u, y, True, continuous.SUBSTEPS, energies, forecasts)
+    ode.run_samples(mean, cov, noises, walk, pieces, u, y, True, continuous.SUBSTEPS, energies, forecasts, None)
 
     rows = block_of([prior.record] * LANES, 0.0, 0.0).reshape(N_ROWS, LANES)
     last_u = 0.0

@@ -18,6 +18,8 @@ ESTIMATORS = {
     "ode, look-ahead": lambda: OnlineEstimator(DuffingODE("look_ahead", substeps=3)),
     "ode, sigma points": lambda: OnlineEstimator(DuffingODE("look_ahead"), expectations="sigma_points", drift=1e-3),
     "three-tap, sigma points": lambda: OnlineEstimator(NLARX(regressors="three-tap"), expectations="sigma_points"),
+    "ensemble": lambda: OnlineEstimator(NLARX(), noise_hypotheses=3),
+    "ode ensemble": lambda: OnlineEstimator(DuffingODE("look_ahead", substeps=3), noise_hypotheses=3),
 }
 
 

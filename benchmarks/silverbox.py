@@ -1,0 +1,361 @@
+"""The peers in the Silverbox protocol, beside our estimators: same record, model, prior and tests, timed in turns.
+
+What a peer needs and does not learn, it gets: our prior, the two noise variances as ours had learned them at the end of
+the training section, and float64. Its coefficients are simulated by our own free run, started by a filter with its
+noises, so that nothing but the identification differs; fastcan's model is simulated by fastcan.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from agents.silverbox_protocol import (
+    GIVEN,
+    LENGTHS,
+    SETTINGS,
+    TESTS,
+    TRAINING_SAMPLES,
+    Outcome,
+    Sections,
+    coverage_of,
+    rmse,
+    samples_until_close,
+    simulation_error,
+)
+from agents.silverbox_results import submission
+from benchmarks.peer_process import NotAvailable, Peers
+from benchmarks.report import ratio
+from benchmarks.timing import Result, Row, measure, timed
+from duffing_env.silverbox import Regime
+from estimator import NLARX, DuffingODE, JointBelief, OnlineEstimator, Prior
+from estimator.models.ode import NOISE_DIRECTION, from_coordinates, to_coordinates
+from estimator.models.regressors import PRESETS, as_arrays
+from estimator.parameters import FloatArray
+
+TIMED = 4096
+"""First samples of the training section, which all online rows are timed on."""
+
+REPETITIONS = 5
+UNIT = "µs/sample"
+
+BAR = 5.0
+"""Ours is to be this many times as fast per sample as dynamax's filter with the same model."""
+
+MODELS: dict[str, tuple[str, NLARX | DuffingODE]] = {
+    "ode": ("ODE linear", DuffingODE()),
+    "three-tap": ("NLARX three-tap", NLARX(regressors="three-tap")),
+    "cubic": ("NLARX cubic", NLARX(regressors="cubic")),
+    "paper": ("paper structured", NLARX(regressors=PRESETS["paper"])),
+}
+"""By the name that a request has: the setting of ours, and its model as peers have it."""
+
+PEERS = {
+    "dynamax EKF, ODE linear": ("dynamax", "ode"),
+    "dynamax EKF, three-tap": ("dynamax", "three-tap"),
+    "dynamax EKF, paper": ("dynamax", "paper"),
+    "filterpy UKF, ODE linear": ("filterpy", "ode"),
+    "padasip RLS, three-tap": ("padasip", "three-tap"),
+    "padasip RLS, cubic": ("padasip", "cubic"),
+}
+"""Online peers, by the titles of their rows."""
+
+OFFLINE = "fastcan NARX, offline"
+
+_MOTION = [0, 1, 2, 3, 4, 5, 6, 8, 9]
+"""Places of the joint state without the cubic damping, which is 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """What a row of the comparison came to.
+
+    Attributes:
+        errors: root mean square simulation error by test [V].
+        coverage: of 90 % intervals of forecasts; NaN where there are none.
+        learning: simulation error on the arrow [V] after each number of training samples.
+        time: time per sample [µs].
+        reason: why there is nothing of all this.
+    """
+
+    time: Result
+    errors: dict[str, float] = field(default_factory=dict)
+    coverage: float = float("nan")
+    learning: dict[int, float] = field(default_factory=dict)
+    reason: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For the JSON file."""
+        if self.reason:
+            return {"not_available": self.reason}
+        return {
+            "rmse": {test: _finite(error) for test, error in self.errors.items()},
+            "coverage": _finite(self.coverage),
+            "samples_until_1_mV": samples_until_close(self.learning),
+            "arrow_rmse_after": {str(samples): _finite(error) for samples, error in self.learning.items()},
+            "time": self.time.to_dict(),
+        }
+
+
+def compare(sections: Sections, outcomes: Mapping[str, Outcome], wanted: bool = True) -> dict[str, Any]:
+    """Runs the peers, prints them beside ours, and returns what was measured, fit for JSON.
+
+    Args:
+        sections: The record, as the protocol cuts it.
+        outcomes: Of our settings, in this run.
+        wanted: Whether there are to be peers at all; without them every row says so.
+    """
+    status = Console(stderr=True).status("Peers")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "given.npz"
+        np.savez(path, **given(sections, outcomes))
+        with Peers(path, wanted) as peers, status:
+            contenders = run(peers, sections, outcomes, status.update)
+            versions = peers.versions()
+    claims = {title: faster(contenders, title) for title in PEERS if title.startswith("dynamax")}
+    report(contenders, claims, versions)
+    return {
+        "rows": {title: contender.to_dict() for title, contender in contenders.items()},
+        "times_as_fast": {title: _finite(claim[0]) for title, claim in claims.items()},
+        "timed_samples": TIMED,
+        "versions": versions,
+    }
+
+
+# --- What they get -------------------------------------------------------------------------------------------------
+
+
+def given(sections: Sections, outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
+    """What `benchmarks.silverbox_peers` reads: samples, models, priors, noises, and the tests' first outputs."""
+    training, test = sections.training, sections.multisine
+    arrays: dict[str, Any] = {
+        "u": np.concatenate([training.u, test.u]),
+        "y": np.concatenate([training.y, test.y]),
+        "timed": TIMED,
+        "lengths": np.array(LENGTHS),
+        "tests": np.array(TESTS),
+    }
+    for name in TESTS:
+        section: Regime = getattr(sections, name)
+        arrays |= {f"{name}_u": section.u, f"{name}_given": section.y[:GIVEN]}
+    for name, (ours, model) in MODELS.items():
+        prior = prior_of(name)
+        learned = outcomes[ours].beliefs[TRAINING_SAMPLES]
+        arrays |= {
+            f"{name}_process_variance": 1 / learned.gamma_mean,
+            f"{name}_measurement_variance": 1 / learned.xi_mean,
+        }
+        if isinstance(model, DuffingODE):
+            mean, cov = to_coordinates(prior.mean, prior.cov)
+            mean, cov, direction = mean[_MOTION], cov[np.ix_(_MOTION, _MOTION)], NOISE_DIRECTION
+            arrays[f"{name}_substeps"] = model.substeps
+        else:
+            mean, cov, direction = prior.mean, prior.cov, np.array([1.0, 0.0])
+            arrays[f"{name}_terms"] = as_arrays(model.terms)
+        arrays |= {f"{name}_mean": mean, f"{name}_cov": cov, f"{name}_direction": direction}
+    return arrays
+
+
+def prior_of(name: str) -> JointBelief:
+    """Our prior for a model of `MODELS`."""
+    ours, model = MODELS[name]
+    prior, own = SETTINGS[ours].prior, model.prior()
+    if not isinstance(prior, Prior):
+        return own
+    mean = np.concatenate([prior.state_mean, prior.theta_mean, [prior.eta_mean]])
+    cov = np.zeros((len(mean), len(mean)))
+    cov[:2, :2], cov[2:, 2:] = prior.state_cov, prior.coefficients_cov
+    noises = (prior.gamma_shape, prior.gamma_rate, prior.xi_shape, prior.xi_rate)
+    return JointBelief(own.names, own.units, mean, cov, *noises)
+
+
+# --- What they come to ---------------------------------------------------------------------------------------------
+
+
+def run(
+    peers: Peers, sections: Sections, outcomes: Mapping[str, Outcome], on_row: Callable[[str], None]
+) -> dict[str, Contender]:
+    """All rows: ours, then the peers that share the model; fastcan last."""
+    training = sections.training
+    u, y = training.u[:TIMED], training.y[:TIMED]
+    rows = []
+    for name, (ours, _) in MODELS.items():
+        rows.append(Row(ours, UNIT, timed(_passes(ours, u, y))))
+        rows += [
+            peers.row(f"silverbox {peer} {name} time", title, UNIT)
+            for title, (peer, model) in PEERS.items()
+            if model == name
+        ]
+    times = measure(rows, REPETITIONS, on_row)
+    contenders: dict[str, Contender] = {}
+    for title, time in times.items():
+        if title in outcomes:
+            outcome = outcomes[title]
+            contenders[title] = Contender(time, outcome.rmse, outcome.coverage, outcome.learning)
+            continue
+        if time.reason:
+            contenders[title] = Contender(time, reason=time.reason.removeprefix("NotAvailable: "))
+            continue
+        peer, model = PEERS[title]
+        on_row(f"protocol: {title}")
+        try:
+            answer = peers.ask(f"silverbox {peer} {model} protocol", 1)
+        except NotAvailable as error:
+            contenders[title] = Contender(time, reason=str(error))
+        else:
+            contenders[title] = judge(model, answer, time, sections, outcomes)
+    on_row(f"protocol: {OFFLINE}")
+    contenders[OFFLINE] = _offline(peers, sections)
+    return contenders
+
+
+def _passes(ours: str, u: FloatArray, y: FloatArray) -> Callable[[int], float]:
+    """Goes through the samples, from the prior on, and returns their number."""
+
+    def action(count: int) -> float:
+        for _ in range(count):
+            SETTINGS[ours].estimator().run(u, y)
+        return count * len(u)
+
+    return action
+
+
+def judge(
+    name: str, answer: Mapping[str, Any], time: Result, sections: Sections, outcomes: Mapping[str, Outcome]
+) -> Contender:
+    """Measures what an online peer answered."""
+    noises = outcomes[MODELS[name][0]].beliefs[TRAINING_SAMPLES]
+    learning = {}
+    for samples, mean in zip(LENGTHS, answer["means"], strict=True):
+        estimator = estimator_at(name, np.array(mean), 1 / noises.gamma_mean, 1 / noises.xi_mean)
+        learning[samples] = float("nan") if estimator is None else rmse(simulation_error(estimator, sections.arrow))
+    errors = dict.fromkeys(TESTS, float("nan"))
+    if estimator is not None:
+        errors = {test: rmse(simulation_error(estimator, getattr(sections, test))) for test in TESTS}
+    covers = float("nan")
+    if answer["forecasts"] is not None:
+        covers = coverage_of(np.array(answer["forecasts"]), sections.multisine.y)
+    return Contender(time, errors, covers, learning)
+
+
+def estimator_at(
+    name: str, mean: FloatArray, process_variance: float, measurement_variance: float
+) -> OnlineEstimator | None:
+    """Ours, with a peer's means (n,) of the joint state and its noises; None where a mean is not finite.
+
+    Of the state only the coefficients count: a simulation begins at rest, with the prior's uncertainty.
+    """
+    if not np.isfinite(mean).all():
+        return None
+    _, model = MODELS[name]
+    prior = prior_of(name)
+    if isinstance(model, DuffingODE):
+        whole = np.zeros(len(prior.mean))
+        whole[_MOTION[2:]] = mean[2:]
+        whole, _ = from_coordinates(whole, np.eye(len(whole)))
+    else:
+        whole = np.concatenate([[0.0, 0.0], mean[2:]])
+    belief = JointBelief(
+        prior.names, prior.units, whole, prior.cov, 1.0, process_variance, 1.0, measurement_variance
+    )  # fmt: skip
+    return OnlineEstimator(model, belief)
+
+
+def _offline(peers: Peers, sections: Sections) -> Contender:
+    """Fastcan's row: fitted, and timed, once with each length."""
+    try:
+        answer = peers.ask("silverbox fastcan - protocol", 1)
+    except NotAvailable as error:
+        return Contender(Result(OFFLINE, UNIT), reason=str(error))
+    time = Result(OFFLINE, UNIT, (1e6 * answer["seconds"] / answer["work"],))
+    with np.errstate(over="ignore", invalid="ignore"):
+        learning = {
+            int(samples): rmse(np.array(simulated) - sections.arrow.y)
+            for samples, simulated in answer["learning"].items()
+        }
+        errors = {
+            test: rmse(np.array(simulated) - getattr(sections, test).y)
+            for test, simulated in answer["simulations"].items()
+        }
+    return Contender(time, errors, learning=learning)
+
+
+# --- Results -------------------------------------------------------------------------------------------------------
+
+
+def faster(contenders: Mapping[str, Contender], title: str) -> tuple[float, bool]:
+    """How many times as fast as a peer ours is with the peer's model, and whether its errors are no larger.
+
+    Errors are compared as the submission line gives them, to the microvolt. NaN and False without the peer.
+    """
+    theirs, ours = contenders[title], contenders[MODELS[PEERS[title][1]][0]]
+    if theirs.reason:
+        return float("nan"), False
+    no_worse = all(round(1e6 * ours.errors[test]) <= round(1e6 * theirs.errors[test]) for test in TESTS)
+    return ratio(theirs.time, ours.time), no_worse
+
+
+def report(
+    contenders: Mapping[str, Contender], claims: Mapping[str, tuple[float, bool]], versions: Mapping[str, str]
+) -> None:
+    """Prints the table, and how much faster ours is than dynamax's filter with the same model."""
+    console = Console(highlight=False, markup=False)
+    console.width = max(console.width, 100)
+    console.print("\nPeers, and ours with the same model:")
+    console.print(table(contenders))
+    for title, contender in contenders.items():
+        if contender.reason:
+            console.print(f"{title}: not available: {contender.reason}")
+    console.print(f"µs per sample: median [least, most] of {REPETITIONS} turns over the first {TIMED:,} samples,")
+    console.print("compiled before; fastcan: of its fit to all samples, once")
+    used = [name for name in ("dynamax", "jax", "filterpy", "padasip", "fastcan", "numpy") if name in versions]
+    console.print(", ".join(f"{name} {versions[name]}" for name in used) or "no peers")
+    console.print("\nSpeed at equal or better error:")
+    for title, (times, no_worse) in claims.items():
+        ours = MODELS[PEERS[title][1]][0]
+        if np.isnan(times):
+            console.print(f"  not available: {title}")
+            continue
+        verdict = "PASS" if times >= BAR and no_worse else "MISS"
+        console.print(f"  {verdict}  {ours} is {times:.1f} times as fast as {title}, at least {BAR:g},")
+        console.print(f"        with {_line(contenders[ours])} mV against {_line(contenders[title])} mV")
+
+
+def _line(contender: Contender) -> str:
+    return submission(1e3 * contender.errors[test] for test in TESTS)
+
+
+def table(contenders: Mapping[str, Contender]) -> Table:
+    """A row for each contender, in 100 characters."""
+    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    shown.add_column("")
+    titles = ("multisine\n[mV]", "arrow\n[mV]", "n.e.\n[mV]", "90 %\ncovers", "<1 mV\nafter", "µs per\nsample")
+    for title in (*titles, "[least, most]"):
+        shown.add_column(title, justify="right")
+    for title, contender in contenders.items():
+        if contender.reason:
+            shown.add_row(title, *["-"] * 7)
+            continue
+        low, high = min(contender.time.values), max(contender.time.values)
+        shown.add_row(
+            title,
+            *(f"{1e3 * contender.errors[test]:.3f}" for test in TESTS),
+            "-" if np.isnan(contender.coverage) else f"{contender.coverage:.3f}",
+            str(samples_until_close(contender.learning) or "never"),
+            f"{contender.time.median:.2f}",
+            f"[{low:.2f}, {high:.2f}]" if len(contender.time.values) > 1 else "-",
+        )
+    return shown
+
+
+def _finite(value: float) -> float | None:
+    """A number for JSON, which has no other."""
+    return value if np.isfinite(value) else None

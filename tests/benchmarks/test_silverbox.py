@@ -1,0 +1,207 @@
+"""Peers in the Silverbox protocol: that they get our models and priors, and are judged as ours. None is installed."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.silverbox_protocol import LENGTHS, SETTINGS, TESTS, TRAINING_SAMPLES, Outcome, Sections, evaluate
+from benchmarks import peer_process, silverbox, silverbox_peers
+from benchmarks.peer_process import NotAvailable, Peers
+from benchmarks.silverbox import MODELS, OFFLINE, PEERS, Contender
+from benchmarks.timing import Result
+from duffing_env.silverbox import Regime
+from estimator import DuffingODE, OnlineEstimator
+from estimator.models.ode import N_MOTION, N_STATES, to_coordinates
+from estimator.models.ode import flow as compiled_flow
+
+
+def time(*values: float) -> Result:
+    return Result("row", silverbox.UNIT, values)
+
+
+# --- The models that they get --------------------------------------------------------------------------------------
+
+
+def test_their_ode_moves_as_ours() -> None:
+    rng = np.random.default_rng(0)
+    parameters = np.array([0.49, 0.069, 0.5, 1.96, -1e-3, 0.0, 3e-3])
+    for substeps in (1, 8):
+        z, v, last, now = 0.1 * rng.standard_normal(4)
+        expected = compiled_flow(
+            z, v, parameters, np.array([last, now - last]), substeps, np.empty((N_STATES, N_MOTION)),
+            np.empty((3, N_STATES, N_MOTION)),
+        )  # fmt: skip
+        state = [z, v, *parameters[:5], parameters[6], 0.01]
+        moved = silverbox_peers.flow(substeps)(state, (now, last, 0.0))
+        np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-15)
+
+
+@pytest.fixture(scope="module")
+def sections() -> Sections:
+    """A simulated oscillator, 3,000 samples of training."""
+    rng = np.random.default_rng(1)
+    u = 0.03 * np.convolve(rng.standard_normal(5003), np.full(4, 0.5), mode="valid")
+    y = OnlineEstimator(DuffingODE()).simulate(u, [0.0, 0.0]) + 3e-4 * rng.standard_normal(5000)
+    regimes = {name: Regime(name, u[3000:], y[3000:]) for name in TESTS}
+    return Sections(Regime("training", u[:3000], y[:3000]), **regimes)
+
+
+@dataclass(frozen=True)
+class Learned:
+    gamma_mean: float = 1 / 5e-6**2
+    xi_mean: float = 1 / 3e-4**2
+
+
+@pytest.fixture(scope="module")
+def outcomes() -> dict[str, Outcome]:
+    errors = dict.fromkeys(TESTS, 4e-4)
+    beliefs = {TRAINING_SAMPLES: Learned()}
+    outcome = Outcome(errors, 1e-4, 0.9, 1e-6, 0.0, {50: 4e-4}, beliefs, np.zeros(3))  # type: ignore[arg-type]
+    return {ours: outcome for ours, _ in MODELS.values()}
+
+
+@pytest.fixture(scope="module")
+def given(sections: Sections, outcomes: dict[str, Outcome]) -> dict[str, np.ndarray]:
+    return {name: np.asarray(value) for name, value in silverbox.given(sections, outcomes).items()}
+
+
+def extended_kalman_filter(model: silverbox_peers.Model, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Textbook, with Jacobians by central differences: what dynamax computes."""
+    mean, cov = model.mean.copy(), model.cov + model.process_cov
+    identity = np.eye(len(mean))
+
+    def transition(state: np.ndarray, taps: np.ndarray) -> np.ndarray:
+        return np.concatenate([model.move(state, taps), state[2:]])
+
+    for t, taps in enumerate(silverbox_peers.taps_of(u)):
+        if t:
+            steps = 1e-6 * identity
+            slopes = [(transition(mean + step, taps) - transition(mean - step, taps)) / 2e-6 for step in steps]
+            mean, cov = transition(mean, taps), np.array(slopes).T @ cov @ np.array(slopes) + model.process_cov
+        readout = np.array([model.read(row, taps) for row in identity])
+        gain = cov @ readout / (readout @ cov @ readout + model.measurement_cov[0, 0])
+        mean = mean + gain * (y[t] - model.read(mean, taps))
+        cov = cov - np.outer(gain, readout @ cov)
+    return mean
+
+
+@pytest.mark.parametrize("name", ["ode", "three-tap"])
+def test_with_noises_that_are_known_theirs_is_our_filter(name: str, sections: Sections, given: dict) -> None:
+    u, y = sections.training.u[:300], sections.training.y[:300]
+    theirs = extended_kalman_filter(silverbox_peers.model(given, name), u, y)
+    _, model = MODELS[name]
+    prior = silverbox.prior_of(name)
+    certain = 1e15
+    noises = (certain, certain * 5e-6**2, certain, certain * 3e-4**2)
+    ours = OnlineEstimator(model, type(prior)(prior.names, prior.units, prior.mean, prior.cov, *noises))
+    ours.run(u, y)
+    mean, cov = ours.belief.mean, ours.belief.cov
+    expected = to_coordinates(mean, cov)[0][silverbox._MOTION] if name == "ode" else mean
+    # A regression's prior is one of the state before the first sample here, and of the first sample there.
+    np.testing.assert_allclose(theirs, expected, rtol=1e-6 if name == "ode" else 0.05, atol=1e-3)
+
+
+# --- How they are judged -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_peer_that_answers_our_means_gets_our_errors(
+    name: str, sections: Sections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours, model = MODELS[name]
+    lengths = (500, 3000)
+    monkeypatch.setattr("agents.silverbox_protocol.LENGTHS", lengths)
+    monkeypatch.setattr("agents.silverbox_protocol.TRAINING_SAMPLES", 3000)
+    monkeypatch.setattr("agents.silverbox_protocol.TIMINGS", 1)
+    monkeypatch.setattr(silverbox, "LENGTHS", lengths)
+    monkeypatch.setattr(silverbox, "TRAINING_SAMPLES", 3000)
+    outcome = evaluate(SETTINGS[ours], sections)
+    means = []
+    for belief in outcome.beliefs.values():
+        if isinstance(model, DuffingODE):
+            means.append(to_coordinates(belief.mean, belief.cov)[0][silverbox._MOTION])
+        else:
+            means.append(np.concatenate([[9.0, 9.0], belief.coefficients_mean]))
+    forecasts = [[y, 1e-8] for y in sections.multisine.y]
+    forecasts[:500] = [[y + 1.0, 1e-8] for y in sections.multisine.y[:500]]
+    answer = {"means": [mean.tolist() for mean in means], "forecasts": forecasts}
+    contender = silverbox.judge(name, answer, time(1.0), sections, {ours: outcome})
+    assert contender.coverage == 0.75
+    # The free run of "paper structured" begins at the last two outputs, that of the preset in a filter's state.
+    tolerance = 0.02 if name == "paper" else 1e-6
+    for test in TESTS:
+        assert contender.errors[test] == pytest.approx(outcome.rmse[test], rel=tolerance)
+    for samples in lengths:  # a peer's runs begin with the noises of the end
+        assert contender.learning[samples] == pytest.approx(outcome.learning[samples], rel=max(tolerance, 1e-3))
+
+
+def test_means_that_are_not_finite_have_no_errors(sections: Sections, outcomes: dict[str, Outcome]) -> None:
+    answer = {"means": [[np.nan] * 9] * len(LENGTHS), "forecasts": None}
+    contender = silverbox.judge("three-tap", answer, time(1.0), sections, outcomes)
+    assert all(np.isnan(error) for error in [*contender.errors.values(), contender.coverage])
+    assert contender.to_dict()["samples_until_1_mV"] is None
+
+
+def test_least_squares_rows_get_the_same_regressors(given: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    class LeastSquares:
+        def __init__(self, n: int, **settings: object) -> None:
+            self.w = np.zeros(n)
+
+        def run(self, d: np.ndarray, x: np.ndarray) -> None:
+            self.w = np.linalg.lstsq(x, d, rcond=None)[0]
+
+    monkeypatch.setitem(sys.modules, "padasip", type(sys)("padasip"))
+    filters = type(sys)("padasip.filters")
+    filters.FilterRLS = LeastSquares  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "padasip.filters", filters)
+    noiseless = dict(given)
+    truth = np.array([1.45, -1.5, -0.93, 0.1, 0.2, 0.1, 1e-3])
+    noiseless["y"] = OnlineEstimator(MODELS["three-tap"][1]).simulate(given["u"], [0.0, 0.0])
+    u, y = given["u"], np.zeros(400)
+    for t in range(2, 400):
+        y[t] = truth @ [y[t - 1], y[t - 1] ** 3, y[t - 2], u[t], u[t - 1], u[t - 2], 1.0]
+    noiseless |= {"u": u[:400], "y": y}
+    means, forecasts = silverbox_peers.padasip_rls(noiseless, "three-tap")(400, (400,))
+    np.testing.assert_allclose(means[0][2:], truth, atol=1e-8)
+    assert forecasts is None
+
+
+def test_speed_counts_at_equal_or_better_errors() -> None:
+    ours = Contender(time(1.0, 2.0, 3.0), dict.fromkeys(TESTS, 4.004e-4))
+    for error, no_worse in ((4.0e-4, True), (3.99e-4, False), (5e-4, True)):
+        theirs = Contender(time(20.0, 9.0, 30.0), dict.fromkeys(TESTS, error))
+        contenders = {"ODE linear": ours, "dynamax EKF, ODE linear": theirs}
+        assert silverbox.faster(contenders, "dynamax EKF, ODE linear") == (10.0, no_worse)
+
+
+# --- Peers that are missing ----------------------------------------------------------------------------------------
+
+
+def test_missing_peers_are_rows_that_say_so(
+    sections: Sections, outcomes: dict[str, Outcome], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(peer_process, "ensure_environment", lambda: Path(sys.executable))
+    monkeypatch.setattr(silverbox, "REPETITIONS", 1)
+    monkeypatch.setattr("benchmarks.timing.LONG_ENOUGH", 0.0)
+    found = silverbox.compare(sections, outcomes)
+    printed = capsys.readouterr().out
+    for title in (*PEERS, OFFLINE):
+        package = title.split()[0].replace("dynamax", "jax")  # its row imports jax first
+        reason = f"ModuleNotFoundError: No module named '{package}"
+        assert found["rows"][title]["not_available"].startswith(reason)
+        assert f"{title}: not available: {reason}" in printed
+    for ours, _ in MODELS.values():
+        assert found["rows"][ours]["rmse"] == dict.fromkeys(TESTS, 4e-4)
+        assert found["rows"][ours]["time"]["median"] > 0
+    assert set(found["times_as_fast"].values()) == {None}
+    assert "not available: dynamax EKF, ODE linear" in printed
+
+
+def test_without_peers_the_table_says_so(sections: Sections, outcomes: dict[str, Outcome], tmp_path: Path) -> None:
+    with Peers(tmp_path / "given.npz", wanted=False) as peers:
+        assert silverbox._offline(peers, sections).reason == "--no-peers"
+        with pytest.raises(NotAvailable, match="--no-peers"):
+            peers.ask("silverbox dynamax ode time", 1)

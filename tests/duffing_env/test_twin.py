@@ -1,0 +1,22 @@
+"""The twins' constants are what the record gives."""
+
+import pytest
+
+from duffing_env.twin import identify_continuous_twin, identify_twin
+from estimator import CONTINUOUS_TWIN, SILVERBOX_TWIN
+
+PARAMETERS = ("m", "c", "a", "b")
+
+
+def test_the_twin_is_identified_from_the_record(record):
+    twin, residual = identify_twin(record)
+    for name in PARAMETERS:
+        assert getattr(twin, name) == pytest.approx(getattr(SILVERBOX_TWIN, name), rel=5e-5)
+    assert residual == pytest.approx(2.292e-3, rel=1e-3)
+
+
+def test_the_continuous_twin_is_identified_from_the_record(record):
+    found = identify_continuous_twin(record)
+    twin = CONTINUOUS_TWIN
+    expected = {"stiffness": twin.a / twin.m, "damping": twin.c / twin.m, "gain": 1 / twin.m, "cubic": twin.b / twin.m}
+    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=5e-6)
