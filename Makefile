@@ -13,7 +13,7 @@ test: $(READY)  ## all tests but the slow evidence
 	$(BIN)/python -m pytest -m "not slow"
 
 docs: $(READY)  ## the manual, into build/manual; a warning is an error
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file docs/manual/mkdocs.yml
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file docs/manual/mkdocs.yml
 	@echo "The manual is in build/manual: open index.html, or see it with its search at localhost:8000 after"
 	@echo "  $(BIN)/python -m http.server --directory build/manual"
 
