@@ -1,9 +1,9 @@
-# The two commands: `make demo` and `make test`. Both build .venv from the lock when it is missing.
+# The commands: `make demo`, `make test`, `make docs`. They build .venv from the lock when it is missing.
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test lint format bench evidence lock clean
+.PHONY: demo test docs lint format bench evidence lock clean
 
 demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
 	rm -rf runs/demo
@@ -11,6 +11,11 @@ demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the 
 
 test: $(READY)  ## all tests but the slow evidence
 	$(BIN)/python -m pytest -m "not slow"
+
+docs: $(READY)  ## the manual, into build/manual; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file docs/manual/mkdocs.yml
+	@echo "The manual is in build/manual: open index.html, or see it with its search at localhost:8000 after"
+	@echo "  $(BIN)/python -m http.server --directory build/manual"
 
 evidence: $(READY)  ## the slow evidence: coverage tables, reproduction
 	$(BIN)/python -m pytest -m slow -s

@@ -87,6 +87,11 @@ class Batch:
             self._outcome,
         )
 
+    def measure(self, u: float, y: float) -> None:
+        """Let the next step play this input and output [V], of an experiment that replays a record of one sample."""
+        recorded_u, recorded_y = self._recorded
+        recorded_u[0], recorded_y[0] = u, y
+
     def outcome(self, name: str) -> FloatArray:
         """(n,) what the last step left behind, by its name in `OUTCOME`; a view."""
         return self._outcome[OUTCOME[name], : self.size]

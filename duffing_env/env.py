@@ -212,7 +212,7 @@ class DuffingEnv(gym.Env[Any, Any]):
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
         value = _one_number(action)
         batch = self._batch
-        batch.step(value)
+        self._apply(value)
         terminated = bool(batch.outcome("terminated")[0])
         truncated = bool(batch.outcome("truncated")[0])
         info: dict[str, Any] = {name: batch.outcome(name)[0].item() for name in self._reported}
@@ -220,14 +220,21 @@ class DuffingEnv(gym.Env[Any, Any]):
             info[flag] = bool(batch.outcome(flag)[0])
         if terminated or truncated:
             self._running = False
-            info["belief"] = self.belief
-            info["truth"] = self.truth
+            info |= self._final_info()
         if self._screen is not None:
             self._draw()
         return batch.observations[0].copy(), batch.outcome("reward")[0].item(), terminated, truncated, info
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)
+
+    def _apply(self, action: float) -> None:
+        """Let one sample pass; the action is in [-1, 1]."""
+        self._batch.step(action)
+
+    def _final_info(self) -> dict[str, Any]:
+        """What is told at the end of an episode only."""
+        return {"belief": self.belief, "truth": self.truth}
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """Input, output and posterior so far: an RGB array (height, width, 3) in mode ``rgb_array``."""
@@ -243,7 +250,7 @@ class DuffingEnv(gym.Env[Any, Any]):
             self._screen = Screen(
                 self.render_mode, self.max_input, self.experiment.max_output, self.metadata["render_fps"]
             )  # fmt: skip
-        self._screen.start(self.truth, self.belief, self.horizon)
+        self._screen.start(self._batch.oscillator(0), self.belief, self.horizon)
 
     def _draw(self) -> None:
         assert self._screen is not None

@@ -209,9 +209,9 @@ class SimulatedExperiment(Experiment):
             "process_noise": self.process_noise,
             "measurement_noise": self.measurement_noise,
             "spread": self.spread if self.plant_spread is None else self.plant_spread,
-            "budget": np.inf if self.max_rms is None else self.horizon * self.max_rms**2,
+            "budget": np.inf if self.max_rms is None else self.horizon * self.max_rms * self.max_rms,
             "max_slew": np.inf if self.max_slew is None else self.max_slew,
-            "input_cost": self.input_cost / self.max_input**2,
+            "input_cost": self.input_cost / self.max_input / self.max_input,
             "jump": self.jump,
             **{f"walk_{c}": (self.drift * std) ** 2 for c, std in zip(COEFFICIENTS, self._prior_stds, strict=True)},
         }

@@ -62,7 +62,7 @@ class PowerEnv(DuffingEnv):
 
     ## Reward, starting state, episode end, information
 
-    As `DuffingEnv`; the information gained over an episode is 12 to 17 nats.
+    As `DuffingEnv`; the information gained over an episode is 9 to 16 nats.
 
     ## Arguments
 

@@ -1,21 +1,18 @@
 """The rewards by name. What each is worth, and how it can be fooled, stands here; the kernel computes them.
 
-================== =============================================================================================
-``information_gain`` entropy decrease of q(θ, η) in nats: ½ log det C_{t-1} - ½ log det C_t. What the estimator
-                     believes it learned. Equals the true information gain only where the posterior is calibrated
-                     (structured); an over-confident one (mean field) pays for its own mistakes.
-``log_posterior``    increase of log q(θ, η) at the true coefficients, in nats. Its expected sum is a lower bound on
-                     the expected information gain, whatever q is: over-confidence lowers it. Needs the truth, so it
-                     is for training and for tests.
-``parameter_error``  decrease of the mean relative error of the estimates of m, c, a and b, each error capped at 1;
-                     an episode's sum lies in [-1, 1]. Noisy: the error of one estimate is one draw of what its
-                     posterior describes.
-``fisher``           increase of ½ log det(Λ0 + F), F the Fisher information of the outputs at the true coefficients
-                     and Λ0 the prior's precision: what an efficient estimator would gain. Needs the truth, so it is for
-                     training and for tests; no estimator can talk it up (`duffing_env.fisher`).
-``free_energy``      minus the free energy of the sample in nats: how well the output was predicted. Rewards inputs
-                     whose outcome is known already, so an agent that maximises it learns nothing; the foil.
-================== =============================================================================================
+- ``information_gain``: entropy decrease of q(θ, η) in nats: ½ log det C_{t-1} - ½ log det C_t. What the estimator
+  believes it learned. Equals the true information gain only where the posterior is calibrated (structured); an
+  over-confident one (mean field) pays for its own mistakes.
+- ``log_posterior``: increase of log q(θ, η) at the true coefficients, in nats. Its expected sum is a lower bound on the
+  expected information gain, whatever q is: over-confidence lowers it. Needs the truth, so it is for training and for
+  tests.
+- ``parameter_error``: decrease of the mean relative error of the estimates of m, c, a and b, each error capped at 1; an
+  episode's sum lies in [-1, 1]. Noisy: the error of one estimate is one draw of what its posterior describes.
+- ``fisher``: increase of ½ log det(Λ0 + F), F the Fisher information of the outputs at the true coefficients and Λ0 the
+  prior's precision: what an efficient estimator would gain. Needs the truth, so it is for training and for tests; no
+  estimator can talk it up (`duffing_env.fisher`).
+- ``free_energy``: minus the free energy of the sample in nats: how well the output was predicted. Rewards inputs whose
+  outcome is known already, so an agent that maximises it learns nothing; the foil.
 
 Information gain, log posterior and parameter error telescope: an episode's sum depends on its first and last belief
 only. So does the Fisher information, on its first and last matrix.

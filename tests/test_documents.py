@@ -7,10 +7,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+# Pages that the manual is built with, out of docstrings; `make docs` fails where a link among them leads nowhere.
+GENERATED = ("tracks/", "reference/", "rewards.md")
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/estimators.md"])
+@pytest.mark.parametrize("document", ["README.md", "docs/estimators.md", "docs/own_plant.md", "docs/quickstart.md"])
 def test_examples_run(document):
     failures, examples = doctest.testfile(str(ROOT / document), module_relative=False, verbose=False)
     assert examples > 10
@@ -20,7 +22,7 @@ def test_examples_run(document):
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_links_lead_somewhere(document):
     for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
-        if "://" not in target:
+        if "://" not in target and not target.startswith(GENERATED):
             assert (document.parent / target).exists(), f"{document.name} points to {target}, which is not there"
 
 

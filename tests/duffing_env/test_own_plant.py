@@ -1,0 +1,233 @@
+"""A plant of one's own: it gets what is promised, and the estimator gets what it gives."""
+
+import copy
+import doctest
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from gymnasium.vector import SyncVectorEnv
+
+from agents import make_policy
+from duffing_env import own_plant
+from duffing_env.env import DuffingEnv
+from duffing_env.own_plant import PlantEnv
+from duffing_env.rewards import REWARDS
+from estimator import Prior
+
+TRACK = "duffing_env/Plant-v0"
+
+
+class Difference:
+    """Eq. (2) without noise; takes down what was asked of it."""
+
+    def __init__(self):
+        self.inputs, self.resets = [], 0
+
+    def reset(self):
+        self.x = self.last = 0.0
+        self.resets += 1
+
+    def step(self, u):
+        self.inputs.append(u)
+        self.x, self.last = 1.5 * self.x - 1.4 * self.x**3 - 0.95 * self.last + 0.4 * u, self.x
+        return self.x
+
+
+class Scripted:
+    """Gives the outputs of a list in turn; an exception in the list is raised."""
+
+    def __init__(self, outputs):
+        self.outputs = outputs
+
+    def reset(self):
+        self.left = list(self.outputs)
+
+    def step(self, u):
+        output = self.left.pop(0)
+        if isinstance(output, Exception):
+            raise output
+        return output
+
+
+def actions(count, seed=0):
+    return np.random.default_rng(seed).uniform(-1.2, 1.2, (count, 1)).astype(np.float32)
+
+
+def test_example_of_the_docstring():
+    results = doctest.testmod(own_plant)
+    assert results.attempted > 3
+    assert results.failed == 0
+
+
+@pytest.mark.parametrize("reward", ["information_gain", "free_energy"])
+@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+def test_a_plant_that_gives_the_simulated_outputs_gives_the_same_episode_to_the_bit(factorisation, reward):
+    options = {"factorisation": factorisation, "reward": reward, "max_output": 0.25}
+    simulated = DuffingEnv(**options)
+    told, outputs, played = [simulated.reset(seed=3)], [], actions(256)
+    for action in played:
+        told.append(simulated.step(action))
+        outputs.append(simulated._batch.quantity("y")[0])
+        if told[-1][2]:
+            break
+    assert told[-1][2]
+    env = PlantEnv(Scripted(outputs), **options)
+    np.testing.assert_array_equal(env.reset(seed=99)[0], told[0][0])
+    for action, expected in zip(played, told[1:], strict=False):
+        observation, received, terminated, truncated, info = env.step(action)
+        np.testing.assert_array_equal(observation, expected[0])
+        assert (received, terminated, truncated) == expected[1:4]
+        assert info["information_gain"] == expected[4]["information_gain"]
+    np.testing.assert_array_equal(info["belief"].record, expected[4]["belief"].record)
+    assert sorted(info) == ["belief", "diverged", "information_gain"]
+
+
+def test_the_plant_gets_the_clipped_float32_action_in_volts():
+    plant = Difference()
+    env = gym.make(TRACK, plant=plant, max_input=0.07, max_output=10.0)
+    env.reset()
+    assert (plant.resets, plant.inputs) == (1, [])
+    asked = [0.1, -1.0, 1 + 1e-6, 7.0, -1e300, np.float64(np.pi / 10)]
+    for action in asked:
+        observation, *_ = env.step([action])
+        assert observation[18] == np.float32(plant.inputs[-1] / 0.07)
+    assert plant.inputs == [0.07 * float(np.float32(min(max(action, -1), 1))) for action in asked]
+    assert all(type(u) is float for u in plant.inputs)
+
+
+@pytest.mark.parametrize("output", [np.nan, np.inf, -np.inf, 1e200, "volts", None, [0.1, 0.2], OSError("cable")])
+def test_a_plant_that_fails_ends_the_episode_flagged_with_the_belief_before(output):
+    env = PlantEnv(Scripted([0.01, -0.02, output]))
+    first, _ = env.reset(seed=0)
+    env.step([0.5])
+    _, _, terminated, _, info = env.step([0.5])
+    assert not terminated
+    assert not info["diverged"]
+    before = env.belief
+    observation, reward, terminated, truncated, info = env.step([0.5])
+    assert (reward, terminated, truncated, info["diverged"], info["information_gain"]) == (0.0, True, False, True, 0.0)
+    assert observation in env.observation_space
+    np.testing.assert_array_equal(info["belief"].record, before.record)
+    assert ("plant_error" in info) == (not isinstance(output, float))
+    if isinstance(output, OSError):
+        assert info["plant_error"] == "OSError: cable"
+    with pytest.raises(ResetNeeded):
+        env.step([0.5])
+    np.testing.assert_array_equal(env.reset()[0], first)
+    assert "plant_error" not in env.step([0.5])[4]
+
+
+def test_a_plant_that_cannot_be_reset_begins_no_episode():
+    class Broken(Difference):
+        def reset(self):
+            super().reset()
+            if self.resets == 2:
+                raise OSError("no answer")
+
+    env = PlantEnv(Broken())
+    env.reset()
+    with pytest.raises(OSError, match="no answer"):
+        env.reset()
+    with pytest.raises(ResetNeeded):
+        env.step([0.0])
+    env.reset()
+    assert not env.step([0.0])[2]
+
+
+def test_refused_actions_do_not_reach_the_plant():
+    plant = Difference()
+    env = PlantEnv(plant)
+    with pytest.raises(ResetNeeded):
+        env.step([0.0])
+    env.reset()
+    with pytest.raises(ValueError, match="action must be"):
+        env.step([np.nan])
+    assert plant.inputs == []
+
+
+@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(factorisation):
+    from stable_baselines3.common.env_checker import check_env as sb3_check
+
+    gymnasium_check(gym.make(TRACK, plant=Difference(), factorisation=factorisation).unwrapped, skip_render_check=True)
+    sb3_check(gym.make(TRACK, plant=Difference(), factorisation=factorisation))
+
+
+def test_policies_find_their_limits():
+    env = gym.make(TRACK, plant=Difference(), horizon=30, max_input=0.05, max_output=1.0)
+    observation, _ = env.reset()
+    policy, state, ended = make_policy("prbs", env), None, []
+    while not any(ended[-1:]):
+        action, state = policy.predict(observation, state)
+        observation, _, _, truncated, _ = env.step(action)
+        ended.append(truncated)
+    assert len(ended) == 30
+    assert set(map(abs, env.unwrapped.plant.inputs)) == {0.05}
+
+
+def test_nobody_knows_the_truth():
+    env = PlantEnv(Difference())
+    with pytest.raises(AttributeError, match="nobody knows"):
+        _ = env.truth
+    assert not hasattr(env, "truth")
+    for reward in set(REWARDS) - {"information_gain", "free_energy"}:
+        with pytest.raises(ValueError, match=f"not be '{reward}'.*use 'information_gain'"):
+            PlantEnv(Difference(), reward=reward)
+
+
+@pytest.mark.parametrize(
+    ("plant", "options", "message"),
+    [
+        (None, {}, r"methods reset\(\) and step\(u\), but None has no reset"),
+        (type("Half", (), {"reset": print}), {}, r"has no step\(\)"),
+        (Difference(), {"prior": "flat"}, r"prior must be an estimator.Prior or None, but is 'flat'"),
+        (Difference(), {"horizon": 0}, "horizon must be a whole number"),
+        (Difference(), {"spread": 0.1}, "spread=0.1 is no option of this environment"),
+    ],
+)
+def test_bad_arguments_are_refused_with_a_remedy(plant, options, message):
+    with pytest.raises(ValueError, match=message):
+        PlantEnv(plant, **options)
+
+
+def test_a_prior_of_ones_own_is_where_episodes_start():
+    prior = Prior.silverbox_twin(spread=0.1, state_std=0.2)
+    env = PlantEnv(Difference(), prior=prior)
+    env.reset()
+    np.testing.assert_array_equal(env.belief.coefficients_cov, prior.coefficients_cov)
+    env.step([1.0])
+    assert env.belief.entropy() < PlantEnv(Difference(), prior=prior).belief.entropy()
+
+
+def test_several_plants_are_several_environments():
+    plants = [Difference(), Difference()]
+    with pytest.raises(ValueError, match="SyncVectorEnv"):
+        gym.make_vec(TRACK, num_envs=2, plant=plants[0])
+    envs = SyncVectorEnv([lambda plant=plant: PlantEnv(plant) for plant in plants])
+    envs.reset()
+    envs.step(np.array([[1.0], [-1.0]], dtype=np.float32))
+    assert [plant.inputs for plant in plants] == [[0.15], [-0.15]]
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+def test_copies_continue_apart(copied):
+    env = PlantEnv(Difference(), max_output=1.0)
+    env.reset()
+    for action in actions(20):
+        env.step(action)
+    twin = copied(env)
+    for action in actions(20, seed=1):
+        np.testing.assert_array_equal(env.step(action)[0], twin.step(action)[0])
+    assert twin.plant is not env.plant
+
+
+def test_it_is_drawn():
+    env = gym.make(TRACK, plant=Difference(), render_mode="rgb_array")
+    env.reset()
+    blank = env.render()
+    env.step([1.0])
+    assert (env.render() != blank).any()
