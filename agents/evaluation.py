@@ -91,9 +91,12 @@ def evaluate(
             on_policy(name)
         evaluation, beliefs, truth, experiment = _roll_out(name, env_id, systems, seed, options)
         if type(experiment) is SimulatedExperiment and experiment.jump == 0:
-            gains = metrics.information(evaluation.inputs, truth, experiment)
+            gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
             means = np.array([belief.coefficients_mean for belief in beliefs])
             evaluation.metrics["fisher_gain"] = gains
+            efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
+            if efficiency is not None:  # an oracle is stored, of the systems of seed 0
+                evaluation.metrics["efficiency"] = efficiency
             evaluation.metrics["silverbox_equivalent"] = metrics.silverbox_equivalents(gains, truth, experiment, seed)
             evaluation.metrics["simulation_rmse"] = metrics.simulation_errors(means, truth)
             evaluation.estimators.update(_audit(evaluation, truth, experiment))

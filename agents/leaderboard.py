@@ -57,6 +57,7 @@ METRICS = {
     "crest_factor": Metric("crest factor", 2),
     "decision_time": Metric("time per decision / µs", 2, 1e6),
     "fisher_gain": Metric("Fisher information / nat", 2),
+    "efficiency": Metric("D-efficiency / %", 1, 100),
     "silverbox_equivalent": Metric("Silverbox equivalent / samples", 0, 1.0, _MEDIAN),
     "simulation_rmse": Metric("RMSE on the twin's arrow / mV", 3, 1e3, _MEDIAN),
     "arrow_rmse": Metric("RMSE on the real arrow / mV", 2, 1e3, _MEDIAN),

@@ -62,19 +62,34 @@ def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
     return {"input_power": power, "input_peak": peak, "crest_factor": crest}
 
 
-def information(inputs: FloatArray, truth: PhysicalParameters, experiment: Any) -> FloatArray:
+def information(
+    inputs: FloatArray, truth: PhysicalParameters, experiment: Any, outputs: FloatArray | None = None
+) -> FloatArray:
     """(n,) ½ log det(Λ0 + F) - ½ log det Λ0 [nats] of inputs (T, n): what an efficient estimator gains from them.
 
-    F is the Fisher information at the true coefficients, along the response without noise; Λ0 the inverse covariance
-    of the environment's prior.
+    F is the Fisher information at the true coefficients, along the outputs (T, n) that were seen, or along the
+    response without noise; Λ0 is the inverse covariance of the environment's prior.
     """
     F = fisher_information(
-        to_coefficients(truth), inputs.T, experiment.process_noise, experiment.measurement_noise
+        to_coefficients(truth), inputs.T, experiment.process_noise, experiment.measurement_noise,
+        y=None if outputs is None else outputs.T,
     )  # fmt: skip
     cov = experiment.believed.coefficients_cov
     std = np.sqrt(np.diag(cov))
     prior = np.linalg.inv(cov / np.outer(std, std))
     return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])
+
+
+def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatArray | None:
+    """(n,) D-efficiency of the systems that the track's stored oracle has (`agents.oracle`); None without one."""
+    from agents.oracle import Oracle, Systems
+
+    try:
+        oracle = Oracle.load(Systems.of(env_id, evaluation.inputs.shape[1], options))
+    except FileNotFoundError:
+        return None
+    n = len(oracle.values)
+    return oracle.efficiency(evaluation.inputs.T[:n], evaluation.outputs.T[:n])
 
 
 def silverbox_equivalents(gains: FloatArray, truth: PhysicalParameters, experiment: Any, seed: int) -> FloatArray:

@@ -128,7 +128,7 @@ def _policies() -> str:
     for name, made in POLICIES.items():
         arguments = made.args if isinstance(made, functools.partial) else ()
         function = made.func if isinstance(made, functools.partial) else made
-        call = ", ".join(arguments)
+        call = ", ".join(argument for argument in arguments if isinstance(argument, str))
         rows.append(f"| `{name}` | {_first_line(function)}{f' ({call})' if call else ''} |")
     return "\n".join(
         [

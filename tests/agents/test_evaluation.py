@@ -63,20 +63,26 @@ def log_density(belief, point):
     return -0.5 * z @ np.linalg.inv(correlation) @ z - spread - 2 * np.log(2 * np.pi)
 
 
-def fisher_gain(coefficients, inputs, prior):
-    """½ log det of a Kalman filter's covariance of (θ, η), linearised at the truth without noise: before and after."""
+def fisher_gain(coefficients, inputs, outputs, prior):
+    """½ log det of a Kalman filter's covariance of (θ, η), linearised where one with the true ones is: before and after."""
     theta1, theta2, theta3, eta = coefficients
-    x = last_x = 0.0
-    cov = np.zeros((6, 6))
+    state, known, cov = np.zeros(2), np.zeros((2, 2)), np.zeros((6, 6))
     cov[2:, 2:] = prior.coefficients_cov
-    for u in inputs:
+    noise = 5e-4**2
+    for u, y in zip(inputs, outputs, strict=True):
+        x, last_x = state
         jacobian = np.eye(6)
         jacobian[0] = [theta1 + 3 * theta2 * x**2, theta3, x, x**3, last_x, u]
         jacobian[1] = [1, 0, 0, 0, 0, 0]
+        transition = jacobian[:2, :2]
         cov = jacobian @ cov @ jacobian.T
-        cov[0, 0] += 5e-4**2
-        cov = cov - np.outer(cov[:, 0], cov[0]) / (cov[0, 0] + 5e-4**2)
-        x, last_x = theta1 * x + theta2 * x**3 + theta3 * last_x + eta * u, x
+        known = transition @ known @ transition.T
+        cov[0, 0] += noise
+        known[0, 0] += noise
+        innovation = y - (theta1 * x + theta2 * x**3 + theta3 * last_x + eta * u)
+        state = np.array([y - innovation, x]) + known[:, 0] / (known[0, 0] + noise) * innovation
+        cov = cov - np.outer(cov[:, 0], cov[0]) / (cov[0, 0] + noise)
+        known = known - np.outer(known[:, 0], known[0]) / (known[0, 0] + noise)
     return 0.5 * (np.linalg.slogdet(prior.coefficients_cov)[1] - np.linalg.slogdet(cov[2:, 2:])[1])
 
 
@@ -166,7 +172,7 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
         assert measured.pop("crest_factor") == pytest.approx(peak / np.sqrt(power), rel=slack)
         assert 0 < measured.pop("decision_time") < 1
         full_prior = Prior.silverbox_twin(options.get("spread", 0.3))  # mean field leaves out its cross-covariances
-        gain = fisher_gain(coefficients, single.inputs, full_prior)
+        gain = fisher_gain(coefficients, single.inputs, single.outputs, full_prior)
         assert measured.pop("fisher_gain") == pytest.approx(gain, abs=1e-3)
         assert measured.pop("silverbox_equivalent") > 0
         u = regime_input("arrow", np.random.default_rng(0))[-8192:]
