@@ -4,7 +4,7 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 """
 
 from estimator.belief import Belief, Prior
-from estimator.fisher import cramer_rao, fisher_information, relative_covariance
+from estimator.fisher import cramer_rao, fisher_information, ode_information, relative_covariance
 from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE
@@ -35,6 +35,7 @@ __all__ = [
     "cramer_rao",
     "fisher_information",
     "load_estimator",
+    "ode_information",
     "relative_covariance",
     "save_estimator",
     "to_coefficients",
