@@ -97,7 +97,7 @@ def row(design: Design) -> str:
 class Config:
     """Print what the inputs of policies are worth against the stored oracles."""
 
-    tracks: tuple[str, ...] = ("duffing_env/Amplitude-v0", "duffing_env/Short-v0", "duffing_env/Power-v0")
+    tracks: tuple[str, ...] = tuple(f"duffing_env/{name}-v0" for name in ("Amplitude", "Short", "Power", "Output"))
     """Ids of tracks with a stored oracle."""
     policies: tuple[str, ...] = ("efe", "efe-myopic", "prbs", "uniform", "silverbox-multisine")
     """Names of policies, or run folders."""

@@ -6,7 +6,7 @@ Useful alone, on any recorded input and output: it knows no environment and no p
 from estimator.belief import Belief, Prior
 from estimator.continuous import CONTINUOUS_TWIN, ContinuousBelief, continuous_prior
 from estimator.ensemble import NoiseRatio
-from estimator.fisher import cramer_rao, fisher_information, relative_covariance
+from estimator.fisher import cramer_rao, fisher_information, ode_information, relative_covariance
 from estimator.gaussian import JointBelief
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE
@@ -41,6 +41,7 @@ __all__ = [
     "cramer_rao",
     "fisher_information",
     "load_estimator",
+    "ode_information",
     "relative_covariance",
     "save_estimator",
     "to_coefficients",

@@ -1,4 +1,4 @@
-"""What an experiment can tell at best: Fisher information and Cramér-Rao bounds of the coefficients of Eq. (2).
+"""What an experiment can tell at best: Fisher information and Cramér-Rao bounds, of Eq. (2) and of Eq. (1).
 
 The displacement is latent, so an output tells about the coefficients only what the past outputs did not. With the
 Kalman filter of the model linearised along the trajectory, ν_t the innovation, S_t its variance, s_t = -∂ν_t/∂(θ, η),
@@ -19,7 +19,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from estimator.checks import series
 from estimator.lanes import jit, kernel
+from estimator.models.ode import N_MOTION, N_STATES, NOISE_DIRECTION, DuffingODE, flow
 from estimator.parameters import SAMPLING_STEP, Coefficients, FloatArray, physical_jacobian, to_physical
 
 
@@ -82,6 +84,48 @@ def fisher_information(
     return information.reshape(*shape, 4, 4)
 
 
+def ode_information(
+    parameters: npt.ArrayLike,
+    u: npt.ArrayLike,
+    process_noise: float = 5e-6,
+    measurement_noise: float = 1e-3,
+    *,
+    model: DuffingODE | None = None,
+) -> FloatArray:
+    """Fisher information of the parameters of Eq. (1) in the outputs that an input brings about.
+
+    The other parameters of `DuffingODE` are 0 and known. The motion starts at rest at the first sample.
+
+    Args:
+        parameters: (4,) stiffness [s⁻²], damping [s⁻¹], gain [s⁻²] and cubic stiffness [V⁻² s⁻²].
+        u: (T,) inputs at the samples [V].
+        process_noise: what the process noise of a sample does to x: standard deviation [V], 0 or more.
+        measurement_noise: standard deviation of v [V], positive.
+        model: says how the input runs between samples; by default linearly.
+
+    Returns:
+        (4, 4), in the units of ``parameters``, along the response without noise.
+
+    Raises:
+        ValueError: for shapes that do not fit, or a noise that is out of range.
+    """
+    if not 0 <= process_noise < np.inf:
+        raise ValueError(f"process_noise must be 0 or more and finite, but is {process_noise}; pass it in V")
+    if not 0 < measurement_noise < np.inf:
+        raise ValueError(f"measurement_noise must be positive and finite, but is {measurement_noise}; pass it in V")
+    values, inputs = np.array(parameters, dtype=np.float64), series("u", u)
+    if values.shape != (4,):
+        raise ValueError(f"parameters must have shape (4,), but have {values.shape}; pass k, c, g and b")
+    model = model or DuffingODE()
+    scales = SAMPLING_STEP ** np.array([2.0, 1.0, 2.0, 2.0])  # to units per sample
+    information = np.zeros((4, 4))
+    _accumulate_ode(
+        np.concatenate([values * scales, np.zeros(3)]), model.pieces(inputs), model.substeps,
+        float(process_noise) ** 2, float(measurement_noise) ** 2, information,
+    )  # fmt: skip
+    return information * np.outer(scales, scales)
+
+
 def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = None) -> FloatArray:
     """Lower bound of the error covariance of any estimate of (θ1, θ2, θ3, η).
 
@@ -139,6 +183,32 @@ def as_rows(coefficients: Coefficients) -> FloatArray:
     """(..., 4) the values of (θ1, θ2, θ3, η)."""
     c = coefficients
     return np.stack([c.theta1, c.theta2, c.theta3, c.eta], axis=-1)
+
+
+@kernel
+def _accumulate_ode(p, pieces, substeps, q, r, information):
+    """Fill in the information (4, 4) of the first four of the motion's parameters p (7,), in units per sample."""
+    J, work = np.empty((N_STATES, N_MOTION)), np.empty((3, N_STATES, N_MOTION))
+    S, P = np.zeros((N_STATES, 4)), np.zeros((N_STATES, N_STATES))
+    direction = NOISE_DIRECTION.copy()
+    z, v = 0.0, 0.0
+    for t in range(len(pieces)):
+        z, v = flow(z, v, p, pieces[t], substeps, J, work)
+        A = J[:, :N_STATES].copy()
+        S = A @ S + J[:, N_STATES : N_STATES + 4]
+        P = A @ P @ A.T
+        for i in range(N_STATES):
+            for j in range(N_STATES):
+                P[i, j] += q * direction[i] * direction[j]
+        weight = 1.0 / (P[0, 0] + r)
+        told, gain = S[0].copy(), weight * P[:, 0].copy()
+        for j in range(4):
+            for k in range(4):
+                information[j, k] += weight * told[j] * told[k]
+        for i in range(N_STATES):
+            for j in range(4):
+                S[i, j] -= gain[i] * told[j]
+        P = P - np.outer(gain, P[0])
 
 
 @kernel

@@ -13,9 +13,12 @@ counted again by the next. The teaching part then telescopes: a plan of the whol
 A displacement x_h must stay within the limit by ``margin`` standard deviations of the output that is then predicted;
 plans that do not are the worse the further they go beyond.
 
-The search is a local one: the last plan, shifted by one sample, is mutated in rounds of `estimator.lanes.LANES`
-candidates, each round from the best so far. Under an amplitude limit the best inputs are nearly all at their limit, so
-candidates are sequences of signs, now and then with a value between. Horizon 1 is the myopic special case.
+The search is a local one (`agents.policies.planning`): the last plan, shifted by one sample, is mutated in rounds of
+`estimator.lanes.LANES` candidates, each round from the best so far. Under an amplitude limit the best inputs are nearly
+all at their limit, so candidates are sequences of signs, now and then with a value between. Horizon 1 is myopic.
+
+Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
+climbs by gradient (`agents.policies.pursuit`): then the question is when to spend, which no short horizon can answer.
 """
 
 from __future__ import annotations
@@ -32,8 +35,8 @@ from estimator.parameters import FloatArray
 #: The last plans (n, horizon) in V, and the streams of random numbers (n, 4).
 PlannerState = tuple[FloatArray, npt.NDArray[np.uint64]]
 
-#: Samples to plan for under an amplitude limit: about two periods of the oscillator.
-_HORIZON = 16
+#: Samples to plan for under an amplitude limit: more than a period of the oscillator.
+_HORIZON = 12
 
 # Places in the observation.
 _TIME_LEFT, _BUDGET_LEFT = 20, 21
@@ -49,15 +52,16 @@ class Planner:
         env: the unwrapped environment, single or vector, whose beliefs it reads: `predict` must be called between
             its steps, with its observations.
         seed: of the search.
-        horizon: samples to plan for.
-        rounds: of the search, `estimator.lanes.LANES` candidates each.
+        horizon: samples to plan for; by default 12, and the whole episode where the energy is limited.
+        rounds: of the search, `estimator.lanes.LANES` candidates each; of no effect on a plan of the whole episode.
         margin: standard deviations that a plan keeps from the displacement limit.
         goal: mean of the goal prior of the displacement [V].
         goal_std: its standard deviation [V]; no goal where it is None.
         input_cost: nats for a V² of input energy.
 
     Raises:
-        ValueError: naming the argument, if there is no environment, it replays a record, or a number is out of range.
+        ValueError: naming the argument, if there is no environment, it replays a record, a number is out of range, or
+            a goal or cost is asked of a plan of the whole episode.
     """
 
     def __init__(
@@ -87,6 +91,11 @@ class Planner:
             raise ValueError(f"goal_std must be positive and finite, but is {goal_std!r}; None is no goal")
         experiment = env.experiment
         whole = experiment.max_rms is not None and horizon is None
+        if whole and (goal_std is not None or input_cost):
+            raise ValueError(
+                "goal_std and input_cost must be left out where the energy is limited, but are "
+                f"{goal_std!r} and {input_cost!r}; pass a horizon to plan with them"
+            )
         horizon = env.horizon if whole else horizon or _HORIZON
         self._energy = env.horizon * experiment.max_rms**2 if whole else None
         self._env = env

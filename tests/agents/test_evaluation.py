@@ -64,7 +64,7 @@ def log_density(belief, point):
 
 
 def fisher_gain(coefficients, inputs, outputs, prior):
-    """½ log det of a Kalman filter's covariance of (θ, η), linearised where one with the true ones is: before and after."""
+    """½ log det of the covariance of (θ, η), before and after, linearised where a filter with the true ones is."""
     theta1, theta2, theta3, eta = coefficients
     state, known, cov = np.zeros(2), np.zeros((2, 2)), np.zeros((6, 6))
     cov[2:, 2:] = prior.coefficients_cov

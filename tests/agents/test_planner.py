@@ -187,3 +187,10 @@ def test_a_planner_needs_an_environment_of_its_own():
     policy = make_policy("efe", gym.make("duffing_env/Amplitude-v0"))
     with pytest.raises(ValueError, match="planner's own 1 environments"):
         policy.predict(np.zeros((3, 22)))
+
+
+def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
+    env = gym.make("duffing_env/Power-v0")
+    with pytest.raises(ValueError, match="pass a horizon"):
+        make_policy("efe", env, input_cost=1.0)
+    assert make_policy("efe", env, horizon=4, input_cost=1.0).horizon == 4

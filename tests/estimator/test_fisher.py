@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from estimator import SILVERBOX_TWIN, Coefficients, OnlineEstimator, PhysicalParameters, Prior, to_coefficients
-from estimator.fisher import as_rows, cramer_rao, fisher_information, relative_covariance
+from estimator import (
+    SAMPLING_STEP,
+    SILVERBOX_TWIN,
+    Coefficients,
+    OnlineEstimator,
+    PhysicalParameters,
+    Prior,
+    to_coefficients,
+)
+from estimator.fisher import as_rows, cramer_rao, fisher_information, ode_information, relative_covariance
+from estimator.models.ode import N_MOTION, DuffingODE, flow
 
 Q, R = 5e-4, 3e-4
 TWIN = to_coefficients(SILVERBOX_TWIN)
@@ -168,3 +177,52 @@ def test_errors_of_batches_and_of_nothing_learned():
         fisher_information(batch, np.zeros((2, 5)))
     with pytest.raises(ValueError, match="positive definite"):
         cramer_rao(fisher_information(TWIN, np.zeros(5)))
+
+
+def ode_innovations(parameters, u, y, q, r):
+    """Innovations and their variances of the extended Kalman filter of Eq. (1) from rest, with matrices."""
+    model, step = DuffingODE(), SAMPLING_STEP
+    p = np.concatenate([parameters * [step**2, step, step**2, step**2], np.zeros(3)])
+    J, work = np.empty((2, N_MOTION)), np.empty((3, 2, N_MOTION))
+    m, P, d = np.zeros(2), np.zeros((2, 2)), np.array([1.0, 2.0])
+    innovations, variances = np.empty(len(u) - 1), np.empty(len(u) - 1)
+    for t, piece in enumerate(model.pieces(u)):
+        m = np.array(flow(m[0], m[1], p, piece, model.substeps, J, work))
+        A = J[:, :2]
+        P = A @ P @ A.T + q**2 * np.outer(d, d)
+        variances[t] = P[0, 0] + r**2
+        K = P[:, 0] / variances[t]
+        innovations[t] = y[t] - m[0]
+        m, P = m + K * innovations[t], P - np.outer(K, P[0])
+    return innovations, variances
+
+
+def test_the_equation_of_motion_has_an_information_too():
+    rng = np.random.default_rng(6)
+    twin = SILVERBOX_TWIN
+    parameters = np.array([twin.a, twin.c, 1.0, twin.b]) / twin.m
+    u, q, r = 0.1 * rng.uniform(-1, 1, 80), 2e-4, 1e-3
+    silent = -ode_innovations(parameters, u, np.zeros(79), 0.0, 1e6)[0]  # no output is believed: a free run
+    slopes = np.empty((79, 4))
+    for j in range(4):
+        h = 1e-5 * parameters * (np.arange(4) == j)
+        sides = [ode_innovations(parameters + s * h, u, silent, q, r)[0] for s in (1, -1)]
+        slopes[:, j] = (sides[0] - sides[1]) / (2 * h[j])
+    variances = ode_innovations(parameters, u, silent, q, r)[1]
+    expected = slopes.T @ (slopes / variances[:, None])
+    scale = np.sqrt(np.diag(expected))
+    F = ode_information(parameters, u, q, r)
+    np.testing.assert_allclose(F / np.outer(scale, scale), expected / np.outer(scale, scale), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "arguments", "words"),
+    [
+        (np.ones(3), {}, r"parameters must have shape \(4,\)"),
+        (np.ones(4), {"process_noise": -1.0}, "process_noise must be 0 or more"),
+        (np.ones(4), {"measurement_noise": 0.0}, "measurement_noise must be positive"),
+    ],
+)
+def test_its_errors_name_the_argument(parameters, arguments, words):
+    with pytest.raises(ValueError, match=words):
+        ode_information(parameters, np.zeros(5), **arguments)
