@@ -1,0 +1,51 @@
+"""A million samples of the record: every covariance stays sound, nothing runs away, memory stays what it was."""
+
+import resource
+
+import numpy as np
+import pytest
+
+from estimator import NLARX, Belief, DuffingODE, OnlineEstimator
+
+SAMPLES, STRETCH = 1_048_576, 8_192
+ESTIMATORS = {
+    "paper, structured": lambda: OnlineEstimator(NLARX()),
+    "paper, mean field": lambda: OnlineEstimator(NLARX(), factorisation="mean_field"),
+    "paper, drift": lambda: OnlineEstimator(NLARX(), drift=0.003),
+    "three-tap": lambda: OnlineEstimator(NLARX(regressors="three-tap")),
+    "cubic": lambda: OnlineEstimator(NLARX(regressors="cubic")),
+    "ODE": lambda: OnlineEstimator(DuffingODE()),
+    "ODE, look-ahead, cubic damping": lambda: OnlineEstimator(DuffingODE("look_ahead", cubic_damping=True)),
+    "ODE, sigma points": lambda: OnlineEstimator(DuffingODE(), expectations="sigma_points"),
+    "ODE, drift": lambda: OnlineEstimator(DuffingODE(), drift=1e-4),
+    "paper, ensemble": lambda: OnlineEstimator(NLARX(), noise_hypotheses=5),
+}
+
+
+def soundness(cov):
+    """The smallest eigenvalue of the correlations of what is not known."""
+    std = np.sqrt(np.diag(cov))
+    free = std > 0
+    return np.linalg.eigvalsh(cov[np.ix_(free, free)] / np.outer(std[free], std[free]))[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_million_samples(name, record):
+    estimator = ESTIMATORS[name]()
+    u, y = (np.resize(series, SAMPLES) for series in (record.u, record.y))
+    smallest, largest, memory = np.inf, 0.0, []
+    for start in range(0, SAMPLES, STRETCH):
+        free_energies = estimator.run(u[start : start + STRETCH], y[start : start + STRETCH])
+        belief = estimator.belief
+        assert np.isfinite(free_energies).all()
+        covariances = (belief.coefficients_cov, belief.state_cov) if isinstance(belief, Belief) else (belief.cov,)
+        smallest = min(smallest, *(soundness(cov) for cov in covariances))
+        largest = max(largest, np.abs(belief.state_mean[0]))
+        memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10)
+    grown = memory[-1] - memory[len(memory) // 4]
+    print(f"\n{name}: smallest eigenvalue of the correlations {smallest:.1e}, |x| at most {largest:.2f} V, ", end="")
+    print(f"memory grown by {grown:.1f} MiB in the last three quarters", end="")
+    assert smallest > 0
+    assert largest < 1
+    assert grown < 5
