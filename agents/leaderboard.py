@@ -158,7 +158,7 @@ def print_table(evaluations: list[Evaluation], title: str) -> None:
         if any(name in summary for summary in summaries.values()):
             table.add_row(metric.title, *(cell_of(metric, summaries[policy].get(name)) for policy in order))
     console = Console(markup=False)  # the brackets of the intervals are no markup
-    console.width = max(console.width, 30 + 20 * len(order))
+    console.width = max(console.width, 36 + 20 * len(order))
     console.print(table)
 
 

@@ -85,7 +85,7 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatAr
     from agents.oracle import Oracle, Systems
 
     try:
-        oracle = Oracle.load(Systems.of(env_id, evaluation.inputs.shape[1], options))
+        oracle = Oracle.of(Systems.of(env_id, evaluation.inputs.shape[1], options))
     except FileNotFoundError:
         return None
     n = len(oracle.values)

@@ -144,7 +144,7 @@ class Oracle:
     values: FloatArray
 
     @classmethod
-    def load(cls, systems: Systems) -> Oracle:
+    def of(cls, systems: Systems) -> Oracle:
         """The stored oracle, of as many of the systems as it has.
 
         Raises:
@@ -338,7 +338,7 @@ def design(
     n = len(systems.theta)
     inputs, values = np.zeros((n, systems.task.samples)), np.full(n, -np.inf)
     try:
-        stored = Oracle.load(systems)
+        stored = Oracle.of(systems)
         inputs[: len(stored.values)], values[: len(stored.values)] = stored.inputs, stored.values
     except FileNotFoundError:
         pass

@@ -47,7 +47,7 @@ class Design:
 
 def measure(track: str, policy: str, systems: int = 256) -> Design:
     """One episode of every system that the track's oracle has, with seed 0."""
-    oracle = Oracle.load(Systems.of(track, systems))
+    oracle = Oracle.of(Systems.of(track, systems))
     n = len(oracle.values)
     envs = make(track, n)
     player = make_policy(policy, envs, seed=0)

@@ -54,11 +54,21 @@ POLICIES: dict[str, Callable[..., Policy]] = {
 }
 
 
+#: Folder of the trained policies that ship with the package: ``ALGORITHM/TRACK``.
+TRAINED = Path(__file__).parent / "trained"
+
+
+def trained_policies() -> list[str]:
+    """Names of the trained policies that ship with the package, such as `"ppo/amplitude"`."""
+    return sorted(card.parent.relative_to(TRAINED).as_posix() for card in TRAINED.glob("*/*/policy.json"))
+
+
 def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0, **options: Any) -> Policy:
     """Makes the policy of this name.
 
     Args:
-        name: A name in `POLICIES`, or the path of a trained policy (`runs/...`).
+        name: A name in `POLICIES`, one of `trained_policies()` such as `"ppo/amplitude"`, or the path of a
+            trained policy (`runs/...`).
         env: The environment it is for, single or vector, wrapped or not: it gives the amplitude
             limit, the episode's length and, where it replays a record, the recorded input. None:
             the limit is 0.15 V.
@@ -82,12 +92,13 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0,
         return make(env if env is None else env.unwrapped, seed, **options)
     if options:
         raise ValueError(f"options must be none for a trained policy, but are {options}; leave them out")
-    if Path(name).exists():
+    if name in trained_policies() or Path(name).exists():
         from agents.policies.learned import load_policy
 
-        return load_policy(name, seed)
-    nearest = difflib.get_close_matches(name, POLICIES, n=1)
+        return load_policy(TRAINED / name if name in trained_policies() else name, seed)
+    nearest = difflib.get_close_matches(name, [*POLICIES, *trained_policies()], n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     raise ValueError(
-        f"name must be one of {', '.join(POLICIES)}, or the path of a trained policy, but it is {name!r}{hint}"
+        f"name must be one of {', '.join([*POLICIES, *trained_policies()])}, or the path of a trained policy, "
+        f"but it is {name!r}{hint}"
     )

@@ -270,13 +270,13 @@ def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverge
 
 
 def test_others_identify_from_the_same_inputs_and_outputs(without_record):
-    (evaluation,) = evaluate(["uniform"], systems=SYSTEMS, seed=SEED)
+    (evaluation,) = evaluate(["uniform"], systems=40, seed=SEED)
     own, others = evaluation.metrics, evaluation.estimators
     assert list(others) == ["structured", "mean_field", "auditor"]
     for name, values in others["structured"].items():  # the environment's own, but for the float32 of its inputs
         np.testing.assert_allclose(values, own[name], rtol=1e-2, atol=1e-6)
-    assert np.median(others["auditor"]["error_b"]) < 1.5 * np.median(own["error_b"])
-    assert np.median(others["mean_field"]["error_m"]) > 1.5 * np.median(others["auditor"]["error_m"])
+    assert np.median(others["auditor"]["error_b"]) < 1.2 * np.median(own["error_b"])
+    assert others["mean_field"]["error_m"].mean() > 1.1 * others["auditor"]["error_m"].mean()
     assert 0.3 < others["auditor"]["nees"].mean() < 2
 
 

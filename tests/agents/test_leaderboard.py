@@ -33,7 +33,7 @@ CONSTANTS = {
     "crest_factor": (2.987, "crest factor", "2.99"),
     "decision_time": (3.14e-6, "time per decision / µs", "3.14"),
     "fisher_gain": (19.394, "Fisher information / nat", "19.39"),
-    "efficiency": (0.8765, "D-efficiency / %", "87.7"),
+    "efficiency": (0.8766, "D-efficiency / %", "87.7"),
     "silverbox_equivalent": (10707.6, "Silverbox equivalent / samples", "10708"),
     "simulation_rmse": (0.0004216, "RMSE on the twin's arrow / mV", "0.422"),
     "arrow_rmse": (0.00512, "RMSE on the real arrow / mV", "5.12"),

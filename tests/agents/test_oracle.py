@@ -63,20 +63,20 @@ def test_under_a_budget_the_search_spends_it_in_a_burst():
 def test_what_is_better_takes_its_place_and_nothing_else(empty_folder):
     systems = Systems.of(SHORT, 2)
     with pytest.raises(FileNotFoundError, match="no oracle is stored"):
-        Oracle.load(systems)
+        Oracle.of(systems)
     poor = Oracle(systems, np.zeros((2, 48)), systems.worth(np.zeros((2, 48)))[0])
     poor.save()
     better = design(systems, np.empty((0, 2, 48)), rounds=1)
     assert np.all(better.values > poor.values + 5)
     better.save()
-    loaded = Oracle.load(systems)
+    loaded = Oracle.of(systems)
     np.testing.assert_array_equal(loaded.inputs, better.inputs)
     np.testing.assert_array_equal(loaded.values, better.values)
     again = design(systems, np.empty((0, 2, 48)), rounds=0, seed=1)
     assert np.all(again.values >= better.values)
     # As many systems as are asked for, if so many are stored.
-    assert len(Oracle.load(Systems.of(SHORT, 1)).values) == 1
-    assert len(Oracle.load(Systems.of(SHORT, 3)).values) == 2
+    assert len(Oracle.of(Systems.of(SHORT, 1)).values) == 1
+    assert len(Oracle.of(Systems.of(SHORT, 3)).values) == 2
 
 
 def test_the_command_stores_and_says_where(empty_folder, capsys):
@@ -87,7 +87,7 @@ def test_the_command_stores_and_says_where(empty_folder, capsys):
 
 def test_efficiency_is_one_for_the_oracle_itself_and_counts_until_the_end():
     systems = Systems.of(SHORT, 3)
-    oracle = Oracle.load(systems)
+    oracle = Oracle.of(systems)
     outputs = answers(systems, oracle.inputs)
     np.testing.assert_allclose(oracle.efficiency(oracle.inputs, outputs), 1.0, rtol=1e-9)
     ended, seen = oracle.inputs.copy(), outputs.copy()
@@ -109,7 +109,7 @@ def test_what_is_stored_is_never_larger_and_stays():
 
 @pytest.mark.parametrize("track", STORED)
 def test_stored_oracles_keep_the_limits_of_their_tracks(track):
-    oracle = Oracle.load(Systems.of(track, 256))
+    oracle = Oracle.of(Systems.of(track, 256))
     task = oracle.systems.task
     assert len(oracle.values) >= 64
     assert np.abs(oracle.inputs).max() <= task.max_input
