@@ -56,6 +56,8 @@ class Setting:
         factorisation: ``structured`` or ``mean_field``.
         as_published: with the published run's two departures from the derived messages.
         passes: how often the training section is gone through; more than once is no longer online.
+        expectations: ``first_order`` or ``sigma_points``.
+        noise_hypotheses: ratios of the noises that are weighed by their evidence.
     """
 
     model: NLARX | DuffingODE
@@ -63,10 +65,15 @@ class Setting:
     factorisation: str = "structured"
     as_published: bool = False
     passes: int = 1
+    expectations: str = "first_order"
+    noise_hypotheses: int = 1
 
     def estimator(self) -> OnlineEstimator:
         """An estimator that has seen nothing yet."""
-        return OnlineEstimator(self.model, self.prior, self.factorisation, as_published=self.as_published)
+        return OnlineEstimator(
+            self.model, self.prior, self.factorisation, as_published=self.as_published,
+            expectations=self.expectations, noise_hypotheses=self.noise_hypotheses,
+        )  # fmt: skip
 
 
 def _without_feedthrough(model: DuffingODE) -> Setting:
@@ -83,6 +90,7 @@ SETTINGS = {
     "paper structured": Setting(NLARX(), Prior.silverbox_twin(state_std=0.1)),  # the section begins in motion
     "NLARX offset": Setting(NLARX(regressors="offset")),
     "NLARX three-tap": Setting(NLARX(regressors="three-tap")),
+    "NLARX three-tap, 9 ratios": Setting(NLARX(regressors="three-tap"), noise_hypotheses=9),
     "NLARX cubic": Setting(NLARX(regressors="cubic")),
     "ODE linear, d = 0": _without_feedthrough(DuffingODE()),
     "ODE linear": Setting(DuffingODE()),
@@ -92,6 +100,7 @@ SETTINGS = {
     "ODE spline, d = 0": _without_feedthrough(DuffingODE("spline")),
     "ODE spline": Setting(DuffingODE("spline")),
     "ODE spline +e": Setting(DuffingODE("spline", cubic_damping=True)),
+    "ODE linear, sigma points": Setting(DuffingODE(), expectations="sigma_points"),
     "ODE spline, 2 passes": Setting(DuffingODE("spline"), passes=2),
     "ODE spline +e, 2 passes": Setting(DuffingODE("spline", cubic_damping=True), passes=2),
 }

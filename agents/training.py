@@ -68,7 +68,7 @@ class TrainConfig:
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
     reward: str = "information_gain"
-    """Name of the reward: information_gain, log_posterior, parameter_error or free_energy."""
+    """Name of the reward: information_gain, log_posterior, parameter_error, fisher or free_energy."""
     steps: int = 5_000_000
     """Samples to train on, over all environments."""
     seed: int = 0
