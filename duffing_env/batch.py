@@ -105,26 +105,39 @@ class Batch:
         records = self._blocks[:, :RECORD_SIZE].swapaxes(1, 2).reshape(-1, RECORD_SIZE)
         return records[: self.size]
 
-    def belief(self, index: int, *, final: bool = False) -> RecordBelief:
-        """The belief of environment ``index``; ``final``: the one its last episode ended with, if reset since."""
-        block, lane = divmod(index, LANES)
-        first = LAYOUT[SAVED[0]] if final else 0
-        record = self._blocks[block, first : first + RECORD_SIZE, lane]
-        return self.experiment.to_belief(record)
+    def belief(self, index: int) -> RecordBelief:
+        """The belief of environment ``index``."""
+        return self.beliefs(np.array([index]))[0]
+
+    def beliefs(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[RecordBelief]:
+        """The beliefs of some environments; ``final``: those that their last episodes ended with, if reset since."""
+        records = self._quantities(indices, LAYOUT[SAVED[0]] if final else 0, RECORD_SIZE)
+        records.flags.writeable = False
+        return self.experiment.to_belief(records[0]).with_records(records)
 
     def truth(self) -> PhysicalParameters:
         """The true oscillators, a batch of n; where a record is replayed, the twin of its circuit."""
         return PhysicalParameters(*(self.quantity(name) for name in OSCILLATOR))
 
-    def oscillator(self, index: int, *, final: bool = False) -> PhysicalParameters:
-        """The true oscillator of environment ``index``; ``final``: that of its last episode, if reset since."""
-        block, lane = divmod(index, LANES)
-        first = LAYOUT["ended_m" if final else "m"]
-        values = self._blocks[block, first : first + len(OSCILLATOR), lane].tolist()
-        # Past its checks, which take as long as 200 steps of one of a thousand environments.
-        oscillator = object.__new__(PhysicalParameters)
-        oscillator.__dict__.update(zip(OSCILLATOR, values, strict=True), tau=np.inf, xi=np.inf)
-        return oscillator
+    def oscillator(self, index: int) -> PhysicalParameters:
+        """The true oscillator of environment ``index``."""
+        return self.oscillators(np.array([index]))[0]
+
+    def oscillators(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[PhysicalParameters]:
+        """The true oscillators of some environments; ``final``: those of their last episodes, if reset since."""
+        found = []
+        for values in self._quantities(indices, LAYOUT["ended_m" if final else "m"], len(OSCILLATOR)).tolist():
+            # Past its checks, which take as long as 200 steps of one of a thousand environments.
+            oscillator = object.__new__(PhysicalParameters)
+            oscillator.__dict__.update(zip(OSCILLATOR, values, strict=True), tau=np.inf, xi=np.inf)
+            found.append(oscillator)
+        return found
+
+    def _quantities(self, indices: npt.NDArray[np.intp], first: int, count: int) -> FloatArray:
+        """(k, count) adjacent rows of the layout, of some environments; a copy."""
+        blocks, lanes = np.divmod(indices, LANES)
+        found: FloatArray = self._blocks[blocks[:, None], first + np.arange(count), lanes[:, None]]
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles must not share memory through the views."""

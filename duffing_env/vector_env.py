@@ -244,9 +244,9 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         """What the finished rows ended with."""
         same_step = self._autoreset_mode == AutoresetMode.SAME_STEP
         beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
-        for row in np.flatnonzero(finished).tolist():
-            beliefs[row] = self._batch.belief(row, final=same_step)
-            truths[row] = self._batch.oscillator(row, final=same_step)
+        rows = np.flatnonzero(finished)
+        beliefs[rows] = self._batch.beliefs(rows, final=same_step)
+        truths[rows] = self._batch.oscillators(rows, final=same_step)
         return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}
 
 
