@@ -112,6 +112,9 @@ def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, floa
     summary: dict[str, dict[str, float]] = {}
     for name, values in evaluation.metrics.items():
         kind, statistic = METRICS[name].center
+        if (values == values[0]).all():  # SciPy warns of samples without spread
+            summary[name] = dict.fromkeys((kind, "low", "high"), float(values[0]))
+            continue
         with np.errstate(invalid="ignore"):  # values may be infinite, and SciPy takes their standard deviation
             low, high = stats.bootstrap(
                 (values,), statistic, n_resamples=_RESAMPLES, method="percentile", vectorized=True,

@@ -15,6 +15,8 @@ from stable_baselines3 import PPO, SAC
 
 import agents
 from agents import make_policy
+from agents.evaluation import evaluate
+from agents.policies import trained_policies
 from agents.policies.learned import CARD, WEIGHTS, load_policy, save_policy
 from agents.vec_env import DuffingVecEnv
 
@@ -281,3 +283,13 @@ def test_no_source_can_unpickle(path):
 )  # fmt: skip
 def test_the_search_for_unpicklers_finds_them(source):
     assert len(list(unpickling(source))) >= 1
+
+
+@pytest.mark.parametrize("name", trained_policies())
+def test_a_policy_that_ships_does_what_its_card_says(name):
+    policy = make_policy(name)
+    env_id, score = policy.card["config"]["env"], policy.card["scores"]["information_gain"]
+    (evaluation,) = evaluate([name], env_id, systems=32)
+    gained = evaluation.metrics["information_gain"]
+    assert abs(gained.mean() - score["mean"]) < 4 * gained.std() / np.sqrt(len(gained)) + 0.05
+    assert 0.8 < evaluation.metrics["coverage"].mean() < 0.98
