@@ -33,7 +33,7 @@ TRACKS: dict[str, dict[str, Any]] = {
         "kwargs": {"horizon": 512, "max_input": 0.15, "max_output": 0.6, "jump": 0.3, "drift": 0.01},
     },
     "duffing_env/Continuous-v0": {
-        "entry_point": "duffing_env.env:ContinuousEnv",
+        "entry_point": "duffing_env.continuous:ContinuousEnv",
         "vector_entry_point": "duffing_env.vector_env:ContinuousVectorEnv",
         "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
     },

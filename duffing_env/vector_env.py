@@ -14,7 +14,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from duffing_env.batch import Batch, spawn_seeds
-from duffing_env.env import ContinuousEnv, DuffingEnv, SilverboxReplayEnv, action_space, observation_space
+from duffing_env.continuous import ContinuousEnv
+from duffing_env.env import DuffingEnv, SilverboxReplayEnv, action_space, observation_space
 from duffing_env.experiment import Experiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from estimator.belief import RecordBelief

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from twin import TwinContinuousEnv, assert_env_follows_twin
 
 from duffing_env.batch import spawn_seeds
-from duffing_env.env import ContinuousEnv
+from duffing_env.continuous import ContinuousEnv
 from duffing_env.layout import LAYOUT
 from duffing_env.rewards import REWARDS
 from duffing_env.vector_env import ContinuousVectorEnv
