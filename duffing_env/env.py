@@ -212,17 +212,17 @@ class DuffingEnv(gym.Env[Any, Any]):
         value = _one_number(action)
         batch = self._batch
         self._apply(value)
-        terminated = bool(batch.outcome("terminated")[0])
-        truncated = bool(batch.outcome("truncated")[0])
-        info: dict[str, Any] = {name: batch.outcome(name)[0].item() for name in self._reported}
+        outcome = batch.outcome(0)
+        terminated, truncated = bool(outcome["terminated"]), bool(outcome["truncated"])
+        info: dict[str, Any] = {name: outcome[name] for name in self._reported}
         for flag in self._flags:
-            info[flag] = bool(batch.outcome(flag)[0])
+            info[flag] = bool(outcome[flag])
         if terminated or truncated:
             self._running = False
             info |= self._final_info()
         if self._screen is not None:
             self._draw()
-        return batch.observations[0].copy(), batch.outcome("reward")[0].item(), terminated, truncated, info
+        return batch.observations[0].copy(), outcome["reward"], terminated, truncated, info
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from duffing_env.layout import ESTIMATORS, OSCILLATOR, PLANTS, SETTINGS
+from duffing_env.layout import OSCILLATOR, SETTINGS
 from duffing_env.rewards import reward_number
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
 from estimator.belief import Belief, Prior, RecordBelief
@@ -77,8 +77,13 @@ class Experiment:
         return SILVERBOX_TWIN
 
     @property
+    def plant_kind(self) -> str:
+        """The plant's name in `duffing_env.kernel.PLANTS`."""
+        return "difference"
+
+    @property
     def estimator_kind(self) -> str:
-        """The estimator's name in `ESTIMATORS`."""
+        """The estimator's name in `duffing_env.kernel.ESTIMATORS`."""
         return self.factorisation
 
     @property
@@ -94,7 +99,7 @@ class Experiment:
     @property
     def plant_settings(self) -> dict[str, float]:
         """Entries of `SETTINGS` that describe the plant."""
-        raise NotImplementedError
+        return {}
 
     @property
     def prior_record(self) -> FloatArray:
@@ -124,11 +129,9 @@ class Experiment:
             **{f"center_{name}": getattr(self.twin, name) for name in OSCILLATOR},
             "step": SAMPLING_STEP,
             "reward": reward_number(self.reward),
-            "estimator": ESTIMATORS[self.estimator_kind],
             "iterations": self.iterations or DEFAULT_ITERATIONS[self.factorisation],
             "as_published": False,
             "nonlinear": self.is_nonlinear,
-            "plant": PLANTS["difference"],
             "delay": 0,
             **{f"prior_{c}": prior[c] for c in ("t1", "t2", "t3", "e")},
             **{f"scale_{c}": _inverse_std(prior[f"P_{c}_{c}"]) for c in ("t1", "t2", "t3", "e")},
@@ -254,6 +257,11 @@ class ContinuousExperiment(SimulatedExperiment):
         return CONTINUOUS_TWIN
 
     @property
+    def plant_kind(self) -> str:
+        """The differential equation."""
+        return "sde"
+
+    @property
     def estimator_kind(self) -> str:
         """The plant's equation, or the factorisation of the paper's."""
         return "ode" if self.estimator == "ode" else self.factorisation
@@ -275,11 +283,6 @@ class ContinuousExperiment(SimulatedExperiment):
     def to_belief(self, record: FloatArray) -> RecordBelief:
         """The readable face of a record (RECORD_SIZE,)."""
         return ContinuousBelief(record) if self.estimator == "ode" else super().to_belief(record)
-
-    @property
-    def plant_settings(self) -> dict[str, float]:
-        """The plant, its noises, and the range of the oscillators."""
-        return {**super().plant_settings, "plant": PLANTS["sde"]}
 
 
 @dataclass(frozen=True)
@@ -349,9 +352,14 @@ class ReplayExperiment(Experiment):
         return self._regime.u, self._regime.y
 
     @property
+    def plant_kind(self) -> str:
+        """The record."""
+        return "replay"
+
+    @property
     def plant_settings(self) -> dict[str, float]:
         """How the record is played, and how the estimator departs from the model."""
-        return {"as_published": self.as_published, "plant": PLANTS["replay"], "delay": self.input_delay}
+        return {"as_published": self.as_published, "delay": self.input_delay}
 
 
 def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:
