@@ -70,9 +70,7 @@ class Terms(NamedTuple):
 @lanewise(
     LAYOUT,
     f"x0 x1 {_COVARIANCES} cost",
-    uniform=(
-        "t1 t2 t3 e q r limit margin walk_t1 walk_t2 walk_t3 walk_e price goal goal_weight"
-    ),
+    uniform=("t1 t2 t3 e q r limit margin walk_t1 walk_t2 walk_t3 walk_e price goal goal_weight"),
 )
 def imagine(
     x0, x1, u,

@@ -152,7 +152,7 @@ class Planner:
             plans, rates = np.zeros((n, self.horizon)), np.zeros((n, 4, 4))
             words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
         else:
-            plans, rates, words = (array.copy() for array in state)
+            plans, rates, words = state[0].copy(), state[1].copy(), state[2].copy()
         if episode_start is not None:
             begun = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)
             plans[begun], rates[begun] = 0.0, 0.0

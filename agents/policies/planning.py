@@ -1,11 +1,10 @@
 """The planner's search, compiled: the best way through the map of (x_t, x_{t-1}), and small changes of it.
 
 The teaching of a plan has many summits, and changing a long plan here and there finds a poor one, even of a system that
-is known. So the plan is built sample by sample, as by dynamic programming: of all ways that lead into the same cell
-of the plane (x_t, x_{t-1}) only the best is followed, with the highest, the lowest and the input nearest to zero. What a
-way is worth on the way is what it has taught, together with what the rest of the episode will teach anyway. That is
-extrapolated from what the last plans would have taught per sample; without it a way would be praised for what every way
-learns sooner or later.
+is known. So the plan is built sample by sample, as by dynamic programming: of all ways that lead into the same cell of
+the plane (x_t, x_{t-1}) only the best is followed, with the highest input, the lowest, and the one nearest to zero. A
+way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of the last
+plans. Without the latter a way would be praised for what every way teaches sooner or later.
 
 The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one.
 """
@@ -20,13 +19,13 @@ from duffing_env.noise import draw, to_unit
 from estimator.lanes import LANES, jit, kernel
 
 #: Cells of the map along each axis, from minus the displacement limit to plus.
-_CELLS = 20
+_CELLS = 24
 
 #: Inputs that are tried at every cell.
 _CHOICES = 3
 
-#: A way this many nats worse than the best of its length is followed no further.
-_HOPELESS = 2.0
+#: A way this much [nats] worse than the best of its length is followed no further.
+_HOPELESS = 1.0
 
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
@@ -111,16 +110,16 @@ def _search(memory, record, left, steps, rounds, terms, last, best, rate, words)
     W = ways[0]
     score = -np.inf
     for k in range(rounds):
+        for j in range(LANES if k > 0 else 0):
+            candidates[j] = best
+            _change(candidates[j], steps, terms.amplitude, words)
+            _bound(candidates[j], steps, last, terms)
         _follow(W, record, candidates, steps, terms)
         appraise(W, M, np.sqrt(left - steps))
         for j in range(LANES):
             if W[SCORE + j] > score:
                 score = W[SCORE + j]
                 best[:] = candidates[j]
-        for j in range(LANES):
-            candidates[j] = best
-            _change(candidates[j], steps, terms.amplitude, words)
-            _bound(candidates[j], steps, last, terms)
     # Where the coefficients walk, what is learned later does not add to what is learned now.
     if terms.walk_t1 == 0.0:
         _refresh(W, record, best, steps, terms, rate)
