@@ -138,6 +138,15 @@ def test_no_limit_is_violated_and_the_inputs_are_at_theirs():
     assert np.mean(np.abs(inputs) > 0.149) > 0.7
 
 
+def test_a_slew_limit_cuts_nothing_that_was_planned():
+    inputs, outputs, early = roll_out("duffing_env/Short-v0", 4, options={"max_slew": 0.06})
+    changes = np.abs(np.diff(inputs, axis=0, prepend=0.0))
+    assert early == 0
+    assert changes.max() <= 0.06 * (1 + 1e-6)
+    assert np.mean(changes > 0.059) > 0.3
+    assert np.abs(outputs).max() > 0.5
+
+
 def test_the_budget_is_spent_and_not_exceeded():
     inputs, _, early = roll_out("duffing_env/Power-v0", 4)
     assert early == 0
