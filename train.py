@@ -4,6 +4,7 @@ python train.py                                  PPO on Amplitude-v0, into runs/
 python train.py --steps 1000000 --seed 3         shorter, another seed
 python train.py --reward log_posterior           another reward
 python train.py --algo sac --help                another algorithm, and its hyperparameters
+python train.py --algo td3 --tune 50             search for its hyperparameters
 python train.py --resume runs/ppo-amplitude-v0-0 go on with a run that was stopped
 """
 
@@ -14,7 +15,7 @@ from typing import Annotated
 import tyro
 
 from agents.cli import run_script
-from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train
+from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, tune
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,15 @@ class Config(TrainConfig):
 
     resume: Path | None = None
     """Run folder to go on with after it was stopped; it has its settings in it, so none are taken here."""
+    tune: int = 0
+    """Trials of a search for hyperparameters, instead of a training; the same command goes on with a search."""
     systems: int = 256
     """Systems to compare on afterwards; 0 to skip the comparison."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.tune < 0:
+            raise ValueError(f"tune must be at least 0, but is {self.tune}")
         if self.systems != 0 and self.systems < 2:
             raise ValueError(f"systems must be 0 or at least 2, but is {self.systems}; intervals need more than one")
 
@@ -36,6 +41,10 @@ def main(config: Config) -> None:
     """Train, compare, and say where everything is."""
     from agents.leaderboard import BASELINES, compare
 
+    if config.tune:
+        best = tune(config, config.tune)
+        print(f"The best hyperparameters are in {best}: python train.py --algo {config.algo} --settings {best}")
+        return
     if config.resume is None:
         run = train(config)
     else:

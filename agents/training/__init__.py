@@ -10,6 +10,7 @@ from agents.training.algorithms import (
     TQCSettings,
 )
 from agents.training.runs import Run, Subject, TrainConfig, resume, train
+from agents.training.tuning import tune
 
 __all__ = [
     "ALGORITHMS",
@@ -24,4 +25,5 @@ __all__ = [
     "TrainConfig",
     "resume",
     "train",
+    "tune",
 ]

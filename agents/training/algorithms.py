@@ -102,10 +102,10 @@ class OnPolicySettings(AlgorithmSettings):
     def suggest(cls, trial: Any) -> dict[str, Any]:
         """Step size, horizon and exploration, and how much is made of a sample."""
         return {
-            "n_steps": trial.suggest_categorical("n_steps", [16, 32, 64, 128]),
+            "n_steps": trial.suggest_int("n_steps", 16, 128, step=16),
             "n_epochs": trial.suggest_int("n_epochs", 2, 10),
             "learning_rate": trial.suggest_float("learning_rate", 2e-4, 5e-3, log=True),
-            "gamma": 1 - trial.suggest_float("1-gamma", 1e-3, 5e-2, log=True),
+            "gamma": trial.suggest_float("gamma", 0.95, 0.999),
             "gae_lambda": trial.suggest_float("gae_lambda", 0.85, 1.0),
             "log_std_init": trial.suggest_float("log_std_init", -1.5, 0.0),
         }
@@ -176,10 +176,10 @@ class OffPolicySettings(AlgorithmSettings):
     def suggest(cls, trial: Any) -> dict[str, Any]:
         """Step size, horizon, and how much is made of a sample."""
         return {
-            "batch_size": trial.suggest_categorical("batch_size", [128, 256, 512]),
-            "gradient_steps": trial.suggest_categorical("gradient_steps", [16, 32, 64]),
+            "batch_size": trial.suggest_int("batch_size", 128, 1024, log=True),
+            "gradient_steps": trial.suggest_int("gradient_steps", 8, 64, log=True),
             "learning_rate": trial.suggest_float("learning_rate", 2e-4, 5e-3, log=True),
-            "gamma": 1 - trial.suggest_float("1-gamma", 1e-3, 5e-2, log=True),
+            "gamma": trial.suggest_float("gamma", 0.95, 0.999),
             "tau": trial.suggest_float("tau", 2e-3, 2e-2, log=True),
         }
 

@@ -7,9 +7,11 @@ import math
 import platform
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +28,7 @@ from agents.training.checkpoints import (
     restore,
     save_checkpoint,
 )
+from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import read_settings, settings_of, track_of
 from estimator.files import write_atomically
 
@@ -60,6 +63,10 @@ class TrainConfig(Subject):
     """Run folder; runs/ALGO-TRACK-SEED where it is not given, with a number where that exists."""
     checkpoints: int = 5
     """Checkpoints over the run, evenly spaced."""
+    eval_every: int = 0
+    """Samples between evaluations on systems held out from training; 0 for none."""
+    tensorboard: bool = False
+    """Whether to write the log for TensorBoard, too; it needs the extra "tensorboard"."""
     torch_threads: int = 1
     """Threads of torch; it moves the last digits. More than one gain little, and lose much on a busy machine."""
     hyperparameters: AlgorithmSettings = field(default=None)  # type: ignore[assignment]
@@ -69,6 +76,10 @@ class TrainConfig(Subject):
         for name in ("steps", "checkpoints", "torch_threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")
+        if self.eval_every < 0:
+            raise ValueError(f"eval_every must be at least 0, but is {self.eval_every}")
+        if self.tensorboard and find_spec("tensorboard") is None:
+            raise ValueError("tensorboard must be installed; do so with: pip install 'duffing-env[tensorboard]'")
         if "reward" in self.options:
             raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
         check_track(self.env)
@@ -98,7 +109,11 @@ class Run:
     seconds: float
 
 
-def train(config: TrainConfig) -> Run:
+#: Called with the samples so far and `heldout.METRICS`, after every evaluation.
+OnEvaluation = Callable[[int, dict[str, float]], None]
+
+
+def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found: None) -> Run:
     """Train a policy, and write a run folder.
 
     The folder then holds
@@ -107,6 +122,9 @@ def train(config: TrainConfig) -> Run:
     - ``policy.safetensors``, ``policy.json``: the policy,
     - ``checkpoints/STEPS/``: the policy on the way, after the update that these samples were for,
     - ``progress.csv``: Stable-Baselines3's log,
+    - ``evaluations.csv``, ``best/``: where ``eval_every`` is given, the policy's worth on held-out systems on the
+      way, and the policy that was best by its log posterior gain,
+    - ``events.out.tfevents.*``: both logs for TensorBoard, where ``tensorboard`` is set,
     - ``learning_curve.png``.
 
     Until it is finished, the latest checkpoint also holds what `resume` goes on from.
@@ -114,7 +132,7 @@ def train(config: TrainConfig) -> Run:
     Raises:
         ValueError: for settings that make no sense, before anything is written.
     """
-    return _Training(config, _run_folder(config)).run()
+    return _Training(config, _run_folder(config), on_evaluation).run()
 
 
 def resume(folder: Path) -> Run:
@@ -141,7 +159,9 @@ def resume(folder: Path) -> Run:
 class _Training:
     """A model, its environments, and what is written on the way."""
 
-    def __init__(self, config: TrainConfig, folder: Path) -> None:
+    def __init__(
+        self, config: TrainConfig, folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
+    ) -> None:
         import torch
 
         from agents.vec_env import DuffingVecEnv
@@ -161,18 +181,24 @@ class _Training:
         if checkpoint is not None:
             restore(checkpoint, self._model)
         self._checkpoints = self._due_checkpoints()
-        self._description = _describe(config)
+        self._held_out = HeldOut(folder, config, begun)
+        self._evaluated = on_evaluation
+        self._board: Any = None
+        self._description = describe(config)
 
     def run(self) -> Run:
-        from stable_baselines3.common.logger import Logger
+        from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
         from agents.figures import draw_learning_curve
         from agents.training.callbacks import ContinuedCSV
 
         if not (self._folder / "config.json").exists():
             write_atomically(self._folder / "config.json", json.dumps(self._description, indent=2))
-        log = ContinuedCSV(self._folder / "progress.csv", self._progress.steps)
-        with closing(Logger(str(self._folder), [log])) as logger:
+        logs: list[KVWriter] = [ContinuedCSV(self._folder / "progress.csv", self._progress.steps)]
+        if self._config.tensorboard:
+            self._board = TensorBoardOutputFormat(str(self._folder))
+            logs.append(self._board)
+        with closing(Logger(str(self._folder), logs)) as logger:
             self._model.set_logger(logger)
             self._learn()
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
@@ -208,7 +234,13 @@ class _Training:
             )
 
     def _on_update(self) -> None:
-        """Write a checkpoint where one is due; the last one is not gone on from."""
+        """Evaluate, and write a checkpoint, where one is due; the last one is not gone on from."""
+        if self._due_evaluation():
+            found = self._held_out.evaluate(self._model, self._card())
+            if self._board is not None:
+                for name in METRICS:
+                    self._board.writer.add_scalar(f"evaluation/{name}", found[name], self._model.num_timesteps)
+            self._evaluated(self._model.num_timesteps, found)
         if self._due_checkpoints() > self._checkpoints:
             self._checkpoints = self._due_checkpoints()
             model, progress = self._model, self._progress
@@ -216,6 +248,11 @@ class _Training:
             progress.episodes, progress.seconds = model._episode_num, self._seconds()
             unfinished = model.num_timesteps < self._config.steps
             save_checkpoint(self._folder, model, self._card(), progress if unfinished else None)
+
+    def _due_evaluation(self) -> bool:
+        """Whether the next multiple of ``eval_every`` is reached, or the end."""
+        steps, every, before = self._model.num_timesteps, self._config.eval_every, self._held_out.steps
+        return every > 0 and (steps // every > before // every or steps >= self._config.steps > before)
 
     def _due_checkpoints(self) -> int:
         """How many checkpoints there should be by now."""
@@ -242,7 +279,8 @@ def _run_folder(config: TrainConfig) -> Path:
     return folder
 
 
-def _describe(config: TrainConfig) -> dict[str, Any]:
+def describe(config: TrainConfig) -> dict[str, Any]:
+    """What a run was made from: the resolved configuration, the command and the versions."""
     resolved = asdict(config) | {"hyperparameters": as_written(config.hyperparameters)}
     resolved = {name: str(value) if isinstance(value, Path) else value for name, value in resolved.items()}
     packages = _PACKAGES + (("sb3-contrib",) if config.algo in ("tqc", "recurrent_ppo") else ())

@@ -79,7 +79,7 @@ def test_help_explains_every_option(name):
             assert explanation in here, flag
             assert "(default: " in here, flag
             explained += 1
-    assert explained == {"train.py": 21, "evaluate.py": 7}[name]
+    assert explained == {"train.py": 24, "evaluate.py": 7}[name]
 
 
 @pytest.mark.parametrize(
@@ -99,6 +99,8 @@ def test_help_explains_every_option(name):
         ("train.py", ["--algo", "sac", "--sac.tau", "2"], "tau must be in [0, 1], but is 2.0"),
         ("train.py", ["--algo", "sac", "--ppo.gamma", "0.9"], "--ppo.gamma"),
         ("train.py", ["--settings", "none.toml"], "none.toml"),
+        ("train.py", ["--eval-every", "-1"], "eval_every must be at least 0, but is -1"),
+        ("train.py", ["--tune", "-1"], "tune must be at least 0, but is -1"),
         ("train.py", ["--resume", "none"], "resume takes all settings but systems from the run"),
         ("evaluate.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
         ("evaluate.py", ["--systems", "1"], "systems must be at least 2, but is 1"),
