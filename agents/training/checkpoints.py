@@ -119,9 +119,7 @@ def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
         if (buffer := _buffer(model)) is not None:
             _refill(buffer, tensors)
     except (KeyError, RuntimeError, ValueError, OSError, SafetensorError) as error:
-        raise ValueError(
-            f"checkpoint must hold the state of this algorithm, but {checkpoint} does not: {error}"
-        ) from error
+        raise ValueError(f"checkpoint must hold this algorithm's state, but {checkpoint} does not: {error}") from error
 
 
 def drop_states(run: Path, but: Path | None = None) -> None:
@@ -146,7 +144,7 @@ def _save_state(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
     if (buffer := _buffer(model)) is not None:
         tensors |= {f"buffer/{name}": getattr(buffer, name)[: buffer.size()] for name in _BUFFER}
         tensors["buffer/position"] = np.array(buffer.pos)
-    save_file({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, folder / TENSORS)
+    save_file({name: np.array(tensor, order="C") for name, tensor in tensors.items()}, folder / TENSORS)
     (folder / STATE).write_text(json.dumps(asdict(progress)))
 
 

@@ -59,10 +59,12 @@ def tune(config: TrainConfig, trials: int) -> Path:
     study.pruner = optuna.pruners.MedianPruner(n_warmup_steps=2 * every)
     if not begun:
         study.enqueue_trial({k: v for k, v in as_written(config.hyperparameters).items() if k != "hidden"})
-    stopped = [trial.number for trial in begun if trial.state == optuna.trial.TrialState.RUNNING]
-    for number in stopped:
-        study.tell(number, state=optuna.trial.TrialState.FAIL)
-    finished = sum(trial.state.is_finished() for trial in begun)
+    state = optuna.trial.TrialState
+    for trial in begun:
+        if trial.state == state.RUNNING:  # the one that the search was stopped in; it is made again
+            study.tell(trial.number, state=state.FAIL)
+            study.enqueue_trial(trial.params)
+    finished = sum(trial.state in (state.COMPLETE, state.PRUNED) for trial in begun)
 
     def objective(trial: Trial) -> float:
         run = replace(
