@@ -32,6 +32,7 @@ REFERENCE = {
         "agents.training.TrainConfig",
         "agents.training.train",
         "agents.training.resume",
+        "agents.training.tune",
         "agents.training.PPOSettings",
         "agents.training.SACSettings",
         "agents.training.TD3Settings",

@@ -1,8 +1,6 @@
 """Files of hyperparameters: what they may hold, what is refused, and what reaches a training."""
 
-import json
 from dataclasses import fields, replace
-from pathlib import Path
 
 import pytest
 
@@ -115,9 +113,3 @@ def test_a_search_stays_within_the_hyperparameters(kind):
 def test_the_name_of_a_table_is_that_of_the_track():
     assert track_of("duffing_env/Amplitude-v0") == "Amplitude-v0"
     assert track_of("Own-v3") == "Own-v3"
-
-
-def test_the_files_travel_with_the_package():
-    """They stand within a package that the wheel holds, so they are no files beside it."""
-    assert FILES.parent == Path(__import__("agents").__file__).parent
-    assert json.loads("[]") == []
