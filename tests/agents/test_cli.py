@@ -74,7 +74,7 @@ def test_help_explains_every_option(name):
             if option == "hyperparameters":
                 continue  # those of the last classes
             flag = f"--{prefix}{option}".replace("_", "-")
-            (index,) = [i for i, line in enumerate(lines) if line.split(" ")[0] == flag]
+            (index,) = [i for i, line in enumerate(lines) if line.split(" ")[0].rstrip(",") == flag]
             here = " ".join(lines[index : index + 2])
             assert explanation in here, flag
             assert "(default: " in here, flag

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import runpy
 import shutil
 import signal
 import subprocess
@@ -207,6 +208,14 @@ def test_only_the_latest_checkpoint_holds_the_state(tmp_path):
     assert buffer["buffer/observations"].shape == (50, 8, 22)  # of 64 samples of each, the buffer holds 50
     earlier = make_policy(str(folder / "checkpoints" / "000000256"))
     assert earlier.card["steps"] == 256
+
+
+def test_the_script_resumes(tmp_path, monkeypatch, capsys):
+    folder = stopped("ppo", tmp_path / "run", at=400)
+    monkeypatch.setattr(sys, "argv", ["train.py", "--resume", str(folder), "--systems", "0"])
+    runpy.run_path(str(Path(agents.__file__).parents[1] / "train.py"), run_name="__main__")
+    assert f"The run is in {folder}" in capsys.readouterr().out.replace("\n", "")
+    assert make_policy(str(folder)).card["steps"] == STEPS
 
 
 def test_a_finished_run_is_not_resumed(tmp_path):
