@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from agents.cli import JsonOptions, run_script
+from agents.cli import JsonOptions, check_track, run_script
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,9 @@ class Config:
     """Folder for evaluation.json and the figures."""
     report: Path | None = None
     """Folder for a report instead: one HTML page, and evaluation.json."""
+
+    def __post_init__(self) -> None:
+        check_track(self.env)
 
 
 def main(config: Config) -> None:

@@ -8,7 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import gymnasium as gym
 import tyro
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.error import Error as GymnasiumError
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -36,13 +38,51 @@ JsonOptions = Annotated[
 Config = TypeVar("Config")
 
 
-def run_script(main: Callable[[Config], None], config: type[Config], description: str) -> None:
+def check_track(env_id: str) -> None:
+    """Refuse an environment that has no vector environment of duffing_env, on which everything here is run.
+
+    Raises:
+        ValueError: for an environment of another package, or one that cannot be imported.
+        gymnasium.error.Error: for an id that is not registered.
+    """
+    from duffing_env.vector_env import DuffingVectorEnv
+
+    try:
+        entry: Any = gym.spec(env_id).vector_entry_point
+        entry = load_env_creator(entry) if isinstance(entry, str) else entry
+    except ImportError as error:
+        raise ValueError(
+            f"env must be the id of a track such as duffing_env/Short-v0, but is {env_id}: {error}"
+        ) from error
+    if entry is None or (isinstance(entry, type) and not issubclass(entry, DuffingVectorEnv)):
+        raise ValueError(
+            f"env must be a track, which has a vector environment of duffing_env, but is {env_id}; "
+            "see the list at: python -c 'import duffing_env; print(*duffing_env.TRACKS)'"
+        )
+
+
+def run_script(
+    main: Callable[[Config], None],
+    config: type[Config],
+    description: str,
+    default: Callable[[], Config] | None = None,
+) -> None:
     """Parse the command line into ``config`` and call ``main`` with it.
 
     An error that the user can mend is printed as one message, with exit status 2 and no traceback.
+
+    Args:
+        main: what the script does.
+        config: its settings, a dataclass.
+        description: stands above the list of settings in the help.
+        default: makes the settings that the command line changes, where they are not those of the class.
     """
     try:
-        main(tyro.cli(config, description=description))
+        if default is None:
+            main(tyro.cli(config, description=description))
+        else:
+            start = default()
+            main(tyro.cli(type(start), description=description, default=start))
     except (ValueError, OSError, GymnasiumError) as error:
         print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
         sys.exit(2)

@@ -89,7 +89,7 @@ def evaluate(
     for name in policies:
         if on_policy is not None:
             on_policy(name)
-        evaluation, beliefs, truth, experiment = _roll_out(name, env_id, systems, seed, options)
+        evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
         if type(experiment) is SimulatedExperiment and experiment.jump == 0:
             gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
             means = np.array([belief.coefficients_mean for belief in beliefs])
@@ -101,14 +101,14 @@ def evaluate(
             evaluation.metrics["simulation_rmse"] = metrics.simulation_errors(means, truth)
             evaluation.estimators.update(_audit(evaluation, truth, experiment))
         if isinstance(experiment, SimulatedExperiment) and isinstance(beliefs[0], Belief) and record_available():
-            _, twins, _, _ = _roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
+            _, twins, _, _ = roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
             means = np.array([belief.coefficients_mean for belief in twins])
             evaluation.metrics["arrow_rmse"] = metrics.arrow_errors(means)
         evaluations.append(evaluation)
     return evaluations
 
 
-def _roll_out(
+def roll_out(
     name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]
 ) -> tuple[Evaluation, list[RecordBelief], PhysicalParameters, Experiment]:
     """One episode of every system; the beliefs it ended with, the truth and the experiment."""

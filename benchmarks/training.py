@@ -92,25 +92,9 @@ def _loop(make: Callable[[], Any], threads: int) -> Callable[[int], tuple[float,
 
 
 def _our_model() -> Any:
-    from stable_baselines3 import PPO
-
     from agents.vec_env import DuffingVecEnv
 
-    ppo = PPOSettings()
-    return PPO(
-        "MlpPolicy",
-        DuffingVecEnv(TRACK, ppo.num_envs, seed=0),
-        n_steps=ppo.n_steps,
-        batch_size=ppo.batch_size,
-        n_epochs=ppo.n_epochs,
-        learning_rate=ppo.learning_rate,
-        gamma=ppo.gamma,
-        gae_lambda=ppo.gae_lambda,
-        policy_kwargs={"net_arch": list(ppo.hidden), "log_std_init": ppo.log_std_init},
-        stats_window_size=ppo.num_envs,
-        seed=0,
-        device="cpu",
-    )
+    return PPOSettings().make(DuffingVecEnv(TRACK, PPOSettings().num_envs, seed=0), seed=0)
 
 
 def _default_model(num_envs: int) -> Any:

@@ -1,13 +1,15 @@
 """Learned policies: weights in a safetensors file, described by a JSON card. Nothing is ever unpickled.
 
-A policy folder holds ``policy.safetensors`` (the whole state of a Stable-Baselines3 actor-critic, by its names) and
-``policy.json`` (the card). Acting needs the actor only: a tanh network, evaluated here with NumPy, so that a trained
-policy runs without torch.
+A policy folder holds ``policy.safetensors`` (the tensors of a Stable-Baselines3 policy, by their names there) and
+``policy.json`` (the card: algorithm, network, what it was trained on). Acting needs the actor only, which is evaluated
+here with NumPy, so that a trained policy runs without torch.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,27 +23,65 @@ if TYPE_CHECKING:
 
 WEIGHTS = "policy.safetensors"
 CARD = "policy.json"
-FORMAT = 1
+#: Format 1, which is read as well, has no network in its card: it is always that of PPO.
+FORMAT = 2
 
 FloatArray = npt.NDArray[np.float32]
+State = tuple[FloatArray, FloatArray]
+
+_ACTIVATIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, np.float32(0)),
+}
+
+
+@dataclass(frozen=True)
+class Network:
+    """The actor, as the card describes it.
+
+    Attributes:
+        layers: names of the linear layers, from the observation (or the memory) to the action.
+        activation: between them: tanh or relu.
+        squashed: whether the action is the tanh of the last layer, or else its clipped value.
+        spread: name of the log standard deviation: a tensor, or a layer beside the last one; None for none.
+        memory: name of the LSTM before the layers; None for none.
+    """
+
+    layers: tuple[str, ...]
+    activation: str = "tanh"
+    squashed: bool = False
+    spread: str | None = "log_std"
+    memory: str | None = None
 
 
 class LearnedPolicy:
-    """A Gaussian policy whose mean is a tanh network of the observation.
+    """A trained actor: a network of the observation, with a memory where it was trained with one.
 
     Args:
-        layers: weights (out, in) and biases (out,) of each layer; the last one gives the action.
-        log_std: (1,) log standard deviation of the action, used where it is not deterministic.
+        network: which tensors make it up, and how.
+        tensors: by name; a layer has a weight (out, in) and a bias (out,).
         card: what the policy was trained on, see `save_policy`.
         seed: of the actions that are sampled.
+
+    Raises:
+        KeyError: for a tensor that is missing, or an activation that is unknown.
     """
 
     def __init__(
-        self, layers: list[tuple[FloatArray, FloatArray]], log_std: FloatArray, card: dict[str, Any], seed: int = 0
+        self, network: Network, tensors: Mapping[str, FloatArray], card: dict[str, Any], seed: int = 0
     ) -> None:
-        self.layers = layers
-        self.log_std = log_std
+        def layer(name: str) -> tuple[FloatArray, FloatArray]:
+            return tensors[f"{name}.weight"], tensors[f"{name}.bias"]
+
         self.card = card
+        self._squashed = network.squashed
+        self._activation = _ACTIVATIONS[network.activation]
+        self._layers = [layer(name) for name in network.layers]
+        self._memory = None if network.memory is None else _Memory(network.memory, tensors)
+        self._spread: FloatArray | tuple[FloatArray, FloatArray] | None = None
+        if network.spread is not None:
+            self._spread = tensors[network.spread] if network.spread in tensors else layer(network.spread)
+        self._features = (self._layers[0][0] if self._memory is None else self._memory.from_input).shape[1]
         self._rng = np.random.default_rng(seed)
 
     def predict(
@@ -51,34 +91,96 @@ class LearnedPolicy:
         episode_start: npt.ArrayLike | None = None,
         deterministic: bool = False,
     ) -> tuple[FloatArray, Any]:
-        """The action (n, 1) for observations (n, features), or (1,) for one observation; the state is not used."""
+        """The action (n, 1) for observations (n, features), or (1,) for one observation.
+
+        The state is Stable-Baselines3's: hidden and cell values, each (1, n, units), of a policy with a memory, which
+        forgets them where ``episode_start``; None is a memory of nothing. Without a memory it is handed on unused.
+        """
         hidden = np.asarray(observation, dtype=np.float32)
-        expected = self.layers[0][0].shape[1]
-        if hidden.shape[-1:] != (expected,):
-            raise ValueError(f"observation must have {expected} entries, but has shape {hidden.shape}")
-        for weight, bias in self.layers[:-1]:
-            hidden = np.tanh(hidden @ weight.T + bias)
-        weight, bias = self.layers[-1]
+        if hidden.shape[-1:] != (self._features,):
+            raise ValueError(f"observation must have {self._features} entries, but has shape {hidden.shape}")
+        if self._memory is not None:
+            state = self._memory.update(np.atleast_2d(hidden), state, episode_start)
+            hidden = state[0][-1].reshape(*hidden.shape[:-1], -1)
+        for weight, bias in self._layers[:-1]:
+            hidden = self._activation(hidden @ weight.T + bias)
+        weight, bias = self._layers[-1]
         action = hidden @ weight.T + bias
-        if not deterministic:
-            action += np.exp(self.log_std) * self._rng.standard_normal(action.shape, dtype=np.float32)
-        return np.clip(action, -1.0, 1.0), state
+        if not deterministic and self._spread is not None:
+            action += np.exp(self._log_std(hidden)) * self._rng.standard_normal(action.shape, dtype=np.float32)
+        return np.tanh(action) if self._squashed else np.clip(action, -1.0, 1.0), state
+
+    def _log_std(self, hidden: FloatArray) -> FloatArray:
+        """Log standard deviation of the action; one that is a layer is kept within Stable-Baselines3's limits."""
+        if isinstance(self._spread, tuple):
+            weight, bias = self._spread
+            return np.clip(hidden @ weight.T + bias, -20.0, 2.0)
+        assert self._spread is not None
+        return self._spread
+
+
+class _Memory:
+    """An LSTM of one layer, with torch's tensors: gates in the order input, forget, cell, output."""
+
+    def __init__(self, name: str, tensors: Mapping[str, FloatArray]) -> None:
+        self.from_input, self._from_hidden = tensors[f"{name}.weight_ih_l0"], tensors[f"{name}.weight_hh_l0"]
+        self._bias = tensors[f"{name}.bias_ih_l0"] + tensors[f"{name}.bias_hh_l0"]
+
+    def update(self, inputs: FloatArray, state: State | None, episode_start: npt.ArrayLike | None) -> State:
+        """Hidden and cell values (1, n, units) after inputs (n, features)."""
+        units = self._from_hidden.shape[1]
+        zeros = np.zeros((1, len(inputs), units), dtype=np.float32)
+        hidden, cell = (zeros, zeros) if state is None else state
+        if hidden.shape != zeros.shape or cell.shape != zeros.shape:
+            raise ValueError(f"state must be two arrays of shape {zeros.shape}, but has {hidden.shape}, {cell.shape}")
+        if episode_start is not None:
+            kept = ~np.atleast_1d(np.asarray(episode_start, dtype=np.bool_))[:, None]
+            hidden, cell = hidden * kept, cell * kept
+        gates = inputs @ self.from_input.T + hidden[0] @ self._from_hidden.T + self._bias
+        admit, keep, candidate, show = np.split(gates, 4, axis=-1)
+        cell = _sigmoid(keep) * cell[0] + _sigmoid(admit) * np.tanh(candidate)
+        hidden = _sigmoid(show) * np.tanh(cell)
+        return hidden[None].astype(np.float32), cell[None].astype(np.float32)
+
+
+def _sigmoid(x: FloatArray) -> FloatArray:
+    return np.float32(0.5) * (np.float32(1) + np.tanh(np.float32(0.5) * x))
 
 
 def save_policy(folder: Path, model: BaseAlgorithm, card: dict[str, Any]) -> None:
-    """Write a trained actor-critic into a folder, each file in one piece.
+    """Write a trained policy into a folder, each file in one piece.
 
     Args:
         folder: made where it is missing.
-        model: PPO with a tanh network.
+        model: PPO, SAC or TD3 of Stable-Baselines3, TQC or RecurrentPPO of sb3-contrib. Of those that learn from a
+            buffer only the actor is written; the actor-critics are written whole.
         card: what it was trained on: algorithm, track, options, seed, steps, versions.
     """
     from safetensors.numpy import save
 
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {name: value.detach().cpu().numpy() for name, value in model.policy.state_dict().items()}
+    if not hasattr(model.policy, "mlp_extractor"):
+        tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
+    network = _network_of(model.policy, tensors)
     write_atomically(folder / WEIGHTS, save(tensors))
-    write_atomically(folder / CARD, json.dumps({"format": FORMAT, **card}, indent=2).encode())
+    described = {"format": FORMAT, "network": asdict(network), **card}
+    write_atomically(folder / CARD, json.dumps(described, indent=2).encode())
+
+
+def _network_of(policy: Any, tensors: Mapping[str, Any]) -> Network:
+    """What the actor of a Stable-Baselines3 policy is made of."""
+
+    def layers(within: str) -> tuple[str, ...]:
+        return tuple(n.removesuffix(".weight") for n in tensors if n.startswith(f"{within}.") and n.endswith(".weight"))
+
+    activation = policy.activation_fn.__name__.lower()
+    if hasattr(policy, "mlp_extractor"):  # PPO and RecurrentPPO
+        memory = "lstm_actor" if hasattr(policy, "lstm_actor") else None
+        return Network((*layers("mlp_extractor.policy_net"), "action_net"), activation, memory=memory)
+    if "actor.log_std.weight" in tensors:  # SAC and TQC
+        return Network((*layers("actor.latent_pi"), "actor.mu"), activation, squashed=True, spread="actor.log_std")
+    return Network(layers("actor.mu"), activation, squashed=True, spread=None)  # TD3
 
 
 def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
@@ -102,15 +204,18 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
             f"policy folder must hold sound files, but {folder} does not: {error}; copy it anew"
         ) from error
     found = card.get("format") if isinstance(card, dict) else None
-    if found != FORMAT:
-        raise ValueError(f"policy card must have format {FORMAT}, but {folder / CARD} has {found!r}; train anew")
+    if found not in (1, FORMAT):
+        raise ValueError(f"policy card must have format 1 or {FORMAT}, but {folder / CARD} has {found!r}; train anew")
+    try:
+        network = _network_of_format_1(tensors) if found == 1 else Network(**card["network"])
+        return LearnedPolicy(network, tensors, card, seed)
+    except (KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"policy must be what its card says, but {folder} is not: {error!r}; copy it anew") from error
+
+
+def _network_of_format_1(tensors: Mapping[str, Any]) -> Network:
     hidden = sorted(
         (name for name in tensors if name.startswith("mlp_extractor.policy_net.") and name.endswith(".weight")),
         key=lambda name: int(name.split(".")[2]),  # by number: layer 10 comes after layer 2
     )
-    names = [name.removesuffix(".weight") for name in hidden] + ["action_net"]
-    try:
-        layers = [(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
-        return LearnedPolicy(layers, tensors["log_std"], card, seed)
-    except KeyError as error:
-        raise ValueError(f"policy must be an actor-critic of PPO, but {folder / WEIGHTS} lacks {error}") from error
+    return Network((*(name.removesuffix(".weight") for name in hidden), "action_net"))

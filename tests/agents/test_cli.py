@@ -17,8 +17,10 @@ from agents.cli import JsonOptions, run_script
 ROOT = Path(__file__).parents[2]
 #: Where the options of each script are declared: file and class.
 DECLARED = {
-    "train.py": [("train.py", "Config", ""), ("agents/training.py", "TrainConfig", ""),
-                 ("agents/training.py", "PPOSettings", "ppo.")],
+    "train.py": [("train.py", "Config", ""), ("agents/training/runs.py", "Subject", ""),
+                 ("agents/training/runs.py", "TrainConfig", ""),
+                 ("agents/training/algorithms.py", "AlgorithmSettings", "ppo."),
+                 ("agents/training/algorithms.py", "OnPolicySettings", "ppo.")],
     "evaluate.py": [("evaluate.py", "Config", "")],
 }  # fmt: skip
 
@@ -69,16 +71,15 @@ def test_help_explains_every_option(name):
     explained = 0
     for file, cls, prefix in DECLARED[name]:
         for option, explanation in declared_options(file, cls):
-            if option == "ppo":
-                assert explanation in lines  # the head of its own group
-                continue
+            if option == "hyperparameters":
+                continue  # those of the last classes
             flag = f"--{prefix}{option}".replace("_", "-")
-            (index,) = [i for i, line in enumerate(lines) if line.split(" ")[0] == flag]
+            (index,) = [i for i, line in enumerate(lines) if line.split(" ")[0].rstrip(",") == flag]
             here = " ".join(lines[index : index + 2])
             assert explanation in here, flag
             assert "(default: " in here, flag
             explained += 1
-    assert explained == {"train.py": 18, "evaluate.py": 7}[name]
+    assert explained == {"train.py": 24, "evaluate.py": 7}[name]
 
 
 @pytest.mark.parametrize(
@@ -93,6 +94,15 @@ def test_help_explains_every_option(name):
         ("train.py", ["--options", '{"reward": "log_posterior"}'], "options must not hold reward"),
         ("train.py", ["--options", '{"horizon": 0}'], "horizon must be a whole number of at least 1, but is 0"),
         ("train.py", ["--env", "duffing_env/Amplitud-v0"], "Amplitud"),
+        ("train.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
+        ("train.py", ["--algo", "sacc"], "invalid choice 'sacc'"),
+        ("train.py", ["--algo", "sac", "--sac.tau", "2"], "tau must be in [0, 1], but is 2.0"),
+        ("train.py", ["--algo", "sac", "--ppo.gamma", "0.9"], "--ppo.gamma"),
+        ("train.py", ["--settings", "none.toml"], "none.toml"),
+        ("train.py", ["--eval-every", "-1"], "eval_every must be at least 0, but is -1"),
+        ("train.py", ["--tune", "-1"], "tune must be at least 0, but is -1"),
+        ("train.py", ["--resume", "none"], "resume takes all settings but systems from the run"),
+        ("evaluate.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
         ("evaluate.py", ["--systems", "1"], "systems must be at least 2, but is 1"),
         ("evaluate.py", ["--systems", "a few"], "a few"),
         ("evaluate.py", ["--policies", "unifrom"], "did you mean 'uniform'"),
@@ -152,7 +162,7 @@ def test_train_then_evaluate(script, tmp_path):
         assert str(Path("made") / name) in finished.stdout.splitlines()
     description = json.loads((tmp_path / "made" / "config.json").read_text())
     assert description["config"]["options"] == {"horizon": 32}
-    assert description["config"]["ppo"]["hidden"] == [6, 5]
+    assert description["config"]["hyperparameters"]["hidden"] == [6, 5]
     assert description["command"][:5] == ["train.py", "--steps", "512", "--seed", "4"]
     compared = json.loads((tmp_path / "made" / "evaluation.json").read_text())
     assert list(compared["policies"]) == ["made", "silverbox-multisine", "silverbox-arrow", "uniform", "prbs"]

@@ -11,23 +11,25 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file, save_file
-from stable_baselines3 import PPO, SAC
 
 import agents
 from agents import make_policy
 from agents.evaluation import evaluate
 from agents.policies import trained_policies
 from agents.policies.learned import CARD, WEIGHTS, load_policy, save_policy
+from agents.training import ALGORITHMS
 from agents.vec_env import DuffingVecEnv
 
 FEATURES = 22
 
 
-def make_model(hidden=(16, 8), algorithm=PPO, log_std=-0.5):
+def make_model(hidden=(16, 8), algo="ppo", log_std=-0.5):
     """A model with random weights, so large that tanh and clipping matter."""
-    envs = DuffingVecEnv("duffing_env/Amplitude-v0", 2)
-    settings = {"n_steps": 8, "batch_size": 16} if algorithm is PPO else {}
-    model = algorithm("MlpPolicy", envs, policy_kwargs={"net_arch": list(hidden)}, device="cpu", **settings)
+    if algo in ("tqc", "recurrent_ppo"):
+        pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed; it is the extra contrib")
+    model = ALGORITHMS[algo](num_envs=2, batch_size=64, hidden=hidden).make(
+        DuffingVecEnv("duffing_env/Amplitude-v0", 2), seed=0
+    )
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for name, parameter in model.policy.named_parameters():
@@ -64,6 +66,80 @@ def test_loaded_policy_acts_as_the_model(tmp_path, hidden):
         np.testing.assert_allclose(single, action, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("hidden", [(16, 8), (5,), ()])
+def test_every_algorithm_is_played_as_stable_baselines_plays_it(tmp_path, algo, hidden):
+    folder, model = saved(tmp_path, algo=algo, hidden=hidden)
+    policy = load_policy(folder)
+    observations = random_observations(2 * 40).reshape(40, 2, FEATURES)
+    state, expected_state, starts = None, None, np.ones(2, dtype=bool)
+    actions = []
+    for t, observation in enumerate(observations):
+        expected, expected_state = model.predict(observation, expected_state, starts, deterministic=True)
+        action, state = policy.predict(observation, state, starts, deterministic=True)
+        assert action.shape == (2, 1)
+        assert action.dtype == np.float32
+        np.testing.assert_allclose(action, expected, rtol=0, atol=2e-6)
+        starts = np.array([t % 7 == 0, t % 5 == 0])  # rows begin anew at different times
+        actions.append(action)
+    assert np.std(actions) > 0.1
+    if algo == "recurrent_ppo":
+        np.testing.assert_allclose(state, expected_state, rtol=0, atol=2e-6)
+        assert state[0].shape == (1, 2, 32)
+    single, _ = policy.predict(observations[0, 0], deterministic=True)
+    assert single.shape == (1,)
+    np.testing.assert_allclose(single, actions[0][0], rtol=0, atol=2e-6)
+    saturated, _ = policy.predict(1e4 * observations[0], deterministic=False)
+    assert np.abs(saturated).max() <= 1
+
+
+def test_a_memory_is_forgotten_where_an_episode_starts(tmp_path):
+    folder, _ = saved(tmp_path, algo="recurrent_ppo")
+    policy = load_policy(folder)
+    first, second = random_observations(4).reshape(2, 2, FEATURES)
+    fresh, _ = policy.predict(second, deterministic=True)
+    _, state = policy.predict(first, deterministic=True)
+    remembered, _ = policy.predict(second, state, deterministic=True)
+    mixed, _ = policy.predict(second, state, np.array([True, False]), deterministic=True)
+    assert not np.allclose(remembered, fresh, atol=1e-3)
+    np.testing.assert_array_equal(mixed, [fresh[0], remembered[1]])
+    with pytest.raises(ValueError, match=r"state must be two arrays of shape \(1, 3, 32\)"):
+        policy.predict(random_observations(3), state)
+
+
+@pytest.mark.parametrize("algo", ["sac", "tqc"])
+def test_squashed_samples_are_those_of_stable_baselines(tmp_path, algo):
+    """Same mean and spread before the tanh, by the quartiles of many samples at one observation."""
+    folder, model = saved(tmp_path, algo=algo)
+    many = np.tile(random_observations(1), (20_000, 1))
+    ours, theirs = (np.quantile(p.predict(many)[0], [0.25, 0.5, 0.75]) for p in (load_policy(folder), model))
+    np.testing.assert_allclose(ours, theirs, atol=0.05)
+
+
+def test_td3_does_not_sample(tmp_path):
+    policy = load_policy(saved(tmp_path, algo="td3")[0])
+    observations = random_observations()
+    np.testing.assert_array_equal(policy.predict(observations)[0], policy.predict(observations, deterministic=True)[0])
+
+
+@pytest.mark.parametrize("algo", ["sac", "td3", "tqc"])
+def test_critics_do_not_travel(tmp_path, algo):
+    folder, _ = saved(tmp_path, algo=algo)
+    assert all(name.startswith("actor.") for name in load_file(folder / WEIGHTS))
+
+
+def test_format_1_is_read_as_before(tmp_path):
+    """Its card has no network; the layers are found by their numbers, 10 after 2."""
+    folder, model = saved(tmp_path, hidden=(4,) * 7)
+    (folder / CARD).write_text('{"format": 1, "algorithm": "ppo"}')
+    observations = random_observations()
+    np.testing.assert_allclose(
+        load_policy(folder).predict(observations, deterministic=True)[0],
+        model.predict(observations, deterministic=True)[0],
+        atol=1e-5,
+    )
+
+
 def test_every_weight_is_saved_as_it_is(tmp_path):
     folder, model = saved(tmp_path)
     tensors, expected = load_file(folder / WEIGHTS), model.policy.state_dict()
@@ -87,8 +163,9 @@ def test_saving_again_replaces_the_policy(tmp_path):
 def test_the_card_tells_what_it_was_told(tmp_path):
     folder, _ = saved(tmp_path, card={"algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}})
     card = load_policy(folder).card
-    assert card == {"format": 1, "algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}}
     assert json.loads((folder / CARD).read_text()) == card
+    assert card.pop("network")["activation"] == "tanh"
+    assert card == {"format": 2, "algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}}
 
 
 def test_actions_are_in_range_and_the_state_is_passed_on(tmp_path):
@@ -177,9 +254,14 @@ def test_pickles_and_archives_are_refused_unopened(tmp_path):
 @pytest.mark.parametrize(
     ("card", "message"),
     [
-        ('{"format": 2}', "must have format 1, but .*policy.json has 2"),
-        ("{}", "must have format 1, but .*policy.json has None"),
-        ("[1]", "must have format 1, but .*policy.json has None"),
+        ('{"format": 3}', "must have format 1 or 2, but .*policy.json has 3"),
+        ("{}", "must have format 1 or 2, but .*policy.json has None"),
+        ("[1]", "must have format 1 or 2, but .*policy.json has None"),
+        ('{"format": 2}', "must be what its card says, but .* is not: KeyError"),
+        ('{"format": 2, "network": {"layers": ["elsewhere"]}}', "KeyError.'elsewhere.weight'"),
+        ('{"format": 2, "network": {"layers": []}}', "IndexError"),
+        ('{"format": 2, "network": {"layers": ["action_net"], "activation": "swish"}}', "KeyError.'swish'"),
+        ('{"format": 2, "network": {"layers": ["action_net"], "depth": 3}}', "TypeError.*depth"),
         ('{"format": 1', "must hold sound files"),
         ("", "must hold sound files"),
     ],
@@ -199,12 +281,12 @@ def test_cut_off_weights_are_refused(tmp_path):
 
 
 def test_weights_of_something_else_are_refused(tmp_path):
-    folder, _ = saved(tmp_path / "sac", algorithm=SAC)
-    with pytest.raises(ValueError, match=r"must be an actor-critic of PPO, but .* lacks 'action_net.weight'"):
-        load_policy(folder)
-    save_file({"weights": np.zeros(3)}, folder / WEIGHTS)
-    with pytest.raises(ValueError, match="must be an actor-critic of PPO"):
-        load_policy(folder)
+    folder, _ = saved(tmp_path)
+    for card in ((folder / CARD).read_text(), '{"format": 1}'):
+        (folder / CARD).write_text(card)
+        save_file({"weights": np.zeros(3)}, folder / WEIGHTS)
+        with pytest.raises(ValueError, match=r"must be what its card says, but .*KeyError\('.*weight'\); copy it anew"):
+            load_policy(folder)
 
 
 def test_loading_and_acting_needs_no_torch(tmp_path):
@@ -264,7 +346,7 @@ def unpickling(source):
 
 
 def test_the_search_covers_the_package():
-    assert {"evaluation", "learned", "signals", "training", "vec_env"} <= {path.stem for path in SOURCES}
+    assert {"checkpoints", "evaluation", "learned", "runs", "signals", "vec_env"} <= {path.stem for path in SOURCES}
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)

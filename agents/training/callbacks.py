@@ -1,0 +1,72 @@
+"""What follows a training from within Stable-Baselines3: its loop's callback, and its log."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import CSVOutputFormat
+
+_STEPS = "time/total_timesteps"
+
+
+class Watch(BaseCallback):
+    """Reports every roll-out, and every update that follows one.
+
+    Args:
+        on_rollout: called with the samples so far and the mean return of the last episodes, before the update.
+        on_update: called after the update.
+    """
+
+    def __init__(self, on_rollout: Callable[[int, float], None], on_update: Callable[[], None]) -> None:
+        super().__init__()
+        self._report, self._updated = on_rollout, on_update
+        self._collected = False
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        episodes: Any = self.model.ep_info_buffer or []
+        self._report(
+            self.num_timesteps, float(np.mean([episode["r"] for episode in episodes])) if episodes else float("nan")
+        )
+        self._collected = True
+
+    def _on_rollout_start(self) -> None:
+        if self._collected:
+            self._updated()
+
+    def _on_training_end(self) -> None:
+        self._updated()
+
+
+class ContinuedCSV(CSVOutputFormat):
+    """A log that goes on after its rows up to ``steps``; what is there already is never lost, as it replaces the file.
+
+    Args:
+        path: of the CSV file; it need not exist.
+        steps: samples that the training goes on from.
+    """
+
+    def __init__(self, path: Path, steps: int) -> None:
+        before = path.read_text().splitlines() if path.exists() else []
+        kept = before[:1] + [line for line in before[1:] if _logged_by(before[0], line, steps)]
+        replacement = path.with_name(f".{path.name}")
+        super().__init__(str(replacement))
+        if len(kept) > 1:
+            self.keys = kept[0].split(",")
+            self.file.write("".join(f"{line}\n" for line in kept))
+            self.file.flush()
+        os.replace(replacement, path)
+
+
+def _logged_by(head: str, line: str, steps: int) -> bool:
+    """Whether a row is whole, and of a sample up to ``steps``."""
+    (row,) = csv.DictReader([head, line])
+    return None not in row.values() and None not in row and int(row[_STEPS] or steps + 1) <= steps

@@ -1,0 +1,103 @@
+"""Files of hyperparameters: TOML, one table for each track, and one for all that have none."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
+from estimator.files import write_atomically
+
+#: Folder of the files that come with the package, ``ALGORITHM.toml``.
+FILES = Path(__file__).parents[1] / "hyperparameters"
+DEFAULT = "default"
+
+Settings = TypeVar("Settings", bound=AlgorithmSettings)
+
+
+def track_of(env_id: str) -> str:
+    """The name of a track without its namespace, which is that of its table: "Amplitude-v0"."""
+    return env_id.split("/")[-1]
+
+
+def read_settings(algo: str, env_id: str, path: Path | None = None) -> AlgorithmSettings:
+    """The hyperparameters of an algorithm on a track: its defaults, the table "default", the table of the track.
+
+    Args:
+        algo: a name in `ALGORITHMS`.
+        env_id: of the track.
+        path: of the file; the package's where it is not given.
+
+    Raises:
+        ValueError: for an unknown algorithm, or a file that is no TOML or has an entry that is no hyperparameter.
+        OSError: where the file cannot be read.
+    """
+    if algo not in ALGORITHMS:
+        raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, but is {algo}{_hint(algo, ALGORITHMS)}")
+    path = FILES / f"{algo}.toml" if path is None else path
+    try:
+        tables = tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"settings must be a TOML file, but {path} is not: {error}") from error
+    for table, entries in tables.items():
+        _check_table(table, entries, ALGORITHMS[algo], path)
+    return settings_of(ALGORITHMS[algo], tables.get(DEFAULT, {}) | tables.get(track_of(env_id), {}))
+
+
+def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
+    """Hyperparameters of this kind from entries as JSON and TOML hold them.
+
+    Raises:
+        ValueError: for an entry that is no field, or whose value has another type.
+    """
+    defaults: dict[str, Any] = {f.name: f.default for f in fields(kind)}
+    values: dict[str, Any] = {}
+    for name, value in entries.items():
+        if name not in defaults:
+            raise ValueError(f"{name} is no hyperparameter of {kind.__name__}{_hint(name, defaults)}")
+        wanted = type(defaults[name])
+        if wanted is float and type(value) is int:
+            value = float(value)
+        if wanted is tuple and isinstance(value, list) and all(type(units) is int for units in value):
+            value = tuple(value)
+        if type(value) is not wanted:
+            kinds = {int: "a whole number", float: "a number", tuple: "a list of whole numbers"}
+            raise ValueError(f"{name} must be {kinds[wanted]}, but is {value!r}")
+        values[name] = value
+    return kind(**values)
+
+
+def write_settings(path: Path, env_id: str, settings: AlgorithmSettings, comment: str) -> None:
+    """Write a file that `read_settings` reads, with these hyperparameters for this track."""
+    lines = [f"# {comment}", f'["{track_of(env_id)}"]']
+    lines += [f"{name} = {json.dumps(value)}" for name, value in as_written(settings).items()]
+    write_atomically(path, "\n".join(lines) + "\n")
+
+
+def _check_table(table: str, entries: Any, kind: type[AlgorithmSettings], path: Path) -> None:
+    """Refuse a table of no registered track, and bad entries also in the tables that are not asked for."""
+    from gymnasium import registry
+
+    import duffing_env  # noqa: F401  registers the tracks
+
+    if not isinstance(entries, dict):
+        raise ValueError(f"settings must be in tables such as [{DEFAULT}], but {path} has {table} in none")
+    if table not in [DEFAULT, *(track_of(name) for name in registry)]:
+        ours = [DEFAULT, *(track_of(name) for name in registry if name.startswith("duffing_env/"))]
+        raise ValueError(
+            f"settings must have tables [{DEFAULT}] or of tracks, but {path} has [{table}]{_hint(table, ours)}"
+        )
+    try:
+        settings_of(kind, entries)
+    except ValueError as error:
+        raise ValueError(f"{error}; mend [{table}] of {path}") from error
+
+
+def _hint(name: str, known: Iterable[str]) -> str:
+    nearest = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {nearest[0]!r}?" if nearest else ""

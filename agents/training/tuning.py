@@ -1,0 +1,133 @@
+"""Search for hyperparameters: Optuna over whole trainings, each judged on held-out systems.
+
+The search folder holds ``study.log`` (Optuna's journal, of JSON lines), ``trials/NUMBER`` (the run folders) and
+``best.toml``, which `train.py --settings` reads.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.training.algorithms import as_written
+from agents.training.heldout import SCORE
+from agents.training.hyperparameters import track_of, write_settings
+from agents.training.runs import TrainConfig, describe, train
+from estimator.files import write_atomically
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+
+BEST = "best.toml"
+
+_EVALUATIONS = 10  # of each trial; after each it may be given up
+_SHOWN = 10
+
+
+def tune(config: TrainConfig, trials: int) -> Path:
+    """Train with many hyperparameters, and write the best.
+
+    The first trial has those of the configuration, the others are chosen by a tree-structured Parzen estimator within
+    `AlgorithmSettings.suggest`; a trial whose score falls below the median of the others' at the same samples is given
+    up. The score is the mean log posterior gain on held-out systems at the end of a training.
+
+    Args:
+        config: of every trial, but for what is searched for.
+        trials: how many the search is to have in the end; one that was stopped goes on in the same folder.
+
+    Returns:
+        The file of the best hyperparameters.
+
+    Raises:
+        ValueError: without Optuna, or where the folder holds another search.
+    """
+    optuna = _optuna()
+    folder = config.output or Path("runs") / f"tune-{config.algo}-{track_of(config.env).lower()}-{config.seed}"
+    _claim(folder, config)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
+    study = optuna.create_study(storage=storage, study_name=folder.name, load_if_exists=True, direction="maximize")
+    begun = study.get_trials(deepcopy=False)
+    every = max(1, config.steps // _EVALUATIONS)
+    study.sampler = optuna.samplers.TPESampler(
+        seed=int(np.random.SeedSequence((config.seed, len(begun))).generate_state(1)[0])
+    )
+    study.pruner = optuna.pruners.MedianPruner(n_warmup_steps=2 * every)
+    if not begun:
+        study.enqueue_trial({k: v for k, v in as_written(config.hyperparameters).items() if k != "hidden"})
+    state = optuna.trial.TrialState
+    for trial in begun:
+        if trial.state == state.RUNNING:  # the one that the search was stopped in; it is made again
+            study.tell(trial.number, state=state.FAIL)
+            study.enqueue_trial(trial.params)
+    finished = sum(trial.state in (state.COMPLETE, state.PRUNED) for trial in begun)
+
+    def objective(trial: Trial) -> float:
+        run = replace(
+            config,
+            hyperparameters=replace(config.hyperparameters, **config.hyperparameters.suggest(trial)),
+            output=folder / "trials" / f"{trial.number:03d}",
+            checkpoints=1,
+            eval_every=every,
+        )
+        scores: list[float] = []
+
+        def report(steps: int, found: dict[str, float]) -> None:
+            scores.append(found[SCORE])
+            trial.report(found[SCORE], steps)
+            if steps < config.steps and trial.should_prune():
+                raise optuna.TrialPruned
+
+        train(run, report)
+        return scores[-1]
+
+    study.optimize(objective, n_trials=max(0, trials - finished))
+    best = replace(config.hyperparameters, **study.best_params)
+    comment = f"{config.algo}, trial {study.best_trial.number} of {folder}: {SCORE} {study.best_value:.3f} nat"
+    write_settings(folder / BEST, config.env, best, comment)
+    _print_table(study)
+    return folder / BEST
+
+
+def _claim(folder: Path, config: TrainConfig) -> None:
+    """Write what the search is made from; a folder that holds a search of something else is refused."""
+    described = json.loads(json.dumps(describe(config)))
+    file = folder / "search.json"
+    before = json.loads(file.read_text()) if file.exists() else described
+    if any(before["config"][f.name] != described["config"][f.name] for f in fields(TrainConfig)):
+        raise ValueError(f"output must be a new folder or that of the same search, but {folder} holds another search")
+    if not file.exists():
+        write_atomically(file, json.dumps(described, indent=2))
+
+
+def _print_table(study: Study) -> None:
+    """The best trials, with what they were given."""
+    from optuna.trial import TrialState
+    from rich.console import Console
+    from rich.table import Table
+
+    complete = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
+    best = sorted(complete, key=lambda trial: -(trial.value or 0.0))[:_SHOWN]
+    pruned = len(study.get_trials(deepcopy=False, states=[TrialState.PRUNED]))
+    table = Table(title=f"Log posterior gain: {len(complete)} trials to the end, {pruned} given up")
+    table.add_column("trial", justify="right")
+    table.add_column("nat", justify="right")
+    for name in best[0].params:
+        table.add_column(name, justify="right")
+    for trial in best:
+        values = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in trial.params.values())
+        table.add_row(str(trial.number), f"{trial.value:.3f}", *values)
+    Console().print(table)
+
+
+def _optuna() -> Any:
+    try:
+        import optuna
+        import optuna.storages.journal
+    except ImportError as error:
+        raise ValueError("tune must be 0 without Optuna; install it with: pip install 'duffing-env[tune]'") from error
+    return optuna

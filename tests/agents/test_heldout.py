@@ -1,0 +1,91 @@
+"""Evaluations on the way: the same metrics as `evaluate.py`, on other systems, without touching the training."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents import make_policy
+from agents.evaluation import evaluate
+from agents.training import PPOSettings, TrainConfig, train
+from agents.training.heldout import METRICS, HeldOut
+
+TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,), learning_rate=0.01)
+ENV = "duffing_env/Short-v0"
+
+
+def tiny(output, **settings):
+    return TrainConfig(**{"env": ENV, "steps": 512, "output": output, "hyperparameters": TINY, **settings})
+
+
+def rows(folder):
+    table = csv.DictReader((folder / "evaluations.csv").read_text().splitlines())
+    return [{name: float(value) for name, value in row.items()} for row in table]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """An evaluated run, and what its evaluations told on the way."""
+    told = []
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return train(tiny(folder, eval_every=200, checkpoints=4), lambda steps, found: told.append((steps, found))), told
+
+
+def test_evaluations_are_told_and_written(run):
+    made, told = run
+    assert [steps for steps, _ in told] == [256, 512]  # the first updates after 200 and 400 samples; 512 is the end
+    assert rows(made.folder) == [{"steps": steps, **found} for steps, found in told]
+    assert set(told[0][1]) == set(METRICS)
+    assert told[0] != told[1]
+
+
+def test_they_are_the_metrics_of_evaluate(run):
+    made, told = run
+    best = json.loads((made.folder / "best" / "policy.json").read_text())
+    (evaluation,) = evaluate([str(made.folder)], ENV, best["evaluation"]["systems"], best["evaluation"]["seed"])
+    for name in METRICS:
+        assert evaluation.metrics[name].mean() == pytest.approx(told[-1][1][name], rel=1e-12), name
+
+
+def test_the_best_policy_is_kept(run):
+    made, told = run
+    steps, found = max(told, key=lambda entry: entry[1]["log_posterior_gain"])
+    card = make_policy(str(made.folder / "best")).card
+    assert card["steps"] == steps
+    assert {name: card["evaluation"][name] for name in METRICS} == found
+
+
+def test_evaluating_does_not_move_the_training(run, tmp_path):
+    alone = train(tiny(tmp_path / "alone"))
+    assert not (alone.folder / "evaluations.csv").exists()
+    assert not (alone.folder / "best").exists()
+    first, second = ((folder / "policy.safetensors").read_bytes() for folder in (alone.folder, run[0].folder))
+    assert first == second
+
+
+@pytest.mark.parametrize("seed", [0, 7, 1_000_003])
+def test_the_systems_are_neither_those_of_training_nor_those_of_evaluate(seed, tmp_path):
+    assert HeldOut(tmp_path, tiny(tmp_path, seed=seed))._seed not in (seed, 0)
+
+
+def test_tensorboard_holds_both_logs(tmp_path):
+    pytest.importorskip("tensorboard", reason="tensorboard is not installed; it is an extra")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    made = train(tiny(tmp_path / "run", eval_every=256, tensorboard=True))
+    (events,) = Path(made.folder).glob("events.out.tfevents.*")
+    accumulator = EventAccumulator(str(events)).Reload()
+    for name in METRICS:
+        scalars = accumulator.Scalars(f"evaluation/{name}")
+        assert [scalar.step for scalar in scalars] == [256, 512]
+        np.testing.assert_allclose([s.value for s in scalars], [row[name] for row in rows(made.folder)], rtol=1e-6)
+    assert [scalar.step for scalar in accumulator.Scalars("train/learning_rate")] == [256, 384, 512]
+
+
+def test_tensorboard_is_asked_for_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("agents.training.runs.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"tensorboard must be installed; do so with: pip install"):
+        train(tiny(tmp_path / "run", tensorboard=True))
+    assert not (tmp_path / "run").exists()

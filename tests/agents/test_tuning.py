@@ -1,0 +1,102 @@
+"""The search for hyperparameters: it goes on where it stopped, and what it writes can be trained with."""
+
+import csv
+import json
+import sys
+
+import pytest
+
+from agents.training import PPOSettings, TrainConfig, train, tune
+from agents.training.hyperparameters import read_settings
+
+ENV = "duffing_env/Short-v0"
+TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=128, hidden=(4,))
+
+
+@pytest.fixture
+def optuna():
+    return pytest.importorskip("optuna", reason="Optuna is not installed; it is the extra tune")
+
+
+def tiny(output, **settings):
+    return TrainConfig(**{"env": ENV, "steps": 512, "output": output, "hyperparameters": TINY, **settings})
+
+
+def scores(folder):
+    """Score of every trial at its end."""
+    return {
+        int(path.parent.name): float(list(csv.DictReader(path.read_text().splitlines()))[-1]["log_posterior_gain"])
+        for path in folder.glob("trials/*/evaluations.csv")
+    }
+
+
+def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
+    folder = tmp_path / "search"
+    best = tune(tiny(folder), 2)
+    first = scores(folder)
+    assert set(first) == {0, 1}
+    assert json.loads((folder / "trials" / "000" / "config.json").read_text())["config"]["hyperparameters"] == {
+        "num_envs": 8, "batch_size": 128, "learning_rate": 1e-3, "gamma": 0.99, "hidden": [4], "n_steps": 16,
+        "n_epochs": 4, "gae_lambda": 0.95, "log_std_init": -0.5,
+    }  # fmt: skip
+    tune(tiny(folder), 2)  # nothing is left to do
+    assert scores(folder) == first
+    tune(tiny(folder), 3)
+    found = scores(folder)
+    assert set(found) == {0, 1, 2}
+    assert {number: found[number] for number in first} == first
+
+    winner = max(found, key=found.__getitem__)
+    assert best == folder / "best.toml"
+    assert best.read_text().startswith(f"# ppo, trial {winner} of ")
+    settings = read_settings("ppo", ENV, best)
+    again = train(tiny(tmp_path / "again", settings=best, hyperparameters=settings))
+    same = folder / "trials" / f"{winner:03d}"
+    assert (again.folder / "policy.safetensors").read_bytes() == (same / "policy.safetensors").read_bytes()
+
+    printed = capsys.readouterr().out
+    assert "3 trials to the end, 0 given up" in printed
+    rows = [line.split("│")[1:3] for line in printed.splitlines() if line.startswith("│")][-3:]
+    assert [int(row[0]) for row in rows] == sorted(found, key=lambda number: -found[number])
+    with pytest.raises(ValueError, match="output must be a new folder or that of the same search"):
+        tune(tiny(folder, seed=1), 4)
+
+
+def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch):
+    def stand_in(run, report):
+        report(run.steps, {"log_posterior_gain": 1.0})
+
+    folder = tmp_path / "search"
+    monkeypatch.setattr("agents.training.tuning.train", stand_in)
+    tune(tiny(folder), 1)
+    journal = folder / "study.log"
+    lines = journal.read_text().splitlines()
+    journal.write_text("\n".join(lines[:-1]) + "\n")  # without its last line, the trial is still running
+    tune(tiny(folder), 1)
+    tune(tiny(folder), 2)
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
+    first, again, other = optuna.load_study(study_name=None, storage=storage).trials
+    assert [trial.state.name for trial in (first, again, other)] == ["FAIL", "COMPLETE", "COMPLETE"]
+    assert first.params == again.params != other.params
+
+
+def test_trials_below_the_median_are_given_up(tmp_path, optuna, monkeypatch):
+    """A training whose score falls from trial to trial; the median of five is needed first."""
+    ended = []
+
+    def fake(run, report):
+        score = -float(run.output.name)
+        for steps in range(run.eval_every, run.steps + 1, run.eval_every):
+            report(steps, {"log_posterior_gain": score})
+        ended.append(run.output.name)
+
+    monkeypatch.setattr("agents.training.tuning.train", fake)
+    tune(tiny(tmp_path / "search", steps=1000), 8)
+    assert ended == ["000", "001", "002", "003", "004"]
+
+
+def test_optuna_is_asked_for_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ValueError, match=r"tune must be 0 without Optuna; install it with: pip install"):
+        tune(tiny(tmp_path / "search"), 2)
+    assert not (tmp_path / "search").exists()
