@@ -61,7 +61,7 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
         lowest = min(lowest, low.min())
         samples = np.arange(len(median))
         axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
-        axes.plot(samples, median, color=colour, label=evaluation.policy)
+        axes.plot(samples, median, color=colour, label=evaluation.title)
     axes.set_xlabel("samples")
     axes.set_ylabel("log posterior gain of the truth / nat")
     axes.set_title(title)
@@ -83,7 +83,7 @@ def draw_excitations(path: Path, evaluations: list[Evaluation], system: int = 0)
             axes.grid(alpha=0.3)
         row[0].set_ylabel("u / V")
         row[1].set_ylabel("y / V")
-        row[0].set_title(evaluation.policy, loc="left", fontsize=9)
+        row[0].set_title(evaluation.title, loc="left", fontsize=9)
     for axes in grid[-1]:
         axes.set_xlabel("time / ms")
     _save(figure, path)
@@ -97,7 +97,7 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
         time = _MILLISECONDS * np.arange(len(evaluation.inputs))
         left.plot(time, evaluation.inputs[:, system], color=colour, linewidth=0.8)
         left.set_ylabel("u / V")
-        left.set_title(evaluation.policy, loc="left", fontsize=9)
+        left.set_title(evaluation.title, loc="left", fontsize=9)
         inputs = np.nan_to_num(evaluation.inputs)  # an episode that ended is silent
         spectrum = np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         right.plot(np.fft.rfftfreq(len(inputs), SAMPLING_STEP), 1e3 * spectrum, color=colour, linewidth=0.8)
@@ -119,7 +119,7 @@ def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
         errors = np.mean([evaluation.metrics[f"error_{name}"] for name in "mcab"], axis=0)
         axes.semilogy(
             evaluation.metrics["fisher_gain"], 100 * errors, ".", color=colour, alpha=0.5, markersize=4,
-            label=evaluation.policy,
+            label=evaluation.title,
         )  # fmt: skip
     axes.set_xlabel("Fisher information / nat")
     axes.set_ylabel("mean error of m, c, a, b / %")
@@ -140,7 +140,7 @@ def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
         axes.plot([0, 100], [0, 100], color="#888888", linewidth=1)
         for evaluation, values, colour in zip(evaluations, found, cycle(_COLOURS), strict=False):
             covered = [100 * float(np.mean(values[estimator][name])) for name in LEVELS]
-            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=evaluation.policy)
+            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=evaluation.title)
         axes.set_title(estimator.replace("_", " "), fontsize=9)
         axes.set_xlabel("nominal level / %")
         axes.grid(alpha=0.3)

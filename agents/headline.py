@@ -1,0 +1,124 @@
+"""The headline: what a chosen sample is worth in samples of the Silverbox regime, and what 256 of them identify.
+
+    python -m agents.headline
+
+On common systems, each policy's information (½ log det(Λ0 + F) at the truth) is compared with that of the Silverbox
+multisine regime over ever longer stretches: as recorded, and scaled so that its peak is the limit of the input. Under
+the same peak that is Amplitude-v0, under the same power Power-v0, whose budget is the regime's own. The errors are
+those of free runs of what 256 samples on the circuit's twin identified: over the real arrow record, and beside the
+twin's own answer to its input.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from agents import metrics
+from agents.cli import run_script
+from agents.evaluation import evaluate
+from agents.leaderboard import MEDIAN, METRICS, Metric, cell_of, center_and_interval, finite
+from duffing_env.silverbox import regime_input
+from estimator import SILVERBOX_TWIN, Belief
+from estimator.files import write_atomically
+
+REGIME = "silverbox-multisine"
+
+#: What is compared: the limit that both sides have, its track, and who chooses there.
+COMPARISONS = {
+    "equal peak": ("duffing_env/Amplitude-v0", ("ppo/amplitude", "efe")),
+    "equal power": ("duffing_env/Power-v0", ("ppo/power", "efe")),
+}
+
+#: Longest stretch of the regime: log2 of its samples. It repeats after some 87,000, with other answers to it.
+_LONGEST = 17.0
+
+#: Rows of the table.
+ROWS = {
+    "fisher_gain": METRICS["fisher_gain"],
+    "worth_recorded": Metric("a sample is worth, of the regime as recorded", 1, center=MEDIAN),
+    "worth_scaled": Metric("a sample is worth, of the regime scaled to the limit", 1, center=MEDIAN),
+    "arrow_rmse": METRICS["arrow_rmse"],
+    "twin_rmse": METRICS["simulation_rmse"],
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Compare shipped policies with the Silverbox regime."""
+
+    systems: int = 256
+    """Systems, the same for all."""
+    seed: int = 0
+    """Seed of systems and noise."""
+    json: Path = Path("runs/headline.json")
+    """Where all numbers are written."""
+
+
+def compare(track: str, names: tuple[str, ...], systems: int, seed: int) -> dict[str, dict[str, npt.NDArray[Any]]]:
+    """Policies, and the regime itself, on one track: name to values (systems,) of what `ROWS` names."""
+    envs: Any = gym.make_vec(track, num_envs=systems, vectorization_mode="vector_entry_point")
+    envs.reset(seed=seed)
+    truth, experiment = envs.truth, envs.experiment
+    peak = float(np.abs(regime_input("multisine", np.random.default_rng(seed))).max())
+    found = {}
+    on_twin = evaluate((*names, REGIME), track, systems, seed, {"plant_spread": 0.0})
+    for evaluation, twin in zip(evaluate((*names, REGIME), track, systems, seed), on_twin, strict=True):
+        values = {"fisher_gain": evaluation.metrics["fisher_gain"], "twin_rmse": twin.metrics["simulation_rmse"]}
+        for name, scale in (("worth_recorded", 1.0), ("worth_scaled", experiment.max_input / peak)):
+            equivalents = metrics.silverbox_equivalents(
+                values["fisher_gain"], truth, experiment, seed, scale=scale, longest=_LONGEST
+            )
+            values[name] = equivalents / np.count_nonzero(~np.isnan(evaluation.inputs), axis=0)
+        if "arrow_rmse" in evaluation.metrics:
+            values["arrow_rmse"] = evaluation.metrics["arrow_rmse"]
+        found[evaluation.policy] = values
+    return found
+
+
+def main(config: Config) -> None:
+    """Compare, print, write."""
+    results = {}
+    for limit, (track, names) in COMPARISONS.items():
+        compared = compare(track, names, config.systems, config.seed)
+        results[limit] = {
+            policy: {name: center_and_interval(values[name][None], row) for name, row in ROWS.items() if name in values}
+            for policy, values in compared.items()
+        }
+    floor = None
+    if any("arrow_rmse" in entry for entry in results["equal peak"].values()):
+        floor = float(metrics.arrow_errors(Belief.coefficients_of(SILVERBOX_TWIN)[None])[0])
+    show(results, floor)
+    written = {"systems": config.systems, "seed": config.seed, "twin_on_the_arrow": floor, "comparisons": results}
+    write_atomically(config.json, json.dumps(finite(written), indent=2, allow_nan=False) + "\n")
+    print(config.json)
+
+
+def show(results: dict[str, Any], floor: float | None) -> None:
+    """Print a table for each limit."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(markup=False)
+    console.width = max(console.width, 120)
+    for limit, policies in results.items():
+        track, _ = COMPARISONS[limit]
+        table = Table(f"{limit}: {track}", *policies, box=box.MARKDOWN)
+        for name, row in ROWS.items():
+            if any(name in entry for entry in policies.values()):
+                cells = (cell_of(row, entry.get(name)).replace("\n", " ") for entry in policies.values())
+                table.add_row(row.title, *cells)
+        console.print(table)
+    if floor is not None:
+        console.print(f"The twin itself, with its true coefficients, simulates the real arrow to {1e3 * floor:.2f} mV.")
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__ or "")
