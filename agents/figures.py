@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from agents.evaluation import Evaluation
+    from agents.leaderboard import Metric
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
 _RESONANCES = (49.5, 94.7)
@@ -147,6 +148,34 @@ def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
     panels[0].set_ylabel("intervals that hold the truth / %")
     panels[0].legend(fontsize=7)
     return figure
+
+
+def draw_study(path: Path, results: dict[str, dict[str, Any]], measures: dict[str, Metric]) -> None:
+    """Compare recipes: a panel for each measure, the centre with its interval, and every seed above as a tick.
+
+    Args:
+        path: of the PNG file.
+        results: name of a recipe to `agents.leaderboard.center_and_interval` of each measure; those that begin with the
+            same words up to a comma have one colour.
+        measures: how they are printed, by name.
+    """
+    figure = _figure(10, 5.2)
+    panels = figure.subplots(2, -(-len(measures) // 2), sharey=True)
+    kinds = list(dict.fromkeys(recipe.partition(",")[0] for recipe in results))
+    for axes, (name, metric) in zip(panels.flat, measures.items(), strict=False):
+        for row, (recipe, summary) in enumerate(results.items()):
+            colour = _COLOURS[kinds.index(recipe.partition(",")[0])]
+            entry = summary[name]
+            each = metric.scale * np.array(entry.get("seeds", []))
+            axes.plot(each, np.full(len(each), row - 0.25), "|", color=colour, markersize=7)
+            axes.plot(metric.scale * np.array([entry["low"], entry["high"]]), [row, row], color=colour, linewidth=2.5)
+            axes.plot(metric.scale * next(iter(entry.values())), row, "o", color=colour, markersize=5)
+        axes.set_xlabel(metric.title)
+        axes.grid(alpha=0.3, axis="x")
+    for axes in panels[:, 0]:
+        axes.set_yticks(range(len(results)), list(results))
+    panels[0, 0].invert_yaxis()
+    _save(figure, path)
 
 
 def draw_policies(path: Path, systems: int = 64, samples: int = 256) -> None:
