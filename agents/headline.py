@@ -16,15 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
 from agents import metrics
 from agents.cli import run_script
-from agents.evaluation import evaluate
+from agents.evaluation import roll_out
 from agents.leaderboard import MEDIAN, METRICS, Metric, cell_of, center_and_interval, finite
-from duffing_env.silverbox import regime_input
+from duffing_env.silverbox import record_available, regime_input
 from estimator import SILVERBOX_TWIN, Belief
 from estimator.files import write_atomically
 
@@ -36,8 +35,8 @@ COMPARISONS = {
     "equal power": ("duffing_env/Power-v0", ("ppo/power", "efe")),
 }
 
-#: Longest stretch of the regime: log2 of its samples. It repeats after some 87,000, with other answers to it.
-_LONGEST = 17.0
+#: Longest stretch of the regime, log2 of its samples: 65,536 of its some 90,000.
+_LONGEST = 16.0
 
 #: Rows of the table.
 ROWS = {
@@ -63,22 +62,23 @@ class Config:
 
 def compare(track: str, names: tuple[str, ...], systems: int, seed: int) -> dict[str, dict[str, npt.NDArray[Any]]]:
     """Policies, and the regime itself, on one track: name to values (systems,) of what `ROWS` names."""
-    envs: Any = gym.make_vec(track, num_envs=systems, vectorization_mode="vector_entry_point")
-    envs.reset(seed=seed)
-    truth, experiment = envs.truth, envs.experiment
     peak = float(np.abs(regime_input("multisine", np.random.default_rng(seed))).max())
+    told: dict[str, Any] = {}
     found = {}
-    on_twin = evaluate((*names, REGIME), track, systems, seed, {"plant_spread": 0.0})
-    for evaluation, twin in zip(evaluate((*names, REGIME), track, systems, seed), on_twin, strict=True):
-        values = {"fisher_gain": evaluation.metrics["fisher_gain"], "twin_rmse": twin.metrics["simulation_rmse"]}
-        for name, scale in (("worth_recorded", 1.0), ("worth_scaled", experiment.max_input / peak)):
-            equivalents = metrics.silverbox_equivalents(
-                values["fisher_gain"], truth, experiment, seed, scale=scale, longest=_LONGEST
-            )
-            values[name] = equivalents / np.count_nonzero(~np.isnan(evaluation.inputs), axis=0)
-        if "arrow_rmse" in evaluation.metrics:
-            values["arrow_rmse"] = evaluation.metrics["arrow_rmse"]
-        found[evaluation.policy] = values
+    for name in (*names, REGIME):
+        evaluation, _, truth, experiment = roll_out(name, track, systems, seed, {})
+        if not told:
+            for row, scale in (("worth_recorded", 1.0), ("worth_scaled", experiment.max_input / peak)):
+                told[row] = metrics.regime_information(truth, experiment, seed, scale, _LONGEST)
+        gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
+        samples = np.count_nonzero(~np.isnan(evaluation.inputs), axis=0)
+        worth = {row: metrics.equal_information(gains, *regime) / samples for row, regime in told.items()}
+        _, beliefs, twins, _ = roll_out(name, track, systems, seed, {"plant_spread": 0.0})
+        means = np.array([belief.coefficients_mean for belief in beliefs])
+        errors = {"twin_rmse": metrics.simulation_errors(means, twins)}
+        if record_available():
+            errors["arrow_rmse"] = metrics.arrow_errors(means)
+        found[name] = {"fisher_gain": gains, **worth, **errors}
     return found
 
 
@@ -92,7 +92,7 @@ def main(config: Config) -> None:
             for policy, values in compared.items()
         }
     floor = None
-    if any("arrow_rmse" in entry for entry in results["equal peak"].values()):
+    if record_available():
         floor = float(metrics.arrow_errors(Belief.coefficients_of(SILVERBOX_TWIN)[None])[0])
     show(results, floor)
     written = {"systems": config.systems, "seed": config.seed, "twin_on_the_arrow": floor, "comparisons": results}

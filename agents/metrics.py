@@ -10,7 +10,6 @@ from scipy import stats
 
 from agents.policies.excitations import draw_regime
 from duffing_env.experiment import ContinuousExperiment
-from duffing_env.layout import OSCILLATOR
 from duffing_env.silverbox import load_record, regime_input
 from estimator import NLARX, Belief, ContinuousBelief, PhysicalParameters, fisher_information, to_coefficients
 from estimator.belief import RecordBelief
@@ -99,27 +98,34 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatAr
     return oracle.efficiency(evaluation.inputs.T[:n], evaluation.outputs.T[:n])
 
 
-def silverbox_equivalents(
-    gains: FloatArray,
-    truth: PhysicalParameters,
-    experiment: Any,
-    seed: int,
-    scale: float = 1.0,
-    longest: float = 15.5,
-) -> FloatArray:
+def silverbox_equivalents(gains: FloatArray, truth: PhysicalParameters, experiment: Any, seed: int) -> FloatArray:
     """(n,) samples of the Silverbox multisine regime that tell as much as ``gains`` (n,) of `information`.
 
-    Each system is given a stretch of the regime as recorded, times ``scale``. Interpolated between powers of √2; inf
-    where even the longest stretch, 2**longest samples (46,340), tells less.
+    Each system is given a stretch of the regime as recorded, at its own power. Interpolated between powers of √2; inf
+    where even the longest stretch, 46,340 samples, tells less.
+    """
+    return equal_information(gains, *regime_information(truth, experiment, seed))
+
+
+def regime_information(
+    truth: PhysicalParameters, experiment: Any, seed: int, scale: float = 1.0, longest: float = 15.5
+) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    """What stretches of the Silverbox multisine regime, times ``scale``, tell of each system.
+
+    Returns:
+        Their lengths (k,) up to 2**longest samples, and (k, n) the `information` in them [nats].
     """
     lengths = np.unique(np.round(2 ** np.arange(4, longest + 0.1, 0.5)).astype(int))
     rng, draw = np.random.default_rng(seed), draw_regime("multisine")
+    inputs = scale * np.stack([draw(rng, lengths[-1]) for _ in range(np.size(truth.m))], axis=1)
+    return lengths, np.array([information(inputs[:length], truth, experiment) for length in lengths])
+
+
+def equal_information(gains: FloatArray, lengths: npt.NDArray[np.int64], told: FloatArray) -> FloatArray:
+    """(n,) the lengths at which ``told`` (k, n) reaches ``gains`` (n,); inf where it does not."""
     equivalents = np.empty(len(gains))
     for i, gain in enumerate(gains):
-        system = PhysicalParameters(*(getattr(truth, name)[i : i + 1] for name in OSCILLATOR))
-        u = scale * draw(rng, lengths[-1])[:, None]
-        told = np.array([information(u[:length], system, experiment)[0] for length in lengths])
-        curve = np.maximum.accumulate(told)
+        curve = np.maximum.accumulate(told[:, i])
         equivalents[i] = np.exp(np.interp(gain, curve, np.log(lengths))) if gain <= curve[-1] else np.inf
     return equivalents
 

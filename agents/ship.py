@@ -94,7 +94,7 @@ def _card(run: Path) -> dict[str, Any]:
 def _recipe(runs: tuple[Path, ...], cards: list[dict[str, Any]]) -> tuple[str, dict[str, Any], list[int]]:
     """Track, options and seeds of runs that differ by nothing else than their seeds and folders."""
     recipes = [
-        {"algorithm": card["algorithm"], **card["config"]} | {"seed": None, "output": None, "systems": None}
+        {"algorithm": card.get("algorithm"), **card["config"]} | {"seed": None, "output": None, "systems": None}
         for card in cards
     ]
     for run, recipe in zip(runs, recipes, strict=True):

@@ -99,7 +99,7 @@ def learn(recipe: Recipe, config: Config, seed: int) -> Path:
     if folder.exists():
         shutil.rmtree(folder)
     options = {"factorisation": recipe.factorisation}
-    train(TrainConfig(TRACK, recipe.reward, config.steps, seed, options, folder))
+    train(TrainConfig(env=TRACK, reward=recipe.reward, steps=config.steps, seed=seed, options=options, output=folder))
     return folder
 
 

@@ -10,10 +10,12 @@ from agents.evaluation import evaluate
 from agents.study import MEASURES, RECIPES, Config, learn, main
 from agents.training import train
 
+UPDATE = 32_768  # samples between two updates of PPO
+
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
-    return Config(steps=1, seeds=2, systems=4, folder=tmp_path_factory.mktemp("study"))
+    return Config(steps=UPDATE, seeds=2, systems=4, folder=tmp_path_factory.mktemp("study"))
 
 
 @pytest.fixture
@@ -40,7 +42,7 @@ def test_a_run_that_is_finished_is_kept_and_one_that_was_stopped_begins_anew(con
     assert len(trained) == 2
     card = json.loads((folder / "policy.json").read_text())["config"]
     assert (card["reward"], card["options"]) == ("fisher", {"factorisation": "mean_field"})
-    with pytest.raises(ValueError, match="steps must be those of the runs that are there, 1, but are 2"):
+    with pytest.raises(ValueError, match="steps must be those of the runs that are there, 32768, but are 2"):
         learn(recipe, Config(steps=2, folder=config.folder), 0)
 
 
