@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from agents.policies.excitations import draw_regime
 from duffing_env.experiment import ContinuousExperiment
 from duffing_env.silverbox import load_record, regime_input
 from estimator import NLARX, Belief, ContinuousBelief, PhysicalParameters, fisher_information, to_coefficients
@@ -101,8 +100,8 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatAr
 def silverbox_equivalents(gains: FloatArray, truth: PhysicalParameters, experiment: Any, seed: int) -> FloatArray:
     """(n,) samples of the Silverbox multisine regime that tell as much as ``gains`` (n,) of `information`.
 
-    Each system is given a stretch of the regime as recorded, at its own power. Interpolated between powers of √2; inf
-    where even the longest stretch, 46,340 samples, tells less.
+    Each system is given a stretch of the regime as recorded, at its own power (`regime_information`). Interpolated
+    between powers of √2; inf where even the longest stretch, 46,340 samples, tells less.
     """
     return equal_information(gains, *regime_information(truth, experiment, seed))
 
@@ -112,12 +111,17 @@ def regime_information(
 ) -> tuple[npt.NDArray[np.int64], FloatArray]:
     """What stretches of the Silverbox multisine regime, times ``scale``, tell of each system.
 
+    They start anywhere in the regime and go on at its begin where it ends, so that every part of it counts alike: rare
+    peaks of the displacement tell most of what is known of b, and some parts have more of them.
+
     Returns:
         Their lengths (k,) up to 2**longest samples, and (k, n) the `information` in them [nats].
     """
     lengths = np.unique(np.round(2 ** np.arange(4, longest + 0.1, 0.5)).astype(int))
-    rng, draw = np.random.default_rng(seed), draw_regime("multisine")
-    inputs = scale * np.stack([draw(rng, lengths[-1]) for _ in range(np.size(truth.m))], axis=1)
+    rng = np.random.default_rng(seed)
+    regime = regime_input("multisine", rng)
+    starts = rng.integers(len(regime), size=np.size(truth.m))
+    inputs = scale * np.take(regime, np.arange(lengths[-1])[:, None] + starts, mode="wrap")
     return lengths, np.array([information(inputs[:length], truth, experiment) for length in lengths])
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from agents import oracle as module
+from agents.evaluation import evaluate
 from agents.oracle import Config, Oracle, Systems, as_stored, design, main, search
 
 SHORT, POWER = "duffing_env/Short-v0", "duffing_env/Power-v0"
@@ -77,6 +78,32 @@ def test_what_is_better_takes_its_place_and_nothing_else(empty_folder):
     # As many systems as are asked for, if so many are stored.
     assert len(Oracle.of(Systems.of(SHORT, 1)).values) == 1
     assert len(Oracle.of(Systems.of(SHORT, 3)).values) == 2
+
+
+def test_the_search_starts_from_what_policies_played(empty_folder, monkeypatch):
+    started = []
+
+    def instead(systems, row, given, rng, rounds):
+        started.append(given)
+        return given[0], float(systems.worth(np.tile(given[0], (row + 1, 1)))[0][row])
+
+    monkeypatch.setattr(module, "search", instead)
+    main(Config(env=SHORT, systems=2, policies=("ppo/short", "velocity-sign"), rounds=0))
+    played = [evaluation.inputs for evaluation in evaluate(["ppo/short", "velocity-sign"], SHORT, 2)]
+    for row, given in enumerate(started):
+        np.testing.assert_array_equal(given, [np.nan_to_num(inputs[:, row]) for inputs in played])
+    stored = Oracle.of(Systems.of(SHORT, 2))
+    np.testing.assert_allclose(stored.inputs, played[0].T, atol=1e-4)
+
+
+def test_a_search_that_starts_from_better_inputs_ends_no_worse(monkeypatch):
+    systems = Systems.of(SHORT, 1)
+    best = Oracle.of(systems)
+    monkeypatch.setattr(module, "_STARTS", 2)
+    alone = search(systems, 0, np.empty((0, 48)), np.random.default_rng(0), rounds=0)[1]
+    helped = search(systems, 0, best.inputs, np.random.default_rng(0), rounds=0)[1]
+    assert alone < best.values[0] - 0.1
+    assert helped > best.values[0] - 0.01
 
 
 def test_the_command_stores_and_says_where(empty_folder, capsys):
