@@ -75,11 +75,12 @@ def evaluate(
     """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
 
     Learned policies act by their mean. An episode that a limit ends is never dropped: it counts with what was known by
-    then. The metrics of information, simulation and other estimators need a simulated difference equation whose truth
-    stays as it is. The arrow error is that of the difference equation identified on the track's twin
-    (``plant_spread=0``) in a free run over the real arrow record; it is left out without the record. So it is for the
-    differential equation: the simulated plant has no offsets, and those of the circuit, 8 mV at the input, would be
-    nearly all of its error (5.3 mV for the twin itself).
+    then. Information at the truth, and what other estimators make of the inputs and outputs, need a simulated plant
+    whose truth stays as it is; what is measured by free runs or in samples of the Silverbox regime, the difference
+    equation. The arrow error is that of the difference equation identified on the track's twin (``plant_spread=0``) in
+    a free run over the real arrow record; it is left out without the record, and for the differential equation: the
+    simulated plant has no offsets, and those of the circuit, 8 mV at the input, would be nearly all of its error
+    (5.3 mV for the twin itself).
 
     Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the
     entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.

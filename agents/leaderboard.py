@@ -211,7 +211,11 @@ def print_estimators(evaluations: list[Evaluation]) -> None:
     from rich.table import Table
 
     titles = [METRICS[name].title for name in ESTIMATOR_METRICS]
-    table = Table("policy", "estimator", *titles, title="the same inputs and outputs in other hands")
+    table = Table(title="the same inputs and outputs in other hands")
+    for name in ("policy", "estimator"):
+        table.add_column(name, no_wrap=True)
+    for text in titles:
+        table.add_column(text)
     for evaluation in evaluations:
         for estimator, values in evaluation.estimators.items():
             cells = []
@@ -222,7 +226,7 @@ def print_estimators(evaluations: list[Evaluation]) -> None:
         table.add_section()
     if table.rows:
         console = Console(markup=False)
-        console.width = max(console.width, 110)
+        console.width = max(console.width, 130)
         console.print(table)
 
 
