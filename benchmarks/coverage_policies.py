@@ -109,6 +109,8 @@ def show(rows: list[Coverage]) -> None:
     missed = [f"{row.policy} on {row.track}" for row in rows if not row.passed]
     told = f"; missed: {', '.join(missed)}" if missed else ""
     console.print(f"{len(rows) - len(missed)} of {len(rows)} are in [{LOWEST}, {HIGHEST}]{told}")
+    single = [share for row in rows for share in row.by_coefficient]
+    console.print(f"single coefficients: from {min(single):.3f} to {max(single):.3f}")
 
 
 def _cell(row: Coverage | None) -> str:
