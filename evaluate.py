@@ -2,6 +2,7 @@
 
 python evaluate.py                                        the reference and baseline policies
 python evaluate.py --policies runs/demo prbs              a trained policy beside PRBS
+python evaluate.py --policies "ppo=runs/ppo-*-[0-4]"      five training seeds as one entry
 python evaluate.py --report runs/report                   all of it on one HTML page
 python evaluate.py --options '{"max_output": 0.3}'        under another limit
 """
@@ -19,7 +20,7 @@ class Config:
     """Compare policies on common random numbers."""
 
     policies: tuple[str, ...] = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")
-    """Names of policies, or run folders."""
+    """Names of policies, or run folders; TITLE=PATTERN for the folders of several training seeds as one entry."""
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
     options: JsonOptions = field(default_factory=dict)

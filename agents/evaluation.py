@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import glob
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -13,12 +15,13 @@ import numpy.typing as npt
 
 from agents import metrics
 from agents.policies import make_policy
-from duffing_env.experiment import Experiment, SimulatedExperiment
+from duffing_env.experiment import ContinuousExperiment, Experiment, SimulatedExperiment
 from duffing_env.layout import OBSERVATION, OSCILLATOR
 from duffing_env.silverbox import record_available
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator import NLARX, Belief, OnlineEstimator, PhysicalParameters
+from estimator import Belief, ContinuousBelief, PhysicalParameters, Prior
 from estimator.belief import RecordBelief
+from estimator.identify import identify
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 
 FloatArray = npt.NDArray[np.float64]
@@ -33,15 +36,18 @@ _LAST_INPUT, _LAST_OUTPUT = (list(OBSERVATION).index(name) for name in ("last_in
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What happened under one policy, system by system.
+    """What happened under one policy, system by system; or under several of one recipe, which differ by their seeds.
+
+    Arrays over systems hold those of the first seed, then those of the second, and so on: the same systems again.
 
     Attributes:
-        policy: its name.
+        policy: its name, or that of the recipe.
         metrics: name of a metric to its value for each system (systems,); see `agents.leaderboard.METRICS`.
         curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats].
         inputs: (horizon, systems) inputs that the plant was given [V], NaN after the end of an episode.
         outputs: (horizon, systems) outputs [V], likewise.
         estimators: what others make of the same inputs and outputs: name of an estimator to its `metrics`.
+        seeds: number of policies.
     """
 
     policy: str
@@ -50,6 +56,12 @@ class Evaluation:
     inputs: FloatArray
     outputs: FloatArray
     estimators: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
+    seeds: int = 1
+
+    @property
+    def title(self) -> str:
+        """The name, and of several the number of seeds."""
+        return self.policy if self.seeds == 1 else f"{self.policy} ({self.seeds} seeds)"
 
 
 def evaluate(
@@ -63,14 +75,18 @@ def evaluate(
     """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
 
     Learned policies act by their mean. An episode that a limit ends is never dropped: it counts with what was known by
-    then. The metrics of information, simulation and other estimators need a simulated difference equation whose truth
-    stays as it is. The arrow error is that of the difference equation identified on the track's twin
-    (``plant_spread=0``) in a free run over the real arrow record; it is left out without the record. So it is for the
-    differential equation: the simulated plant has no offsets, and those of the circuit, 8 mV at the input, would be
-    nearly all of its error (5.3 mV for the twin itself).
+    then. Information at the truth, and what other estimators make of the inputs and outputs, need a simulated plant
+    whose truth stays as it is; what is measured by free runs or in samples of the Silverbox regime, the difference
+    equation. The arrow error is that of the difference equation identified on the track's twin (``plant_spread=0``) in
+    a free run over the real arrow record; it is left out without the record, and for the differential equation: the
+    simulated plant has no offsets, and those of the circuit, 8 mV at the input, would be nearly all of its error
+    (5.3 mV for the twin itself).
+
+    Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the
+    entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.
 
     Args:
-        policies: names or run folders, see `agents.policies.make_policy`; at least one.
+        policies: names or run folders, see `agents.policies.make_policy`, or patterns as above; at least one.
         env_id: a registered track.
         systems: number of systems, at least 2.
         seed: of systems and noise; and of the policies' own randomness.
@@ -78,34 +94,74 @@ def evaluate(
         on_policy: called with each policy's name before its turn.
 
     Raises:
-        ValueError: for no policies, an unknown one, fewer than two systems, or options that the track does not take.
+        ValueError: for no policies, an unknown one, a pattern that less than two policies match, fewer than two
+            systems, or options that the track does not take.
     """
     if not policies:
         raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
     if systems < 2:
         raise ValueError(f"systems must be at least 2, but is {systems}; intervals need more than one")
-    options = dict(options or {})
     evaluations = []
     for name in policies:
-        if on_policy is not None:
-            on_policy(name)
-        evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
-        if type(experiment) is SimulatedExperiment and experiment.jump == 0:
-            gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
+        title, members = _members(name)
+        each = []
+        for member in members:
+            if on_policy is not None:
+                on_policy(member)
+            each.append(_evaluate(member, env_id, systems, seed, dict(options or {})))
+        evaluations.append(each[0] if title is None else pooled(title, each))
+    return evaluations
+
+
+def _members(name: str) -> tuple[str | None, list[str]]:
+    """The title of a group and the policies in it; without a title, the one policy of this name."""
+    title, equals, pattern = name.partition("=")
+    if not equals or Path(name).exists():
+        return None, [name]
+    found = sorted(path for path in glob.glob(pattern) if (Path(path) / "policy.json").is_file())
+    if not title or len(found) < 2:
+        raise ValueError(
+            f"policies must name a group as TITLE=PATTERN, whose pattern two policy folders or more match, but "
+            f"{name!r} matches {found}; write e.g. 'ppo=runs/ppo-amplitude-v0-*'"
+        )
+    return title, found
+
+
+def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Policies of one recipe as one entry; they must have been evaluated on the same systems."""
+
+    def join(tables: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+        return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+    return Evaluation(
+        title,
+        join([e.metrics for e in evaluations]),
+        np.concatenate([e.curve for e in evaluations], axis=1),
+        np.concatenate([e.inputs for e in evaluations], axis=1),
+        np.concatenate([e.outputs for e in evaluations], axis=1),
+        {name: join([e.estimators[name] for e in evaluations]) for name in evaluations[0].estimators},
+        sum(e.seeds for e in evaluations),
+    )
+
+
+def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]) -> Evaluation:
+    """One policy."""
+    evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
+    if isinstance(experiment, SimulatedExperiment) and experiment.jump == 0:
+        gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
+        evaluation.metrics["fisher_gain"] = gains
+        if not isinstance(experiment, ContinuousExperiment):
             means = np.array([belief.coefficients_mean for belief in beliefs])
-            evaluation.metrics["fisher_gain"] = gains
             efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
             if efficiency is not None:  # an oracle is stored, of the systems of seed 0
                 evaluation.metrics["efficiency"] = efficiency
             evaluation.metrics["silverbox_equivalent"] = metrics.silverbox_equivalents(gains, truth, experiment, seed)
             evaluation.metrics["simulation_rmse"] = metrics.simulation_errors(means, truth)
-            evaluation.estimators.update(_audit(evaluation, truth, experiment))
-        if isinstance(experiment, SimulatedExperiment) and isinstance(beliefs[0], Belief) and record_available():
-            _, twins, _, _ = roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
-            means = np.array([belief.coefficients_mean for belief in twins])
-            evaluation.metrics["arrow_rmse"] = metrics.arrow_errors(means)
-        evaluations.append(evaluation)
-    return evaluations
+        evaluation.estimators.update(_audit(evaluation, truth, experiment))
+    if isinstance(experiment, SimulatedExperiment) and isinstance(beliefs[0], Belief) and record_available():
+        _, twins, _, _ = roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
+        evaluation.metrics["arrow_rmse"] = metrics.arrow_errors(np.array([twin.coefficients_mean for twin in twins]))
+    return evaluation
 
 
 def roll_out(
@@ -160,20 +216,32 @@ def roll_out(
 def _audit(
     evaluation: Evaluation, truth: PhysicalParameters, experiment: SimulatedExperiment
 ) -> dict[str, dict[str, FloatArray]]:
-    """What both factorisations and the auditor make of the inputs and outputs of a policy."""
-    prior = experiment.believed
+    """What every estimator of the plant, and the auditor, make of the inputs and outputs of a policy.
+
+    The auditor fits the plant's own equation. That of the paper, on the plant of the other, takes as an environment
+    does the input at the sample before.
+    """
+    u, y = evaluation.inputs.T, evaluation.outputs.T
+    hands: dict[str, tuple[RecordBelief, FloatArray]] = {}
+    if isinstance(experiment, ContinuousExperiment):
+        earlier = np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
+        hands["ode"] = experiment.physical_prior, u
+        hands |= {f"nlarx_{name}": (_paper_prior(experiment, name), earlier) for name in FACTORISATIONS}
+        auditor: Prior | ContinuousBelief = experiment.physical_prior
+    else:
+        hands |= {name: (_paper_prior(experiment, name), u) for name in FACTORISATIONS}
+        auditor = experiment.believed
     found: dict[str, dict[str, FloatArray]] = {}
-    for factorisation in FACTORISATIONS:
-        beliefs = []
-        for u, y in zip(evaluation.inputs.T, evaluation.outputs.T, strict=True):
-            estimator = OnlineEstimator(NLARX(input_delay=0), prior, factorisation)
-            played = ~np.isnan(u)
-            estimator.run(u[played], y[played])
-            beliefs.append(estimator.belief)
+    for name, (prior, acting) in hands.items():
+        beliefs = identify(acting, y, prior)
         means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
-        found[factorisation] = metrics.estimate_metrics(means, covs, truth)
-    fit = maximum_a_posteriori(
-        evaluation.inputs.T, evaluation.outputs.T, prior, experiment.process_noise, experiment.measurement_noise
-    )
-    found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth)
+        found[name] = metrics.estimate_metrics(means, covs, truth, type(prior))
+    fit = maximum_a_posteriori(u, y, auditor, experiment.process_noise, experiment.measurement_noise)
+    kind = ContinuousBelief if isinstance(auditor, ContinuousBelief) else Belief
+    found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, kind)
     return found
+
+
+def _paper_prior(experiment: SimulatedExperiment, factorisation: str) -> Belief:
+    """What the estimator of the paper's equation believes first."""
+    return Belief(experiment.believed.to_record(factorisation=factorisation), factorisation)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from agents.evaluation import Evaluation
+    from agents.leaderboard import Metric
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
 _RESONANCES = (49.5, 94.7)
@@ -61,7 +62,7 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
         lowest = min(lowest, low.min())
         samples = np.arange(len(median))
         axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
-        axes.plot(samples, median, color=colour, label=evaluation.policy)
+        axes.plot(samples, median, color=colour, label=evaluation.title)
     axes.set_xlabel("samples")
     axes.set_ylabel("log posterior gain of the truth / nat")
     axes.set_title(title)
@@ -83,7 +84,7 @@ def draw_excitations(path: Path, evaluations: list[Evaluation], system: int = 0)
             axes.grid(alpha=0.3)
         row[0].set_ylabel("u / V")
         row[1].set_ylabel("y / V")
-        row[0].set_title(evaluation.policy, loc="left", fontsize=9)
+        row[0].set_title(evaluation.title, loc="left", fontsize=9)
     for axes in grid[-1]:
         axes.set_xlabel("time / ms")
     _save(figure, path)
@@ -97,7 +98,7 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
         time = _MILLISECONDS * np.arange(len(evaluation.inputs))
         left.plot(time, evaluation.inputs[:, system], color=colour, linewidth=0.8)
         left.set_ylabel("u / V")
-        left.set_title(evaluation.policy, loc="left", fontsize=9)
+        left.set_title(evaluation.title, loc="left", fontsize=9)
         inputs = np.nan_to_num(evaluation.inputs)  # an episode that ended is silent
         spectrum = np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         right.plot(np.fft.rfftfreq(len(inputs), SAMPLING_STEP), 1e3 * spectrum, color=colour, linewidth=0.8)
@@ -119,7 +120,7 @@ def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
         errors = np.mean([evaluation.metrics[f"error_{name}"] for name in "mcab"], axis=0)
         axes.semilogy(
             evaluation.metrics["fisher_gain"], 100 * errors, ".", color=colour, alpha=0.5, markersize=4,
-            label=evaluation.policy,
+            label=evaluation.title,
         )  # fmt: skip
     axes.set_xlabel("Fisher information / nat")
     axes.set_ylabel("mean error of m, c, a, b / %")
@@ -140,13 +141,41 @@ def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
         axes.plot([0, 100], [0, 100], color="#888888", linewidth=1)
         for evaluation, values, colour in zip(evaluations, found, cycle(_COLOURS), strict=False):
             covered = [100 * float(np.mean(values[estimator][name])) for name in LEVELS]
-            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=evaluation.policy)
+            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=evaluation.title)
         axes.set_title(estimator.replace("_", " "), fontsize=9)
         axes.set_xlabel("nominal level / %")
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("intervals that hold the truth / %")
     panels[0].legend(fontsize=7)
     return figure
+
+
+def draw_study(path: Path, results: dict[str, dict[str, Any]], measures: dict[str, Metric]) -> None:
+    """Compare recipes: a panel for each measure, the centre with its interval, and every seed above as a tick.
+
+    Args:
+        path: of the PNG file.
+        results: name of a recipe to `agents.leaderboard.center_and_interval` of each measure; those that begin with the
+            same words up to a comma have one colour.
+        measures: how they are printed, by name.
+    """
+    figure = _figure(10, 5.2)
+    panels = figure.subplots(2, -(-len(measures) // 2), sharey=True)
+    kinds = list(dict.fromkeys(recipe.partition(",")[0] for recipe in results))
+    for axes, (name, metric) in zip(panels.flat, measures.items(), strict=False):
+        for row, (recipe, summary) in enumerate(results.items()):
+            colour = _COLOURS[kinds.index(recipe.partition(",")[0])]
+            entry = summary[name]
+            each = metric.scale * np.array(entry.get("seeds", []))
+            axes.plot(each, np.full(len(each), row - 0.25), "|", color=colour, markersize=7)
+            axes.plot(metric.scale * np.array([entry["low"], entry["high"]]), [row, row], color=colour, linewidth=2.5)
+            axes.plot(metric.scale * next(iter(entry.values())), row, "o", color=colour, markersize=5)
+        axes.set_xlabel(metric.title)
+        axes.grid(alpha=0.3, axis="x")
+    for axes in panels[:, 0]:
+        axes.set_yticks(range(len(results)), list(results))
+    panels[0, 0].invert_yaxis()
+    _save(figure, path)
 
 
 def draw_policies(path: Path, systems: int = 64, samples: int = 256) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from agents.policies.excitations import draw_regime
+from duffing_env.experiment import ContinuousExperiment
 from duffing_env.silverbox import load_record, regime_input
-from estimator import NLARX, Belief, PhysicalParameters, fisher_information, to_coefficients
+from estimator import NLARX, Belief, ContinuousBelief, PhysicalParameters, fisher_information, to_coefficients
 from estimator.belief import RecordBelief
+from estimator.continuous_likelihood import continuous_information
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -68,13 +69,17 @@ def information(
     """(n,) ½ log det(Λ0 + F) - ½ log det Λ0 [nats] of inputs (T, n): what an efficient estimator gains from them.
 
     F is the Fisher information at the true coefficients, along the outputs (T, n) that were seen, or along the
-    response without noise; Λ0 is the inverse covariance of the environment's prior.
+    response without noise; Λ0 is the inverse covariance of the environment's prior. The coefficients are those of the
+    plant's equation; that of the plant ``sde`` needs the outputs.
     """
-    F = fisher_information(
-        to_coefficients(truth), inputs.T, experiment.process_noise, experiment.measurement_noise,
-        y=None if outputs is None else outputs.T,
-    )  # fmt: skip
-    cov = experiment.believed.coefficients_cov
+    noises = experiment.process_noise, experiment.measurement_noise
+    if isinstance(experiment, ContinuousExperiment):
+        assert outputs is not None
+        cov = experiment.physical_prior.coefficients_cov
+        F = continuous_information(ContinuousBelief.coefficients_of(truth), inputs.T, outputs.T, *noises)
+    else:
+        cov = experiment.believed.coefficients_cov
+        F = fisher_information(to_coefficients(truth), inputs.T, *noises, y=None if outputs is None else outputs.T)
     std = np.sqrt(np.diag(cov))
     prior = np.linalg.inv(cov / np.outer(std, std))
     return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])
@@ -95,13 +100,33 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatAr
 def silverbox_equivalents(gains: FloatArray, truth: PhysicalParameters, experiment: Any, seed: int) -> FloatArray:
     """(n,) samples of the Silverbox multisine regime that tell as much as ``gains`` (n,) of `information`.
 
-    Each system is given a stretch of the regime as recorded, at its own power. Interpolated between powers of √2; inf
-    where even the longest stretch, 46,340 samples, tells less.
+    Each system is given a stretch of the regime as recorded, at its own power (`regime_information`). Interpolated
+    between powers of √2; inf where even the longest stretch, 46,340 samples, tells less.
     """
-    lengths = np.unique(np.round(2 ** np.arange(4, 15.6, 0.5)).astype(int))
-    rng, draw = np.random.default_rng(seed), draw_regime("multisine")
-    inputs = np.stack([draw(rng, lengths[-1]) for _ in gains], axis=1)
-    told = np.array([information(inputs[:length], truth, experiment) for length in lengths])
+    return equal_information(gains, *regime_information(truth, experiment, seed))
+
+
+def regime_information(
+    truth: PhysicalParameters, experiment: Any, seed: int, scale: float = 1.0, longest: float = 15.5
+) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    """What stretches of the Silverbox multisine regime, times ``scale``, tell of each system.
+
+    They start anywhere in the regime and go on at its begin where it ends, so that every part of it counts alike: rare
+    peaks of the displacement tell most of what is known of b, and some parts have more of them.
+
+    Returns:
+        Their lengths (k,) up to 2**longest samples, and (k, n) the `information` in them [nats].
+    """
+    lengths = np.unique(np.round(2 ** np.arange(4, longest + 0.1, 0.5)).astype(int))
+    rng = np.random.default_rng(seed)
+    regime = regime_input("multisine", rng)
+    starts = rng.integers(len(regime), size=np.size(truth.m))
+    inputs = scale * np.take(regime, np.arange(lengths[-1])[:, None] + starts, mode="wrap")
+    return lengths, np.array([information(inputs[:length], truth, experiment) for length in lengths])
+
+
+def equal_information(gains: FloatArray, lengths: npt.NDArray[np.int64], told: FloatArray) -> FloatArray:
+    """(n,) the lengths at which ``told`` (k, n) reaches ``gains`` (n,); inf where it does not."""
     equivalents = np.empty(len(gains))
     for i, gain in enumerate(gains):
         curve = np.maximum.accumulate(told[:, i])

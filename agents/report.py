@@ -15,7 +15,7 @@ import numpy as np
 
 from agents.evaluation import Evaluation
 from agents.figures import figure_of_calibration, figure_of_contraction, figure_of_information, figure_of_inputs
-from agents.leaderboard import ESTIMATOR_METRICS, METRICS, cell_of, in_order, summarise
+from agents.leaderboard import ESTIMATOR_METRICS, METRICS, caption_of, cell_of, in_order, summarise
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
         settings: of the comparison: ``env``, ``systems``, ``seed``, ``options``.
         command: the words of the command line that made it.
     """
-    title = f"{settings['env']}: {', '.join(evaluation.policy for evaluation in evaluations)}"
+    title = f"{settings['env']}: {', '.join(evaluation.title for evaluation in evaluations)}"
     figures = [
         (
             "Posterior contraction",
@@ -90,8 +90,8 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
         f"options <code>{html.escape(json.dumps(settings['options']))}</code>.</p>",
         "<h2>Leaderboard</h2>",
         _leaderboard(evaluations),
-        "<p><small>Means, errors as medians; below them 95 % bootstrap intervals over systems. An episode that a limit "
-        "ends counts with what was known by then.</small></p>",
+        f"<p><small>{caption_of(evaluations).capitalize()}. An episode that a limit ends counts with what was known by "
+        "then.</small></p>",
         _estimators(evaluations),
     ]
     for heading, figure, caption in figures:
@@ -116,14 +116,17 @@ def _leaderboard(evaluations: list[Evaluation]) -> str:
     """The table of all metrics, a column for each policy, the best first."""
     ordered = in_order(evaluations)
     summaries = [summarise(evaluation) for evaluation in ordered]
-    head = "".join(f"<th>{html.escape(evaluation.policy)}</th>" for evaluation in ordered)
+    head = "".join(f"<th>{html.escape(evaluation.title)}</th>" for evaluation in ordered)
     rows = []
     for name, metric in METRICS.items():
         if any(name in summary for summary in summaries):
             cells = (cell_of(metric, summary.get(name)).partition("\n") for summary in summaries)
             rows.append(
                 f"<tr><td>{html.escape(metric.title)}</td>"
-                + "".join(f"<td>{center}<br><small>{interval}</small></td>" for center, _, interval in cells)
+                + "".join(
+                    f"<td>{center}<br><small>{below.replace(chr(10), '<br>')}</small></td>"
+                    for center, _, below in cells
+                )
                 + "</tr>"
             )
     return _table(f"<th></th>{head}", rows)
@@ -134,7 +137,7 @@ def _estimators(evaluations: list[Evaluation]) -> str:
     rows = []
     for evaluation in in_order(evaluations):
         for estimator, values in evaluation.estimators.items():
-            cells = [html.escape(evaluation.policy), html.escape(estimator.replace("_", " "))]
+            cells = [html.escape(evaluation.title), html.escape(estimator.replace("_", " "))]
             for name in ESTIMATOR_METRICS:
                 metric = METRICS[name]
                 cells.append(f"{metric.scale * float(metric.center[1](values[name])):.{metric.digits}f}")

@@ -273,12 +273,15 @@ class ContinuousExperiment(SimulatedExperiment):
         return Prior.silverbox_twin(self.spread, *noises, center=self.twin)
 
     @property
-    def prior_record(self) -> FloatArray:
-        """The prior that fits oscillators so drawn, and the noises."""
-        if self.estimator == "nlarx":
-            return super().prior_record
+    def physical_prior(self) -> ContinuousBelief:
+        """The prior of ``ode`` that fits oscillators so drawn, and the noises."""
         noises = self.process_noise, self.measurement_noise, self.noise_shape
-        return continuous_prior(self.twin, self.spread, *noises).record
+        return continuous_prior(self.twin, self.spread, *noises)
+
+    @property
+    def prior_record(self) -> FloatArray:
+        """That of the estimator at hand."""
+        return super().prior_record if self.estimator == "nlarx" else self.physical_prior.record
 
     def to_belief(self, record: FloatArray) -> RecordBelief:
         """The readable face of a record (RECORD_SIZE,)."""

@@ -6,17 +6,21 @@ beliefs. With the Kalman filter's innovations ν_t and their variances S_t at (�
     L(ψ) = ½ Σ_t (ν_t² / S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0)
 
 by Gauss-Newton steps (Λ0 + F)⁻¹, damped after Levenberg and Marquardt, with the sensitivities and the information F of
-`estimator.fisher`. The inverse of Λ0 + F at the minimum is the posterior's covariance by Laplace's approximation.
+`estimator.fisher`. The inverse of Λ0 + F at the minimum is the posterior's covariance by Laplace's approximation. The
+same for Eq. (1) with ψ = (stiffness, cubic stiffness, damping, gain), by `estimator.continuous_likelihood`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from estimator import continuous_likelihood
 from estimator.belief import Prior
+from estimator.continuous import ContinuousBelief
 from estimator.fisher import regress, spread
 from estimator.lanes import kernel
 from estimator.parameters import FloatArray
@@ -32,7 +36,7 @@ class Fit:
     """The posterior's mode and curvature, for n records.
 
     Attributes:
-        mean: (n, 4) the most probable (θ1, θ2, θ3, η).
+        mean: (n, 4) the most probable (θ1, θ2, θ3, η); or stiffness, cubic stiffness, damping and gain per sample.
         cov: (n, 4, 4) inverse of Λ0 + F there.
         converged: (n,) whether the last step was small; where not, ``mean`` is the best point that was seen.
     """
@@ -43,16 +47,20 @@ class Fit:
 
 
 def maximum_a_posteriori(
-    u: npt.ArrayLike, y: npt.ArrayLike, prior: Prior, process_noise: float, measurement_noise: float
+    u: npt.ArrayLike,
+    y: npt.ArrayLike,
+    prior: Prior | ContinuousBelief,
+    process_noise: float,
+    measurement_noise: float,
 ) -> Fit:
-    """Fit (θ, η) to whole records, each from rest.
+    """Fit the coefficients to whole records, each from rest.
 
     Args:
-        u: (n, T) inputs [V]; the t-th acts on the displacement of the sample before. A record ends before its first
-            NaN, so that episodes of different lengths fit into one array.
+        u: (n, T) inputs [V]; the t-th acts on the displacement of the sample before, or is by Eq. (1) the input at the
+            sample. A record ends before its first NaN, so that episodes of different lengths fit into one array.
         y: (n, T) the outputs that followed them [V].
-        prior: of the coefficients; its belief in the noises is not used.
-        process_noise: standard deviation of w̃ [V], positive.
+        prior: of the coefficients: a `Prior` of (θ, η), or a `ContinuousBelief`. Its belief in the noises is not used.
+        process_noise: standard deviation of w̃ [V], or by Eq. (1) of what a sample's noise does to x; positive.
         measurement_noise: standard deviation of v [V], positive.
 
     Raises:
@@ -64,15 +72,14 @@ def maximum_a_posteriori(
     for name, value in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
         if not 0 < value < np.inf:
             raise ValueError(f"{name} must be positive and finite, but is {value}; pass a standard deviation in V")
-    assert prior.coefficients_cov is not None
-    center = np.append(prior.theta_mean, prior.eta_mean)
-    scale = np.sqrt(np.diag(prior.coefficients_cov))  # all is solved in units of the prior, for its condition's sake
-    precision = np.linalg.inv(prior.coefficients_cov / np.outer(scale, scale))
+    center, cov, accumulate = _problem(prior)
+    scale = np.sqrt(np.diag(cov))  # all is solved in units of the prior, for its condition's sake
+    precision = np.linalg.inv(cov / np.outer(scale, scale))
     variances = (process_noise**2, measurement_noise**2, float(prior.state_cov[0, 0]))
 
     def appraise(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         loss, slope, information = np.zeros(len(points)), np.zeros((len(points), 4)), np.zeros((len(points), 4, 4))
-        _accumulate(center + scale * points, inputs, outputs, *variances, loss, slope, information)
+        accumulate(center + scale * points, inputs, outputs, *variances, loss, slope, information)
         pull = points @ precision
         loss += 0.5 * (points * pull).sum(axis=1)
         return loss, scale * slope + pull, information * np.outer(scale, scale) + precision
@@ -95,8 +102,15 @@ def maximum_a_posteriori(
         converged |= better & (size < _SMALL)
         if (converged | (damping > _STUCK)).all():
             break
-    cov = np.linalg.inv(curvature) * np.outer(scale, scale)
-    return Fit(center + scale * points, cov, converged)
+    return Fit(center + scale * points, np.linalg.inv(curvature) * np.outer(scale, scale), converged)
+
+
+def _problem(prior: Prior | ContinuousBelief) -> tuple[FloatArray, FloatArray, Callable[..., None]]:
+    """Mean and covariance of the coefficients before, and the likelihood of their equation."""
+    if isinstance(prior, ContinuousBelief):
+        return prior.coefficients_mean, prior.coefficients_cov, continuous_likelihood.accumulate
+    assert prior.coefficients_cov is not None
+    return np.append(prior.theta_mean, prior.eta_mean), prior.coefficients_cov, _accumulate
 
 
 @kernel

@@ -333,7 +333,53 @@ def test_the_continuous_track_is_evaluated_in_its_own_coefficients():
             "error_b": abs(cubic / gain / truth.b - 1),
         }
         assert {name: evaluation.metrics[name][row] for name in expected} == pytest.approx(expected, abs=1e-6)
+        for name in expected:  # the environment's own estimator, but for the float32 of its inputs
+            assert evaluation.estimators["ode"][name][row] == pytest.approx(evaluation.metrics[name][row], abs=2e-3)
     assert "arrow_rmse" not in evaluation.metrics
+
+
+def test_on_the_continuous_track_others_identify_too():
+    options = {"horizon": 200}
+    (by_ode,) = evaluate(["uniform"], CONTINUOUS, systems=40, seed=SEED, options=options)
+    (by_paper,) = evaluate(["uniform"], CONTINUOUS, systems=40, seed=SEED, options={**options, "estimator": "nlarx"})
+    for evaluation, own in ((by_ode, "ode"), (by_paper, "nlarx_structured")):
+        assert list(evaluation.estimators) == ["ode", "nlarx_structured", "nlarx_mean_field", "auditor"]
+        assert np.median(evaluation.estimators[own]["error_m"]) == pytest.approx(
+            np.median(evaluation.metrics["error_m"]), rel=1e-2
+        )
+        errors = {name: np.median(values["error_m"]) for name, values in evaluation.estimators.items()}
+        assert max(errors["ode"], errors["auditor"]) < 0.02 < 0.1 < errors["nlarx_structured"]  # misspecified
+        assert 0.8 < evaluation.estimators["auditor"]["coverage"].mean() < 0.98
+        assert 0.6 < evaluation.estimators["auditor"]["nees"].mean() < 1.4
+        # What an efficient estimator gains is what the well-specified one does, and no one talks it into more.
+        assert evaluation.metrics["fisher_gain"].mean() == pytest.approx(
+            by_ode.metrics["information_gain"].mean(), abs=0.3
+        )
+    assert by_paper.metrics["coverage"].mean() < 0.4
+
+
+def test_policies_of_several_seeds_are_one_entry(tmp_path, without_record):
+    names = [f"run-{seed}" for seed in (2, 0, 1)]
+    for seed, name in enumerate(names):
+        model = PPO("MlpPolicy", DuffingVecEnv(TRACK, 2), n_steps=8, batch_size=16, seed=seed, device="cpu")
+        save_policy(tmp_path / name, model, {})
+    (tmp_path / "run-3").mkdir()  # a training that is not finished
+    told, options = [], {"horizon": 20}
+    arguments = {"systems": 3, "seed": SEED, "options": options}
+    group, alone = evaluate([f"ppo={tmp_path}/run-*", "uniform"], on_policy=told.append, **arguments)
+    each = evaluate(sorted(str(tmp_path / name) for name in names), **arguments)
+    assert (group.policy, group.seeds, group.title, alone.title) == ("ppo", 3, "ppo (3 seeds)", "uniform")
+    assert told == [*(evaluation.policy for evaluation in each), "uniform"]
+    for name, values in group.metrics.items():
+        if name != "decision_time":
+            np.testing.assert_array_equal(values.reshape(3, 3), [evaluation.metrics[name] for evaluation in each])
+    for i, evaluation in enumerate(each):
+        np.testing.assert_array_equal(group.inputs[:, 3 * i : 3 * i + 3], evaluation.inputs)
+        np.testing.assert_array_equal(group.curve[:, 3 * i : 3 * i + 3], evaluation.curve)
+        audited = evaluation.estimators["auditor"]["error_b"]
+        np.testing.assert_array_equal(group.estimators["auditor"]["error_b"][3 * i : 3 * i + 3], audited)
+    with pytest.raises(ValueError, match=r"two policy folders or more match, but 'ppo=.*run-1' matches"):
+        evaluate([f"ppo={tmp_path}/run-1"], systems=2)
 
 
 @pytest.mark.parametrize("systems", [1, 0, -3])

@@ -110,6 +110,32 @@ def test_a_constant_metric_has_an_interval_of_width_zero():
     }
 
 
+def test_of_several_seeds_the_centre_is_the_interquartile_mean(capsys):
+    rng = np.random.default_rng(0)
+    seeds, systems = 5, 60
+    difficulty = rng.normal(0, 1, systems)  # the same systems under every seed
+    gained = 20 + difficulty + np.arange(seeds)[:, None] + 0.1 * rng.normal(size=(seeds, systems))
+    early = (rng.uniform(size=(seeds, systems)) < 0.05).astype(float)
+    group = replace(make_evaluation("ppo", log_posterior_gain=gained.ravel(), ended_early=early.ravel()), seeds=seeds)
+    entry = summarise(group)["log_posterior_gain"]
+    assert set(entry) == {"iqm", "low", "high", "seeds", "median_of_seeds"}
+    ordered = np.sort(gained.ravel())
+    assert entry["iqm"] == pytest.approx(ordered[75:225].mean())
+    assert entry["seeds"] == pytest.approx(gained.mean(axis=1))
+    assert entry["median_of_seeds"] == pytest.approx(gained.mean(axis=1)[2])
+    # Systems are resampled together, because they are the same for all seeds: by themselves, they would average out.
+    resampled = [np.sort(gained[:, rng.integers(0, systems, systems)].ravel())[75:225].mean() for _ in range(4000)]
+    assert (entry["low"], entry["high"]) == pytest.approx(tuple(np.percentile(resampled, [2.5, 97.5])), abs=0.05)
+    # An interquartile mean of rare events would be 0.
+    assert summarise(group)["ended_early"]["mean"] == pytest.approx(early.mean()) != 0
+    capsys.readouterr()
+    print_table([group, make_evaluation("uniform", log_posterior_gain=np.zeros(3))], "a title")
+    printed = capsys.readouterr().out
+    assert "ppo (5 seeds)" in printed
+    assert f"median seed {entry['median_of_seeds']:.2f}" in printed
+    assert "interquartile" in printed
+
+
 def test_diverged_free_runs_make_the_interval_infinite_not_the_median():
     values = np.append(np.linspace(1.0, 2.0, 13), [np.inf] * 8)
     entry = summarise(make_evaluation(arrow_rmse=values))["arrow_rmse"]

@@ -373,5 +373,11 @@ def test_a_policy_that_ships_does_what_its_card_says(name):
     env_id, score = policy.card["config"]["env"], policy.card["scores"]["information_gain"]
     (evaluation,) = evaluate([name], env_id, systems=32)
     gained = evaluation.metrics["information_gain"]
-    assert abs(gained.mean() - score["mean"]) < 4 * gained.std() / np.sqrt(len(gained)) + 0.05
+    # Of several training seeds the card tells all, and which of them ships.
+    expected = (
+        score["seeds"][policy.card["seeds"].index(policy.card["shipped"]["seed"])]
+        if "seeds" in score
+        else score["mean"]
+    )
+    assert abs(gained.mean() - expected) < 4 * gained.std() / np.sqrt(len(gained)) + 0.05
     assert 0.8 < evaluation.metrics["coverage"].mean() < 0.98

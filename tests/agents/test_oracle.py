@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from agents import oracle as module
+from agents.evaluation import evaluate
 from agents.oracle import Config, Oracle, Systems, as_stored, design, main, search
 
 SHORT, POWER = "duffing_env/Short-v0", "duffing_env/Power-v0"
@@ -79,6 +80,32 @@ def test_what_is_better_takes_its_place_and_nothing_else(empty_folder):
     assert len(Oracle.of(Systems.of(SHORT, 3)).values) == 2
 
 
+def test_the_search_starts_from_what_policies_played(empty_folder, monkeypatch):
+    started = []
+
+    def instead(systems, row, given, rng, rounds):
+        started.append(given)
+        return given[0], float(systems.worth(np.tile(given[0], (row + 1, 1)))[0][row])
+
+    monkeypatch.setattr(module, "search", instead)
+    main(Config(env=SHORT, systems=2, policies=("ppo/short", "velocity-sign"), rounds=0))
+    played = [evaluation.inputs for evaluation in evaluate(["ppo/short", "velocity-sign"], SHORT, 2)]
+    for row, given in enumerate(started):
+        np.testing.assert_array_equal(given, [np.nan_to_num(inputs[:, row]) for inputs in played])
+    stored = Oracle.of(Systems.of(SHORT, 2))
+    np.testing.assert_allclose(stored.inputs, played[0].T, atol=1e-4)
+
+
+def test_a_search_that_starts_from_better_inputs_ends_no_worse(monkeypatch):
+    systems = Systems.of(SHORT, 1)
+    best = Oracle.of(systems)
+    monkeypatch.setattr(module, "_STARTS", 2)
+    alone = search(systems, 0, np.empty((0, 48)), np.random.default_rng(0), rounds=0)[1]
+    helped = search(systems, 0, best.inputs, np.random.default_rng(0), rounds=0)[1]
+    assert alone < best.values[0] - 0.1
+    assert helped > best.values[0] - 0.01
+
+
 def test_the_command_stores_and_says_where(empty_folder, capsys):
     main(Config(env=SHORT, systems=2, policies=("prbs",), rounds=0))
     assert "2 systems in" in capsys.readouterr().out
@@ -111,7 +138,7 @@ def test_what_is_stored_is_never_larger_and_stays():
 def test_stored_oracles_keep_the_limits_of_their_tracks(track):
     oracle = Oracle.of(Systems.of(track, 256))
     task = oracle.systems.task
-    assert len(oracle.values) >= 64
+    assert len(oracle.values) == 256
     assert np.abs(oracle.inputs).max() <= task.max_input
     assert oracle.systems.worth(oracle.inputs)[1].max() <= task.max_output
     assert np.all((oracle.inputs**2).sum(axis=1) <= task.energy * (1 + 1e-9))

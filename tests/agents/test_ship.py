@@ -1,0 +1,85 @@
+"""Shipping: the median seed goes out, with a card that tells of all."""
+
+import json
+
+import pytest
+from stable_baselines3 import PPO
+
+from agents import make_policy, policies
+from agents.evaluation import evaluate
+from agents.policies.learned import load_policy, save_policy
+from agents.ship import Config, median_index, ship
+from agents.vec_env import DuffingVecEnv
+
+SHORT = "duffing_env/Short-v0"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Three run folders of policies that nobody trained, of one recipe."""
+    base, envs = tmp_path_factory.mktemp("runs"), DuffingVecEnv(SHORT, 2)
+    for seed in range(3):
+        settings = {"net_arch": [8], "log_std_init": -1.0}
+        model = PPO("MlpPolicy", envs, n_steps=8, batch_size=16, policy_kwargs=settings, seed=seed, device="cpu")
+        config = {"env": SHORT, "reward": "information_gain", "options": {}, "seed": seed, "output": str(seed)}
+        save_policy(base / f"run-{seed}", model, {"algorithm": "ppo", "config": config, "command": ["train.py"]})
+    return tuple(base / f"run-{seed}" for seed in range(3))
+
+
+@pytest.fixture
+def shelf(monkeypatch, tmp_path):
+    monkeypatch.setattr(policies, "TRAINED", tmp_path / "trained")
+    return tmp_path / "trained"
+
+
+def changed(run, folder, **config):
+    """A copy of a run with another configuration in its card."""
+    folder.mkdir()
+    card = json.loads((run / "policy.json").read_text())
+    (folder / "policy.json").write_text(json.dumps(card | {"config": card["config"] | config}))
+    (folder / "policy.safetensors").write_bytes((run / "policy.safetensors").read_bytes())
+    return folder
+
+
+def test_the_median_seed_ships_with_the_scores_of_all(runs, shelf, capsys):
+    folder = ship(Config("ppo/short", runs, systems=8))
+    assert folder == shelf / "ppo" / "short"
+    assert sorted(path.name for path in folder.iterdir()) == ["policy.json", "policy.safetensors"]
+    card = json.loads((folder / "policy.json").read_text())
+    assert (card["track"], card["reward"], card["seeds"]) == (SHORT, "information_gain", [0, 1, 2])
+    assert card["command"] == ["train.py"]
+    scores = card["scores"]
+    each = evaluate([str(run) for run in runs], SHORT, systems=8)
+    for name in ("efficiency", "information_gain"):
+        assert scores[name]["seeds"] == pytest.approx([float(e.metrics[name].mean()) for e in each])
+        assert scores[name]["median_of_seeds"] == pytest.approx(sorted(scores[name]["seeds"])[1])
+        assert scores[name]["low"] <= scores[name]["iqm"] <= scores[name]["high"]
+    shipped = card["shipped"]["seed"]
+    assert card["shipped"]["median_by"] == "efficiency"
+    assert scores["efficiency"]["seeds"][shipped] == scores["efficiency"]["median_of_seeds"]
+    assert card["config"]["seed"] == shipped
+    weights = "policy.safetensors"
+    assert (folder / weights).read_bytes() == (runs[shipped] / weights).read_bytes()
+    assert make_policy("ppo/short").card == load_policy(folder).card
+    assert "(3 seeds)" in capsys.readouterr().out
+
+
+def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
+    other = changed(runs[1], tmp_path / "other", reward="fisher")
+    with pytest.raises(ValueError, match=r"one recipe, but .*other has another reward"):
+        ship(Config("ppo/short", (runs[0], other)))
+    twice = changed(runs[1], tmp_path / "twice", seed=0)
+    with pytest.raises(ValueError, match=r"a seed each, but have \[0, 0\]"):
+        ship(Config("ppo/short", (runs[0], twice)))
+    with pytest.raises(ValueError, match="finished run folders"):
+        ship(Config("ppo/short", (runs[0], tmp_path)))
+    with pytest.raises(ValueError, match="two folders or more, but are 1"):
+        Config("ppo/short", runs[:1])
+    with pytest.raises(ValueError, match="ALGORITHM/TRACK"):
+        Config("../short", runs)
+    assert not shelf.exists()
+
+
+def test_the_median_of_an_even_number_is_the_lower_one():
+    assert median_index([3.0, 1.0, 2.0]) == 2
+    assert median_index([4.0, 1.0, 3.0, 2.0]) == 3
