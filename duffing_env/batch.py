@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from duffing_env import kernel
 from duffing_env.experiment import Experiment
-from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OSCILLATOR, OUTCOME, SAVED
+from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OSCILLATOR, OUTCOME, SAVED, SETTINGS
 from duffing_env.noise import stream_words
 from estimator.belief import RecordBelief
 from estimator.lanes import LANES
@@ -25,18 +25,20 @@ class Batch:
         size: their number n; memory is laid out for a multiple of `LANES`.
         reset_mode: `kernel.RESET_BY_HAND`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
         threads: threads that step the blocks; results do not depend on it.
+        hold: samples that a step plays, at most: an environment stops where its episode ends.
 
     Attributes:
         observations: (n, N_OBSERVATION) float32, overwritten by every step.
         final_observations: the same, for what was reset within the step.
     """
 
-    def __init__(self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1) -> None:
+    def __init__(self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1, hold: int = 1) -> None:
         self.experiment = experiment
         self.size = size
         self._reset_mode = reset_mode
         self._threads = threads
         self._settings = experiment.settings
+        self._settings[SETTINGS["hold"]] = hold
         # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
         self._prior = experiment.prior_record.copy()
         self._recorded = tuple(series.copy() for series in experiment.recorded)
@@ -67,7 +69,7 @@ class Batch:
         kernel.reset(self._flat_blocks, mask, self._settings, self._prior, self._observations)
 
     def step(self, actions: npt.ArrayLike) -> None:
-        """Apply actions (n,) for one sample: in parts of the largest input, clipped to [-1, 1], in float32's range."""
+        """Apply actions (n,) for a step: in parts of the largest input, clipped to [-1, 1], in float32's range."""
         self._actions[: self.size] = actions
         step = kernel.step_serial
         if self._threads > 1:

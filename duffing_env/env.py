@@ -18,7 +18,7 @@ from duffing_env.experiment import (
     make_experiment,
 )
 from duffing_env.kernel import RESET_BY_HAND
-from duffing_env.layout import OBSERVATION
+from duffing_env.layout import OBSERVATION, SUMMED
 from estimator.belief import RecordBelief
 from estimator.parameters import FloatArray, PhysicalParameters
 
@@ -201,7 +201,7 @@ class DuffingEnv(gym.Env[Any, Any]):
         return self._batch.observations[0].copy(), {}
 
     def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Apply one input for one sample.
+        """Apply one input for ``hold`` samples, or until the episode ends.
 
         Raises:
             ValueError: if the action is not one finite number; nothing has changed then.
@@ -211,7 +211,7 @@ class DuffingEnv(gym.Env[Any, Any]):
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
         value = _one_number(action)
         batch = self._batch
-        self._apply(value)
+        self._play(value)
         terminated = bool(batch.outcome("terminated")[0])
         truncated = bool(batch.outcome("truncated")[0])
         info: dict[str, Any] = {name: batch.outcome(name)[0].item() for name in self._reported}
@@ -220,12 +220,26 @@ class DuffingEnv(gym.Env[Any, Any]):
         if terminated or truncated:
             self._running = False
             info |= self._final_info()
-        if self._screen is not None:
-            self._draw()
         return batch.observations[0].copy(), batch.outcome("reward")[0].item(), terminated, truncated, info
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)
+
+    def _play(self, action: float) -> None:
+        """Let as many samples pass as the action holds; the batch's outcome is then that of all of them."""
+        self._play_sample(action)
+        for _ in range(1, self.experiment.hold):
+            if self._batch.outcome("terminated")[0] or self._batch.outcome("truncated")[0]:
+                return
+            earned = [self._batch.outcome(name)[0] for name in SUMMED]
+            self._play_sample(action)
+            for name, before in zip(SUMMED, earned, strict=True):
+                self._batch.outcome(name)[0] += before
+
+    def _play_sample(self, action: float) -> None:
+        self._apply(action)
+        if self._screen is not None:
+            self._draw()
 
     def _apply(self, action: float) -> None:
         """Let one sample pass; the action is in [-1, 1]."""

@@ -34,6 +34,10 @@ class Experiment:
         reward: its name, see `duffing_env.rewards`.
         max_input: input of the action 1 [V].
         max_output: displacement limit [V]: the episode ends at \|y\| above it.
+        hold: samples that an action is applied for; a step's reward is the sum of theirs, and an episode may end within.
+        terminal: whether the episode's whole reward is paid in its last step, and 0 before.
+        terminated_return: what an episode that ends by termination returns as a whole: its last reward takes back what
+            was received, and gives this. What was gained is kept where it is None.
     """
 
     factorisation: str = "structured"
@@ -41,6 +45,9 @@ class Experiment:
     reward: str = "information_gain"
     max_input: float = 0.15
     max_output: float = 0.6
+    hold: int = 1
+    terminal: bool = False
+    terminated_return: float | None = None
 
     def __post_init__(self) -> None:
         if self.factorisation not in list(DEFAULT_ITERATIONS):
@@ -50,11 +57,21 @@ class Experiment:
         reward_number(self.reward)
         self._check_positive("max_input")
         self._check_positive("max_output")
+        self._check_count("hold")
+        self._check_flag("terminal")
+        if self.terminated_return is not None and not (
+            _is_number(self.terminated_return) and np.isfinite(self.terminated_return)
+        ):
+            raise ValueError(f"terminated_return must be a finite number or None, but is {self.terminated_return!r}")
 
     def _check_positive(self, name: str) -> None:
         value = getattr(self, name)
         if not (_is_number(value) and 0 < value < np.inf):
             raise ValueError(f"{name} must be a positive, finite number, but is {value!r}; pass a value above 0")
+
+    def _check_flag(self, name: str) -> None:
+        if not isinstance(getattr(self, name), bool):
+            raise ValueError(f"{name} must be True or False, but is {getattr(self, name)!r}")
 
     def _check_count(self, name: str) -> None:
         value = getattr(self, name)
@@ -113,6 +130,7 @@ class Experiment:
             "max_input": self.max_input,
             "max_output": self.max_output,
             "horizon": self.samples,
+            "hold": 1,
             "process_noise": 0.0,
             "measurement_noise": 0.0,
             "budget": np.inf,
@@ -124,6 +142,9 @@ class Experiment:
             **{f"center_{name}": getattr(self.twin, name) for name in OSCILLATOR},
             "step": SAMPLING_STEP,
             "reward": reward_number(self.reward),
+            "terminal": self.terminal,
+            "forfeits": self.terminated_return is not None,
+            "terminated_return": self.terminated_return or 0.0,
             "estimator": ESTIMATORS[self.estimator_kind],
             "iterations": self.iterations or DEFAULT_ITERATIONS[self.factorisation],
             "as_published": False,
@@ -308,8 +329,9 @@ class ReplayExperiment(Experiment):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {list(choices)}, but is {getattr(self, name)!r}")
         for name in ("nonlinear", "as_published"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} must be True or False, but is {getattr(self, name)!r}")
+            self._check_flag(name)
+        if self.hold != 1:
+            raise ValueError(f"hold must be 1 for a record, which answers one recorded input after another, but is {self.hold}")
         if self.reward == "fisher":
             raise ValueError("reward must not be 'fisher' for a record, whose true oscillator nobody knows")
         if self.as_published and self.factorisation != "mean_field":

@@ -10,17 +10,19 @@ import math
 import numpy as np
 from numba import prange
 
-from duffing_env import fisher
+from duffing_env import expectation, fisher, simulation
 from duffing_env.layout import (
     ESTIMATORS,
     LAYOUT,
     N_OBSERVATION,
     N_OUTCOME,
+    N_ROWS,
     OBSERVATION,
     OSCILLATOR,
     PLANTS,
     SAVED,
     SETTINGS,
+    SUMMED,
 )
 from duffing_env.noise import as_bits, as_word, draw, to_unit
 from duffing_env.plant import draw_noise, integrate_plant, limit_input, move_plant, play_record
@@ -44,7 +46,9 @@ _RECORDED_U, _RECORDED_Y = LAYOUT["recorded_u"] * LANES, LAYOUT["recorded_y"] * 
 _OUTCOME, _OBS = LAYOUT["reward"] * LANES, LAYOUT["obs_mean_t1"] * LANES
 _TERMINATED, _TRUNCATED = LAYOUT["terminated"] * LANES, LAYOUT["truncated"] * LANES
 _DIVERGED, _OFF_RECORD = LAYOUT["diverged"] * LANES, LAYOUT["off_record"] * LANES
-_SURPRISE = LAYOUT["surprise"] * LANES
+_SURPRISE, _EARNED = LAYOUT["surprise"] * LANES, LAYOUT["earned"] * LANES
+_ERROR, _MISFIT = LAYOUT["error"] * LANES, LAYOUT["misfit"] * LANES
+_SUMMED = tuple(LAYOUT[name] * LANES for name in SUMMED)
 _SAVED_RECORD = LAYOUT[SAVED[0]] * LANES
 _OSCILLATOR, _ENDED_OSCILLATOR = LAYOUT["m"] * LANES, LAYOUT["ended_m"] * LANES
 _N_OSCILLATOR = len(OSCILLATOR)
@@ -61,6 +65,9 @@ _PLANT, _DELAY = SETTINGS["plant"], SETTINGS["delay"]
 _REPLAY, _SDE = PLANTS["replay"], PLANTS["sde"]
 _MEAN_FIELD, _ODE = ESTIMATORS["mean_field"], ESTIMATORS["ode"]
 _FREE_ENERGY, _FISHER = REWARDS["free_energy"], REWARDS["fisher"]
+_EXPECTED, _SIMULATION = REWARDS["expected_free_energy"], REWARDS["simulation_error"]
+_HOLD, _TERMINAL = SETTINGS["hold"], SETTINGS["terminal"]
+_FORFEITS, _TERMINATED_RETURN = SETTINGS["forfeits"], SETTINGS["terminated_return"]
 _PRIOR_T1, _SCALE_T1 = SETTINGS["prior_t1"], SETTINGS["scale_t1"]
 _PRIOR_LOG_GAMMA, _PRIOR_LOG_XI = SETTINGS["prior_log_gamma"], SETTINGS["prior_log_xi"]
 
@@ -176,16 +183,26 @@ def reset_lane(W, j, settings, prior):
     W[_JUMP_AT + j] = -1.0
     if settings[_JUMP] > 0.0:
         draw_jump(W, j, settings[_JUMP], settings[_HORIZON])
-    for row in (_U, _LAST_U, _Y, _X, _LAST_X, _VELOCITY, _ELAPSED, _WAITING, _SPENT):
+    for row in (_U, _LAST_U, _Y, _X, _LAST_X, _VELOCITY, _ELAPSED, _WAITING, _SPENT, _EARNED):
         W[row + j] = 0.0
-    appraise(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
+    _appraise(W, j, settings)
     if settings[_REWARD] == _FISHER:
         fisher.begin(W, j, prior, settings[_NONLINEAR])
 
 
 @jit
+def _appraise(W, j, settings):
+    """Measure lane j's belief beside its oscillator, where either is new."""
+    continuous = settings[_ESTIMATOR] == _ODE
+    appraise(W, j, settings[_STEP], settings[_NONLINEAR], 1.0 if continuous else 0.0)
+    if settings[_REWARD] == _SIMULATION:
+        simulation.compare(W, settings[_MAX_INPUT], continuous)
+        W[_ERROR + j] = W[_MISFIT + j]
+
+
+@jit
 def _infer(W, settings):
-    """Update the beliefs of a block with its samples, and tell their free energy where that is the reward."""
+    """Update the beliefs of a block with its samples, and tell what the reward needs of the update."""
     if settings[_WALK] > 0.0:
         walk(W, settings[_WALK], settings[_WALK + 1], settings[_WALK + 2], settings[_WALK + 3])
     structured = settings[_ESTIMATOR] != _MEAN_FIELD
@@ -197,11 +214,20 @@ def _infer(W, settings):
         if settings[_PLANT] == _SDE:
             _swap_inputs(W)
         update(W, structured, iterations, settings[_AS_PUBLISHED] != 0.0, W[:0])
+        if settings[_REWARD] == _EXPECTED and not structured:
+            expectation.predict(W)
         if settings[_PLANT] == _SDE:
             _swap_inputs(W)
     if settings[_REWARD] == _FREE_ENERGY:
         for j in range(LANES):
             W[_SURPRISE + j] = free_energy(W, j, structured)
+    if settings[_REWARD] == _EXPECTED:
+        expectation.expect(
+            W, settings[_WALK], settings[_WALK + 1], settings[_WALK + 2], settings[_WALK + 3], settings[_NONLINEAR],
+            1.0 if settings[_ESTIMATOR] == _ODE else 0.0,
+        )  # fmt: skip
+    if settings[_REWARD] == _SIMULATION:
+        simulation.compare(W, settings[_MAX_INPUT], settings[_ESTIMATOR] == _ODE)
 
 
 @jit
@@ -233,7 +259,7 @@ def _integrate_and_infer(W, settings, recorded_u, recorded_y):
     settle(
         W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR],
         1.0 if settings[_ESTIMATOR] == _ODE else 0.0, settings[_REWARD],
-        settings[_INPUT_COST],
+        settings[_INPUT_COST], settings[_TERMINAL], settings[_FORFEITS], settings[_TERMINATED_RETURN],
     )  # fmt: skip
     for j in range(LANES):
         if W[_DIVERGED + j] != 0.0 or W[_OFF_RECORD + j] != 0.0:
@@ -256,6 +282,37 @@ def _write_observations(W, settings, observations):
 
 
 @jit
+def _play_sample(W, actions, settings, recorded_u, recorded_y):
+    """One sample of a block: the inputs within their limits, a jump where it is due, and what follows."""
+    for j in range(LANES):
+        W[_LAST_U + j] = W[_U + j]
+        W[_ASKED + j] = settings[_MAX_INPUT] * max(-1.0, min(1.0, actions[j]))
+    limit_input(W, settings[_BUDGET], settings[_MAX_SLEW])
+    if settings[_JUMP] > 0.0:
+        for j in range(LANES):
+            if W[_ELAPSED + j] == W[_JUMP_AT + j]:
+                jump_mass(W, j, settings[_STEP], 1.0 if settings[_ESTIMATOR] == _ODE else 0.0)
+                _appraise(W, j, settings)
+    _integrate_and_infer(W, settings, recorded_u, recorded_y)
+
+
+@jit
+def _play(W, actions, settings, recorded_u, recorded_y):
+    """Apply the actions for as many samples as they hold; an environment that ends meanwhile stays as it ended."""
+    for s in range(np.int64(settings[_HOLD])):
+        before = W.copy() if s > 0 else W[:0]
+        _play_sample(W, actions, settings, recorded_u, recorded_y)
+        if s > 0:
+            for j in range(LANES):
+                if before[_TERMINATED + j] + before[_TRUNCATED + j] != 0.0:
+                    for row in range(N_ROWS):
+                        W[row * LANES + j] = before[row * LANES + j]
+                else:
+                    for row in _SUMMED:
+                        W[row + j] += before[row + j]
+
+
+@jit
 def _step_block(
     W, actions, settings, prior, recorded_u, recorded_y, reset_mode, observations, final_observations, outcome
 ):  # fmt: skip
@@ -263,17 +320,8 @@ def _step_block(
     waiting = 0
     for j in range(LANES):
         waiting += W[_WAITING + j] != 0.0
-        W[_LAST_U + j] = W[_U + j]
-        W[_ASKED + j] = settings[_MAX_INPUT] * max(-1.0, min(1.0, actions[j]))
-    limit_input(W, settings[_BUDGET], settings[_MAX_SLEW])
-    if settings[_JUMP] > 0.0:
-        continuous = 1.0 if settings[_ESTIMATOR] == _ODE else 0.0
-        for j in range(LANES):
-            if W[_ELAPSED + j] == W[_JUMP_AT + j]:
-                jump_mass(W, j, settings[_STEP], continuous)
-                appraise(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
     if waiting < LANES:
-        _integrate_and_infer(W, settings, recorded_u, recorded_y)
+        _play(W, actions, settings, recorded_u, recorded_y)
     finished = 0
     for j in range(LANES):
         if W[_WAITING + j] != 0.0 and reset_mode == RESET_NEXT_STEP:

@@ -27,9 +27,9 @@ N_OBSERVATION = len(OBSERVATION)
 
 #: What the kernel is told about a track: (len(SETTINGS),) float64, the same for all environments.
 SETTINGS = rows(
-    "max_input max_output horizon process_noise measurement_noise spread center_m center_c center_a center_b step",
+    "max_input max_output horizon hold process_noise measurement_noise spread center_m center_c center_a center_b step",
     "budget max_slew input_cost jump walk_t1 walk_t2 walk_t3 walk_e",
-    "reward estimator iterations as_published nonlinear plant delay",
+    "reward terminal forfeits terminated_return estimator iterations as_published nonlinear plant delay",
     "prior_t1 prior_t2 prior_t3 prior_e scale_t1 scale_t2 scale_t3 scale_e prior_log_gamma prior_log_xi",
 )
 
@@ -40,6 +40,9 @@ ESTIMATORS = {"mean_field": 0, "structured": 1, "ode": 2}
 #: What a step leaves for an environment's face: rows of (len(OUTCOME), n) float64.
 OUTCOME = rows("reward information_gain log_posterior_gain terminated truncated diverged off_record")
 N_OUTCOME = len(OUTCOME)
+
+#: Those of them that add up over the samples of a step; the others are as the last sample leaves them.
+SUMMED = ("reward", "information_gain", "log_posterior_gain")
 
 #: The record before the step, to return to where the step came to nothing; after a reset in the same step, the record
 #: that the episode ended with.
@@ -60,7 +63,7 @@ LAYOUT = {
         "true_t1 true_t2 true_t3 true_e",
         "x last_x velocity elapsed waiting recorded_u recorded_y",
         "asked spent jump_at jump_factor",
-        "log_det log_density error surprise fisher_gain ideal_log_det",
+        "log_det log_density error misfit surprise fisher_gain expected_gain earned ideal_log_det",
         " ".join(f"ideal_{name}" for name in IDEAL),
         " ".join(OUTCOME),
         " ".join(f"obs_{name}" for name in OBSERVATION),

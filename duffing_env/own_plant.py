@@ -11,11 +11,9 @@ import numpy as np
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
 from duffing_env.layout import PLANTS
+from duffing_env.rewards import NEED_THE_TRUTH
 from estimator.belief import Prior
 from estimator.parameters import PhysicalParameters
-
-#: Rewards that compare the belief with the true oscillator.
-_NEED_THE_TRUTH = ("log_posterior", "parameter_error", "fisher")
 
 
 class Plant(Protocol):
@@ -44,10 +42,10 @@ class PlantExperiment(Experiment):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_count("horizon")
-        if self.reward in _NEED_THE_TRUTH:
+        if self.reward in NEED_THE_TRUTH:
             raise ValueError(
                 f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "
-                "use 'information_gain' or 'free_energy'"
+                "use 'information_gain', 'expected_free_energy' or 'free_energy'"
             )
         if self.prior is not None and not isinstance(self.prior, Prior):
             raise ValueError(f"prior must be an estimator.Prior or None, but is {self.prior!r}")

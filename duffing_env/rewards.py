@@ -30,7 +30,18 @@ from estimator.lanes import at_lane, inlined, lanewise
 _SMALLEST, _INFINITE = 2.0**-1022, float("inf")
 
 #: Name of a reward to its number in the kernel.
-REWARDS = {"information_gain": 0, "log_posterior": 1, "parameter_error": 2, "free_energy": 3, "fisher": 4}
+REWARDS = {
+    "information_gain": 0,
+    "log_posterior": 1,
+    "parameter_error": 2,
+    "free_energy": 3,
+    "fisher": 4,
+    "expected_free_energy": 5,
+    "simulation_error": 6,
+}
+
+#: Rewards that compare the belief with the true oscillator, or need it to be told.
+NEED_THE_TRUTH = ("log_posterior", "parameter_error", "fisher", "simulation_error")
 
 
 def reward_number(name: str) -> int:
@@ -99,28 +110,31 @@ def _capped(ratio):
 
 @lanewise(
     LAYOUT,
-    " ".join(OUTCOME) + " log_det log_density error elapsed",
-    uniform="max_output horizon step nonlinear continuous reward_kind input_cost",
+    " ".join(OUTCOME) + " log_det log_density error elapsed earned",
+    uniform="max_output horizon step nonlinear continuous reward_kind input_cost terminal forfeits terminated_return",
 )
 def settle(
     x0, x1, x2, t1, t2, t3, e, P_x0_x0, P_x1_x1, P_x2_x2,
     P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
     g_rate, n_rate, m, c, a, b, true_t1, true_t2, true_t3, true_e,
-    u, x, y, elapsed, log_det, log_density, error, surprise, fisher_gain, off_record,
-    max_output, horizon, step, nonlinear, continuous, reward_kind, input_cost,
+    u, x, y, elapsed, log_det, log_density, error, misfit, surprise, fisher_gain, expected_gain, earned, off_record,
+    max_output, horizon, step, nonlinear, continuous, reward_kind, input_cost, terminal, forfeits, terminated_return,
 ):  # fmt: skip
     """What the step was worth, and whether the episode ends.
 
     A number that is not finite ends it, flagged, and so does a covariance that is not positive definite any more.
-    ``surprise`` is the free energy of the sample where that is the reward, and 0 elsewhere; so is ``fisher_gain``.
+    ``surprise`` is the free energy of the sample where that is the reward, and 0 elsewhere; so are ``fisher_gain``,
+    ``expected_gain`` and ``misfit``. ``earned`` is the episode's return so far, if it were paid sample by sample.
     """
     P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
     new_log_det, new_log_density, sound = log_det_and_density(
         t1, t2, t3, e, P, true_t1, true_t2, true_t3, true_e, nonlinear != 0.0
     )  # fmt: skip
     new_error = _relative_error(t1, t2, t3, e, m, c, a, b, step, continuous != 0.0)
+    if reward_kind == 6.0:
+        new_error = misfit
     total = x + y + x0 + x1 + x2 + t1 + t2 + t3 + e + P_x0_x0 + P_x1_x1 + P_x2_x2 + g_rate + n_rate
-    total += new_log_density + new_error + surprise
+    total += new_log_density + new_error + surprise + expected_gain
     sound = sound and P_x0_x0 > 0.0 and P_x1_x1 > 0.0 and g_rate > 0.0 and n_rate > 0.0
     diverged = 0.0 if (total - total == 0.0 and sound) else 1.0
     void = diverged != 0.0 or off_record != 0.0
@@ -133,19 +147,27 @@ def settle(
     reward = information_gain
     if reward_kind == 1.0:
         reward = log_posterior_gain
-    if reward_kind == 2.0:
+    if reward_kind == 2.0 or reward_kind == 6.0:
         reward = error - new_error
     if reward_kind == 3.0:
         reward = 0.0 if void else -surprise
     if reward_kind == 4.0:
         reward = fisher_gain
+    if reward_kind == 5.0:
+        reward = 0.0 if void else expected_gain
     reward -= input_cost * u * u
     terminated = 1.0 if (void or abs(y) > max_output) else 0.0
     elapsed += 1.0
     truncated = 1.0 if (elapsed >= horizon and terminated == 0.0) else 0.0
+    received = 0.0 if terminal != 0.0 else earned
+    earned += reward
+    if terminal != 0.0:
+        reward = earned if terminated + truncated != 0.0 else 0.0
+    if forfeits != 0.0 and terminated != 0.0:
+        reward = terminated_return - received
     return (
         reward, information_gain, log_posterior_gain, terminated, truncated, diverged, off_record,
-        new_log_det, new_log_density, new_error, elapsed,
+        new_log_det, new_log_density, new_error, elapsed, earned,
     )  # fmt: skip
 
 
