@@ -78,7 +78,7 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     ## Reward
 
-    By name (``reward=``), all in nats but ``parameter_error``; C is the posterior covariance of (θ, η), c* the truth.
+    By name (``reward=``), in nats but for the two errors; C is the posterior covariance of (θ, η), c* the truth.
 
     | Name | Reward of a step | Range |
     |------|------------------|-------|
@@ -86,7 +86,13 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``log_posterior`` | log q_t(c*) - log q_{t-1}(c*) | unbounded below; its mean is at most the information gain |
     | ``parameter_error`` | e_{t-1} - e_t, e = mean of min(relative error, 1) over m, c, a, b | [-1, 1] |
     | ``fisher`` | ½ log det(Λ0 + F_t) - ½ log det(Λ0 + F_{t-1}), F the Fisher information at the truth | >= 0 |
+    | ``expected_free_energy`` | ½ log det C_{t-1} - ½ log det C'_t, C'_t as expected before the outcome | >= 0 |
+    | ``simulation_error`` | s_{t-1} - s_t, s the relative error of a free run, at most 1 | [-1, 1] |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
+
+    The ranges are those of an episode's sum. `duffing_env.rewards` (the manual's page "Rewards") says what each bounds,
+    and how it can be fooled. What is gained is kept when an episode is terminated, unless ``terminated_return`` is set;
+    with ``terminal`` it is paid in the last step, in one sum.
 
     ## Starting state
 
@@ -102,9 +108,9 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     ## Information
 
-    Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], ``diverged``. At the end of an
-    episode also ``belief`` (`estimator.Belief`) and ``truth`` (`estimator.PhysicalParameters`). At any time:
-    ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+    Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], summed over the samples that an
+    action is held for; ``diverged``. At the end of an episode also ``belief`` (`estimator.Belief`) and ``truth``
+    (`estimator.PhysicalParameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
 
     ## Arguments
 
@@ -116,6 +122,9 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``max_input`` | 0.15 | input limit [V] |
     | ``max_output`` | 0.6 | displacement limit [V] |
     | ``horizon`` | 256 | samples of an episode |
+    | ``hold`` | 1 | samples that an action is applied for; see below |
+    | ``terminal`` | False | pay the episode's whole reward in its last step, and 0 before |
+    | ``terminated_return`` | None | return of an episode that is terminated, whatever it gained; None keeps that |
     | ``process_noise`` | 5e-4 | standard deviation of w̃ [V] |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
     | ``spread`` | 0.3 | half width of the parameters' range, relative |
@@ -126,6 +135,10 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``input_cost`` | 0 | taken off the reward for every (u / ``max_input``)² |
     | ``jump``, ``drift`` | 0 | a mass that jumps, an estimator that expects change; see `DriftEnv` |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
+
+    With ``hold`` a step is that many samples with the same action, to the bit: its reward is the sum of theirs, limits
+    hold for every sample, and an episode may end within. ``horizon`` stays in samples, so an episode has
+    ceil(horizon / hold) steps, and the last may be shorter; the observation is that of the last sample.
 
     >>> import gymnasium as gym
     >>> import duffing_env
@@ -289,8 +302,8 @@ class SilverboxReplayEnv(DuffingEnv):
 
     ## Action space, observation space, reward
 
-    As `DuffingEnv`. The true parameters of a circuit are not known: ``log_posterior`` and ``parameter_error`` are
-    relative to its twin, identified from the whole training part.
+    As `DuffingEnv`. The true parameters of a circuit are not known: ``log_posterior``, ``parameter_error`` and
+    ``simulation_error`` are relative to its twin, identified from the whole training part.
 
     ## Starting state
 
@@ -307,7 +320,8 @@ class SilverboxReplayEnv(DuffingEnv):
 
     ## Arguments
 
-    ``factorisation``, ``iterations``, ``reward``, ``max_input``, ``max_output`` and ``render_mode`` as `DuffingEnv`.
+    ``factorisation``, ``iterations``, ``reward``, ``terminal``, ``terminated_return``, ``max_input``, ``max_output``
+    and ``render_mode`` as `DuffingEnv`. There is no ``hold``: a record is answered sample by sample.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|

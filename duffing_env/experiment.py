@@ -34,7 +34,7 @@ class Experiment:
         reward: its name, see `duffing_env.rewards`.
         max_input: input of the action 1 [V].
         max_output: displacement limit [V]: the episode ends at \|y\| above it.
-        hold: samples that an action is applied for; a step's reward is the sum of theirs, and an episode may end within.
+        hold: samples that an action is applied for; a step's reward is the sum of theirs. An episode may end within.
         terminal: whether the episode's whole reward is paid in its last step, and 0 before.
         terminated_return: what an episode that ends by termination returns as a whole: its last reward takes back what
             was received, and gives this. What was gained is kept where it is None.
@@ -331,7 +331,7 @@ class ReplayExperiment(Experiment):
         for name in ("nonlinear", "as_published"):
             self._check_flag(name)
         if self.hold != 1:
-            raise ValueError(f"hold must be 1 for a record, which answers one recorded input after another, but is {self.hold}")
+            raise ValueError(f"hold must be 1 for a record, which answers sample by sample, but is {self.hold}")
         if self.reward == "fisher":
             raise ValueError("reward must not be 'fisher' for a record, whose true oscillator nobody knows")
         if self.as_published and self.factorisation != "mean_field":

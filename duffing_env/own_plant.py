@@ -90,8 +90,8 @@ class PlantEnv(DuffingEnv):
 
     ## Reward
 
-    ``information_gain`` (default) or ``free_energy``, as `DuffingEnv`. The others compare with the true oscillator,
-    which nobody knows: they are refused.
+    ``information_gain`` (default), ``expected_free_energy`` or ``free_energy``, as `DuffingEnv`. The others compare
+    with the true oscillator, which nobody knows: they are refused.
 
     ## Starting state
 
@@ -114,12 +114,13 @@ class PlantEnv(DuffingEnv):
 
     ## Arguments
 
-    ``factorisation``, ``iterations``, ``max_input``, ``max_output`` and ``render_mode`` as `DuffingEnv`.
+    ``factorisation``, ``iterations``, ``max_input``, ``max_output``, ``hold``, ``terminal``, ``terminated_return`` and
+    ``render_mode`` as `DuffingEnv`. With ``hold`` the plant's ``step`` is called for every sample, with the same input.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
     | ``plant`` | | the plant; it stays the caller's, who closes it |
-    | ``reward`` | ``information_gain`` | or ``free_energy`` |
+    | ``reward`` | ``information_gain`` | or ``expected_free_energy``, ``free_energy`` |
     | ``horizon`` | 256 | samples of an episode |
     | ``prior`` | None | an `estimator.Prior`; None: that of Amplitude-v0 |
 

@@ -12,20 +12,20 @@
   prior's precision: what an efficient estimator would gain. Needs the truth, so it is for training and for tests; no
   estimator can talk it up (`duffing_env.fisher`).
 - ``expected_free_energy``: minus the expected free energy of the input that was chosen, in nats: the information about
-  (θ, η) that the sample was expected to give by the belief before it, -½ log(1 - cᵀ C⁻¹ c / S), with C the coefficients'
-  covariance, S the variance of the output and c its covariance with them (`duffing_env.expectation`). There is no goal
-  prior, so nothing pragmatic; ``input_cost`` is the prior on the input. Never negative, and free of the outcome's noise.
-  By the chain rule of information its mean over episodes is that of the information gain, if the belief is the exact
-  posterior: 17.79 nats beside 17.79 with uniform inputs on Amplitude-v0, structured. It bounds nothing by itself: it is
-  what the belief promises. A promise that is not kept is made, and paid, again: whoever keeps the posterior wide is paid
-  most. So a belief that contracts more than it promised is paid too little (mean field: 10.9 nats promised, 16.5
-  claimed), one that is widened between samples (``drift``) for the same knowledge again and again, and inputs for which
-  the linearisation promises what the update does not keep are worth looking for.
-- ``simulation_error``: decrease of the error of a free run: the posterior mean's oscillator beside the true one, both from
-  rest, over a fixed multisine of 64 samples (`duffing_env.simulation`); RMS of the difference over that of the true
-  run, capped at 1, so an episode's sum lies in [-1, 1]. It counts the parameters by what they do to the output, so those
-  that do little there may stay wrong: the test input has half of ``max_input``, and what only shows beyond is not seen.
-  Noisy as the parameter error is, and flat where the error is above the cap. Needs the truth.
+  (θ, η) that the sample was expected to give by the belief before it, -½ log(1 - cᵀ C⁻¹ c / S), with C the
+  coefficients' covariance, S the variance of the output and c its covariance with them (`duffing_env.expectation`).
+  There is no goal prior, so nothing pragmatic; ``input_cost`` is the prior on the input. Never negative, and free of
+  the outcome's noise. By the chain rule of information its mean over episodes is that of the information gain, if the
+  belief is the exact posterior: 17.79 nats beside 17.79 with uniform inputs on Amplitude-v0, structured. It bounds
+  nothing by itself: it is what the belief promises. A promise that is not kept is made, and paid, again: whoever keeps
+  the posterior wide is paid most. So a belief that contracts more than it promised is paid too little (mean field:
+  10.9 nats promised, 16.5 claimed), one that is widened between samples (``drift``) for the same knowledge again and
+  again, and inputs for which the linearisation promises what the update does not keep are worth looking for.
+- ``simulation_error``: decrease of the error of a free run: the posterior mean's oscillator beside the true one, both
+  from rest, over a fixed multisine of 64 samples (`duffing_env.simulation`); RMS of the difference over that of the
+  true run, capped at 1, so an episode's sum lies in [-1, 1]. It counts the parameters by what they do to the output,
+  so those that do little there may stay wrong: the test input has half of ``max_input``, and what only shows beyond is
+  not seen. Noisy as the parameter error is, and flat where the error is above the cap. Needs the truth.
 - ``free_energy``: minus the free energy of the sample in nats: how well the output was predicted. Rewards inputs whose
   outcome is known already, so an agent that maximises it learns nothing; the foil.
 
@@ -35,15 +35,18 @@ and last belief only. So does the Fisher information, on its first and last matr
 Three options go with every reward:
 
 - ``input_cost`` takes its part off for every sample.
-- ``terminal=True`` pays the episode's whole sum in its last step, and 0 before. Without discount the return is the same;
-  what is lost is the hint which input earned it.
-- ``terminated_return`` is the return of an episode that ends by termination: its last reward takes back what was received
-  and gives this number. Without it what was gained before the end is kept, which is right for an experiment that is over,
-  and wrong where the end stands for damage: on Amplitude-v0 the input that pumps until the limit ends the episode gains
-  BANK nats, no input at all REST. And where ``max_output`` lets the explicit plant blow up, its growing powers
-  tell the coefficients to many digits: that is the plant's failure, and no experiment. With ``terminated_return=-10``
-  every reward but the foil is then worth less than no input (tests/agents/test_blow_up.py). It holds for a discount
-  of 1.
+- ``terminal=True`` pays the episode's whole sum in its last step, and 0 before. Without discount the return is the
+  same; what is lost is the hint which input earned it.
+- ``terminated_return`` is the return of an episode that ends by termination: its last reward takes back what was
+  received and gives this number. Without it what was gained before the end is kept, which is right for an experiment
+  that is over, and wrong where the end stands for damage: on Amplitude-v0 pushing along the velocity until the limit
+  ends the episode gains 15.2 nats, no input at all 2.4. And where ``max_output`` lets the explicit plant blow up, its
+  powers tell the coefficients to many digits: 23.5 nats at a limit of 1 kV. That is the plant's failure, and no
+  experiment. With ``terminated_return=-10`` such inputs return less than none, whatever the reward. A number below
+  what no input returns will do; it is for a discount of 1.
+
+The figures of uniform inputs are those of tests/duffing_env/test_expectation.py, those of inputs that pump of
+tests/duffing_env/test_blow_up.py.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from estimator import SAMPLING_STEP
 TRACK, SYSTEMS, SAMPLES = "duffing_env/Amplitude-v0", 8, 256
 LEARNABLE = [name for name in REWARDS if name != "free_energy"]  # the foil rewards what is known already
 LIMITS = {"standard": 0.6, "raised": 1e3, "none": 1e300}
-PENALTY = -10.0
+WORTH = -10.0
 TIME = SAMPLING_STEP * np.arange(SAMPLES)
 
 
@@ -19,38 +19,72 @@ def bank():
     """Full inputs (n, SAMPLES) that pump: squares and sines about the resonances, chirps through them, long pulses."""
     squares = [np.sign(np.sin(2 * np.pi * f * TIME + 1e-9)) for f in (55, 65, 75, 85, 95)]
     sines = [np.sin(2 * np.pi * f * TIME) for f in (60, 75, 90)]
-    chirps = [np.sin(2 * np.pi * (low + (high - low) * TIME / TIME[-1] / 2) * TIME) for low, high in ((0, 200), (130, 40))]
+    chirps = [
+        np.sin(2 * np.pi * (low + (high - low) * TIME / TIME[-1] / 2) * TIME) for low, high in ((0, 200), (130, 40))
+    ]
     return np.array([*squares, *sines, *chirps, np.ones(SAMPLES)])
 
 
 def returns(reward, max_output, **options):
-    """Returns (inputs, SYSTEMS) of the bank and of feedback, which ended by termination, and those of no input (SYSTEMS,)."""
+    """Returns and early ends (inputs + 2, SYSTEMS): of the bank, of feedback along the velocity, and of no input."""
     inputs = bank()
-    rows = (len(inputs) + 2) * SYSTEMS
+    count = len(inputs) + 2
     envs = gym.make_vec(
-        TRACK, num_envs=rows, vectorization_mode="vector_entry_point", reward=reward, max_output=max_output, **options
-    )
-    observations, _ = envs.reset(seed=spawn_seeds(0, SYSTEMS) * (len(inputs) + 2))
-    told, ended, running = np.zeros(rows), np.zeros(rows, dtype=bool), np.ones(rows, dtype=bool)
-    push = np.ones(SYSTEMS)
+        TRACK, num_envs=count * SYSTEMS, vectorization_mode="vector_entry_point",
+        reward=reward, max_output=max_output, **options,
+    )  # fmt: skip
+    envs.reset(seed=spawn_seeds(0, SYSTEMS) * count)
+    told = np.zeros(count * SYSTEMS)
+    ended, running = told > 0, told == 0
     for t in range(SAMPLES):
+        states = envs.unwrapped.records[-2 * SYSTEMS : -SYSTEMS]
+        push = np.where(states[:, 0] < states[:, 1], -1.0, 1.0)
         actions = np.concatenate([np.repeat(inputs[:, t], SYSTEMS), push, np.zeros(SYSTEMS)])
-        observations, rewards, terminated, truncated, _ = envs.step(actions[:, None].astype(np.float32))
-        feedback = slice(-2 * SYSTEMS, -SYSTEMS)
-        push = np.where(observations[feedback, 16] < observations[feedback, 17], -1.0, 1.0)  # along the velocity
+        _, rewards, terminated, truncated, _ = envs.step(actions[:, None].astype(np.float32))
         told[running] += rewards[running]
         ended |= running & terminated
         running &= ~(terminated | truncated)
-    told, ended = told.reshape(-1, SYSTEMS), ended.reshape(-1, SYSTEMS)
+    return told.reshape(count, SYSTEMS), ended.reshape(count, SYSTEMS)
+
+
+@pytest.mark.parametrize("limit", LIMITS)
+@pytest.mark.parametrize("reward", LEARNABLE)
+def test_a_blow_up_returns_less_than_no_input_where_that_is_asked_for(reward, limit):
+    told, ended = returns(reward, LIMITS[limit], terminated_return=WORTH)
+    assert ended.sum() >= SYSTEMS
+    assert ended[-2].all()
     assert not ended[-1].any()
-    return told[:-1], ended[:-1], told[-1]
+    worse = told < told[-1]
+    assert worse[ended].all()
+    np.testing.assert_allclose(told[ended], WORTH, rtol=0, atol=1e-9)
 
 
-if __name__ == "__main__":
-    for reward in REWARDS:
-        for name, limit in LIMITS.items():
-            for kw in ({}, {"terminated_return": PENALTY}, {"terminated_return": PENALTY, "terminal": True}):
-                told, ended, rest = returns(reward, limit, **kw)
-                fb = told[-1]
-                if not kw: print(f"{reward:22s} {name:9s} ended {ended.mean():.2f} feedback ended {ended[-1].mean():.2f} mean return of ended {told[ended].mean():9.2f} [{told[ended].min():.2f} {told[ended].max():.2f}], feedback {fb.mean():.2f}, rest {rest.mean():.2f} [{rest.min():.2f}], worse than rest {(told < rest)[ended].mean():.2f}", flush=True)
-                else: print("      with", kw, "worse", (told < rest)[ended].mean(), "range", told[ended].min(), told[ended].max(), flush=True)
+def test_it_does_so_where_the_reward_is_paid_at_the_end():
+    told, ended = returns("information_gain", LIMITS["raised"], terminated_return=WORTH, terminal=True)
+    assert ended[-2].all()
+    np.testing.assert_array_equal(told[ended], WORTH)
+
+
+def test_what_was_gained_before_the_end_is_kept_otherwise():
+    # The figures of `duffing_env.rewards`.
+    told, ended = returns("information_gain", LIMITS["standard"])
+    assert ended[-2].all()
+    assert told[-2].mean() == pytest.approx(15.2, abs=0.05)
+    assert told[-1].mean() == pytest.approx(2.4, abs=0.05)
+    told, ended = returns("information_gain", LIMITS["raised"])
+    assert ended[-2].all()
+    assert told[-2].mean() == pytest.approx(23.5, abs=0.05)
+
+
+@pytest.mark.parametrize("reward", LEARNABLE)
+def test_the_registered_tracks_end_at_their_limit_and_never_diverge(reward):
+    """So no number of theirs depends on what a diverged step is worth."""
+    inputs = np.repeat(bank(), SYSTEMS, axis=0)
+    envs = gym.make_vec(TRACK, num_envs=len(inputs), vectorization_mode="vector_entry_point", reward=reward)
+    envs.reset(seed=0)
+    ended = 0
+    for t in range(SAMPLES):
+        _, _, terminated, _, infos = envs.step(inputs[:, t : t + 1].astype(np.float32))
+        ended += terminated.sum()
+        assert not infos["diverged"].any()
+    assert ended > 100

@@ -1,5 +1,7 @@
 """Actions that are held for several samples: the same as applying them sample by sample, to the bit."""
 
+from itertools import pairwise
+
 import gymnasium as gym
 import numba
 import numpy as np
@@ -140,7 +142,7 @@ def test_every_sample_is_drawn():
         env.step([0.5])
         assert env._screen._samples == count
         frames.append(env.render())
-    assert not any(np.array_equal(a, b) for a, b in zip(frames, frames[1:], strict=False))
+    assert not any(np.array_equal(a, b) for a, b in pairwise(frames))
 
 
 @pytest.mark.parametrize(
@@ -157,5 +159,5 @@ def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(options):
 
 @pytest.mark.usefixtures("record")
 def test_a_record_is_not_held():
-    with pytest.raises(ValueError, match="hold must be 1 for a record, .* but is 2"):
+    with pytest.raises(ValueError, match=r"hold must be 1 for a record, .* but is 2"):
         ReplayExperiment(hold=2)

@@ -196,13 +196,13 @@ class TwinEnv:
 
     def _free_run(self, coefficients):
         """x (64,) of the difference equation from rest under the test input."""
-        t1, t2, t3, e = coefficients
-        x = last_x = 0.0
-        told = []
-        for u in self.max_input * multisine():
-            x, last_x = t1 * x + t2 * x**3 + t3 * last_x + e * u, x
-            told.append(x)
-        return np.array(told)
+        t1, t2, t3, e = np.float64(coefficients)
+        x, last_x, told = np.zeros(1), np.zeros(1), []
+        with np.errstate(all="ignore"):  # one that runs away
+            for u in self.max_input * multisine():
+                x, last_x = t1 * x + t2 * x**3 + t3 * last_x + e * u, x
+                told.append(x)
+        return np.concatenate(told)
 
     def _true_coefficients(self):
         psi = self.coefficients
