@@ -67,8 +67,8 @@ def evaluate(
     counts with what was known by then. The metrics of information, simulation and other estimators need a simulated
     difference equation whose truth stays as it is. The arrow error is that of the difference equation identified on the
     track's twin (``plant_spread=0``) in a free run over the real arrow record; it is left out without the record. So it
-    is for the differential equation: the simulated plant has no offsets, and those of the circuit, 8 mV at the input, would be
-    nearly all of its error (5.3 mV for the twin itself).
+    is for the differential equation: the simulated plant has no offsets, and those of the circuit, 8 mV at the input,
+    would be nearly all of its error (5.3 mV for the twin itself).
 
     Args:
         policies: names or run folders, see `agents.policies.make_policy`; at least one.

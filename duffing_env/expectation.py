@@ -21,11 +21,10 @@ from duffing_env.rewards import log_det_and_density
 from estimator.elementary import log
 from estimator.inference import structured
 from estimator.lanes import lanewise, relaid
-from estimator.record import MEAN_FIELD_SCRATCH, RECORD
+from estimator.record import MEAN_FIELD_SCRATCH, NOISES, RECORD
 
 # The structured prediction from the record before the sample. What it makes of the noises is not needed.
-_NOISES = ("g_shape", "g_rate", "n_shape", "n_rate", "prior_g_rate", "prior_n_rate")
-_NOISES += ("next_process_variance", "next_measurement_variance")
+_NOISES = [*NOISES, "prior_g_rate", "prior_n_rate", "next_process_variance", "next_measurement_variance"]
 _BEFORE = {**LAYOUT, **{name: LAYOUT[f"saved_{name}"] for name in RECORD}}
 _BEFORE |= {name: LAYOUT[row] for name, row in zip(_NOISES, MEAN_FIELD_SCRATCH, strict=False)}
 
