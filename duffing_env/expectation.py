@@ -9,7 +9,7 @@ coefficients, which is what the expected free energy counts as epistemic, there 
 with C the coefficients' covariance: the decrease of their entropy that conditioning on the output brings, whatever the
 output is. For the physical equation S has N_xx/E[γ] in the place of 1/E[γ] (`estimator.inference.continuous`).
 
-It is computed after the update, from what that left untouched: the record before it, and its prediction.
+The prediction is the structured one for every belief; of a mean-field one the covariances between its factors are zero.
 """
 
 from __future__ import annotations
@@ -19,37 +19,43 @@ import numpy as np
 from duffing_env.layout import LAYOUT
 from duffing_env.rewards import log_det_and_density
 from estimator.elementary import log
+from estimator.inference import continuous as ode
 from estimator.inference import structured
-from estimator.lanes import lanewise, relaid
-from estimator.record import MEAN_FIELD_SCRATCH, NOISES, RECORD
+from estimator.lanes import jit, lanewise, relaid
+from estimator.record import MEAN_FIELD_SCRATCH, NOISES
 
-# The structured prediction from the record before the sample. What it makes of the noises is not needed.
-_NOISES = [*NOISES, "prior_g_rate", "prior_n_rate", "next_process_variance", "next_measurement_variance"]
-_BEFORE = {**LAYOUT, **{name: LAYOUT[f"saved_{name}"] for name in RECORD}}
-_BEFORE |= {name: LAYOUT[row] for name, row in zip(_NOISES, MEAN_FIELD_SCRATCH, strict=False)}
+# The belief stays as it is: what a prediction makes of its noises goes to rows that only a mean-field update uses.
+_MADE = (*NOISES, "prior_g_rate", "prior_n_rate", "next_process_variance", "next_measurement_variance")
+_LAYOUT = {**LAYOUT, **{name: LAYOUT[row] for name, row in zip(_MADE, MEAN_FIELD_SCRATCH, strict=False)}}
 
-#: ``predict(W)`` makes the prediction that a mean-field update goes without; ``u`` must be the input it was given.
-predict = relaid(structured.predict, _BEFORE)
+_predict_difference = relaid(structured.predict, _LAYOUT)
+_predict_continuous = relaid(ode.predict, _LAYOUT)
 
 
-@lanewise(LAYOUT, "expected_gain", uniform="walk_t1 walk_t2 walk_t3 walk_e nonlinear continuous")
-def expect(
+@lanewise(LAYOUT, "expected_gain", uniform="nonlinear continuous")
+def _expect(
     predicted_variance, c_t1, c_t2, c_t3, c_e, N_xx,
-    saved_P_t1_t1, saved_P_t1_t2, saved_P_t1_t3, saved_P_t1_e, saved_P_t2_t2, saved_P_t2_t3, saved_P_t2_e,
-    saved_P_t3_t3, saved_P_t3_e, saved_P_e_e, saved_g_shape, saved_g_rate, saved_n_shape, saved_n_rate,
-    walk_t1, walk_t2, walk_t3, walk_e, nonlinear, continuous,
+    P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
+    g_shape, g_rate, n_shape, n_rate, nonlinear, continuous,
 ):  # fmt: skip
-    """The expected information gain of a sample; the coefficients walked by these variances before it."""
-    P = (
-        saved_P_t1_t1 + walk_t1, saved_P_t1_t2, saved_P_t1_t3, saved_P_t1_e, saved_P_t2_t2 + walk_t2, saved_P_t2_t3,
-        saved_P_t2_e, saved_P_t3_t3 + walk_t3, saved_P_t3_e, saved_P_e_e + walk_e,
-    )  # fmt: skip
-    process_variance = saved_g_rate / saved_g_shape
-    if continuous != 0.0:
-        process_variance *= N_xx
-    scale = 1.0 / np.sqrt(predicted_variance + process_variance + saved_n_rate / saved_n_shape)
+    P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
+    process_variance = g_rate / g_shape * (N_xx if continuous != 0.0 else 1.0)
+    scale = 1.0 / np.sqrt(predicted_variance + process_variance + n_rate / n_shape)
     log_det, log_density, _ = log_det_and_density(
         0.0, 0.0, 0.0, 0.0, P, c_t1 * scale, c_t2 * scale, c_t3 * scale, c_e * scale, nonlinear != 0.0
     )  # fmt: skip
     explained = -2.0 * log_density - log_det  # cᵀ C⁻¹ c / S
     return -0.5 * log(1.0 - explained)
+
+
+@jit
+def foresee(W, nonlinear, continuous):
+    """What the coming sample is expected to say, in rows ``expected_gain``; its input stands in row ``u``."""
+    if continuous != 0.0:
+        ode.begin(W)
+        for s in range(ode.SUBSTEPS):
+            ode.move(W, s / ode.SUBSTEPS, 1.0 / ode.SUBSTEPS)
+        _predict_continuous(W)
+    else:
+        _predict_difference(W)
+    _expect(W, nonlinear, continuous)
