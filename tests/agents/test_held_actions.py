@@ -74,7 +74,7 @@ def test_the_planner_refuses_and_says_what_to_do():
 
 def test_every_sample_is_evaluated(monkeypatch):
     monkeypatch.setattr("agents.evaluation.record_available", lambda: False)
-    options = {"hold": HOLD, "horizon": 50, "max_output": 0.2}
+    options = {"hold": HOLD, "horizon": 50, "max_output": 0.3}
     (evaluation,) = evaluate(["uniform"], systems=6, seed=5, options=options)
     envs = make(TRACK, 6, options)
     policy, state = make_policy("uniform", envs, seed=5), None

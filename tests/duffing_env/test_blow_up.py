@@ -87,4 +87,4 @@ def test_the_registered_tracks_end_at_their_limit_and_never_diverge(reward):
         _, _, terminated, _, infos = envs.step(inputs[:, t : t + 1].astype(np.float32))
         ended += terminated.sum()
         assert not infos["diverged"].any()
-    assert ended > 100
+    assert ended > 50
