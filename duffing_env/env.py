@@ -224,35 +224,35 @@ class DuffingEnv(gym.Env[Any, Any]):
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
         value = _one_number(action)
         batch = self._batch
-        self._play(value)
-        terminated = bool(batch.outcome("terminated")[0])
-        truncated = bool(batch.outcome("truncated")[0])
-        info: dict[str, Any] = {name: batch.outcome(name)[0].item() for name in self._reported}
+        outcome = self._play(value)
+        terminated, truncated = bool(outcome["terminated"]), bool(outcome["truncated"])
+        info: dict[str, Any] = {name: outcome[name] for name in self._reported}
         for flag in self._flags:
-            info[flag] = bool(batch.outcome(flag)[0])
+            info[flag] = bool(outcome[flag])
         if terminated or truncated:
             self._running = False
             info |= self._final_info()
-        return batch.observations[0].copy(), batch.outcome("reward")[0].item(), terminated, truncated, info
+        return batch.observations[0].copy(), outcome["reward"], terminated, truncated, info
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)
 
-    def _play(self, action: float) -> None:
-        """Let as many samples pass as the action holds; the batch's outcome is then that of all of them."""
-        self._play_sample(action)
+    def _play(self, action: float) -> dict[str, float]:
+        """Let as many samples pass as the action holds: sums of what they earned, and how the last one left it."""
+        outcome = self._play_sample(action)
         for _ in range(1, self.experiment.hold):
-            if self._batch.outcome("terminated")[0] or self._batch.outcome("truncated")[0]:
-                return
-            earned = [self._batch.outcome(name)[0] for name in SUMMED]
-            self._play_sample(action)
-            for name, before in zip(SUMMED, earned, strict=True):
-                self._batch.outcome(name)[0] += before
+            if outcome["terminated"] or outcome["truncated"]:
+                break
+            before, outcome = outcome, self._play_sample(action)
+            for name in SUMMED:
+                outcome[name] += before[name]
+        return outcome
 
-    def _play_sample(self, action: float) -> None:
+    def _play_sample(self, action: float) -> dict[str, float]:
         self._apply(action)
         if self._screen is not None:
             self._draw()
+        return self._batch.outcome(0)
 
     def _apply(self, action: float) -> None:
         """Let one sample pass; the action is in [-1, 1]."""

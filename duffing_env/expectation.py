@@ -32,7 +32,7 @@ _predict_difference = relaid(structured.predict, _LAYOUT)
 _predict_continuous = relaid(ode.predict, _LAYOUT)
 
 
-@lanewise(LAYOUT, "expected_gain", uniform="nonlinear continuous")
+@lanewise(LAYOUT, "surprise", uniform="nonlinear continuous")
 def _expect(
     predicted_variance, c_t1, c_t2, c_t3, c_e, N_xx,
     P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
@@ -45,12 +45,12 @@ def _expect(
         0.0, 0.0, 0.0, 0.0, P, c_t1 * scale, c_t2 * scale, c_t3 * scale, c_e * scale, nonlinear != 0.0
     )  # fmt: skip
     explained = -2.0 * log_density - log_det  # cᵀ C⁻¹ c / S
-    return -0.5 * log(1.0 - explained)
+    return 0.5 * log(1.0 - explained)
 
 
 @jit
 def foresee(W, nonlinear, continuous):
-    """What the coming sample is expected to say, in rows ``expected_gain``; its input stands in row ``u``."""
+    """The expected free energy of the coming sample, in rows ``surprise``; its input stands in row ``u``."""
     if continuous != 0.0:
         ode.begin(W)
         for s in range(ode.SUBSTEPS):

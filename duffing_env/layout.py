@@ -63,7 +63,7 @@ LAYOUT = {
         "true_t1 true_t2 true_t3 true_e",
         "x last_x velocity elapsed waiting recorded_u recorded_y",
         "asked spent jump_at jump_factor",
-        "log_det log_density error misfit surprise fisher_gain expected_gain earned ideal_log_det",
+        "log_det log_density error misfit surprise fisher_gain earned ideal_log_det",
         " ".join(f"ideal_{name}" for name in IDEAL),
         " ".join(OUTCOME),
         " ".join(f"obs_{name}" for name in OBSERVATION),

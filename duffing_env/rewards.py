@@ -141,21 +141,21 @@ def _capped(ratio):
 
 @lanewise(
     LAYOUT,
-    " ".join(OUTCOME) + " log_det log_density error elapsed earned",
-    uniform="max_output horizon step nonlinear continuous reward_kind input_cost terminal forfeits terminated_return",
+    " ".join(OUTCOME) + " log_det log_density error elapsed",
+    uniform="max_output horizon step nonlinear continuous reward_kind input_cost",
 )
 def settle(
     x0, x1, x2, t1, t2, t3, e, P_x0_x0, P_x1_x1, P_x2_x2,
     P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
     g_rate, n_rate, m, c, a, b, true_t1, true_t2, true_t3, true_e,
-    u, x, y, elapsed, log_det, log_density, error, misfit, surprise, fisher_gain, expected_gain, earned, off_record,
-    max_output, horizon, step, nonlinear, continuous, reward_kind, input_cost, terminal, forfeits, terminated_return,
+    u, x, y, elapsed, log_det, log_density, error, misfit, surprise, fisher_gain, off_record,
+    max_output, horizon, step, nonlinear, continuous, reward_kind, input_cost,
 ):  # fmt: skip
     """What the step was worth, and whether the episode ends.
 
     A number that is not finite ends it, flagged, and so does a covariance that is not positive definite any more.
-    ``surprise`` is the free energy of the sample where that is the reward, and 0 elsewhere; so are ``fisher_gain``,
-    ``expected_gain`` and ``misfit``. ``earned`` is the episode's return so far, if it were paid sample by sample.
+    ``surprise`` is the free energy of the sample, or the expected one, where that is the reward, and 0 elsewhere; so
+    are ``fisher_gain`` and ``misfit``.
     """
     P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
     new_log_det, new_log_density, sound = log_det_and_density(
@@ -165,7 +165,7 @@ def settle(
     if reward_kind == 6.0:
         new_error = misfit
     total = x + y + x0 + x1 + x2 + t1 + t2 + t3 + e + P_x0_x0 + P_x1_x1 + P_x2_x2 + g_rate + n_rate
-    total += new_log_density + new_error + surprise + expected_gain
+    total += new_log_density + new_error + surprise
     sound = sound and P_x0_x0 > 0.0 and P_x1_x1 > 0.0 and g_rate > 0.0 and n_rate > 0.0
     diverged = 0.0 if (total - total == 0.0 and sound) else 1.0
     void = diverged != 0.0 or off_record != 0.0
@@ -180,26 +180,33 @@ def settle(
         reward = log_posterior_gain
     if reward_kind == 2.0 or reward_kind == 6.0:
         reward = error - new_error
-    if reward_kind == 3.0:
+    if reward_kind == 3.0 or reward_kind == 5.0:
         reward = 0.0 if void else -surprise
     if reward_kind == 4.0:
         reward = fisher_gain
-    if reward_kind == 5.0:
-        reward = 0.0 if void else expected_gain
     reward -= input_cost * u * u
     terminated = 1.0 if (void or abs(y) > max_output) else 0.0
     elapsed += 1.0
     truncated = 1.0 if (elapsed >= horizon and terminated == 0.0) else 0.0
+    return (
+        reward, information_gain, log_posterior_gain, terminated, truncated, diverged, off_record,
+        new_log_det, new_log_density, new_error, elapsed,
+    )  # fmt: skip
+
+
+@lanewise(LAYOUT, "reward earned", uniform="terminal forfeits terminated_return")
+def pay(reward, earned, terminated, truncated, terminal, forfeits, terminated_return):
+    """When the reward is paid, and what an episode that is terminated returns.
+
+    ``earned`` is what the episode was worth so far, as if it were paid sample by sample.
+    """
     received = 0.0 if terminal != 0.0 else earned
     earned += reward
     if terminal != 0.0:
         reward = earned if terminated + truncated != 0.0 else 0.0
     if forfeits != 0.0 and terminated != 0.0:
         reward = terminated_return - received
-    return (
-        reward, information_gain, log_posterior_gain, terminated, truncated, diverged, off_record,
-        new_log_det, new_log_density, new_error, elapsed, earned,
-    )  # fmt: skip
+    return reward, earned
 
 
 @at_lane(LAYOUT, "log_det log_density error", uniform="step nonlinear continuous")

@@ -82,7 +82,7 @@ def compare(W, max_input, continuous):
     _rest(W)
     for t in range(SAMPLES):
         u = max_input * TEST_INPUT[t]
-        if continuous:
+        if continuous != 0.0:
             begin = max_input * TEST_INPUT[t - 1] if t > 0 else 0.0
             rise = (u - begin) / (2 * _SUBSTEPS)
             for s in range(_SUBSTEPS):

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from duffing_env.layout import LAYOUT, N_ROWS
-from duffing_env.rewards import REWARDS, appraise, reward_number, settle
+from duffing_env.rewards import REWARDS, appraise, pay, reward_number, settle
 from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Belief, PhysicalParameters, Prior, to_coefficients
 from estimator.lanes import LANES
 from estimator.record import COEFFICIENTS, COVARIANCES, QUANTITIES, RECORD_SIZE
@@ -49,9 +49,11 @@ class Lanes:
             appraise(self.rows.reshape(-1), lane, SAMPLING_STEP, float(self.nonlinear), 0.0)
 
     def settle(self, reward="information_gain", input_cost=0.0, terminal=False, terminated_return=None):
-        paid = float(terminal), float(terminated_return is not None), terminated_return or 0.0
-        settings = float(self.nonlinear), 0.0, float(REWARDS[reward]), input_cost, *paid
+        settings = float(self.nonlinear), 0.0, float(REWARDS[reward]), input_cost
         settle(self.rows.reshape(-1), MAX_OUTPUT, float(HORIZON), SAMPLING_STEP, *settings)
+        forfeits = terminated_return is not None
+        if terminal or forfeits:
+            pay(self.rows.reshape(-1), float(terminal), float(forfeits), terminated_return or 0.0)
 
     @property
     def belief(self):
@@ -111,7 +113,6 @@ def test_a_step_is_worth_the_increase_by_the_named_measure(reward):
     lanes.set_coefficients(*random_belief(np.random.default_rng(1)))
     lanes["surprise"][:] = 1.25
     lanes["fisher_gain"][:] = 0.75
-    lanes["expected_gain"][:] = 0.5
     lanes["misfit"][:] = 0.3
     if reward == "simulation_error":
         lanes["error"][:] = 0.9
@@ -127,7 +128,7 @@ def test_a_step_is_worth_the_increase_by_the_named_measure(reward):
         "parameter_error": (error(before) - error(after)).mean(),
         "free_energy": -1.25,
         "fisher": 0.75,
-        "expected_free_energy": 0.5,
+        "expected_free_energy": -1.25,
         "simulation_error": 0.6,
     }
     lanes.settle(reward)
@@ -186,7 +187,7 @@ def test_what_cannot_be_ends_the_episode_and_is_worth_nothing(reward):
     for name, value in impossible():
         lanes = Lanes()
         lanes["elapsed"][:] = HORIZON - 1
-        lanes["surprise"][:] = lanes["expected_gain"][:] = 2.0
+        lanes["surprise"][:] = 2.0
         lanes["misfit"][:] = 0.5
         before = lanes["log_det"][1], lanes["log_density"][1], lanes["error"][1]
         lanes[name][1] = value
@@ -195,16 +196,16 @@ def test_what_cannot_be_ends_the_episode_and_is_worth_nothing(reward):
         assert lanes["diverged"].tolist() == [0, 1] + [0] * (LANES - 2), case
         assert lanes["terminated"][1] == 1, case
         assert lanes["truncated"][1] == 0, case
-        for outcome in ("reward", "information_gain", "log_posterior_gain", "earned"):
+        for outcome in ("reward", "information_gain", "log_posterior_gain"):
             assert lanes[outcome][1] == 0, case
         assert (lanes["log_det"][1], lanes["log_density"][1], lanes["error"][1]) == before, case
 
 
 @pytest.mark.parametrize("told", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize(("reward", "row"), [("free_energy", "surprise"), ("expected_free_energy", "expected_gain")])
-def test_a_reward_that_is_not_finite_ends_the_episode(reward, row, told):
+@pytest.mark.parametrize("reward", ["free_energy", "expected_free_energy"])
+def test_a_free_energy_that_is_not_finite_ends_the_episode(reward, told):
     lanes = Lanes()
-    lanes[row][3] = told
+    lanes["surprise"][3] = told
     lanes.settle(reward)
     assert np.flatnonzero(lanes["diverged"]).tolist() == [3]
     np.testing.assert_array_equal(lanes["reward"], 0.0)
