@@ -29,6 +29,7 @@ import numpy.typing as npt
 from agents.ascent import appraise, improve
 from agents.cli import JsonOptions, run_script
 from agents.evaluation import evaluate, make
+from agents.policies.imagination import Terms
 from agents.policies.planning import play
 from agents.policies.pursuit import swings
 from duffing_env.vector_env import DuffingVectorEnv
@@ -273,9 +274,9 @@ def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.N
     value |= {"g_shape": 1.0, "g_rate": task.process_noise**2, "n_shape": 1.0, "n_rate": task.measurement_noise**2}
     record = np.array([value[name] for name in RECORD])
     first = int(rng.integers(-task.samples // 8, task.samples - 1))
-    horizon, rounds = int(rng.integers(8, 25)), int(rng.integers(4, 17))
+    horizon, rounds = int(rng.integers(8, 25)), int(rng.integers(1, 9))
     limit = 0.9999 * task.max_output  # leaves room for the rounding of what is stored
-    play(record, first, horizon, rounds, task.max_input, limit, 0.0, planned, words)
+    play(record, first, horizon, rounds, Terms(task.max_input, np.inf, limit, 0.0), planned, words)
     return planned
 
 

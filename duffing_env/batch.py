@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from duffing_env import kernel
 from duffing_env.experiment import Experiment
-from duffing_env.layout import LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OSCILLATOR, OUTCOME, SAVED, SETTINGS
+from duffing_env.kernel import compiled
+from duffing_env.layout import ENDED, LAYOUT, N_OBSERVATION, N_ROWS, OSCILLATOR, OUTCOME, SETTINGS
 from duffing_env.noise import stream_words
 from estimator.belief import RecordBelief
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, PhysicalParameters
-from estimator.record import RECORD_SIZE
+from estimator.record import RECORD, RECORD_SIZE
+
+_OUTCOME = LAYOUT["reward"]
 
 
 class Batch:
@@ -23,7 +26,7 @@ class Batch:
     Args:
         experiment: what is fixed about them.
         size: their number n; memory is laid out for a multiple of `LANES`.
-        reset_mode: `kernel.RESET_BY_HAND`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
+        reset_mode: `duffing_env.kernel.RESET_BY_HAND`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
         threads: threads that step the blocks; results do not depend on it.
         hold: samples that a step plays, at most: an environment stops where its episode ends.
 
@@ -37,6 +40,7 @@ class Batch:
         self.size = size
         self._reset_mode = reset_mode
         self._threads = threads
+        self._kind = experiment.plant_kind, experiment.estimator_kind, experiment.reward
         self._settings = experiment.settings
         self._settings[SETTINGS["hold"]] = hold
         # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
@@ -45,15 +49,19 @@ class Batch:
         n_blocks = -(-size // LANES)
         padded = n_blocks * LANES
         self._blocks = np.zeros((n_blocks, N_ROWS, LANES))
-        self._flat_blocks = self._blocks.reshape(n_blocks, N_ROWS * LANES)
+        self._flat_blocks = self._blocks.reshape(n_blocks, -1)
+        self._ended = np.zeros((n_blocks, len(ENDED), LANES))
+        self._flat_ended = self._ended.reshape(n_blocks, -1)
+        self._saved = np.zeros((threads, RECORD_SIZE * LANES))
         self._actions = np.zeros(padded, dtype=np.float32)
         self._observations = np.zeros((padded, N_OBSERVATION), dtype=np.float32)
         self._final_observations = np.zeros_like(self._observations)
-        self._outcome = np.zeros((N_OUTCOME, padded))
         self.observations = self._observations[:size]
         self.final_observations = self._final_observations[:size]
         # Lanes beyond the last environment do the same work as the others, so that none of them runs wild.
-        self._reset(np.ones(padded, dtype=np.bool_))
+        self._mask = np.ones(padded, dtype=np.bool_)
+        self._reset()
+        self._mask[size:] = False
 
     def seed(self, index: int, generator: np.random.Generator) -> None:
         """Start environment ``index``'s stream of random numbers from its ``np_random``."""
@@ -63,15 +71,18 @@ class Batch:
 
     def reset(self, mask: npt.NDArray[np.bool_]) -> None:
         """Start episodes where ``mask`` (n,) is true."""
-        self._reset(np.ascontiguousarray(mask, dtype=np.bool_))
+        self._mask[: self.size] = mask
+        self._reset()
 
-    def _reset(self, mask: npt.NDArray[np.bool_]) -> None:
-        kernel.reset(self._flat_blocks, mask, self._settings, self._prior, self._observations)
+    def _reset(self) -> None:
+        reset = compiled(*self._kind).reset
+        reset(self._flat_blocks, self._mask, self._settings, self._prior, self._observations)
 
     def step(self, actions: npt.ArrayLike) -> None:
         """Apply actions (n,) for a step: in parts of the largest input, clipped to [-1, 1], in float32's range."""
         self._actions[: self.size] = actions
-        step = kernel.step_serial
+        kernel = compiled(*self._kind)
+        step = kernel.step
         if self._threads > 1:
             import numba
 
@@ -79,6 +90,7 @@ class Batch:
             step = kernel.step_parallel
         step(
             self._flat_blocks,
+            self._saved,
             self._actions,
             self._settings,
             self._prior,
@@ -86,7 +98,7 @@ class Batch:
             self._reset_mode,
             self._observations,
             self._final_observations,
-            self._outcome,
+            self._flat_ended,
         )
 
     def measure(self, u: float, y: float) -> None:
@@ -94,13 +106,14 @@ class Batch:
         recorded_u, recorded_y = self._recorded
         recorded_u[0], recorded_y[0] = u, y
 
-    def outcome(self, name: str) -> FloatArray:
-        """(n,) what the last step left behind, by its name in `OUTCOME`; a view."""
-        return self._outcome[OUTCOME[name], : self.size]
+    def outcome(self, index: int) -> dict[str, float]:
+        """What the last step left behind for one environment, by its names in `OUTCOME`."""
+        block, lane = divmod(index, LANES)
+        return dict(zip(OUTCOME, self._blocks[block, _OUTCOME : _OUTCOME + len(OUTCOME), lane].tolist(), strict=True))
 
     def quantity(self, name: str) -> FloatArray:
-        """(n,) current values of a quantity of `LAYOUT`; a copy."""
-        return self._blocks[:, LAYOUT[name], :].reshape(-1)[: self.size].copy()
+        """(n,) current values of a quantity of `LAYOUT`, such as what the last step left behind; a copy."""
+        return self._blocks[:, LAYOUT[name]].flatten()[: self.size]
 
     def records(self) -> FloatArray:
         """(n, RECORD_SIZE) the beliefs now, as flat records (`estimator.record`); a copy."""
@@ -113,7 +126,7 @@ class Batch:
 
     def beliefs(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[RecordBelief]:
         """The beliefs of some environments; ``final``: those that their last episodes ended with, if reset since."""
-        records = self._quantities(indices, LAYOUT[SAVED[0]] if final else 0, RECORD_SIZE)
+        records = self._quantities(indices, RECORD, final=final)
         records.flags.writeable = False
         return self.experiment.to_belief(records[0]).with_records(records)
 
@@ -128,29 +141,31 @@ class Batch:
     def oscillators(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[PhysicalParameters]:
         """The true oscillators of some environments; ``final``: those of their last episodes, if reset since."""
         found = []
-        for values in self._quantities(indices, LAYOUT["ended_m" if final else "m"], len(OSCILLATOR)).tolist():
+        for values in self._quantities(indices, OSCILLATOR, final=final).tolist():
             # Past its checks, which take as long as 200 steps of one of a thousand environments.
             oscillator = object.__new__(PhysicalParameters)
             oscillator.__dict__.update(zip(OSCILLATOR, values, strict=True), tau=np.inf, xi=np.inf)
             found.append(oscillator)
         return found
 
-    def _quantities(self, indices: npt.NDArray[np.intp], first: int, count: int) -> FloatArray:
-        """(k, count) adjacent rows of the layout, of some environments; a copy."""
+    def _quantities(self, indices: npt.NDArray[np.intp], names: Sequence[str], *, final: bool) -> FloatArray:
+        """(k, len(names)) adjacent rows of some environments, now or at the end of their last episodes; a copy."""
+        stored, layout = (self._ended, ENDED) if final else (self._blocks, LAYOUT)
         blocks, lanes = np.divmod(indices, LANES)
-        found: FloatArray = self._blocks[blocks[:, None], first + np.arange(count), lanes[:, None]]
+        found: FloatArray = stored[blocks[:, None], layout[names[0]] + np.arange(len(names)), lanes[:, None]]
         return found
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles must not share memory through the views."""
         state = self.__dict__.copy()
-        for view in ("observations", "final_observations", "_flat_blocks"):
+        for view in ("observations", "final_observations", "_flat_blocks", "_flat_ended"):
             del state[view]
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._flat_blocks = self._blocks.reshape(len(self._blocks), -1)
+        self._flat_ended = self._ended.reshape(len(self._ended), -1)
         self.observations = self._observations[: self.size]
         self.final_observations = self._final_observations[: self.size]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from duffing_env.layout import ESTIMATORS, OSCILLATOR, PLANTS, SETTINGS
+from duffing_env.layout import OSCILLATOR, SETTINGS
 from duffing_env.rewards import reward_number
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
 from estimator.belief import Belief, Prior, RecordBelief
@@ -36,8 +36,7 @@ class Experiment:
         max_output: displacement limit [V]: the episode ends at \|y\| above it.
         hold: samples that an action is applied for; a step's reward is the sum of theirs. An episode may end within.
         terminal: whether the episode's whole reward is paid in its last step, and 0 before.
-        terminated_return: what an episode that ends by termination returns as a whole: its last reward takes back what
-            was received, and gives this. What was gained is kept where it is None.
+        terminated_return: what an episode that is terminated returns, whatever it gained. None keeps what it gained.
     """
 
     factorisation: str = "structured"
@@ -59,10 +58,9 @@ class Experiment:
         self._check_positive("max_output")
         self._check_count("hold")
         self._check_flag("terminal")
-        if self.terminated_return is not None and not (
-            _is_number(self.terminated_return) and np.isfinite(self.terminated_return)
-        ):
-            raise ValueError(f"terminated_return must be a finite number or None, but is {self.terminated_return!r}")
+        worth = self.terminated_return
+        if worth is not None and not (_is_number(worth) and np.isfinite(worth)):
+            raise ValueError(f"terminated_return must be a finite number, but is {worth!r}; None keeps what was gained")
 
     def _check_positive(self, name: str) -> None:
         value = getattr(self, name)
@@ -94,8 +92,13 @@ class Experiment:
         return SILVERBOX_TWIN
 
     @property
+    def plant_kind(self) -> str:
+        """The plant's name in `duffing_env.kernel.PLANTS`."""
+        return "difference"
+
+    @property
     def estimator_kind(self) -> str:
-        """The estimator's name in `ESTIMATORS`."""
+        """The estimator's name in `duffing_env.kernel.ESTIMATORS`."""
         return self.factorisation
 
     @property
@@ -111,7 +114,7 @@ class Experiment:
     @property
     def plant_settings(self) -> dict[str, float]:
         """Entries of `SETTINGS` that describe the plant."""
-        raise NotImplementedError
+        return {}
 
     @property
     def prior_record(self) -> FloatArray:
@@ -145,11 +148,9 @@ class Experiment:
             "terminal": self.terminal,
             "forfeits": self.terminated_return is not None,
             "terminated_return": self.terminated_return or 0.0,
-            "estimator": ESTIMATORS[self.estimator_kind],
             "iterations": self.iterations or DEFAULT_ITERATIONS[self.factorisation],
             "as_published": False,
             "nonlinear": self.is_nonlinear,
-            "plant": PLANTS["difference"],
             "delay": 0,
             **{f"prior_{c}": prior[c] for c in ("t1", "t2", "t3", "e")},
             **{f"scale_{c}": _inverse_std(prior[f"P_{c}_{c}"]) for c in ("t1", "t2", "t3", "e")},
@@ -275,6 +276,11 @@ class ContinuousExperiment(SimulatedExperiment):
         return CONTINUOUS_TWIN
 
     @property
+    def plant_kind(self) -> str:
+        """The differential equation."""
+        return "sde"
+
+    @property
     def estimator_kind(self) -> str:
         """The plant's equation, or the factorisation of the paper's."""
         return "ode" if self.estimator == "ode" else self.factorisation
@@ -296,11 +302,6 @@ class ContinuousExperiment(SimulatedExperiment):
     def to_belief(self, record: FloatArray) -> RecordBelief:
         """The readable face of a record (RECORD_SIZE,)."""
         return ContinuousBelief(record) if self.estimator == "ode" else super().to_belief(record)
-
-    @property
-    def plant_settings(self) -> dict[str, float]:
-        """The plant, its noises, and the range of the oscillators."""
-        return {**super().plant_settings, "plant": PLANTS["sde"]}
 
 
 @dataclass(frozen=True)
@@ -371,9 +372,14 @@ class ReplayExperiment(Experiment):
         return self._regime.u, self._regime.y
 
     @property
+    def plant_kind(self) -> str:
+        """The record."""
+        return "replay"
+
+    @property
     def plant_settings(self) -> dict[str, float]:
         """How the record is played, and how the estimator departs from the model."""
-        return {"as_published": self.as_published, "plant": PLANTS["replay"], "delay": self.input_delay}
+        return {"as_published": self.as_published, "delay": self.input_delay}
 
 
 def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:

@@ -18,7 +18,12 @@ _WRITTEN = (*QUANTITIES, *(name for name in RECORD if "x2" in name and name != "
 _WRITTEN += ("g_shape", "g_rate", "n_shape", "n_rate", "prior_g_rate", "prior_n_rate")
 _WRITTEN += ("next_process_variance", "next_measurement_variance", "next_g_rate", "next_n_rate")
 _SCRATCH = {name: LAYOUT[row] for name, row in zip(_WRITTEN, MEAN_FIELD_SCRATCH, strict=False)}
-_AFTER = {**LAYOUT, **_SCRATCH, **{name: LAYOUT[f"ideal_{name}"] for name in IDEAL}, "y": LAYOUT["predicted"]}
+_AFTER = {
+    **LAYOUT,
+    **_SCRATCH,
+    **{name.removeprefix("ideal_"): LAYOUT[name] for name in IDEAL},
+    "y": LAYOUT["predicted"],
+}
 _BEFORE = {**_AFTER, **{name: LAYOUT[row] for name, row in (("x0", "x"), ("x1", "last_x"))}}
 _BEFORE |= {name: LAYOUT[f"true_{name}"] for name in ("t1", "t2", "t3", "e")}
 
@@ -39,7 +44,7 @@ def _gain(
 _appraise = lanewise(_AFTER, "fisher_gain ideal_log_det", uniform="nonlinear")(_gain)
 _appraise_lane = at_lane(_AFTER, "fisher_gain ideal_log_det", uniform="nonlinear")(_gain)
 
-_PRIOR_COVARIANCES = tuple((RECORD.index(name), LAYOUT[f"ideal_{name}"] * LANES) for name in IDEAL)
+_PRIOR_COVARIANCES = tuple((RECORD.index(name.removeprefix("ideal_")), LAYOUT[name] * LANES) for name in IDEAL)
 _PROCESS_VARIANCE, _MEASUREMENT_VARIANCE = (LAYOUT[f"{name}_variance"] * LANES for name in ("process", "measurement"))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from estimator.lanes import rows
 from estimator.record import LAYOUT as BELIEF_LAYOUT
 from estimator.record import N_ROWS as N_BELIEF_ROWS
-from estimator.record import RECORD
+from estimator.record import RECORD, SCRATCH_BEGIN
 
 #: Entries of the observation, in order, with their bounds; the environment's docstring says what they are.
 OBSERVATION = {
@@ -29,32 +29,28 @@ N_OBSERVATION = len(OBSERVATION)
 SETTINGS = rows(
     "max_input max_output horizon hold process_noise measurement_noise spread center_m center_c center_a center_b step",
     "budget max_slew input_cost jump walk_t1 walk_t2 walk_t3 walk_e",
-    "reward terminal forfeits terminated_return estimator iterations as_published nonlinear plant delay",
+    "reward terminal forfeits terminated_return iterations as_published nonlinear delay",
     "prior_t1 prior_t2 prior_t3 prior_e scale_t1 scale_t2 scale_t3 scale_e prior_log_gamma prior_log_xi",
 )
 
-#: Numbers of the plants, and of the estimators, in the settings.
-PLANTS = {"difference": 0, "replay": 1, "sde": 2}
-ESTIMATORS = {"mean_field": 0, "structured": 1, "ode": 2}
-
-#: What a step leaves for an environment's face: rows of (len(OUTCOME), n) float64.
-OUTCOME = rows("reward information_gain log_posterior_gain terminated truncated diverged off_record")
+#: What a step leaves for an environment's face, in adjacent rows of its block.
+OUTCOME = (
+    *("reward", "information_gain", "log_posterior_gain"),
+    *("terminated", "truncated", "diverged", "off_record"),
+)
 N_OUTCOME = len(OUTCOME)
 
 #: Those of them that add up over the samples of a step; the others are as the last sample leaves them.
 SUMMED = ("reward", "information_gain", "log_posterior_gain")
 
-#: The record before the step, to return to where the step came to nothing; after a reset in the same step, the record
-#: that the episode ended with.
-SAVED = tuple(f"saved_{name}" for name in RECORD)
-
 #: The covariance that one who knows the truth would have, for the reward ``fisher``; the third lag is not needed.
-IDEAL = tuple(name for name in RECORD if name.startswith("P_") and "x2" not in name)
+IDEAL = tuple(f"ideal_{name}" for name in RECORD if name.startswith("P_") and "x2" not in name)
 
-#: The true oscillator; after a reset in the same step, that of the episode which ended is in the rows ``ended_``.
+#: The true oscillator.
 OSCILLATOR = ("m", "c", "a", "b")
 
-#: Name of a quantity to its row.
+#: Name of a quantity to its row. The observation, which is written last, lies in rows that only an estimator's update
+#: uses: the fewer rows a step touches, the less memory it waits for.
 LAYOUT = {
     **BELIEF_LAYOUT,
     **rows(
@@ -64,12 +60,13 @@ LAYOUT = {
         "x last_x velocity elapsed waiting recorded_u recorded_y",
         "asked spent jump_at jump_factor",
         "log_det log_density error misfit surprise fisher_gain earned ideal_log_det",
-        " ".join(f"ideal_{name}" for name in IDEAL),
+        " ".join(IDEAL),
         " ".join(OUTCOME),
-        " ".join(f"obs_{name}" for name in OBSERVATION),
-        " ".join(SAVED),
-        " ".join(f"ended_{name}" for name in OSCILLATOR),
         start=N_BELIEF_ROWS,
     ),
+    **rows(" ".join(f"obs_{name}" for name in OBSERVATION), start=SCRATCH_BEGIN),
 }
-N_ROWS = len(LAYOUT)
+N_ROWS = N_BELIEF_ROWS + len(LAYOUT) - len(BELIEF_LAYOUT) - N_OBSERVATION
+
+#: What is kept of an episode that ended, where the next one began in the same step: its record and its oscillator.
+ENDED = rows(" ".join(RECORD), " ".join(OSCILLATOR))

@@ -10,7 +10,6 @@ import numpy as np
 
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
-from duffing_env.layout import PLANTS
 from duffing_env.rewards import NEED_THE_TRUTH
 from estimator.belief import Prior
 from estimator.parameters import PhysicalParameters
@@ -61,9 +60,9 @@ class PlantExperiment(Experiment):
         return self.prior or Prior.silverbox_twin()
 
     @property
-    def plant_settings(self) -> dict[str, float]:
+    def plant_kind(self) -> str:
         """A record of one sample, which is written anew before every step."""
-        return {"plant": PLANTS["replay"]}
+        return "replay"
 
 
 class PlantEnv(DuffingEnv):

@@ -172,12 +172,12 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
             raise ResetNeeded(f"rows {rows} have finished or not begun: reset them with options={{'reset_mask': mask}}")
         batch = self._batch
         batch.step(actions[:, 0])
-        terminated = batch.outcome("terminated") != 0.0
-        truncated = batch.outcome("truncated") != 0.0
+        terminated = batch.quantity("terminated") != 0.0
+        truncated = batch.quantity("truncated") != 0.0
         finished = terminated | truncated
         infos = self._infos(was_finished=self._finished, finished=finished)
         self._finished = finished
-        return self._observations(), batch.outcome("reward").copy(), terminated, truncated, infos
+        return self._observations(), batch.quantity("reward"), terminated, truncated, infos
 
     def _observations(self) -> Observations:
         return self._batch.observations.copy() if self._copy else self._batch.observations
@@ -235,10 +235,10 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
     def _step_infos(self, mask: Flags) -> dict[str, Any]:
         infos: dict[str, Any] = {}
         for name in self.single._reported:
-            infos[name] = self._batch.outcome(name).copy()
+            infos[name] = self._batch.quantity(name)
             infos[f"_{name}"] = mask.copy()
         for name in self.single._flags:
-            infos[name] = self._batch.outcome(name) != 0.0
+            infos[name] = self._batch.quantity(name) != 0.0
             infos[f"_{name}"] = mask.copy()
         return infos
 

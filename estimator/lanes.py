@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -115,17 +115,40 @@ def _places(
     return arguments, targets
 
 
-def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+def kernel(function: Callable[..., Any] | None = None, *, kind: str = "", **options: Any) -> Any:
     """Compile an entry point: a function that Python calls, cached on disk.
 
     Numba's cache knows when the file of the function changed, but not the files of the functions it calls; a stale
     kernel would give wrong numbers in silence. So the stamp of the cache is a digest of all our sources.
+
+    Args:
+        function: to compile.
+        kind: see `part`.
+        options: of Numba.
     """
     if function is None:
-        return lambda f: kernel(f, **options)
-    dispatcher = numba.njit(cache=True, **OPTIONS, **options)(function)
-    dispatcher._cache._cache_file._source_stamp = _source_digest(Path(function.__code__.co_filename).parent)
+        return partial(kernel, kind=kind, **options)
+    dispatcher = numba.njit(cache=True, **OPTIONS, **options)(_renamed(function, kind))
+    stored = dispatcher._cache
+    stored._cache_file._source_stamp = _source_digest(Path(function.__code__.co_filename).parent)
+    if kind:
+        # Numba would add a pickle of what the function has from around, which is another one in every process.
+        stored._index_key = lambda signature, codegen: (signature, codegen.magic_tuple())
     return dispatcher
+
+
+def part(kind: str) -> Any:
+    """Compile a function that is defined within another, and called by other compiled functions.
+
+    ``kind`` tells it from the functions that the other defines at other times: the cache on disk, and the linker where
+    it joins what several processes compiled, go by names.
+    """
+    return lambda function: jit(_renamed(function, kind))
+
+
+def _renamed(function: Callable[..., Any], kind: str) -> Callable[..., Any]:
+    function.__qualname__ += f"_{kind}" if kind else ""
+    return function
 
 
 @cache
@@ -144,4 +167,6 @@ def _define(source: str, function: Callable[..., Any], **names: Any) -> Callable
     defined: Callable[..., Any] = namespace[function.__name__]
     defined.__module__ = function.__module__
     defined.__doc__ = function.__doc__
+    # One scalar function may have several loops, which must not share a name: see `part`.
+    defined.__qualname__ = f"{function.__qualname__}_{hashlib.sha256(source.encode()).hexdigest()[:12]}"
     return defined

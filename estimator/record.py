@@ -65,3 +65,6 @@ _CONTINUOUS = """
 #: Rows of an estimator's block. An environment's block has these first, then its own.
 LAYOUT = rows(" ".join(RECORD), "u y last_u", _PRIOR_RATES, _STRUCTURED, _MEAN_FIELD, _CONTINUOUS)
 N_ROWS = len(LAYOUT)
+
+#: From this row on, a block holds what only lasts for an update.
+SCRATCH_BEGIN = LAYOUT["prior_g_rate"]

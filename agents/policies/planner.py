@@ -2,23 +2,26 @@
 
 Of a sequence of inputs u over the next H samples the expected free energy is, in nats,
 
-    G(u) = -[½ log det C_0 - ½ log det C_H(u)]                          what it teaches (epistemic)
+    G(u) = -[½ log det C_0 - ½ log det (C_H(u)⁻¹ + J)⁻¹]              what it teaches (epistemic)
            + Σ_h E[(x_h - goal)²] / (2 goal_std²)                       how far it is from a goal (pragmatic, optional)
            + input_cost Σ_h u_h²                                        what it costs (optional)
 
 with C_0 the covariance of (θ, η) now and C_H the one after the H outputs that are expected, by belief propagation: the
 joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample teaches is not
 counted again by the next. The teaching part then telescopes: a plan of the whole episode would be Bayesian D-optimal.
+J is the information that the rest of the episode after H will bring anyway, at the rate of the last plans; so a plan
+looks for what will be lacking at the end. Where the coefficients walk (``drift``) J is 0, and the walk is imagined too.
 
-A displacement x_h must stay within the limit by ``margin`` standard deviations of the output that is then predicted;
-plans that do not are the worse the further they go beyond.
+A displacement x_h must stay within the limit by a margin of standard deviations of the output that is then predicted;
+plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian exceeds with
+probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes true.
 
-The search is a local one (`agents.policies.planning`): the last plan, shifted by one sample, is mutated in rounds of
-`estimator.lanes.LANES` candidates, each round from the best so far. Under an amplitude limit the best inputs are nearly
-all at their limit, so candidates are sequences of signs, now and then with a value between. Horizon 1 is myopic.
+The search (`agents.policies.planning`) builds a plan sample by sample, by the best ways through the plane of the last
+two displacements, and improves it by small changes. Horizon 1 is myopic.
 
 Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
 climbs by gradient (`agents.policies.pursuit`): then the question is when to spend, which no short horizon can answer.
+That search knows neither ``max_slew`` nor ``drift``.
 """
 
 from __future__ import annotations
@@ -27,19 +30,22 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
+from agents.policies.imagination import Terms
 from agents.policies.planning import plan
 from agents.policies.pursuit import pursue
+from duffing_env.layout import SETTINGS
 from estimator.parameters import FloatArray
 
-#: The last plans (n, horizon) in V, and the streams of random numbers (n, 4).
-PlannerState = tuple[FloatArray, npt.NDArray[np.uint64]]
+#: The last plans (n, horizon) in V, what plans taught per sample (n, 4, 4), and the streams of random numbers (n, 4).
+PlannerState = tuple[FloatArray, FloatArray, npt.NDArray[np.uint64]]
 
-#: Samples to plan for under an amplitude limit: more than a period of the oscillator.
-_HORIZON = 12
+#: Samples to plan for under an amplitude limit: some periods of the oscillator.
+_HORIZON = 24
 
 # Places in the observation.
-_TIME_LEFT, _BUDGET_LEFT = 20, 21
+_LAST_INPUT, _TIME_LEFT, _BUDGET_LEFT = 18, 20, 21
 
 
 class Planner:
@@ -52,9 +58,9 @@ class Planner:
         env: the unwrapped environment, single or vector, whose beliefs it reads: `predict` must be called between
             its steps, with its observations.
         seed: of the search.
-        horizon: samples to plan for; by default 12, and the whole episode where the energy is limited.
-        rounds: of the search, `estimator.lanes.LANES` candidates each; of no effect on a plan of the whole episode.
-        margin: standard deviations that a plan keeps from the displacement limit.
+        horizon: samples to plan for; by default 24, and the whole episode where the energy is limited.
+        rounds: of changed copies, `estimator.lanes.LANES` each; of no effect on a plan of the whole episode.
+        risk: upper bound of the probability that an episode ends early, in (0, 1), where the belief is right.
         goal: mean of the goal prior of the displacement [V].
         goal_std: its standard deviation [V]; no goal where it is None.
         input_cost: nats for a V² of input energy.
@@ -70,8 +76,8 @@ class Planner:
         seed: int = 0,
         *,
         horizon: int | None = None,
-        rounds: int = 24,
-        margin: float = 4.0,
+        rounds: int = 4,
+        risk: float = 0.01,
         goal: float = 0.0,
         goal_std: float | None = None,
         input_cost: float = 0.0,
@@ -84,9 +90,10 @@ class Planner:
         for name, count in (("horizon", 1 if horizon is None else horizon), ("rounds", rounds)):
             if not isinstance(count, int | np.integer) or count < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, but is {count!r}")
-        for name, value in (("margin", margin), ("input_cost", input_cost)):
-            if not 0 <= value < np.inf:
-                raise ValueError(f"{name} must be 0 or more and finite, but is {value!r}")
+        if not 0 < risk < 1:
+            raise ValueError(f"risk must be a probability between 0 and 1, but is {risk!r}")
+        if not 0 <= input_cost < np.inf:
+            raise ValueError(f"input_cost must be 0 or more and finite, but is {input_cost!r}")
         if goal_std is not None and not 0 < goal_std < np.inf:
             raise ValueError(f"goal_std must be positive and finite, but is {goal_std!r}; None is no goal")
         experiment = env.experiment
@@ -101,14 +108,22 @@ class Planner:
                 "goal_std and input_cost must be left out where the energy is limited, but are "
                 f"{goal_std!r} and {input_cost!r}; pass a horizon to plan with them"
             )
-        horizon = env.horizon if whole else horizon or _HORIZON
+        horizon = env.horizon if whole else min(horizon or _HORIZON, env.horizon)
         self._energy = env.horizon * experiment.max_rms**2 if whole else None
         self._env = env
         self.seed = seed
-        self.horizon, self.rounds, self.margin = int(horizon), int(rounds), float(margin)
-        self._price = float(input_cost)
-        self._goal = float(goal)
-        self._goal_weight = 0.0 if goal_std is None else 0.5 / goal_std**2
+        self.horizon, self.rounds = int(horizon), int(rounds)
+        settings = dict(zip(SETTINGS, experiment.settings.tolist(), strict=True))
+        self._terms = Terms(
+            amplitude=settings["max_input"],
+            slew=settings["max_slew"],
+            limit=settings["max_output"],
+            margin=float(stats.norm.isf(risk / env.horizon)),
+            **{name: settings[name] for name in Terms._fields if name.startswith("walk")},
+            price=float(input_cost),
+            goal=float(goal),
+            goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
+        )
 
     def predict(
         self,
@@ -139,25 +154,26 @@ class Planner:
             )
         n = len(records)
         if state is None:
-            plans = np.zeros((n, self.horizon))
+            plans, rates = np.zeros((n, self.horizon)), np.zeros((n, 4, 4))
             words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
         else:
-            plans, words = state[0].copy(), state[1].copy()
+            plans, rates, words = state[0].copy(), state[1].copy(), state[2].copy()
         if episode_start is not None:
-            plans[np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)] = 0.0
-        time_left = observed.reshape(n, -1)[:, _TIME_LEFT]
+            begun = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)
+            plans[begun], rates[begun] = 0.0, 0.0
+        last, time_left, budget_left = observed.reshape(n, -1)[:, [_LAST_INPUT, _TIME_LEFT, _BUDGET_LEFT]].T
         left = np.rint(time_left * self._env.horizon).astype(np.int64)
-        experiment = self._env.experiment
-        limits = float(experiment.max_input), float(experiment.max_output), self.margin
+        terms = self._terms
         inputs, scores = np.empty((2, n))
         if self._energy is not None:
-            energies = observed.reshape(n, -1)[:, _BUDGET_LEFT] * self._energy
+            energies = budget_left * self._energy
+            limits = terms.amplitude, terms.limit, terms.margin
             pursue(records, left, energies, *limits, plans, words, inputs, scores)
         else:
-            costs = self._price, self._goal, self._goal_weight
-            plan(records, left, self.horizon, self.rounds, *limits, *costs, plans, words, inputs, scores)
-        actions = (inputs / experiment.max_input).astype(np.float32)
-        return actions.reshape(*observed.shape[:-1], 1), (plans, words)
+            last = terms.amplitude * last
+            plan(records, left, self.horizon, self.rounds, terms, last, plans, rates, words, inputs, scores)
+        actions = (inputs / terms.amplitude).astype(np.float32)
+        return actions.reshape(*observed.shape[:-1], 1), (plans, rates, words)
 
 
 def _stream(seed: np.random.SeedSequence) -> npt.NDArray[np.uint64]:

@@ -1,184 +1,238 @@
-"""The planner's search, compiled: what each of many candidate sequences of inputs would teach, and mutations of them.
+"""The planner's search, compiled: the best way through the map of (x_t, x_{t-1}), and small changes of it.
 
-A candidate is imagined by the structured update (`estimator.inference.structured`) with E[γ] and E[ξ] fixed and every
-output as it is expected: the means follow the trajectory without noise, and the joint covariance of (x_t, x_{t-1}) and
-(θ, η) contracts as it would. So what one sample teaches is not counted again by the next.
+The teaching of a plan has many summits, and changing a long plan here and there finds a poor one, even of a system that
+is known. So the plan is built sample by sample, as by dynamic programming: of all ways that lead into the same cell of
+the plane (x_t, x_{t-1}) only the best is followed, with the highest input, the lowest, and the one nearest to zero. A
+way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of the last
+plans. Without the latter a way would be praised for what every way teaches sooner or later.
 
-Candidates lie in the lanes of a block, so that the compiler imagines several at a time.
+The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from agents.design import half_log_det
+from agents.policies.imagination import SCORE, SIZE, X0, X1, U, advance, appraise, load, precision, unload
 from duffing_env.noise import draw, to_unit
-from estimator.elementary import log
-from estimator.lanes import LANES, jit, kernel, lanewise, rows
-from estimator.record import COEFFICIENTS, RECORD
+from estimator.lanes import LANES, jit, kernel
 
-_JOINT = ("x0", "x1", *COEFFICIENTS)
-_PAIRS = [(i, j) for n, i in enumerate(_JOINT) for j in _JOINT[n:]]
-_COVARIANCES = " ".join(f"P_{i}_{j}" for i, j in _PAIRS)
-LAYOUT = rows("x0 x1", _COVARIANCES, "u cost score")
+#: Cells of the map along each axis, from minus the displacement limit to plus.
+_CELLS = 24
 
-# Where the record's entries go in a block.
-_LOADED = np.array([(RECORD.index(name), LAYOUT[name]) for name in ("x0", "x1", *_COVARIANCES.split())])
-_COEFFICIENTS = RECORD.index("t1")
-_NOISES = RECORD.index("g_shape")
-_SIZE = len(LAYOUT) * LANES
-_U, _COST, _SCORE = (LAYOUT[name] * LANES for name in ("u", "cost", "score"))
+#: Inputs that are tried at every cell.
+_CHOICES = 3
 
-#: Nats that a displacement beyond its limit costs, per limit that it is beyond: more than any plan can teach.
-_BEYOND = 1e4
+#: A way this much [nats] worse than the best of its length is followed no further.
+_HOPELESS = 1.0
 
+#: Part of what a plan teaches per sample that goes into the running mean.
+_REFRESHED = 0.2
 
-@lanewise(LAYOUT, f"x0 x1 {_COVARIANCES} cost", uniform="t1 t2 t3 e q r limit margin price goal goal_weight")
-def imagine(
-    x0, x1, u,
-    P_x0_x0, P_x0_x1, P_x0_t1, P_x0_t2, P_x0_t3, P_x0_e,
-    P_x1_x1, P_x1_t1, P_x1_t2, P_x1_t3, P_x1_e,
-    P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e, cost,
-    t1, t2, t3, e, q, r, limit, margin, price, goal, goal_weight,
-):  # fmt: skip
-    """One expected sample: the structured update of an output that is what was predicted, and what it costs."""
-    cube = x0 * x0 * x0
-    a = t1 + 3 * t2 * x0 * x0
-    c_x0 = a * P_x0_x0 + t3 * P_x0_x1 + x0 * P_x0_t1 + cube * P_x0_t2 + x1 * P_x0_t3 + u * P_x0_e
-    c_x1 = a * P_x0_x1 + t3 * P_x1_x1 + x0 * P_x1_t1 + cube * P_x1_t2 + x1 * P_x1_t3 + u * P_x1_e
-    c_t1 = a * P_x0_t1 + t3 * P_x1_t1 + x0 * P_t1_t1 + cube * P_t1_t2 + x1 * P_t1_t3 + u * P_t1_e
-    c_t2 = a * P_x0_t2 + t3 * P_x1_t2 + x0 * P_t1_t2 + cube * P_t2_t2 + x1 * P_t2_t3 + u * P_t2_e
-    c_t3 = a * P_x0_t3 + t3 * P_x1_t3 + x0 * P_t1_t3 + cube * P_t2_t3 + x1 * P_t3_t3 + u * P_t3_e
-    c_e = a * P_x0_e + t3 * P_x1_e + x0 * P_t1_e + cube * P_t2_e + x1 * P_t3_e + u * P_e_e
-    predicted = t1 * x0 + t2 * cube + t3 * x1 + e * u
-    variance = a * c_x0 + t3 * c_x1 + x0 * c_t1 + cube * c_t2 + x1 * c_t3 + u * c_e + q
-    w = 1.0 / (variance + r)
-    keep = r * w
-    over = abs(predicted) + margin * np.sqrt(variance + r) - limit
-    over = over if over > 0.0 else 0.0
-    off = predicted - goal
-    cost += _BEYOND / limit * over + price * u * u + goal_weight * (off * off + variance)
-    return (
-        predicted, x0,
-        keep * variance, keep * c_x0, keep * c_t1, keep * c_t2, keep * c_t3, keep * c_e,
-        P_x0_x0 - w * c_x0 * c_x0, P_x0_t1 - w * c_x0 * c_t1, P_x0_t2 - w * c_x0 * c_t2,
-        P_x0_t3 - w * c_x0 * c_t3, P_x0_e - w * c_x0 * c_e,
-        P_t1_t1 - w * c_t1 * c_t1, P_t1_t2 - w * c_t1 * c_t2, P_t1_t3 - w * c_t1 * c_t3, P_t1_e - w * c_t1 * c_e,
-        P_t2_t2 - w * c_t2 * c_t2, P_t2_t3 - w * c_t2 * c_t3, P_t2_e - w * c_t2 * c_e,
-        P_t3_t3 - w * c_t3 * c_t3, P_t3_e - w * c_t3 * c_e, P_e_e - w * c_e * c_e, cost,
-    )  # fmt: skip
-
-
-@lanewise(LAYOUT, "score")
-def judge(P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e, cost):
-    """Minus the expected free energy, up to a constant: -½ log det of the coefficients' covariance, less the cost."""
-    d1 = P_t1_t1
-    l2, l3, le = P_t1_t2 / d1, P_t1_t3 / d1, P_t1_e / d1
-    d2 = P_t2_t2 - l2 * P_t1_t2
-    w23, w2e = P_t2_t3 - l2 * P_t1_t3, P_t2_e - l2 * P_t1_e
-    m3, me = w23 / d2, w2e / d2
-    d3 = P_t3_t3 - l3 * P_t1_t3 - m3 * w23
-    w3e = P_t3_e - l3 * P_t1_e - m3 * w2e
-    de = P_e_e - le * P_t1_e - me * w2e - w3e * w3e / d3
-    determinant = d1 * d2 * d3 * de
-    return -0.5 * log(determinant) - cost if determinant > 0.0 else -1e300
+_BLOCKS = -(-_CELLS * _CELLS // LANES)
 
 
 @kernel
-def plan(
-    records, left, horizon, rounds, amplitude, limit, margin, price, goal, goal_weight, plans, words, actions, scores
-):  # fmt: skip
+def plan(records, left, horizon, rounds, terms, last, plans, rates, words, actions, scores):
     """Search the best next inputs of n environments.
 
     Args:
         records: (n, RECORD_SIZE) their beliefs.
         left: (n,) samples left in their episodes.
         horizon: samples to plan for, at most.
-        rounds: of `LANES` candidates each.
-        amplitude: largest input [V].
-        limit: of the displacement [V].
-        margin: predictive standard deviations that a plan keeps from it.
-        price: nats for a V² of input energy.
-        goal: mean of the goal prior of the displacement [V].
-        goal_weight: half its precision [1/V²]; 0 for no goal.
+        rounds: of `LANES` changed copies each.
+        terms: `Terms`.
+        last: (n,) the inputs that were applied last [V].
         plans: (n, horizon) the last plans, begun one sample ago [V]; overwritten by the new ones.
+        rates: (n, 4, 4) information per sample that plans have brought, a running mean; zeros where there was none yet.
+            Overwritten.
         words: (n, 4) streams of random numbers; overwritten.
         actions: (n,) receives the first input of the best plan [V].
         scores: (n,) receives the best plan's score [nats].
     """
-    W = np.empty(_SIZE)
-    candidates = np.empty((LANES, horizon))
+    memory = _memory(horizon)
     for i in range(len(records)):
-        steps = max(1, min(horizon, left[i]))
+        rest = max(1, left[i])
         scores[i] = _search(
-            W, candidates, records[i], steps, rounds, amplitude, limit, margin, price, goal, goal_weight,
-            plans[i], words[i],
+            memory, records[i], rest, min(horizon, rest), rounds, terms, last[i], plans[i], rates[i], words[i]
         )  # fmt: skip
         actions[i] = plans[i, 0]
 
 
 @kernel
-def play(record, first, horizon, rounds, amplitude, limit, margin, u, words):
+def play(record, first, horizon, rounds, terms, u, words):
     """Plan the inputs u (T,) from sample ``first`` on, where the means of the belief are the truth.
 
     The inputs before it are followed as they are. Arguments as `plan`; ``words`` is (4,), the record is overwritten.
     """
-    W = np.empty(_SIZE)
-    candidates = np.empty((LANES, horizon))
-    best = np.zeros(horizon)
-    lane = np.empty((1, 1))
+    memory = _memory(horizon)
+    best, rate, W = np.zeros(horizon), np.zeros((4, 4)), np.empty(SIZE)
     for t in range(len(u)):
+        left = len(u) - t
         if t >= first:
-            steps = min(horizon, len(u) - t)
-            _search(W, candidates, record, steps, rounds, amplitude, limit, margin, 0.0, 0.0, 0.0, best, words)
+            last = u[t - 1] if t > 0 else 0.0
+            _search(memory, record, left, min(horizon, left), rounds, terms, last, best, rate, words)
             u[t] = best[0]
-        lane[0, 0] = u[t]
-        _imagine_all(W, record, lane, 1, limit, margin, 0.0, 0.0, 0.0)
-        for place in range(len(_LOADED)):
-            record[_LOADED[place, 0]] = W[_LOADED[place, 1] * LANES]
+        load(W, record)
+        W[U : U + LANES] = u[t]
+        advance(W, record, terms)
+        unload(W, record)
 
 
 @jit
-def _search(
-    W, candidates, record, steps, rounds, amplitude, limit, margin, price, goal, goal_weight, best, words
-):  # fmt: skip
-    """Improve the plan ``best``, begun one sample ago; gives its score [nats]."""
-    last = best[0]
+def _memory(horizon):
+    """What a search writes on: blocks of ways and of their continuations, where these come from, and candidates."""
+    ways, continued = np.empty((_BLOCKS, SIZE)), np.empty((_CHOICES * _BLOCKS, SIZE))
+    cells = _CELLS * _CELLS
+    origins, inputs = np.empty((horizon, cells), np.int64), np.empty((horizon, cells))
+    return ways, continued, origins, inputs, np.empty((LANES, horizon))
+
+
+@jit
+def _search(memory, record, left, steps, rounds, terms, last, best, rate, words):
+    """Improve the plan ``best`` (horizon,), begun one sample ago, and ``rate``; gives the plan's score [nats]."""
+    ways, continued, origins, inputs, candidates = memory
+    M = np.zeros((4, 4))
+    _factor(rate, M)
+    turned = -best[0]
     best[:-1] = best[1:].copy()
-    best[-1] = -last
-    best_score = -np.inf
+    best[steps - 1] = turned
+    _bound(best, steps, last, terms)
+    candidates[0] = best
+    candidates[1] = 0.0
+    _bound(candidates[1], steps, last, terms)
+    _find_way(ways, continued, origins, inputs, record, left, steps, terms, last, M, candidates[2], words)
+    for j in range(3, LANES):
+        candidates[j] = candidates[2 * (j % 2)]
+        _change(candidates[j], steps, terms.amplitude, words)
+        _bound(candidates[j], steps, last, terms)
+    W = ways[0]
+    score = -np.inf
     for k in range(rounds):
-        for j in range(LANES):
+        for j in range(LANES if k > 0 else 0):
             candidates[j] = best
-            if k == 0 and j > 0:
-                _compose(candidates[j], j, steps, amplitude, words)
-            elif k > 0:
-                _mutate(candidates[j], steps, amplitude, words)
-        _imagine_all(W, record, candidates, steps, limit, margin, price, goal, goal_weight)
+            _change(candidates[j], steps, terms.amplitude, words)
+            _bound(candidates[j], steps, last, terms)
+        _follow(W, record, candidates, steps, terms)
+        appraise(W, M, np.sqrt(left - steps))
         for j in range(LANES):
-            if W[_SCORE + j] > best_score:
-                best_score = W[_SCORE + j]
+            if W[SCORE + j] > score:
+                score = W[SCORE + j]
                 best[:] = candidates[j]
-    return best_score
+    # Where the coefficients walk, what is learned later does not add to what is learned now.
+    if terms.walk_t1 == 0.0:
+        _refresh(W, record, best, steps, terms, rate)
+    return score
 
 
 @jit
-def _imagine_all(W, record, candidates, steps, limit, margin, price, goal, goal_weight):
-    """Load the belief into every lane, and follow the candidates (LANES, horizon), or one for all lanes."""
-    for place in range(len(_LOADED)):
-        value = record[_LOADED[place, 0]]
-        first = _LOADED[place, 1] * LANES
-        for j in range(LANES):
-            W[first + j] = value
-    for j in range(LANES):
-        W[_COST + j] = 0.0
-    t1, t2, t3, e = record[_COEFFICIENTS : _COEFFICIENTS + 4]
-    q = record[_NOISES + 1] / record[_NOISES]
-    r = record[_NOISES + 3] / record[_NOISES + 2]
+def _find_way(ways, continued, origins, inputs, record, left, steps, terms, last, M, found, words):
+    """Build a plan (steps,) by the best ways into the cells of the map, which is laid anew at random every time."""
+    best, ends = np.empty(_CELLS * _CELLS), np.empty(_CELLS * _CELLS, np.int64)
+    right, up = uniform(words), uniform(words)
+    load(ways[0], record)
+    ways[0, U : U + LANES] = last
+    count = 1
+    for h in range(steps):
+        best[:] = -np.inf
+        for b in range(_CHOICES * (-(-count // LANES))):
+            W = continued[b]
+            W[:] = ways[b // _CHOICES]
+            for j in range(LANES):
+                W[U + j] = _choose(b % _CHOICES, W[U + j], terms)
+            advance(W, record, terms)
+            appraise(W, M, np.sqrt(left - h - 1))
+            for j in range(min(LANES, count - b // _CHOICES * LANES)):
+                cell = _place(W[X0 + j], terms.limit, right) * _CELLS + _place(W[X1 + j], terms.limit, up)
+                if W[SCORE + j] > best[cell]:
+                    best[cell] = W[SCORE + j]
+                    ends[cell] = b * LANES + j
+        count = _gather(ways, continued, best, ends, origins[h], inputs[h])
+    way = np.argmax(best[:count])
+    for h in range(steps - 1, -1, -1):
+        found[h] = inputs[h, way]
+        way = origins[h, way]
+
+
+@jit
+def _gather(ways, continued, best, ends, origins, inputs):
+    """Make the best continuations the new ways, and note where they come from; gives their number.
+
+    ``best``, the scores of the cells, becomes that of the ways.
+    """
+    enough = np.max(best) - _HOPELESS
+    count = 0
+    for cell in range(len(best)):
+        if best[cell] >= enough and best[cell] > -np.inf:
+            b, j = ends[cell] // LANES, ends[cell] % LANES
+            origins[count] = b // _CHOICES * LANES + j
+            inputs[count] = continued[b, U + j]
+            best[count] = best[cell]
+            way, lane = ways[count // LANES], count % LANES
+            for row in range(0, SIZE, LANES):
+                way[row + lane] = continued[b, row + j]
+            count += 1
+    # Lanes beyond the last way do the same work as the others, so that none of them runs wild.
+    for lane in range(count, -(-count // LANES) * LANES):
+        for row in range(0, SIZE, LANES):
+            ways[lane // LANES, row + lane % LANES] = ways[lane // LANES, row]
+    return count
+
+
+@jit
+def _choose(choice, last, terms):
+    """The highest input after ``last``, the lowest, or the one nearest to zero."""
+    if choice == 0:
+        return min(terms.amplitude, last + terms.slew)
+    if choice == 1:
+        return max(-terms.amplitude, last - terms.slew)
+    return max(last - terms.slew, min(0.0, last + terms.slew))
+
+
+@jit
+def _place(x, limit, offset):
+    """The cell of a displacement along one axis."""
+    place = np.int64((x / limit + 1.0) * 0.5 * (_CELLS - 1) + offset)
+    return max(0, min(_CELLS - 1, place))
+
+
+@jit
+def _bound(candidate, steps, last, terms):
+    """Cut changes of the input beyond the slew limit, as the environment does."""
+    for h in range(steps):
+        candidate[h] = max(last - terms.slew, min(candidate[h], last + terms.slew))
+        last = candidate[h]
+
+
+@jit
+def _follow(W, record, candidates, steps, terms):
+    """Imagine the candidates (LANES, horizon) from a belief on, or one for all lanes."""
+    load(W, record)
     for h in range(steps):
         for j in range(LANES):
-            W[_U + j] = candidates[j % len(candidates), h]
-        imagine(W, t1, t2, t3, e, q, r, limit, margin, price, goal, goal_weight)
-    judge(W)
+            W[U + j] = candidates[j % len(candidates), h]
+        advance(W, record, terms)
+
+
+@jit
+def _refresh(W, record, best, steps, terms, rate):
+    """Let the information per sample of a plan into the running mean; the first one is taken as it is."""
+    before, after = np.empty((4, 4)), np.empty((4, 4))
+    load(W, record)
+    precision(W, before)
+    _follow(W, record, best.reshape(1, -1), steps, terms)
+    precision(W, after)
+    part = _REFRESHED if rate[0, 0] > 0.0 else 1.0
+    rate += part * ((after - before) / steps - rate)
+
+
+@jit
+def _factor(information, M):
+    """The factor M (4, 4) of an information M Mᵀ; zeros where there is none, or it tells nothing of a coefficient."""
+    M[:] = information
+    if half_log_det(M) == -np.inf:
+        M[:] = 0.0
 
 
 @jit
@@ -189,23 +243,7 @@ def uniform(words):
 
 
 @jit
-def _compose(candidate, j, steps, amplitude, words):
-    """Begin anew: lane 1 ends the last plan otherwise, lane 2 rests, the others are random square waves."""
-    if j == 1:
-        candidate[steps - 1] = -candidate[steps - 1]
-        return
-    if j == 2:
-        candidate[:] = 0.0
-        return
-    half_period = 1.0 + 5.0 * uniform(words)
-    phase = 2.0 * half_period * uniform(words)
-    for h in range(len(candidate)):
-        turns = np.int64((h + phase) / half_period)
-        candidate[h] = amplitude if turns % 2 == 0 else -amplitude
-
-
-@jit
-def _mutate(candidate, steps, amplitude, words):
+def _change(candidate, steps, amplitude, words):
     """Change a candidate a little: turn one, two or a run of inputs over, shift it, or put one anywhere."""
     kind = uniform(words)
     h = np.int64(uniform(words) * steps)

@@ -20,28 +20,36 @@ def walk(P_t1_t1, P_t2_t2, P_t3_t3, P_e_e, walk_t1, walk_t2, walk_t3, walk_e):
 
 
 def _updating(on: Callable[[Any], Any]) -> Any:
-    """The update with each of its loops over the lanes turned into something else by ``on``."""
+    """The updates with each of their loops over the lanes turned into something else by ``on``."""
     predict, learn_noise, correct = on(structured.predict), on(structured.learn_noise), on(structured.correct)
     begin, iterate, end = on(mean_field.begin), on(mean_field.iterate), on(mean_field.end)
 
     @jit
+    def update_structured(W, iterations, trace):
+        predict(W)
+        for i in range(iterations):
+            learn_noise(W)
+            if trace.size:
+                trace[i] = structured.free_energy(W, 0)
+        correct(W)
+
+    @jit
+    def update_mean_field(W, iterations, as_published, trace):
+        begin(W)
+        for i in range(iterations):
+            iterate(W, as_published)
+            if trace.size:
+                trace[i] = mean_field.free_energy(W, 0)
+        end(W)
+
+    @jit
     def update(W, is_structured, iterations, as_published, trace):
         if is_structured:
-            predict(W)
-            for i in range(iterations):
-                learn_noise(W)
-                if trace.size:
-                    trace[i] = structured.free_energy(W, 0)
-            correct(W)
+            update_structured(W, iterations, trace)
         else:
-            begin(W)
-            for i in range(iterations):
-                iterate(W, as_published)
-                if trace.size:
-                    trace[i] = mean_field.free_energy(W, 0)
-            end(W)
+            update_mean_field(W, iterations, as_published, trace)
 
-    return update
+    return update_structured, update_mean_field, update
 
 
 #: ``update(W, is_structured, iterations, as_published, trace)`` updates every lane's belief with its rows ``u``, ``y``.
@@ -51,10 +59,12 @@ def _updating(on: Callable[[Any], Any]) -> Any:
 #: - iterations: number of variational iterations, at least 1.
 #: - as_published: mean field with the two departures of the published run.
 #: - trace: (iterations,) receives lane 0's free energy after each iteration [nats]; of size 0 to skip it.
-update = _updating(lambda loop: loop)
+#:
+#: The two before it are the one and the other, with the arguments that it needs.
+update_structured, update_mean_field, update = _updating(lambda loop: loop)
 
 #: The same for the first lane alone, for a single system: a quarter of the time, and other last digits.
-update_alone = _updating(alone)
+_, _, update_alone = _updating(alone)
 
 
 @jit

@@ -11,8 +11,8 @@ import pytest
 import duffing_env
 from agents.design import START_SIZE, worth
 from agents.policies import make_policy
+from agents.policies.imagination import LAYOUT, imagine, judge
 from agents.policies.planner import Planner
-from agents.policies.planning import LAYOUT, imagine, judge
 from agents.policies.pursuit import begin
 from estimator.lanes import LANES
 
@@ -37,9 +37,10 @@ def block_of(beliefs):
     return W
 
 
-def expected_log_det(belief, u, q, r):
+def expected_log_det(belief, u, q, r, walk=(0.0,) * 4):
     """The twin's belief after inputs u whose outputs are as predicted, and ½ log det of its coefficients."""
     for value in u:
+        belief = Moments(belief.mean, belief.cov + np.diag([0.0, 0.0, 0.0, *walk]), belief.gamma, belief.xi)
         x, last, _, t1, t2, t3, eta = belief.mean
         y = t1 * x + t2 * x**3 + t3 * last + eta * value
         belief, _ = structured_step(known_noises(belief, q, r), value, y, 1)
@@ -64,23 +65,28 @@ def roll_out(track, n, seed=0, steps=None, options=None, **planner):
     return np.array(inputs), np.array(outputs), early
 
 
-def test_imagination_is_the_structured_update_of_what_is_expected():
+@pytest.mark.parametrize(("walk", "to_come"), [((0.0,) * 4, 0.0), ((1e-6, 2e-4, 3e-6, 4e-6), 1.0)])
+def test_imagination_is_the_structured_update_of_what_is_expected(walk, to_come):
     rng = np.random.default_rng(0)
     q, r = 0.01**2, 0.02**2
     first = random_prior(rng)
-    uniform = (*first.mean[3:], q, r, 0.5, 2.0, 3.0, 0.1, 4.0)
+    uniform = (*first.mean[3:], q, r, 0.5, 2.0, *walk, 3.0, 0.1, 4.0)
     u = rng.normal(0.0, 0.1, (6, LANES))
+    factor = to_come * np.tril(rng.normal(0.0, 30.0, (4, 4)))
     W = block_of([first] * LANES)
     for inputs in u:
         W[LAYOUT["u"]] = inputs
         imagine(W.reshape(-1), *uniform)
-    judge(W.reshape(-1))
+    judge(W.reshape(-1), *factor[np.tril_indices(4)])
     for j in range(0, LANES, 7):
-        twin, log_det = expected_log_det(first, u[:, j], q, r)
+        twin, _ = expected_log_det(first, u[:, j], q, r, walk)
+        information = np.linalg.inv(twin.cov[3:, 3:]) + factor @ factor.T
         np.testing.assert_allclose(W[:2, j], twin.mean[:2], rtol=1e-9)
         expected = twin.cov[np.ix_(JOINT, JOINT)][np.triu_indices(6)]
         np.testing.assert_allclose(W[2:23, j], expected, rtol=1e-6, atol=1e-12)
-        assert W[LAYOUT["score"], j] + W[LAYOUT["cost"], j] == pytest.approx(-log_det, abs=1e-6)
+        assert W[LAYOUT["score"], j] + W[LAYOUT["cost"], j] == pytest.approx(
+            0.5 * np.linalg.slogdet(information)[1], abs=1e-6
+        )
 
 
 def test_the_cost_is_price_goal_and_what_is_beyond_the_limit():
@@ -89,7 +95,7 @@ def test_the_cost_is_price_goal_and_what_is_beyond_the_limit():
     belief = random_prior(rng)
     W = block_of([belief] * LANES)
     W[LAYOUT["u"]] = 0.1
-    imagine(W.reshape(-1), *belief.mean[3:], q, r, 0.05, 2.0, 3.0, 0.1, 4.0)
+    imagine(W.reshape(-1), *belief.mean[3:], q, r, 0.05, 2.0, 0.0, 0.0, 0.0, 0.0, 3.0, 0.1, 4.0)
     x, last, _, t1, t2, t3, eta = belief.mean
     predicted = t1 * x + t2 * x**3 + t3 * last + eta * 0.1
     slope = np.array([t1 + 3 * t2 * x**2, t3, 0.0, x, x**3, last, 0.1])
@@ -132,6 +138,15 @@ def test_no_limit_is_violated_and_the_inputs_are_at_theirs():
     assert np.mean(np.abs(inputs) > 0.149) > 0.7
 
 
+def test_a_slew_limit_cuts_nothing_that_was_planned():
+    inputs, outputs, early = roll_out("duffing_env/Short-v0", 4, options={"max_slew": 0.06})
+    changes = np.abs(np.diff(inputs, axis=0, prepend=0.0))
+    assert early == 0
+    assert changes.max() <= 0.06 * (1 + 1e-6)
+    assert np.mean(changes > 0.059) > 0.3
+    assert np.abs(outputs).max() > 0.5
+
+
 def test_the_budget_is_spent_and_not_exceeded():
     inputs, _, early = roll_out("duffing_env/Power-v0", 4)
     assert early == 0
@@ -168,7 +183,7 @@ def test_single_environments_are_planned_for_as_rows_are():
     [
         ({"horizon": 0}, "horizon must be a whole number"),
         ({"rounds": 1.5}, "rounds must be a whole number"),
-        ({"margin": -1.0}, "margin must be 0 or more"),
+        ({"risk": 0.0}, "risk must be a probability"),
         ({"input_cost": float("inf")}, "input_cost must be 0 or more and finite"),
         ({"goal_std": 0.0}, "goal_std must be positive"),
         ({"horizn": 3}, "horizn=3 is no option of policy 'efe'"),

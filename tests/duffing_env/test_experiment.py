@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from duffing_env.experiment import ContinuousExperiment, ReplayExperiment, SimulatedExperiment, make_experiment
-from duffing_env.layout import ESTIMATORS, PLANTS, SETTINGS
+from duffing_env.layout import SETTINGS
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Belief, ContinuousBelief, Prior, continuous_prior
 
 BAD = [
@@ -22,6 +22,9 @@ BAD = [
     ("spread", [0, -0.1, 1, 1.5, np.nan, None]),
     ("noise_shape", [0, -2, np.inf, np.nan]),
     ("plant_spread", [-0.1, 1, np.nan, "0.1", False]),
+    ("hold", [0, -1, 2.0, True, None, "2"]),
+    ("terminal", [0, 1, None, "yes"]),
+    ("terminated_return", [np.nan, np.inf, "-10", True]),
 ]
 BAD_REPLAY = [
     ("regime", ["sine", None, []]),
@@ -29,6 +32,7 @@ BAD_REPLAY = [
     ("input_delay", [2, -1, None]),
     ("nonlinear", ["no", 1, None]),
     ("as_published", ["yes", 0, True]),
+    ("hold", [2, 0, None]),
     ("max_input", [0, 0.12]),
 ]
 
@@ -67,18 +71,18 @@ def test_options_are_json_and_frozen():
 
 
 def test_settings_are_the_options():
-    settings = told(
-        SimulatedExperiment(
-            factorisation="mean_field", iterations=4, reward="free_energy", max_input=0.1, max_output=0.5, horizon=9,
-            process_noise=1e-3, measurement_noise=2e-3, spread=0.2, noise_shape=3.0, plant_spread=0.1,
-        )
+    experiment = SimulatedExperiment(
+        factorisation="mean_field", iterations=4, reward="free_energy", max_input=0.1, max_output=0.5, horizon=9,
+        process_noise=1e-3, measurement_noise=2e-3, spread=0.2, noise_shape=3.0, plant_spread=0.1,
     )  # fmt: skip
+    settings = told(experiment)
+    assert (experiment.plant_kind, experiment.estimator_kind) == ("difference", "mean_field")
     expected = {
-        "estimator": ESTIMATORS["mean_field"], "iterations": 4, "reward": 3, "max_input": 0.1, "max_output": 0.5,
+        "iterations": 4, "reward": 3, "max_input": 0.1, "max_output": 0.5,
         "horizon": 9, "process_noise": 1e-3, "measurement_noise": 2e-3, "spread": 0.1, "nonlinear": 1,
-        "plant": PLANTS["difference"], "delay": 0,
-        "as_published": 0, "step": SAMPLING_STEP, "center_m": SILVERBOX_TWIN.m, "center_c": SILVERBOX_TWIN.c,
-        "center_a": SILVERBOX_TWIN.a, "center_b": SILVERBOX_TWIN.b,
+        "delay": 0, "as_published": 0, "step": SAMPLING_STEP,
+        "center_m": SILVERBOX_TWIN.m, "center_c": SILVERBOX_TWIN.c, "center_a": SILVERBOX_TWIN.a,
+        "center_b": SILVERBOX_TWIN.b,
     }  # fmt: skip
     assert {name: settings[name] for name in expected} == expected
     np.testing.assert_allclose(settings["prior_log_gamma"], -2 * np.log(1e-3), rtol=1e-14)
@@ -87,7 +91,8 @@ def test_settings_are_the_options():
 
 def test_defaults_are_those_of_the_documentation():
     settings = told(SimulatedExperiment())
-    assert (settings["estimator"], settings["iterations"], settings["reward"]) == (1, 3, 0)
+    assert SimulatedExperiment().estimator_kind == "structured"
+    assert (settings["iterations"], settings["reward"]) == (3, 0)
     assert told(SimulatedExperiment(factorisation="mean_field"))["iterations"] == 10
     assert (settings["max_input"], settings["max_output"], settings["horizon"]) == (0.15, 0.6, 256)
     assert (settings["process_noise"], settings["measurement_noise"], settings["spread"]) == (5e-4, 5e-4, 0.3)
@@ -107,7 +112,7 @@ def test_a_continuous_experiment_is_told_of_its_estimator():
     options = {"spread": 0.2, "process_noise": 1e-3, "measurement_noise": 2e-3, "noise_shape": 5.0}
     ode = ContinuousExperiment(**options)
     settings = told(ode)
-    assert (settings["plant"], settings["estimator"]) == (PLANTS["sde"], ESTIMATORS["ode"])
+    assert (ode.plant_kind, ode.estimator_kind) == ("sde", "ode")
     assert (settings["center_m"], settings["center_b"]) == (CONTINUOUS_TWIN.m, CONTINUOUS_TWIN.b)
     prior = continuous_prior(CONTINUOUS_TWIN, 0.2, 1e-3, 2e-3, 5.0)
     assert ode.to_belief(ode.prior_record) == prior
@@ -115,8 +120,7 @@ def test_a_continuous_experiment_is_told_of_its_estimator():
     assert settings["prior_t2"] == prior.coefficients_mean[1]
     for factorisation in ("structured", "mean_field"):
         nlarx = ContinuousExperiment(estimator="nlarx", factorisation=factorisation, **options)
-        settings = told(nlarx)
-        assert (settings["plant"], settings["estimator"]) == (PLANTS["sde"], ESTIMATORS[factorisation])
+        assert (nlarx.plant_kind, nlarx.estimator_kind) == ("sde", factorisation)
         expected = Prior.silverbox_twin(0.2, 1e-3, 2e-3, 5.0, center=CONTINUOUS_TWIN)
         np.testing.assert_array_equal(nlarx.prior_record, expected.to_record(factorisation=factorisation))
         assert isinstance(nlarx.to_belief(nlarx.prior_record), Belief)
@@ -136,7 +140,7 @@ def test_mean_field_is_for_the_difference_equation():
 def test_a_replay_is_told_of_the_record(record):
     experiment = ReplayExperiment(input_delay=1, nonlinear=False, prior="published_run")
     settings = told(experiment)
-    assert (settings["plant"], settings["delay"]) == (PLANTS["replay"], 1)
+    assert (experiment.plant_kind, settings["delay"]) == ("replay", 1)
     assert (settings["nonlinear"], settings["spread"]) == (0, 0)
     assert settings["scale_t2"] == 0.0
     assert settings["horizon"] == experiment.samples == len(record.multisine.u) - 1

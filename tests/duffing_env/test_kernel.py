@@ -109,7 +109,7 @@ def test_lanes_beyond_the_last_environment_keep_within_bounds(mode):
     batch = Batch(SimulatedExperiment(horizon=50), 1, mode)
     batch.seed(0, np.random.default_rng(0))
     for _ in range(2000):
-        if mode == RESET_BY_HAND and batch.outcome("truncated")[0]:
+        if mode == RESET_BY_HAND and batch.quantity("truncated")[0]:
             batch.reset(np.ones(1, dtype=np.bool_))
         batch.step(np.zeros(1))
     assert np.isfinite(batch._observations).all()

@@ -11,7 +11,7 @@ import pytest
 
 from estimator import lanes
 from estimator.inference import mean_field, structured
-from estimator.lanes import LANES, at_lane, lanewise, rows
+from estimator.lanes import LANES, alone, at_lane, lanewise, part, relaid, rows
 
 LAYOUT = {"a": 0, "b": 1, "total": 2, "product": 3}
 
@@ -127,3 +127,24 @@ def test_loops_hold_packed_vector_instructions(loop, uniform):
     # Scalar code has none of the first kind; of the second, a uniform argument may bring a few.
     assert len(packed) > 20
     assert len(scalar) < len(packed) / 10
+
+
+def test_functions_that_differ_have_names_that_differ():
+    """The linker takes one of two functions of a name for both, where two processes compiled them."""
+    layout = rows("p q r s")
+
+    def double(p):
+        return 2.0 * p
+
+    loops = [lanewise(layout, target)(double) for target in "qrs"]
+    names = {loop.py_func.__qualname__ for loop in (*loops, relaid(loops[0], {**layout, "p": 3}), alone(loops[0]))}
+    assert len(names) == 5
+
+    def outer(kind):
+        @part(kind)
+        def inner(p):
+            return p
+
+        return inner
+
+    assert outer("one").py_func.__qualname__ != outer("two").py_func.__qualname__
