@@ -74,13 +74,14 @@ def evaluate(
 ) -> list[Evaluation]:
     """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
 
-    Learned policies act by their mean. An episode that a limit ends is never dropped: it counts with what was known by
-    then. Information at the truth, and what other estimators make of the inputs and outputs, need a simulated plant
-    whose truth stays as it is; what is measured by free runs or in samples of the Silverbox regime, the difference
-    equation. The arrow error is that of the difference equation identified on the track's twin (``plant_spread=0``) in
-    a free run over the real arrow record; it is left out without the record, and for the differential equation: the
-    simulated plant has no offsets, and those of the circuit, 8 mV at the input, would be nearly all of its error
-    (5.3 mV for the twin itself).
+    Learned policies act by their mean. With ``hold`` in the options, inputs, outputs and what is made of them are those
+    of every sample; a stored oracle is that of the track without it. An episode that a limit ends is never dropped: it
+    counts with what was known by then. Information at the truth, and what other estimators make of the inputs and
+    outputs, need a simulated plant whose truth stays as it is; what is measured by free runs or in samples of the
+    Silverbox regime, the difference equation. The arrow error is that of the difference equation identified on the
+    track's twin (``plant_spread=0``) in a free run over the real arrow record; it is left out without the record, and
+    for the differential equation: the simulated plant has no offsets, and those of the circuit, 8 mV at the input, would
+    be nearly all of its error (5.3 mV for the twin itself).
 
     Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the
     entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.
@@ -164,13 +165,22 @@ def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str
     return evaluation
 
 
+def make(env_id: str, systems: int, options: dict[str, Any] | None = None) -> DuffingVectorEnv:
+    """A batch of a track."""
+    envs = gym.make_vec(env_id, num_envs=systems, vectorization_mode="vector_entry_point", **(options or {}))
+    assert isinstance(envs, DuffingVectorEnv)
+    return envs
+
+
 def roll_out(
     name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]
 ) -> tuple[Evaluation, list[RecordBelief], PhysicalParameters, Experiment]:
     """One episode of every system; the beliefs it ended with, the truth and the experiment."""
-    envs = gym.make_vec(env_id, num_envs=systems, vectorization_mode="vector_entry_point", **options)
-    assert isinstance(envs, DuffingVectorEnv)
+    envs = make(env_id, systems, options)
     policy = make_policy(name, envs, seed=seed)
+    hold = envs.experiment.hold
+    if hold > 1:  # applied sample by sample instead, which is the same, so that every sample is seen
+        envs = make(env_id, systems, {**options, "hold": 1})
     observations, _ = envs.reset(seed=seed)
     prior, horizon = envs.belief(0), envs.horizon
     curve = np.zeros((horizon + 1, systems))
@@ -182,9 +192,11 @@ def roll_out(
     state, episode_start = None, np.ones(systems, dtype=np.bool_)
     decisions, deciding = 0, 0.0
     for t in range(horizon):
-        started = time.perf_counter()
-        actions, state = policy.predict(observations, state, episode_start, deterministic=True)
-        deciding, decisions = deciding + time.perf_counter() - started, decisions + systems
+        if t % hold == 0:
+            started = time.perf_counter()
+            actions, state = policy.predict(observations, state, episode_start, deterministic=True)
+            deciding, decisions = deciding + time.perf_counter() - started, decisions + systems
+            episode_start = np.zeros(systems, dtype=np.bool_)
         observations, _, terminated, truncated, infos = envs.step(actions)
         curve[t + 1] = curve[t] + np.where(running, infos["log_posterior_gain"], 0.0)
         inputs[t, running] = envs.max_input * observations[running, _LAST_INPUT]
@@ -194,7 +206,7 @@ def roll_out(
             beliefs[row], truths[row] = infos["belief"][row], infos["truth"][row]
         ended_early[finished & terminated] = 1.0
         running &= ~finished
-        episode_start = terminated | truncated
+        episode_start |= terminated | truncated
         if not running.any():
             curve[t + 2 :] = curve[t + 1]
             break

@@ -23,12 +23,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
 from agents.ascent import appraise, improve
 from agents.cli import JsonOptions, run_script
+from agents.evaluation import evaluate, make
 from agents.policies.imagination import Terms
 from agents.policies.planning import play
 from agents.policies.pursuit import swings
@@ -312,13 +312,6 @@ def _changed(u: FloatArray, task: Task, rng: np.random.Generator) -> FloatArray:
     return changed
 
 
-def make(env_id: str, systems: int, options: dict[str, Any] | None = None) -> DuffingVectorEnv:
-    """A batch of a track."""
-    envs = gym.make_vec(env_id, num_envs=systems, vectorization_mode="vector_entry_point", **(options or {}))
-    assert isinstance(envs, DuffingVectorEnv)
-    return envs
-
-
 def design(
     systems: Systems,
     given: FloatArray,
@@ -376,8 +369,6 @@ class Config:
 
 def main(config: Config) -> None:
     """Search, store, and say how far it is."""
-    from agents.evaluation import evaluate
-
     systems = Systems.of(config.env, config.systems, config.options)
     given = np.empty((0, config.systems, systems.task.samples))
     if config.policies:

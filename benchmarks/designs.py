@@ -14,7 +14,8 @@ import numpy as np
 import tyro
 from scipy import stats
 
-from agents.oracle import Oracle, Systems, make
+from agents.evaluation import make
+from agents.oracle import Oracle, Systems
 from agents.policies import make_policy
 from estimator.files import write_atomically
 from estimator.parameters import FloatArray

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from duffing_env.experiment import Experiment
 from duffing_env.kernel import compiled
-from duffing_env.layout import ENDED, LAYOUT, N_OBSERVATION, N_ROWS, OSCILLATOR, OUTCOME
+from duffing_env.layout import ENDED, LAYOUT, N_OBSERVATION, N_ROWS, OSCILLATOR, OUTCOME, SETTINGS
 from duffing_env.noise import stream_words
 from estimator.belief import RecordBelief
 from estimator.lanes import LANES
@@ -28,19 +28,21 @@ class Batch:
         size: their number n; memory is laid out for a multiple of `LANES`.
         reset_mode: `duffing_env.kernel.RESET_BY_HAND`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
         threads: threads that step the blocks; results do not depend on it.
+        hold: samples that a step plays, at most: an environment stops where its episode ends.
 
     Attributes:
         observations: (n, N_OBSERVATION) float32, overwritten by every step.
         final_observations: the same, for what was reset within the step.
     """
 
-    def __init__(self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1) -> None:
+    def __init__(self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1, hold: int = 1) -> None:
         self.experiment = experiment
         self.size = size
         self._reset_mode = reset_mode
         self._threads = threads
         self._kind = experiment.plant_kind, experiment.estimator_kind, experiment.reward
         self._settings = experiment.settings
+        self._settings[SETTINGS["hold"]] = hold
         # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
         self._prior = experiment.prior_record.copy()
         self._recorded = tuple(series.copy() for series in experiment.recorded)
@@ -77,7 +79,7 @@ class Batch:
         reset(self._flat_blocks, self._mask, self._settings, self._prior, self._observations)
 
     def step(self, actions: npt.ArrayLike) -> None:
-        """Apply actions (n,) for one sample: in parts of the largest input, clipped to [-1, 1], in float32's range."""
+        """Apply actions (n,) for a step: in parts of the largest input, clipped to [-1, 1], in float32's range."""
         self._actions[: self.size] = actions
         kernel = compiled(*self._kind)
         step = kernel.step

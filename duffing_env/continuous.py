@@ -55,7 +55,7 @@ class ContinuousEnv(DuffingEnv):
 
     ## Reward
 
-    By name (``reward=``), all in nats but ``parameter_error``; C is the posterior covariance of (k, κ, d, g), c* their
+    By name (``reward=``), in nats but for the two errors; C is the posterior covariance of (k, κ, d, g), c* their
     true values. With ``estimator="nlarx"`` they are θ1, θ2, θ3, η, the true ones by Eq. (3), and the estimates of
     m, c, a, b by Eq. (4).
 
@@ -64,7 +64,11 @@ class ContinuousEnv(DuffingEnv):
     | ``information_gain`` (default) | ½ log det C_{t-1} - ½ log det C_t | about 16 over an episode, mostly >= 0 |
     | ``log_posterior`` | log q_t(c*) - log q_{t-1}(c*) | unbounded below; its mean is at most the information gain |
     | ``parameter_error`` | e_{t-1} - e_t, e = mean of min(relative error, 1) over m, c, a, b | [-1, 1] |
+    | ``expected_free_energy`` | ½ log det C_{t-1} - ½ log det C'_t, C'_t as expected before the outcome | >= 0 |
+    | ``simulation_error`` | s_{t-1} - s_t, s the relative error of a free run, at most 1 | [-1, 1] |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
+
+    The ranges are those of an episode's sum; see `DuffingEnv`.
 
     ## Starting state
 
@@ -96,6 +100,7 @@ class ContinuousEnv(DuffingEnv):
     | ``max_input`` | 0.15 | input limit [V] |
     | ``max_output`` | 0.6 | the sensor's limit [V] |
     | ``horizon`` | 256 | samples of an episode |
+    | ``hold``, ``terminal``, ``terminated_return`` | 1, False, None | as `DuffingEnv` |
     | ``process_noise`` | 5e-4 | standard deviation of what a sample's process noise alone does to x [V] |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
     | ``spread`` | 0.3 | half width of the parameters' range, relative |

@@ -18,7 +18,7 @@ from duffing_env.experiment import (
     make_experiment,
 )
 from duffing_env.kernel import RESET_BY_HAND
-from duffing_env.layout import OBSERVATION
+from duffing_env.layout import OBSERVATION, SUMMED
 from estimator.belief import RecordBelief
 from estimator.parameters import FloatArray, PhysicalParameters
 
@@ -78,7 +78,7 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     ## Reward
 
-    By name (``reward=``), all in nats but ``parameter_error``; C is the posterior covariance of (θ, η), c* the truth.
+    By name (``reward=``), in nats but for the two errors; C is the posterior covariance of (θ, η), c* the truth.
 
     | Name | Reward of a step | Range |
     |------|------------------|-------|
@@ -86,7 +86,13 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``log_posterior`` | log q_t(c*) - log q_{t-1}(c*) | unbounded below; its mean is at most the information gain |
     | ``parameter_error`` | e_{t-1} - e_t, e = mean of min(relative error, 1) over m, c, a, b | [-1, 1] |
     | ``fisher`` | ½ log det(Λ0 + F_t) - ½ log det(Λ0 + F_{t-1}), F the Fisher information at the truth | >= 0 |
+    | ``expected_free_energy`` | ½ log det C_{t-1} - ½ log det C'_t, C'_t as expected before the outcome | >= 0 |
+    | ``simulation_error`` | s_{t-1} - s_t, s the relative error of a free run, at most 1 | [-1, 1] |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
+
+    The ranges are those of an episode's sum. `duffing_env.rewards` (the manual's page "Rewards") says what each bounds,
+    and how it can be fooled. What is gained is kept when an episode is terminated, unless ``terminated_return`` is set;
+    with ``terminal`` it is paid in the last step, in one sum.
 
     ## Starting state
 
@@ -102,9 +108,9 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     ## Information
 
-    Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], ``diverged``. At the end of an
-    episode also ``belief`` (`estimator.Belief`) and ``truth`` (`estimator.PhysicalParameters`). At any time:
-    ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+    Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], summed over the samples that an
+    action is held for; ``diverged``. At the end of an episode also ``belief`` (`estimator.Belief`) and ``truth``
+    (`estimator.PhysicalParameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
 
     ## Arguments
 
@@ -116,6 +122,9 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``max_input`` | 0.15 | input limit [V] |
     | ``max_output`` | 0.6 | displacement limit [V] |
     | ``horizon`` | 256 | samples of an episode |
+    | ``hold`` | 1 | samples that an action is applied for; see below |
+    | ``terminal`` | False | pay the episode's whole reward in its last step, and 0 before |
+    | ``terminated_return`` | None | return of an episode that is terminated, whatever it gained; None keeps that |
     | ``process_noise`` | 5e-4 | standard deviation of w̃ [V] |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
     | ``spread`` | 0.3 | half width of the parameters' range, relative |
@@ -126,6 +135,10 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``input_cost`` | 0 | taken off the reward for every (u / ``max_input``)² |
     | ``jump``, ``drift`` | 0 | a mass that jumps, an estimator that expects change; see `DriftEnv` |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
+
+    With ``hold`` a step is that many samples with the same action, to the bit: its reward is the sum of theirs, limits
+    hold for every sample, and an episode may end within. ``horizon`` stays in samples, so an episode has
+    ceil(horizon / hold) steps, and the last may be shorter; the observation is that of the last sample.
 
     >>> import gymnasium as gym
     >>> import duffing_env
@@ -201,7 +214,7 @@ class DuffingEnv(gym.Env[Any, Any]):
         return self._batch.observations[0].copy(), {}
 
     def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Apply one input for one sample.
+        """Apply one input for ``hold`` samples, or until the episode ends.
 
         Raises:
             ValueError: if the action is not one finite number; nothing has changed then.
@@ -211,8 +224,7 @@ class DuffingEnv(gym.Env[Any, Any]):
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
         value = _one_number(action)
         batch = self._batch
-        self._apply(value)
-        outcome = batch.outcome(0)
+        outcome = self._play(value)
         terminated, truncated = bool(outcome["terminated"]), bool(outcome["truncated"])
         info: dict[str, Any] = {name: outcome[name] for name in self._reported}
         for flag in self._flags:
@@ -220,12 +232,27 @@ class DuffingEnv(gym.Env[Any, Any]):
         if terminated or truncated:
             self._running = False
             info |= self._final_info()
-        if self._screen is not None:
-            self._draw()
         return batch.observations[0].copy(), outcome["reward"], terminated, truncated, info
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)
+
+    def _play(self, action: float) -> dict[str, float]:
+        """Let as many samples pass as the action holds: sums of what they earned, and how the last one left it."""
+        outcome = self._play_sample(action)
+        for _ in range(1, self.experiment.hold):
+            if outcome["terminated"] or outcome["truncated"]:
+                break
+            before, outcome = outcome, self._play_sample(action)
+            for name in SUMMED:
+                outcome[name] += before[name]
+        return outcome
+
+    def _play_sample(self, action: float) -> dict[str, float]:
+        self._apply(action)
+        if self._screen is not None:
+            self._draw()
+        return self._batch.outcome(0)
 
     def _apply(self, action: float) -> None:
         """Let one sample pass; the action is in [-1, 1]."""
@@ -275,8 +302,8 @@ class SilverboxReplayEnv(DuffingEnv):
 
     ## Action space, observation space, reward
 
-    As `DuffingEnv`. The true parameters of a circuit are not known: ``log_posterior`` and ``parameter_error`` are
-    relative to its twin, identified from the whole training part.
+    As `DuffingEnv`. The true parameters of a circuit are not known: ``log_posterior``, ``parameter_error`` and
+    ``simulation_error`` are relative to its twin, identified from the whole training part.
 
     ## Starting state
 
@@ -293,7 +320,8 @@ class SilverboxReplayEnv(DuffingEnv):
 
     ## Arguments
 
-    ``factorisation``, ``iterations``, ``reward``, ``max_input``, ``max_output`` and ``render_mode`` as `DuffingEnv`.
+    ``factorisation``, ``iterations``, ``reward``, ``terminal``, ``terminated_return``, ``max_input``, ``max_output``
+    and ``render_mode`` as `DuffingEnv`. There is no ``hold``: a record is answered sample by sample.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|

@@ -34,6 +34,9 @@ class Experiment:
         reward: its name, see `duffing_env.rewards`.
         max_input: input of the action 1 [V].
         max_output: displacement limit [V]: the episode ends at \|y\| above it.
+        hold: samples that an action is applied for; a step's reward is the sum of theirs. An episode may end within.
+        terminal: whether the episode's whole reward is paid in its last step, and 0 before.
+        terminated_return: what an episode that is terminated returns, whatever it gained. None keeps what it gained.
     """
 
     factorisation: str = "structured"
@@ -41,6 +44,9 @@ class Experiment:
     reward: str = "information_gain"
     max_input: float = 0.15
     max_output: float = 0.6
+    hold: int = 1
+    terminal: bool = False
+    terminated_return: float | None = None
 
     def __post_init__(self) -> None:
         if self.factorisation not in list(DEFAULT_ITERATIONS):
@@ -50,11 +56,20 @@ class Experiment:
         reward_number(self.reward)
         self._check_positive("max_input")
         self._check_positive("max_output")
+        self._check_count("hold")
+        self._check_flag("terminal")
+        worth = self.terminated_return
+        if worth is not None and not (_is_number(worth) and np.isfinite(worth)):
+            raise ValueError(f"terminated_return must be a finite number, but is {worth!r}; None keeps what was gained")
 
     def _check_positive(self, name: str) -> None:
         value = getattr(self, name)
         if not (_is_number(value) and 0 < value < np.inf):
             raise ValueError(f"{name} must be a positive, finite number, but is {value!r}; pass a value above 0")
+
+    def _check_flag(self, name: str) -> None:
+        if not isinstance(getattr(self, name), bool):
+            raise ValueError(f"{name} must be True or False, but is {getattr(self, name)!r}")
 
     def _check_count(self, name: str) -> None:
         value = getattr(self, name)
@@ -118,6 +133,7 @@ class Experiment:
             "max_input": self.max_input,
             "max_output": self.max_output,
             "horizon": self.samples,
+            "hold": 1,
             "process_noise": 0.0,
             "measurement_noise": 0.0,
             "budget": np.inf,
@@ -129,6 +145,9 @@ class Experiment:
             **{f"center_{name}": getattr(self.twin, name) for name in OSCILLATOR},
             "step": SAMPLING_STEP,
             "reward": reward_number(self.reward),
+            "terminal": self.terminal,
+            "forfeits": self.terminated_return is not None,
+            "terminated_return": self.terminated_return or 0.0,
             "iterations": self.iterations or DEFAULT_ITERATIONS[self.factorisation],
             "as_published": False,
             "nonlinear": self.is_nonlinear,
@@ -314,8 +333,9 @@ class ReplayExperiment(Experiment):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {list(choices)}, but is {getattr(self, name)!r}")
         for name in ("nonlinear", "as_published"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} must be True or False, but is {getattr(self, name)!r}")
+            self._check_flag(name)
+        if self.hold != 1:
+            raise ValueError(f"hold must be 1 for a record, which answers sample by sample, but is {self.hold}")
         if self.reward == "fisher":
             raise ValueError("reward must not be 'fisher' for a record, whose true oscillator nobody knows")
         if self.as_published and self.factorisation != "mean_field":

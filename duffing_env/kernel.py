@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from duffing_env import fisher
-from duffing_env.layout import ENDED, LAYOUT, N_OBSERVATION, N_OUTCOME, OSCILLATOR, SETTINGS
+from duffing_env import expectation, fisher, simulation
+from duffing_env.layout import ENDED, LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OSCILLATOR, SETTINGS, SUMMED
 from duffing_env.observation import observe
 from duffing_env.oscillator import draw_jump, draw_oscillator, jump_mass
 from duffing_env.plant import draw_noise, integrate_plant, limit_input, move_plant, play_record
-from duffing_env.rewards import appraise, settle
+from duffing_env.rewards import appraise, pay, settle
 from estimator.inference import continuous as ode
 from estimator.inference import mean_field, structured, update_mean_field, update_structured, walk
 from estimator.lanes import LANES, jit, kernel, part
@@ -39,6 +39,8 @@ _TERMINATED, _TRUNCATED = LAYOUT["terminated"] * LANES, LAYOUT["truncated"] * LA
 _DIVERGED, _OFF_RECORD = LAYOUT["diverged"] * LANES, LAYOUT["off_record"] * LANES
 _SURPRISE, _OSCILLATOR = LAYOUT["surprise"] * LANES, LAYOUT["m"] * LANES
 _ENDED_OSCILLATOR, _N_OSCILLATOR = ENDED["m"] * LANES, len(OSCILLATOR)
+_EARNED, _ERROR, _MISFIT = (LAYOUT[name] * LANES for name in ("earned", "error", "misfit"))
+_SUMMED = tuple(LAYOUT[name] * LANES for name in SUMMED)
 _RECORD = RECORD_SIZE * LANES
 
 # Where settings stand.
@@ -47,7 +49,9 @@ _PROCESS_NOISE, _MEASUREMENT_NOISE = SETTINGS["process_noise"], SETTINGS["measur
 _BUDGET, _MAX_SLEW, _INPUT_COST = (SETTINGS[name] for name in ("budget", "max_slew", "input_cost"))
 _JUMP, _WALK = SETTINGS["jump"], SETTINGS["walk_t1"]
 _SPREAD, _CENTER, _STEP = SETTINGS["spread"], SETTINGS["center_m"], SETTINGS["step"]
-_REWARD, _ITERATIONS = SETTINGS["reward"], SETTINGS["iterations"]
+_REWARD, _ITERATIONS, _HOLD = (SETTINGS[name] for name in ("reward", "iterations", "hold"))
+_TERMINAL, _FORFEITS = SETTINGS["terminal"], SETTINGS["forfeits"]
+_TERMINATED_RETURN = SETTINGS["terminated_return"]
 _AS_PUBLISHED, _NONLINEAR, _DELAY = SETTINGS["as_published"], SETTINGS["nonlinear"], SETTINGS["delay"]
 _PRIOR_T1, _SCALE_T1 = SETTINGS["prior_t1"], SETTINGS["scale_t1"]
 _PRIOR_LOG_GAMMA, _PRIOR_LOG_XI = SETTINGS["prior_log_gamma"], SETTINGS["prior_log_xi"]
@@ -146,12 +150,16 @@ class Kernel:
     step_parallel: Any
 
 
+#: The rewards that take work of their own.
+_WORKED = ("fisher", "free_energy", "expected_free_energy", "simulation_error")
+
+
 def compiled(plant: str, estimator: str, reward: str) -> Kernel:
     """The kernel of an experiment; names as in `PLANTS`, `ESTIMATORS` and `duffing_env.rewards.REWARDS`.
 
     Its parts are compiled when they are called first, and kept on disk.
     """
-    return _compiled(plant, estimator, reward if reward in ("fisher", "free_energy") else "")
+    return _compiled(plant, estimator, reward if reward in _WORKED else "")
 
 
 @cache
@@ -160,11 +168,20 @@ def _compiled(plant: str, estimator: str, worked: str) -> Kernel:
     move, (infer, free_energy) = PLANTS[plant], ESTIMATORS[estimator]
     # Constants to the compiler, which leaves out what they make idle.
     is_fisher, is_free_energy = worked == "fisher", worked == "free_energy"
+    is_expected, is_simulation = worked == "expected_free_energy", worked == "simulation_error"
     # Eq. (2) takes the input at x_t. Between two actions of the plant ``sde`` that is the last one.
     takes_last_input = plant == "sde" and estimator != "ode"
     continuous = 1.0 if estimator == "ode" else 0.0
     kind = "_".join((plant, estimator, worked))
     inner, entry = part(kind), kernel(kind=kind)
+
+    @inner
+    def judge(W, j, settings):
+        """Measure lane j's belief beside its oscillator, where either is new."""
+        appraise(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
+        if is_simulation:
+            simulation.compare(W, settings[_MAX_INPUT], continuous)
+            W[_ERROR + j] = W[_MISFIT + j]
 
     @inner
     def reset_lane(W, j, settings, prior):
@@ -178,9 +195,9 @@ def _compiled(plant: str, estimator: str, worked: str) -> Kernel:
         W[_JUMP_AT + j] = -1.0
         if settings[_JUMP] > 0.0:
             draw_jump(W, j, settings[_JUMP], settings[_HORIZON])
-        for row in (_U, _Y, _X, _LAST_X, _VELOCITY, _ELAPSED, _WAITING, _SPENT):
+        for row in (_U, _Y, _X, _LAST_X, _VELOCITY, _ELAPSED, _WAITING, _SPENT, _EARNED):
             W[row + j] = 0.0
-        appraise(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
+        judge(W, j, settings)
         if is_fisher:
             fisher.begin(W, j, prior, settings[_NONLINEAR])
 
@@ -195,7 +212,7 @@ def _compiled(plant: str, estimator: str, worked: str) -> Kernel:
             for j in range(LANES):
                 if W[_ELAPSED + j] == W[_JUMP_AT + j]:
                     jump_mass(W, j, settings[_STEP], continuous)
-                    appraise(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
+                    judge(W, j, settings)
 
     @inner
     def sample(W, saved, settings, recorded_u, recorded_y):
@@ -211,16 +228,22 @@ def _compiled(plant: str, estimator: str, worked: str) -> Kernel:
             walk(W, settings[_WALK], settings[_WALK + 1], settings[_WALK + 2], settings[_WALK + 3])
         if takes_last_input:
             _swap_inputs(W)
+        if is_expected:
+            expectation.foresee(W, settings[_NONLINEAR], continuous)
         infer(W, settings)
         if takes_last_input:
             _swap_inputs(W)
         if is_free_energy:
             for j in range(LANES):
                 W[_SURPRISE + j] = free_energy(W, j)
+        if is_simulation:
+            simulation.compare(W, settings[_MAX_INPUT], continuous)
         settle(
             W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR], continuous,
             settings[_REWARD], settings[_INPUT_COST],
         )  # fmt: skip
+        if settings[_TERMINAL] + settings[_FORFEITS] > 0.0:
+            pay(W, settings[_TERMINAL], settings[_FORFEITS], settings[_TERMINATED_RETURN])
         void = 0
         for j in range(LANES):
             void += (W[_DIVERGED + j] != 0.0) | (W[_OFF_RECORD + j] != 0.0)
@@ -249,6 +272,22 @@ def _compiled(plant: str, estimator: str, worked: str) -> Kernel:
         return finished
 
     @inner
+    def play(W, saved, actions, settings, recorded_u, recorded_y):
+        """Apply the actions for as many samples as they hold; an environment that ends meanwhile stays as it ended."""
+        for s in range(np.int64(settings[_HOLD])):
+            before = W.copy() if s > 0 else W[:0]
+            limit(W, actions, settings)
+            sample(W, saved, settings, recorded_u, recorded_y)
+            if s > 0:
+                for j in range(LANES):
+                    if before[_TERMINATED + j] + before[_TRUNCATED + j] != 0.0:
+                        for row in range(N_ROWS):
+                            W[row * LANES + j] = before[row * LANES + j]
+                    else:
+                        for row in _SUMMED:
+                            W[row + j] += before[row + j]
+
+    @inner
     def step_block(
         W, saved, actions, settings, prior, recorded_u, recorded_y, reset_mode, observations, final_observations, ended
     ):  # fmt: skip
@@ -256,9 +295,8 @@ def _compiled(plant: str, estimator: str, worked: str) -> Kernel:
         waiting = 0
         for j in range(LANES):
             waiting += W[_WAITING + j] != 0.0
-        limit(W, actions, settings)
         if waiting < LANES:
-            sample(W, saved, settings, recorded_u, recorded_y)
+            play(W, saved, actions, settings, recorded_u, recorded_y)
         finished = begin_or_end(W, settings, prior, reset_mode)
         _write_observations(W, settings, observations)
         if reset_mode == RESET_SAME_STEP and finished:

@@ -27,9 +27,9 @@ N_OBSERVATION = len(OBSERVATION)
 
 #: What the kernel is told about a track: (len(SETTINGS),) float64, the same for all environments.
 SETTINGS = rows(
-    "max_input max_output horizon process_noise measurement_noise spread center_m center_c center_a center_b step",
+    "max_input max_output horizon hold process_noise measurement_noise spread center_m center_c center_a center_b step",
     "budget max_slew input_cost jump walk_t1 walk_t2 walk_t3 walk_e",
-    "reward iterations as_published nonlinear delay",
+    "reward terminal forfeits terminated_return iterations as_published nonlinear delay",
     "prior_t1 prior_t2 prior_t3 prior_e scale_t1 scale_t2 scale_t3 scale_e prior_log_gamma prior_log_xi",
 )
 
@@ -39,6 +39,9 @@ OUTCOME = (
     *("terminated", "truncated", "diverged", "off_record"),
 )
 N_OUTCOME = len(OUTCOME)
+
+#: Those of them that add up over the samples of a step; the others are as the last sample leaves them.
+SUMMED = ("reward", "information_gain", "log_posterior_gain")
 
 #: The covariance that one who knows the truth would have, for the reward ``fisher``; the third lag is not needed.
 IDEAL = tuple(f"ideal_{name}" for name in RECORD if name.startswith("P_") and "x2" not in name)
@@ -56,7 +59,7 @@ LAYOUT = {
         "true_t1 true_t2 true_t3 true_e",
         "x last_x velocity elapsed waiting recorded_u recorded_y",
         "asked spent jump_at jump_factor",
-        "log_det log_density error surprise fisher_gain ideal_log_det",
+        "log_det log_density error misfit surprise fisher_gain earned ideal_log_det",
         " ".join(IDEAL),
         " ".join(OUTCOME),
         start=N_BELIEF_ROWS,

@@ -10,11 +10,9 @@ import numpy as np
 
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
+from duffing_env.rewards import NEED_THE_TRUTH
 from estimator.belief import Prior
 from estimator.parameters import PhysicalParameters
-
-#: Rewards that compare the belief with the true oscillator.
-_NEED_THE_TRUTH = ("log_posterior", "parameter_error", "fisher")
 
 
 class Plant(Protocol):
@@ -43,10 +41,10 @@ class PlantExperiment(Experiment):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_count("horizon")
-        if self.reward in _NEED_THE_TRUTH:
+        if self.reward in NEED_THE_TRUTH:
             raise ValueError(
                 f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "
-                "use 'information_gain' or 'free_energy'"
+                "use 'information_gain', 'expected_free_energy' or 'free_energy'"
             )
         if self.prior is not None and not isinstance(self.prior, Prior):
             raise ValueError(f"prior must be an estimator.Prior or None, but is {self.prior!r}")
@@ -91,8 +89,8 @@ class PlantEnv(DuffingEnv):
 
     ## Reward
 
-    ``information_gain`` (default) or ``free_energy``, as `DuffingEnv`. The others compare with the true oscillator,
-    which nobody knows: they are refused.
+    ``information_gain`` (default), ``expected_free_energy`` or ``free_energy``, as `DuffingEnv`. The others compare
+    with the true oscillator, which nobody knows: they are refused.
 
     ## Starting state
 
@@ -115,12 +113,13 @@ class PlantEnv(DuffingEnv):
 
     ## Arguments
 
-    ``factorisation``, ``iterations``, ``max_input``, ``max_output`` and ``render_mode`` as `DuffingEnv`.
+    ``factorisation``, ``iterations``, ``max_input``, ``max_output``, ``hold``, ``terminal``, ``terminated_return`` and
+    ``render_mode`` as `DuffingEnv`. With ``hold`` the plant's ``step`` is called for every sample, with the same input.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
     | ``plant`` | | the plant; it stays the caller's, who closes it |
-    | ``reward`` | ``information_gain`` | or ``free_energy`` |
+    | ``reward`` | ``information_gain`` | or ``expected_free_energy``, ``free_energy`` |
     | ``horizon`` | 256 | samples of an episode |
     | ``prior`` | None | an `estimator.Prior`; None: that of Amplitude-v0 |
 

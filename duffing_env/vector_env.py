@@ -96,10 +96,11 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
-        if max_episode_steps is not None and max_episode_steps < self.experiment.samples:
-            options["horizon"] = max_episode_steps
+        if max_episode_steps is not None and max_episode_steps * self.experiment.hold < self.experiment.samples:
+            options["horizon"] = max_episode_steps * self.experiment.hold
             self.experiment = make_experiment(self.single.experiment_kind, options)
-        self._batch = Batch(self.experiment, self.num_envs, _RESET_MODES[self._autoreset_mode], int(threads))
+        reset_mode = _RESET_MODES[self._autoreset_mode]
+        self._batch = Batch(self.experiment, self.num_envs, reset_mode, int(threads), self.experiment.hold)
         self._copy = copy
         self._seeded: Flags = np.zeros(self.num_envs, dtype=np.bool_)
         self._finished: Flags = np.ones(self.num_envs, dtype=np.bool_)
@@ -151,7 +152,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
     def step(
         self, actions: npt.NDArray[np.float32]
     ) -> tuple[Observations, npt.NDArray[np.float64], Flags, Flags, dict[str, Any]]:
-        """Apply one input to each row for one sample.
+        """Apply one input to each row, for ``hold`` samples.
 
         Raises:
             ValueError: if the actions are not finite numbers of shape (num_envs, 1); nothing has changed then.

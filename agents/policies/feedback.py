@@ -9,7 +9,7 @@ Both give ±amplitude: the amplitude limit, or the budget's RMS where that is sm
 against the velocity, while the amplitude that the oscillation is believed to have is beyond `TURN` of the displacement
 that ends the episode. Where the limits allow for an amplitude so large, they spend the rest of the episode about it,
 pumping and braking by turns, which puts most of the power above the resonance. Both are deterministic: the seed has no
-effect.
+effect. Where an action is held for several samples, both choose it by what is believed at the first.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class SquareBelieved(FeedbackPolicy):
                 )
         phase = np.where(starts, 0.0, phase)
         wave = np.where(phase < 0.5, 1.0, -1.0)
-        following = (phase + SAMPLING_STEP * self.frequency(rows)) % 1.0
+        following = (phase + self.limits.hold * SAMPLING_STEP * self.frequency(rows)) % 1.0
         return self._actions(observation, rows, wave), following
 
 

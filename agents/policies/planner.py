@@ -66,8 +66,8 @@ class Planner:
         input_cost: nats for a V² of input energy.
 
     Raises:
-        ValueError: naming the argument, if there is no environment, it replays a record, a number is out of range, or
-            a goal or cost is asked of a plan of the whole episode.
+        ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
+            samples, a number is out of range, or a goal or cost is asked of a plan of the whole episode.
     """
 
     def __init__(
@@ -97,6 +97,11 @@ class Planner:
         if goal_std is not None and not 0 < goal_std < np.inf:
             raise ValueError(f"goal_std must be positive and finite, but is {goal_std!r}; None is no goal")
         experiment = env.experiment
+        if experiment.hold != 1:
+            raise ValueError(
+                f"env must take an action for every sample, as plans do, but its hold is {experiment.hold}; "
+                "make it with hold=1, or choose a learned policy or a signal"
+            )
         whole = experiment.max_rms is not None and horizon is None
         if whole and (goal_std is not None or input_cost):
             raise ValueError(

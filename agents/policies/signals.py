@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.policies.excitations import EXCITATIONS, Draw, draw_recorded
 
-# Samples already played, shape (n,), and actions, shape (n, samples), of each environment's signal.
+# Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
 SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 DEFAULT_MAX_INPUT = 0.15  # V; the largest input of the Silverbox record is 0.149 V
@@ -30,6 +30,7 @@ class Limits:
     Attributes:
         max_input: The input at action 1, in volts, positive.
         max_rms: The largest root mean square over an episode, in volts, positive; None where there is none.
+        hold: Samples that an action is applied for, at least 1.
 
     Raises:
         ValueError: `max_input` or `max_rms` is not positive and finite.
@@ -37,6 +38,7 @@ class Limits:
 
     max_input: float = DEFAULT_MAX_INPUT
     max_rms: float | None = None
+    hold: int = 1
 
     def __post_init__(self) -> None:
         for name, value in (("max_input", self.max_input), ("max_rms", self.max_rms)):
@@ -50,19 +52,23 @@ class Limits:
         to it as a whole, because the environment would otherwise play its beginning at full size and cut the rest
         to zero. It is never scaled up.
 
+        Where an action is applied for several samples, the input is what a slower generator makes of it: the first of
+        every `hold` samples, held. Frequencies stay what they are in Hz; those above half of the actions' rate fold.
+
         Args:
             volts: The input of an episode, or of a part that repeats, shape `(samples,)`.
 
         Returns:
-            Actions in [-1, 1], shape `(samples,)`.
+            Actions in [-1, 1], shape `(ceil(samples / hold),)`.
         """
-        actions = np.clip(volts / self.max_input, -1.0, 1.0)
+        held = np.repeat(volts[:: self.hold], self.hold)[: len(volts)]
+        actions = np.clip(held / self.max_input, -1.0, 1.0)
         if self.max_rms is not None:
             allowed = _WITHIN * self.max_rms / self.max_input
             rms = np.sqrt(np.mean(actions**2))
             if rms > allowed:
                 actions *= allowed / rms
-        return actions
+        return actions[:: self.hold]
 
 
 class SignalPolicy:
@@ -77,6 +83,7 @@ class SignalPolicy:
         limits: What every signal is fitted to.
         samples: The length of one draw. A signal that runs out before its episode ends is
             continued by the next draw.
+        actions: The number of actions that play it: fewer, where an action is held for several samples.
         seed: The seed that `reset` starts from.
     """
 
@@ -88,6 +95,7 @@ class SignalPolicy:
         max_input: float,
         max_rms: float | None = None,
         samples: int = DEFAULT_SAMPLES,
+        hold: int = 1,
         seed: int = 0,
     ) -> None:
         """Fits an excitation to the limits of an environment.
@@ -99,6 +107,7 @@ class SignalPolicy:
             max_input: The input at action 1, in volts, positive; the signal is clipped there.
             max_rms: The largest root mean square of a draw, in volts; see `Limits.fit`. None: no limit.
             samples: The length of one draw, at least 1.
+            hold: Samples that an action is applied for; see `Limits.fit`.
             seed: The seed of all the signals.
 
         Raises:
@@ -107,8 +116,9 @@ class SignalPolicy:
         if samples < 1:
             raise ValueError(f"samples must be 1 or more, but it is {samples}")
         self.name = name
-        self.limits = Limits(max_input, max_rms)
+        self.limits = Limits(max_input, max_rms, hold)
         self.samples = samples
+        self.actions = -(-samples // hold)
         self.seed = seed
         self._draw = draw
         self.reset()
@@ -165,12 +175,12 @@ class SignalPolicy:
             )
         rows = 1 if len(observed) == 1 else observed[0]
         if state is None:
-            position = np.full(rows, self.samples)
-            signals = np.empty((rows, self.samples), dtype=np.float32)
+            position = np.full(rows, self.actions)
+            signals = np.empty((rows, self.actions), dtype=np.float32)
         else:
             position, signals = state
             _check_rows("state", len(position), rows)
-        due = position == self.samples
+        due = position == self.actions
         if episode_start is not None:
             starts = np.atleast_1d(np.asarray(episode_start, dtype=bool))
             _check_rows("episode_start", len(starts), rows)
@@ -184,7 +194,7 @@ class SignalPolicy:
         return actions.reshape(*observed[:-1], 1), (position + 1, signals)
 
     def _next_signal(self, row: int) -> NDArray[np.float64]:
-        """The actions, shape `(samples,)`, of the next draw for environment `row`."""
+        """The actions, shape `(self.actions,)`, of the next draw for environment `row`."""
         missing = row + 1 - len(self._generators)
         if missing > 0:
             self._generators += map(np.random.default_rng, self._seeds.spawn(missing))
@@ -217,7 +227,9 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     recorded = getattr(env, "recorded_input", None)
     if recorded is not None and name.startswith("silverbox-"):
         draw, samples = draw_recorded(recorded), len(recorded)
-    return SignalPolicy(name, draw, max_input=limits.max_input, max_rms=limits.max_rms, samples=samples, seed=seed)
+    return SignalPolicy(
+        name, draw, max_input=limits.max_input, max_rms=limits.max_rms, samples=samples, hold=limits.hold, seed=seed
+    )
 
 
 def limits_of(env: Any) -> tuple[Limits, int]:
@@ -233,5 +245,6 @@ def limits_of(env: Any) -> tuple[Limits, int]:
             f"env must be an environment of duffing_env, which has max_input, but its unwrapped "
             f"type is {type(env).__name__}; pass env=None for a limit of {DEFAULT_MAX_INPUT} V"
         )
-    max_rms = getattr(getattr(env, "experiment", None), "max_rms", None)
-    return Limits(env.max_input, max_rms), getattr(env, "horizon", None) or DEFAULT_SAMPLES
+    experiment = getattr(env, "experiment", None)
+    limits = Limits(env.max_input, getattr(experiment, "max_rms", None), getattr(experiment, "hold", 1))
+    return limits, getattr(env, "horizon", None) or DEFAULT_SAMPLES

@@ -22,6 +22,9 @@ BAD = [
     ("spread", [0, -0.1, 1, 1.5, np.nan, None]),
     ("noise_shape", [0, -2, np.inf, np.nan]),
     ("plant_spread", [-0.1, 1, np.nan, "0.1", False]),
+    ("hold", [0, -1, 2.0, True, None, "2"]),
+    ("terminal", [0, 1, None, "yes"]),
+    ("terminated_return", [np.nan, np.inf, "-10", True]),
 ]
 BAD_REPLAY = [
     ("regime", ["sine", None, []]),
@@ -29,6 +32,7 @@ BAD_REPLAY = [
     ("input_delay", [2, -1, None]),
     ("nonlinear", ["no", 1, None]),
     ("as_published", ["yes", 0, True]),
+    ("hold", [2, 0, None]),
     ("max_input", [0, 0.12]),
 ]
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from duffing_env.layout import LAYOUT, N_ROWS
-from duffing_env.rewards import REWARDS, appraise, reward_number, settle
+from duffing_env.rewards import REWARDS, appraise, pay, reward_number, settle
 from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Belief, PhysicalParameters, Prior, to_coefficients
 from estimator.lanes import LANES
 from estimator.record import COEFFICIENTS, COVARIANCES, QUANTITIES, RECORD_SIZE
@@ -48,9 +48,12 @@ class Lanes:
         for lane in range(LANES):
             appraise(self.rows.reshape(-1), lane, SAMPLING_STEP, float(self.nonlinear), 0.0)
 
-    def settle(self, reward="information_gain", input_cost=0.0):
+    def settle(self, reward="information_gain", input_cost=0.0, terminal=False, terminated_return=None):
         settings = float(self.nonlinear), 0.0, float(REWARDS[reward]), input_cost
         settle(self.rows.reshape(-1), MAX_OUTPUT, float(HORIZON), SAMPLING_STEP, *settings)
+        forfeits = terminated_return is not None
+        if terminal or forfeits:
+            pay(self.rows.reshape(-1), float(terminal), float(forfeits), terminated_return or 0.0)
 
     @property
     def belief(self):
@@ -110,6 +113,9 @@ def test_a_step_is_worth_the_increase_by_the_named_measure(reward):
     lanes.set_coefficients(*random_belief(np.random.default_rng(1)))
     lanes["surprise"][:] = 1.25
     lanes["fisher_gain"][:] = 0.75
+    lanes["misfit"][:] = 0.3
+    if reward == "simulation_error":
+        lanes["error"][:] = 0.9
     after, truth = lanes.belief, lanes.truth
 
     def error(belief):
@@ -122,6 +128,8 @@ def test_a_step_is_worth_the_increase_by_the_named_measure(reward):
         "parameter_error": (error(before) - error(after)).mean(),
         "free_energy": -1.25,
         "fisher": 0.75,
+        "expected_free_energy": -1.25,
+        "simulation_error": 0.6,
     }
     lanes.settle(reward)
     np.testing.assert_allclose(lanes["reward"], worth[reward], rtol=1e-8)
@@ -180,6 +188,7 @@ def test_what_cannot_be_ends_the_episode_and_is_worth_nothing(reward):
         lanes = Lanes()
         lanes["elapsed"][:] = HORIZON - 1
         lanes["surprise"][:] = 2.0
+        lanes["misfit"][:] = 0.5
         before = lanes["log_det"][1], lanes["log_density"][1], lanes["error"][1]
         lanes[name][1] = value
         lanes.settle(reward)
@@ -192,11 +201,12 @@ def test_what_cannot_be_ends_the_episode_and_is_worth_nothing(reward):
         assert (lanes["log_det"][1], lanes["log_density"][1], lanes["error"][1]) == before, case
 
 
-@pytest.mark.parametrize("surprise", [np.nan, np.inf, -np.inf])
-def test_a_free_energy_that_is_not_finite_ends_the_episode(surprise):
+@pytest.mark.parametrize("told", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("reward", ["free_energy", "expected_free_energy"])
+def test_a_free_energy_that_is_not_finite_ends_the_episode(reward, told):
     lanes = Lanes()
-    lanes["surprise"][3] = surprise
-    lanes.settle("free_energy")
+    lanes["surprise"][3] = told
+    lanes.settle(reward)
     assert np.flatnonzero(lanes["diverged"]).tolist() == [3]
     np.testing.assert_array_equal(lanes["reward"], 0.0)
 
@@ -212,8 +222,49 @@ def test_an_action_off_the_record_ends_the_episode_and_is_worth_nothing():
     assert lanes["reward"][0] != 0.0
 
 
+def three_steps(**options):
+    """Rewards (3, LANES) of steps that are worth 1, 2 and 3, less a cost of ½; lane 1 is terminated by the last."""
+    lanes, told = Lanes(), []
+    lanes["elapsed"][:] = HORIZON - 3
+    lanes["u"][:] = 0.1
+    for worth in (1.0, 2.0, 3.0):
+        lanes["fisher_gain"][:] = worth
+        lanes["y"][1] = 0.7 if worth == 3.0 else 0.0
+        lanes.settle("fisher", input_cost=50.0, **options)
+        told.append(lanes["reward"].copy())
+    assert lanes["terminated"][:3].tolist() == [0, 1, 0]
+    assert lanes["truncated"][:3].tolist() == [1, 0, 1]
+    return np.array(told)
+
+
+def test_a_terminal_reward_is_the_sum_at_the_end():
+    dense, terminal = three_steps(), three_steps(terminal=True)
+    np.testing.assert_array_equal(terminal[:2], 0.0)
+    np.testing.assert_array_equal(terminal[2], dense[0] + dense[1] + dense[2])
+    np.testing.assert_allclose(terminal[2], 4.5, rtol=1e-14)
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+@pytest.mark.parametrize("worth", [-10.0, 0.0, 2.5])
+def test_an_episode_that_is_terminated_returns_what_was_said(worth, terminal):
+    kept, told = three_steps(terminal=terminal), three_steps(terminal=terminal, terminated_return=worth)
+    np.testing.assert_allclose(told.sum(axis=0)[1], worth, rtol=0, atol=1e-14)
+    told[2, 1] = kept[2, 1]
+    np.testing.assert_array_equal(told, kept)  # and nothing else is touched
+
+
+def test_an_episode_that_diverges_returns_what_was_said():
+    lanes = Lanes()
+    lanes["fisher_gain"][:] = 4.0
+    lanes.settle("fisher", terminated_return=-1.0)
+    lanes["x"][2] = np.nan
+    lanes.settle("fisher", terminated_return=-1.0)
+    assert lanes["diverged"].tolist() == [0, 0, 1] + [0] * (LANES - 3)
+    assert lanes["reward"][:4].tolist() == [4.0, 4.0, -5.0, 4.0]
+
+
 def test_rewards_by_name():
-    assert [reward_number(name) for name in REWARDS] == [0, 1, 2, 3, 4]
+    assert [reward_number(name) for name in REWARDS] == [0, 1, 2, 3, 4, 5, 6]
     with pytest.raises(ValueError, match="did you mean 'information_gain'"):
         reward_number("infomation_gain")
     for unknown in ("entropy!", None, 0, []):

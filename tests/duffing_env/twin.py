@@ -21,9 +21,32 @@ from estimator import (
 )
 from estimator.inference import continuous, free_energy
 from estimator.lanes import LANES
-from estimator.record import LAYOUT, N_ROWS
+from estimator.record import LAYOUT, N_ROWS, RECORD
 
 PARAMETERS = ("m", "c", "a", "b")
+JOINT = ("x0", "x1", "t1", "t2", "t3", "e")
+
+
+def multisine():
+    """The input of a free run in parts of the largest: 20 harmonics over 64 samples, Schroeder's phases, peak ½."""
+    waves = np.zeros(64)
+    for k in range(1, 21):
+        waves += np.cos(2 * np.pi * k * np.arange(64) / 64 - np.pi * k * (k - 1) / 20)
+    return 0.5 * waves / np.abs(waves).max()
+
+
+def misfit(believed, true):
+    """Error of a free run beside the true one, relative to its size, capped."""
+    with np.errstate(all="ignore"):
+        error = np.sqrt(((believed - true) ** 2).sum() / (true**2).sum())
+    return error if error < 1.0 else 1.0
+
+
+def joint_moments(belief):
+    """Means (6,) and covariance (6, 6) of x_t, x_{t-1}, θ, η from the record."""
+    told = dict(zip(RECORD, belief.record, strict=True))
+    cov = [[told.get(f"P_{a}_{b}", told.get(f"P_{b}_{a}")) for b in JOINT] for a in JOINT]
+    return np.array([told[name] for name in JOINT]), np.array(cov)
 
 
 class Stream:
@@ -117,7 +140,7 @@ class TwinEnv:
             self.truth = replace(self.truth, m=self.truth.m * self.jump_factor)
             self._know()
             self._worth = self._appraise()
-        fisher = self._fisher_gain()
+        fisher, expected = self._fisher_gain(), self._expected_gain()
         self._move()
         self._update()
         self.elapsed += 1
@@ -125,6 +148,7 @@ class TwinEnv:
         rewards = {name: self._worth[name] - before[name] for name in before}
         rewards["free_energy"] = -self.free_energy
         rewards["fisher"] = fisher
+        rewards["expected_free_energy"] = expected
         self.reported = dict(rewards)
         cost = self.input_cost * (self.u / self.max_input) ** 2
         rewards = {name: reward - cost for name, reward in rewards.items()}
@@ -154,6 +178,36 @@ class TwinEnv:
         before, self.ideal_cov = self.ideal_cov, cov - np.outer(gain, cov[0])
         return 0.5 * (np.linalg.slogdet(before[2:, 2:])[1] - np.linalg.slogdet(self.ideal_cov[2:, 2:])[1])
 
+    def _expected_gain(self):
+        """½ log det C less that after an output, whatever it is: a Kalman step with the noises as believed."""
+        belief = self.belief
+        (x, last_x, t1, t2, t3, _), cov = joint_moments(belief)
+        first_std = np.sqrt(np.diag(self.first_belief.coefficients_cov))
+        cov[2:, 2:] += np.diag((self.drift * first_std) ** 2)
+        direction = np.array([t1 + 3 * t2 * x**2, t3, x, x**3, last_x, self._input_of_the_model()])
+        c = cov @ direction
+        variance = direction @ c + 1 / belief.gamma_mean + 1 / belief.xi_mean
+        before, after = cov[2:, 2:], cov[2:, 2:] - np.outer(c[2:], c[2:]) / variance
+        scale = np.sqrt(np.outer(np.diag(before), np.diag(before)))
+        return 0.5 * (np.linalg.slogdet(before / scale)[1] - np.linalg.slogdet(after / scale)[1])
+
+    def _input_of_the_model(self):
+        return self.u
+
+    def _free_run(self, coefficients):
+        """x (64,) of the difference equation from rest under the test input."""
+        t1, t2, t3, e = np.float64(coefficients)
+        x, last_x, told = np.zeros(1), np.zeros(1), []
+        with np.errstate(all="ignore"):  # one that runs away
+            for u in self.max_input * multisine():
+                x, last_x = t1 * x + t2 * x**3 + t3 * last_x + e * u, x
+                told.append(x)
+        return np.concatenate(told)
+
+    def _true_coefficients(self):
+        psi = self.coefficients
+        return [psi.theta1, psi.theta2, psi.theta3, psi.eta]
+
     def _appraise(self):
         """What the belief is worth by each reward that is a difference: a step's reward is its increase."""
         mean, _ = self.belief.physical()
@@ -162,6 +216,9 @@ class TwinEnv:
             "information_gain": -self.belief.entropy(),
             "log_posterior": self.belief.log_prob(self.coefficients),
             "parameter_error": -np.minimum(np.abs(mean / truth - 1.0), 1.0).mean(),
+            "simulation_error": -misfit(
+                self._free_run(self.belief.coefficients_mean), self._free_run(self._true_coefficients())
+            ),
         }
 
     def observation(self):
@@ -213,6 +270,45 @@ class TwinContinuousEnv(TwinEnv):
 
     def _fisher_gain(self):
         return np.nan  # refused on this plant
+
+    def _input_of_the_model(self):
+        return self.last_u
+
+    def _expected_gain(self):
+        if self.kind != "ode":
+            return super()._expected_gain()
+        # Where the noises are known, what an update gives does not depend on the output.
+        block, before = self.block.copy(), self.belief.entropy()
+        for name in ("g_shape", "g_rate", "n_shape", "n_rate"):
+            block[LAYOUT[name]] *= 1e12
+        for name, value in (("last_u", self.last_u), ("u", self.u), ("y", 0.0)):
+            block[LAYOUT[name]] = value
+        continuous.update(block.reshape(-1), 1, continuous.SUBSTEPS)
+        return before - ContinuousBelief(block[: len(self.prior.record), 0]).entropy()
+
+    def _free_run(self, coefficients):
+        if self.kind != "ode":
+            return super()._free_run(coefficients)
+        stiffness, cubic, damping, gain = coefficients
+        state, told, last_u, h = np.zeros(2), [], 0.0, 0.5
+        for u in self.max_input * multisine():
+
+            def slope(tau, state, begin=last_u, end=u):
+                x, v = state
+                return np.array([v, gain * (begin + tau * (end - begin)) - stiffness * x - cubic * x**3 - damping * v])
+
+            for tau in (0.0, h):
+                k1 = slope(tau, state)
+                k2 = slope(tau + h / 2, state + h / 2 * k1)
+                k3 = slope(tau + h / 2, state + h / 2 * k2)
+                k4 = slope(tau + h, state + h * k3)
+                state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+                told.append(state[0])
+            last_u = u
+        return np.array(told)
+
+    def _true_coefficients(self):
+        return self.coefficients if self.kind == "ode" else super()._true_coefficients()
 
     @property
     def belief(self):

@@ -1,0 +1,57 @@
+"""The reward ``expected_free_energy``: what is promised before the outcome, beside what is then gained."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+SYSTEMS, SAMPLES = 256, 256
+
+
+def sums(track="duffing_env/Amplitude-v0", systems=SYSTEMS, samples=SAMPLES, **options):
+    """Sums (samples, systems) so far of promises and of information gains, with uniform inputs; NaN after the end."""
+    options = {"reward": "expected_free_energy", **options}
+    envs = gym.make_vec(track, num_envs=systems, vectorization_mode="vector_entry_point", **options)
+    envs.reset(seed=0)
+    rng, running = np.random.default_rng(0), np.ones(systems, dtype=bool)
+    promised, gained = np.full((2, samples, systems), np.nan)
+    for t in range(samples):
+        actions = rng.uniform(-1, 1, (systems, 1)).astype(np.float32)
+        _, rewards, terminated, truncated, infos = envs.step(actions)
+        promised[t, running], gained[t, running] = rewards[running], infos["information_gain"][running]
+        running &= ~(terminated | truncated)
+    return promised, gained
+
+
+KNOWN = {"noise_shape": 1e9, "horizon": 60}  # noises that are known, so that no outcome changes what it tells
+
+
+@pytest.mark.parametrize(
+    ("track", "options"),
+    [
+        ("duffing_env/Amplitude-v0", {}),
+        ("duffing_env/Continuous-v0", {}),
+        ("duffing_env/Continuous-v0", {"estimator": "nlarx"}),
+        ("duffing_env/Continuous-v0", {"max_slew": 0.02}),
+    ],
+)
+def test_what_is_promised_is_gained_where_the_noises_are_known(track, options):
+    promised, gained = sums(track, 8, 60, **KNOWN, **options)
+    seen = ~np.isnan(promised)
+    assert seen.sum() > 300
+    assert promised[seen].max() > 0.1
+    np.testing.assert_allclose(promised[seen], gained[seen], rtol=0, atol=1e-6)
+
+
+def test_a_promise_is_for_the_sample_and_not_for_what_drift_forgets():
+    promised, gained = sums(systems=8, samples=60, drift=0.01, **KNOWN)
+    assert (promised[~np.isnan(promised)] >= 0).all()
+    assert np.nansum(promised) > np.nansum(gained) + 8 * 0.5  # paid again for what was known already
+
+
+def test_promises_are_kept_on_average_by_calibrated_beliefs_only():
+    promised, gained = (np.nansum(told, axis=0) for told in sums())
+    assert promised.mean() == pytest.approx(17.79, abs=0.01)  # the figures of `duffing_env.rewards`
+    assert abs((promised - gained).mean()) < 0.05
+    promised, gained = (np.nansum(told, axis=0) for told in sums(factorisation="mean_field"))
+    assert promised.mean() == pytest.approx(10.9, abs=0.05)
+    assert gained.mean() == pytest.approx(16.5, abs=0.05)
