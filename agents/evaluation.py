@@ -80,8 +80,8 @@ def evaluate(
     outputs, need a simulated plant whose truth stays as it is; what is measured by free runs or in samples of the
     Silverbox regime, the difference equation. The arrow error is that of the difference equation identified on the
     track's twin (``plant_spread=0``) in a free run over the real arrow record; it is left out without the record, and
-    for the differential equation: the simulated plant has no offsets, and those of the circuit, 8 mV at the input, would
-    be nearly all of its error (5.3 mV for the twin itself).
+    for the differential equation: the simulated plant has no offsets, and those of the circuit, 8 mV at the input,
+    would be nearly all of its error (5.3 mV for the twin itself).
 
     Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the
     entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.
