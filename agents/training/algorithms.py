@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 # Hyperparameters by what they may be; whole numbers that are not named here are at least 1.
-_FROM_ZERO = ("learning_starts", "exploration_noise", "weight_decay", "dropped_quantiles")
+_FROM_ZERO = ("learning_starts", "exploration_noise", "dropped_quantiles")
 _POSITIVE = ("learning_rate", "entropy_weight")
 _SHARES = ("gamma", "gae_lambda", "tau")
 
@@ -233,8 +233,6 @@ class TD3Settings(OffPolicySettings):
 
     exploration_noise: float = 0.2
     """Standard deviation of the noise on the action while samples are collected."""
-    weight_decay: float = 1e-3
-    """Decay of the weights (in Adam's gradient); without it the actor saturates, where it has no gradient left."""
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """Stable-Baselines3's TD3."""
@@ -243,9 +241,7 @@ class TD3Settings(OffPolicySettings):
         from stable_baselines3.common.noise import NormalActionNoise
 
         noise = NormalActionNoise(np.zeros(1), np.full(1, self.exploration_noise))
-        arguments = self._off_policy(envs, seed)
-        arguments["policy_kwargs"]["optimizer_kwargs"] = {"weight_decay": self.weight_decay}
-        return TD3("MlpPolicy", action_noise=noise, **arguments)
+        return TD3("MlpPolicy", action_noise=noise, **self._off_policy(envs, seed))
 
     @classmethod
     def suggest(cls, trial: Any) -> dict[str, Any]:
