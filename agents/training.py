@@ -13,7 +13,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.analytic_gradient import AscentSettings, ascend_policy
 from agents.cli import JsonOptions
+from agents.imitation import ImitationSettings, imitate
 from agents.policies.learned import save_policy
 from estimator.files import write_atomically
 
@@ -70,7 +72,7 @@ class TrainConfig:
     reward: str = "information_gain"
     """Name of the reward: information_gain, log_posterior, parameter_error, fisher or free_energy."""
     steps: int = 5_000_000
-    """Samples to train on, over all environments."""
+    """Samples to train on with PPO, over all environments; 0 for none, after imitation or ascent."""
     seed: int = 0
     """Seed of systems, noise, weights and exploration; the same seed gives the same policy."""
     options: JsonOptions = field(default_factory=dict)
@@ -83,11 +85,16 @@ class TrainConfig:
     """Threads of torch; it moves the last digits. More than one gain little, and lose much on a busy machine."""
     ppo: PPOSettings = field(default_factory=PPOSettings)
     """Hyperparameters of PPO."""
+    imitation: ImitationSettings = field(default_factory=ImitationSettings)
+    """What the network learns from a teacher, first of all."""
+    ascent: AscentSettings = field(default_factory=AscentSettings)
+    """How far it then climbs by exact derivatives, before PPO."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "checkpoints", "torch_threads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")
+        least = 0 if self.imitation.labels or self.ascent.updates else 1
+        for name, lowest in (("steps", least), ("checkpoints", 1), ("torch_threads", 1)):
+            if getattr(self, name) < lowest:
+                raise ValueError(f"{name} must be at least {lowest}, but is {getattr(self, name)}")
         if "reward" in self.options:
             raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
 
@@ -159,9 +166,12 @@ def train(config: TrainConfig) -> Run:
             checkpoints += 1
             save(folder / "checkpoints" / f"{steps:09d}")
 
+    imitate(model, config.env, config.options, config.imitation, config.seed)
+    ascend_policy(model, config.env, config.options, config.ascent, config.seed)
     with closing(configure(str(folder), ["csv"])) as logger:
         model.set_logger(logger)
-        _learn(model, config.steps, on_update)
+        if config.steps:
+            _learn(model, config.steps, on_update)
     save(folder)
     draw_learning_curve(folder / "learning_curve.png", curve, config.reward)
     envs.close()
