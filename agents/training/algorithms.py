@@ -7,8 +7,12 @@ batches, few gradient steps. `agents/hyperparameters/ALGORITHM.toml` has what di
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
+
+from agents.analytic_gradient import AscentSettings, ascend_policy
+from agents.imitation import ImitationSettings, imitate
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -55,6 +59,16 @@ class AlgorithmSettings(ABC):
     @abstractmethod
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """A model with these hyperparameters; ValueError where its package is not installed."""
+
+    @property
+    def has_start(self) -> bool:
+        """Whether a new model is taught anything before it learns by itself."""
+        return False
+
+    def start(  # noqa: B027  most algorithms have none
+        self, model: Any, env_id: str, options: dict[str, Any], seed: int, on_progress: Callable[[str], None]
+    ) -> None:
+        """Teach a new model what it is to know before it learns by itself."""
 
     @classmethod
     @abstractmethod
@@ -122,6 +136,30 @@ class OnPolicySettings(AlgorithmSettings):
 @dataclass(frozen=True)
 class PPOSettings(OnPolicySettings):
     """Hyperparameters of PPO; chosen for a batched environment: large batches, few epochs."""
+
+    imitation: ImitationSettings = field(default_factory=ImitationSettings)
+    """What the network learns from a teacher, first of all."""
+    ascent: AscentSettings = field(default_factory=AscentSettings)
+    """How far it then climbs by exact derivatives, before PPO."""
+
+    @property
+    def has_start(self) -> bool:
+        """Whether there is imitation or ascent."""
+        return self.imitation.labels > 0 or self.ascent.updates > 0
+
+    def start(
+        self, model: Any, env_id: str, options: dict[str, Any], seed: int, on_progress: Callable[[str], None]
+    ) -> None:
+        """Imitation, then ascent."""
+
+        def on_labels(labels: int, error: float) -> None:
+            on_progress(f"Imitation: {labels:,} of {self.imitation.labels:,} labels, mean squared error {error:.3f}")
+
+        def on_ascent(update: int, gain: float) -> None:
+            on_progress(f"Ascent: {update} of {self.ascent.updates} updates, {gain:.2f} nat of Fisher information")
+
+        imitate(model, env_id, options, self.imitation, seed, on_labels)
+        ascend_policy(model, env_id, options, self.ascent, seed, on_ascent)
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """Stable-Baselines3's PPO."""

@@ -6,7 +6,7 @@ import difflib
 import json
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +17,7 @@ from estimator.files import write_atomically
 FILES = Path(__file__).parents[1] / "hyperparameters"
 DEFAULT = "default"
 
-Settings = TypeVar("Settings", bound=AlgorithmSettings)
+Settings = TypeVar("Settings")
 
 
 def track_of(env_id: str) -> str:
@@ -55,7 +55,7 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
     Raises:
         ValueError: for an entry that is no field, or whose value has another type.
     """
-    defaults: dict[str, Any] = {f.name: f.default for f in fields(kind)}
+    defaults: dict[str, Any] = {f.name: getattr(kind(), f.name) for f in fields(kind)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     for name, value in entries.items():
         if name not in defaults:
@@ -65,8 +65,11 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
             value = float(value)
         if wanted is tuple and isinstance(value, list) and all(type(units) is int for units in value):
             value = tuple(value)
+        if is_dataclass(wanted) and isinstance(value, dict):
+            value = settings_of(wanted, value)
         if type(value) is not wanted:
-            kinds = {int: "a whole number", float: "a number", tuple: "a list of whole numbers"}
+            kinds = {int: "a whole number", float: "a number", tuple: "a list of whole numbers", str: "a name"}
+            kinds.setdefault(wanted, "a table")
             raise ValueError(f"{name} must be {kinds[wanted]}, but is {value!r}")
         values[name] = value
     return kind(**values)
@@ -75,7 +78,9 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
 def write_settings(path: Path, env_id: str, settings: AlgorithmSettings, comment: str) -> None:
     """Write a file that `read_settings` reads, with these hyperparameters for this track."""
     lines = [f"# {comment}", f'["{track_of(env_id)}"]']
-    lines += [f"{name} = {json.dumps(value)}" for name, value in as_written(settings).items()]
+    for name, value in as_written(settings).items():
+        entries = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
+        lines += [f"{key} = {json.dumps(each)}" for key, each in entries.items()]
     write_atomically(path, "\n".join(lines) + "\n")
 
 

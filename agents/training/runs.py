@@ -54,7 +54,7 @@ class TrainConfig(Subject):
     reward: str = "information_gain"
     """Name of the reward: information_gain, log_posterior, parameter_error, fisher or free_energy."""
     steps: int = 5_000_000
-    """Samples to train on, over all environments."""
+    """Samples to learn from, over all environments; 0 for none, after imitation or ascent."""
     seed: int = 0
     """Seed of systems, noise, weights and exploration; the same seed gives the same policy."""
     options: JsonOptions = field(default_factory=dict)
@@ -73,7 +73,7 @@ class TrainConfig(Subject):
     """Hyperparameters; those that the file has for the track where they are not given."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "checkpoints", "torch_threads"):
+        for name in ("checkpoints", "torch_threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")
         if self.eval_every < 0:
@@ -90,6 +90,9 @@ class TrainConfig(Subject):
                 f"hyperparameters must be {ALGORITHMS[self.algo].__name__} for {self.algo}, "
                 f"but are {type(self.hyperparameters).__name__}"
             )
+        least = 0 if self.hyperparameters.has_start else 1
+        if self.steps < least:
+            raise ValueError(f"steps must be at least {least}, but is {self.steps}")
 
 
 @dataclass(frozen=True)
@@ -200,13 +203,24 @@ class _Training:
             logs.append(self._board)
         with closing(Logger(str(self._folder), logs)) as logger:
             self._model.set_logger(logger)
-            self._learn()
+            if self._progress.steps == 0:
+                self._start()
+            if self._config.steps:
+                self._learn()
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
         draw_learning_curve(self._folder / "learning_curve.png", curve, self._config.reward)
         save_policy(self._folder, self._model, self._card())
         drop_states(self._folder)
         self._envs.close()
         return Run(self._config, self._folder, curve, self._seconds())
+
+    def _start(self) -> None:
+        """Teach the new model what its settings have for it."""
+        from rich.console import Console
+
+        config = self._config
+        with Console().status("Compiling") as status:
+            config.hyperparameters.start(self._model, config.env, config.options, config.seed, status.update)
 
     def _learn(self) -> None:
         """Learn with a progress bar."""
@@ -256,7 +270,8 @@ class _Training:
 
     def _due_checkpoints(self) -> int:
         """How many checkpoints there should be by now."""
-        return min(self._model.num_timesteps, self._config.steps) * self._config.checkpoints // self._config.steps
+        done = min(self._model.num_timesteps, self._config.steps)
+        return done * self._config.checkpoints // max(1, self._config.steps)
 
     def _card(self) -> dict[str, Any]:
         return {"algorithm": self._config.algo, "steps": self._model.num_timesteps, **self._description}
