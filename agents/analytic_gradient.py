@@ -115,7 +115,7 @@ def ascend_policy(
         )
     actor, rng = Actor(model), np.random.default_rng([seed, 2])
     envs.reset(seed=seed)
-    prior = np.linalg.inv(envs.belief(0).coefficients_cov)
+    prior = np.linalg.inv(envs.belief(0).coefficients_cov).astype(np.float64)
     optimiser = torch.optim.Adam(actor.parameters, settings.learning_rate, betas=(0.9, 0.99))
     with actor.standardised(_roll_out(envs, actor.act).observations) as standard:
         for k in range(settings.updates):
