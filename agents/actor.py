@@ -60,12 +60,12 @@ class Actor:
         mean, std = torch.from_numpy(standard.mean), torch.from_numpy(standard.std)
         weight, bias = self.parameters[:2]
         with torch.no_grad():
-            bias += weight @ mean
-            weight *= std
+            bias.add_(weight @ mean)
+            weight.mul_(std)
         yield standard
         with torch.no_grad():
-            weight /= std
-            bias -= weight @ mean
+            weight.div_(std)
+            bias.sub_(weight @ mean)
 
 
 class Standard:
