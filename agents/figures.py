@@ -174,6 +174,8 @@ def draw_study(path: Path, results: dict[str, dict[str, Any]], measures: dict[st
         axes.grid(alpha=0.3, axis="x")
         if metric.center[0] == "median":  # errors, which span decades
             axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter("")
     for axes in panels[:, 0]:
         axes.set_yticks(range(len(results)), list(results))
     panels[0, 0].invert_yaxis()
