@@ -172,6 +172,10 @@ def draw_study(path: Path, results: dict[str, dict[str, Any]], measures: dict[st
             axes.plot(metric.scale * next(iter(entry.values())), row, "o", color=colour, markersize=5)
         axes.set_xlabel(metric.title)
         axes.grid(alpha=0.3, axis="x")
+        if metric.center[0] == "median":  # errors, which span decades
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter("")
     for axes in panels[:, 0]:
         axes.set_yticks(range(len(results)), list(results))
     panels[0, 0].invert_yaxis()
