@@ -148,7 +148,7 @@ def judge(
 
 
 @jit
-def load(W, record):
+def fill(W, record):
     """Put a belief into every lane."""
     for place in range(len(_LOADED)):
         value = record[_LOADED[place, 0]]
@@ -160,7 +160,7 @@ def load(W, record):
 
 
 @jit
-def unload(W, record):
+def collect(W, record):
     """Take the belief of the first lane."""
     for place in range(len(_LOADED)):
         record[_LOADED[place, 0]] = W[_LOADED[place, 1] * LANES]

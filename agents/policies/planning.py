@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from agents.design import half_log_det
-from agents.policies.imagination import SCORE, SIZE, X0, X1, U, advance, appraise, load, precision, unload
+from agents.policies.imagination import SCORE, SIZE, X0, X1, U, advance, appraise, collect, fill, precision
 from duffing_env.noise import draw, to_unit
 from estimator.lanes import LANES, jit, kernel
 
@@ -74,10 +74,10 @@ def play(record, first, horizon, rounds, terms, u, words):
             last = u[t - 1] if t > 0 else 0.0
             _search(memory, record, left, min(horizon, left), rounds, terms, last, best, rate, words)
             u[t] = best[0]
-        load(W, record)
+        fill(W, record)
         W[U : U + LANES] = u[t]
         advance(W, record, terms)
-        unload(W, record)
+        collect(W, record)
 
 
 @jit
@@ -131,7 +131,7 @@ def _find_way(ways, continued, origins, inputs, record, left, steps, terms, last
     """Build a plan (steps,) by the best ways into the cells of the map, which is laid anew at random every time."""
     best, ends = np.empty(_CELLS * _CELLS), np.empty(_CELLS * _CELLS, np.int64)
     right, up = uniform(words), uniform(words)
-    load(ways[0], record)
+    fill(ways[0], record)
     ways[0, U : U + LANES] = last
     count = 1
     for h in range(steps):
@@ -208,7 +208,7 @@ def _bound(candidate, steps, last, terms):
 @jit
 def _follow(W, record, candidates, steps, terms):
     """Imagine the candidates (LANES, horizon) from a belief on, or one for all lanes."""
-    load(W, record)
+    fill(W, record)
     for h in range(steps):
         for j in range(LANES):
             W[U + j] = candidates[j % len(candidates), h]
@@ -219,7 +219,7 @@ def _follow(W, record, candidates, steps, terms):
 def _refresh(W, record, best, steps, terms, rate):
     """Let the information per sample of a plan into the running mean; the first one is taken as it is."""
     before, after = np.empty((4, 4)), np.empty((4, 4))
-    load(W, record)
+    fill(W, record)
     precision(W, before)
     _follow(W, record, best.reshape(1, -1), steps, terms)
     precision(W, after)

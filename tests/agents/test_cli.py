@@ -20,7 +20,9 @@ DECLARED = {
     "train.py": [("train.py", "Config", ""), ("agents/training/runs.py", "Subject", ""),
                  ("agents/training/runs.py", "TrainConfig", ""),
                  ("agents/training/algorithms.py", "AlgorithmSettings", "ppo."),
-                 ("agents/training/algorithms.py", "OnPolicySettings", "ppo.")],
+                 ("agents/training/algorithms.py", "OnPolicySettings", "ppo."),
+                 ("agents/imitation.py", "ImitationSettings", "ppo.imitation."),
+                 ("agents/analytic_gradient.py", "AscentSettings", "ppo.ascent.")],
     "evaluate.py": [("evaluate.py", "Config", "")],
 }  # fmt: skip
 
@@ -67,7 +69,8 @@ def test_help_explains_every_option(name):
     finished = command(name, "--help")
     assert finished.returncode == 0, finished.stderr
     assert finished.stderr == ""
-    lines = [line.strip("│ ") for line in finished.stdout.splitlines()]
+    columns = [line.split("││") for line in finished.stdout.splitlines()]
+    lines = [cells[k].strip("│ ") for k in (0, 1) for cells in columns if len(cells) > k]
     explained = 0
     for file, cls, prefix in DECLARED[name]:
         for option, explanation in declared_options(file, cls):
@@ -79,7 +82,7 @@ def test_help_explains_every_option(name):
             assert explanation in here, flag
             assert "(default: " in here, flag
             explained += 1
-    assert explained == {"train.py": 24, "evaluate.py": 7}[name]
+    assert explained == {"train.py": 39, "evaluate.py": 7}[name]
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from agents.evaluation import evaluate
 from agents.imitation import ImitationSettings
 from agents.leaderboard import summarise
 from agents.training import PPOSettings, TrainConfig, train
+from agents.training.hyperparameters import settings_of
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SMALL = PPOSettings(num_envs=64, n_steps=64, batch_size=1024, hidden=(16,))
@@ -84,8 +85,7 @@ def test_the_configuration_can_rebuild_the_run(runs, tmp_path):
     assert set(description) == {"config", "command", "versions"}
     settings = description["config"]
     assert settings.pop("output") == str(runs["first"].folder)
-    settings["hyperparameters"]["hidden"] = tuple(settings["hyperparameters"]["hidden"])
-    settings["hyperparameters"] = PPOSettings(**settings["hyperparameters"])
+    settings["hyperparameters"] = settings_of(PPOSettings, settings["hyperparameters"])
     rebuilt = TrainConfig(**settings, output=tmp_path / "rebuilt")
     assert replace(rebuilt, output=None) == TrainConfig(steps=20_000, seed=0, torch_threads=1, hyperparameters=SMALL)
     assert description["command"][1:] == sys.argv[1:]
