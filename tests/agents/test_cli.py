@@ -3,6 +3,7 @@
 import ast
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -69,7 +70,7 @@ def test_help_explains_every_option(name):
     finished = command(name, "--help")
     assert finished.returncode == 0, finished.stderr
     assert finished.stderr == ""
-    columns = [line.split("││") for line in finished.stdout.splitlines()]
+    columns = [re.split("[│╮╯]│", line) for line in finished.stdout.splitlines()]
     lines = [cells[k].strip("│ ") for k in (0, 1) for cells in columns if len(cells) > k]
     explained = 0
     for file, cls, prefix in DECLARED[name]:
