@@ -35,19 +35,23 @@ class Actor:
 
     def __init__(self, model: OnPolicyAlgorithm) -> None:
         policy: Any = model.policy
+        levels = int(getattr(policy.action_space, "n", 0))
+        self._levels = torch.linspace(-1.0, 1.0, levels) if levels else None
         self._network = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
         self.parameters = list(self._network.parameters())
 
     def __call__(self, observations: torch.Tensor) -> torch.Tensor:
         """Means (n,) of the action, not clipped, for observations (n, features)."""
-        means: torch.Tensor = self._network(observations)[:, 0]
-        return means
+        outputs: torch.Tensor = self._network(observations)
+        return outputs[:, 0] if self._levels is None else outputs.softmax(dim=1) @ self._levels
 
     def act(self, observations: FloatArray) -> FloatArray:
-        """The same in NumPy, without a gradient."""
+        """The means, or the likeliest of some levels, in NumPy and without a gradient."""
         with torch.no_grad():
-            means: FloatArray = self(torch.from_numpy(observations)).numpy()
-        return means
+            outputs = self._network(torch.from_numpy(observations))
+            actions = outputs[:, 0] if self._levels is None else self._levels[outputs.argmax(dim=1)]
+        found: FloatArray = actions.numpy()
+        return found
 
     @contextmanager
     def standardised(self, observations: FloatArray) -> Iterator[Standard]:

@@ -27,10 +27,11 @@ class DuffingVecEnv(VecEnv):
         env_id: a registered track.
         num_envs: number of rows.
         seed: of the batch; the next reset uses it.
+        levels: an action is one of so many evenly spaced inputs from -1 to 1, by its number; 0: any input between.
         options: of the environment, and ``threads``.
     """
 
-    def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **options: Any) -> None:
+    def __init__(self, env_id: str, num_envs: int, seed: int | None = None, *, levels: int = 0, **options: Any) -> None:
         made = gym.make_vec(
             env_id,
             num_envs=num_envs,
@@ -41,7 +42,9 @@ class DuffingVecEnv(VecEnv):
         assert isinstance(made, DuffingVectorEnv)
         self.envs = made
         self.render_mode = None
-        super().__init__(num_envs, made.single_observation_space, made.single_action_space)
+        self._levels = np.linspace(-1.0, 1.0, levels, dtype=np.float32) if levels else None
+        action_space = gym.spaces.Discrete(levels) if levels else made.single_action_space
+        super().__init__(num_envs, made.single_observation_space, action_space)
         self._seed_of_batch = seed
         self._actions = np.zeros((num_envs, 1), dtype=np.float32)
         self._returns = np.zeros(num_envs)
@@ -64,7 +67,7 @@ class DuffingVecEnv(VecEnv):
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Take the actions of the next `step_wait`."""
-        self._actions = actions
+        self._actions = actions if self._levels is None else self._levels[actions][:, None]
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows; rows that finish start their next episode."""

@@ -45,6 +45,8 @@ class Network:
         squashed: whether the action is the tanh of the last layer, or else its clipped value.
         spread: name of the log standard deviation: a tensor, or a layer beside the last one; None for none.
         memory: name of the LSTM before the layers; None for none.
+        levels: evenly spaced actions from -1 to 1, of which the last layer has the log probabilities, up to a constant;
+            0 where it has the action itself.
     """
 
     layers: tuple[str, ...]
@@ -52,6 +54,7 @@ class Network:
     squashed: bool = False
     spread: str | None = "log_std"
     memory: str | None = None
+    levels: int = 0
 
 
 class LearnedPolicy:
@@ -75,6 +78,7 @@ class LearnedPolicy:
 
         self.card = card
         self._squashed = network.squashed
+        self._levels = np.linspace(-1.0, 1.0, network.levels, dtype=np.float32) if network.levels else None
         self._activation = _ACTIVATIONS[network.activation]
         self._layers = [layer(name) for name in network.layers]
         self._memory = None if network.memory is None else _Memory(network.memory, tensors)
@@ -106,6 +110,10 @@ class LearnedPolicy:
             hidden = self._activation(hidden @ weight.T + bias)
         weight, bias = self._layers[-1]
         action = hidden @ weight.T + bias
+        if self._levels is not None:
+            if not deterministic:
+                action += self._rng.gumbel(size=action.shape).astype(np.float32)  # the largest is then a random one
+            return self._levels[action.argmax(axis=-1)][..., None], state
         if not deterministic and self._spread is not None:
             action += np.exp(self._log_std(hidden)) * self._rng.standard_normal(action.shape, dtype=np.float32)
         return np.tanh(action) if self._squashed else np.clip(action, -1.0, 1.0), state
@@ -177,7 +185,10 @@ def _network_of(policy: Any, tensors: Mapping[str, Any]) -> Network:
     activation = policy.activation_fn.__name__.lower()
     if hasattr(policy, "mlp_extractor"):  # PPO and RecurrentPPO
         memory = "lstm_actor" if hasattr(policy, "lstm_actor") else None
-        return Network((*layers("mlp_extractor.policy_net"), "action_net"), activation, memory=memory)
+        levels = int(getattr(policy.action_space, "n", 0))
+        spread = None if levels else "log_std"
+        names = (*layers("mlp_extractor.policy_net"), "action_net")
+        return Network(names, activation, spread=spread, memory=memory, levels=levels)
     if "actor.log_std.weight" in tensors:  # SAC and TQC
         return Network((*layers("actor.latent_pi"), "actor.mu"), activation, squashed=True, spread="actor.log_std")
     return Network(layers("actor.mu"), activation, squashed=True, spread=None)  # TD3

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from agents.analytic_gradient import AscentSettings, ascend_policy
 from agents.imitation import ImitationSettings, imitate
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 # Hyperparameters by what they may be; whole numbers that are not named here are at least 1.
-_FROM_ZERO = ("learning_starts", "exploration_noise", "dropped_quantiles")
+_FROM_ZERO = ("learning_starts", "exploration_noise", "dropped_quantiles", "levels")
 _POSITIVE = ("learning_rate", "entropy_weight")
 _SHARES = ("gamma", "gae_lambda", "tau")
 
@@ -38,6 +38,9 @@ class AlgorithmSettings(ABC):
     """Discount factor."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
+
+    #: Evenly spaced inputs from -1 to 1 that the policy chooses from; 0 for all between.
+    levels: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -100,10 +103,14 @@ class OnPolicySettings(AlgorithmSettings):
     gae_lambda: float = 0.95
     """Trade-off of bias and variance in the advantage (generalised advantage estimation)."""
     log_std_init: float = -0.5
-    """Log standard deviation of the action at the start."""
+    """Log standard deviation of the action at the start, where it is not one of some levels."""
+    levels: int = 0
+    """Evenly spaced inputs from one limit to the other that the policy chooses from; 0 for all between."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.levels == 1:
+            raise ValueError("levels must be 0 or at least 2, but is 1; there is nothing to choose from one")
         if self.batch_size == 1 or self.num_envs * self.n_steps == 1:
             raise ValueError("batch_size and num_envs * n_steps must be at least 2; PPO normalises over a batch")
 
@@ -129,7 +136,8 @@ class OnPolicySettings(AlgorithmSettings):
             "n_steps": self.n_steps,
             "n_epochs": self.n_epochs,
             "gae_lambda": self.gae_lambda,
-            "policy_kwargs": {"net_arch": list(self.hidden), "log_std_init": self.log_std_init},
+            "policy_kwargs": {"net_arch": list(self.hidden)}
+            | ({} if self.levels else {"log_std_init": self.log_std_init}),
         }
 
 
@@ -141,6 +149,11 @@ class PPOSettings(OnPolicySettings):
     """What the network learns from a teacher, first of all."""
     ascent: AscentSettings = field(default_factory=AscentSettings)
     """How far it then climbs by exact derivatives, before PPO."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.levels and self.ascent.updates:
+            raise ValueError(f"levels must be 0 for ascent, but is {self.levels}; a choice has no derivative")
 
     @property
     def has_start(self) -> bool:

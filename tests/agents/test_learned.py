@@ -23,13 +23,12 @@ from agents.vec_env import DuffingVecEnv
 FEATURES = 22
 
 
-def make_model(hidden=(16, 8), algo="ppo", log_std=-0.5):
+def make_model(hidden=(16, 8), algo="ppo", log_std=-0.5, **settings):
     """A model with random weights, so large that tanh and clipping matter."""
     if algo in ("tqc", "recurrent_ppo"):
         pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed; it is the extra contrib")
-    model = ALGORITHMS[algo](num_envs=2, batch_size=64, hidden=hidden).make(
-        DuffingVecEnv("duffing_env/Amplitude-v0", 2), seed=0
-    )
+    found = ALGORITHMS[algo](num_envs=2, batch_size=64, hidden=hidden, **settings)
+    model = found.make(DuffingVecEnv("duffing_env/Amplitude-v0", 2, levels=found.levels), seed=0)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for name, parameter in model.policy.named_parameters():
@@ -91,6 +90,29 @@ def test_every_algorithm_is_played_as_stable_baselines_plays_it(tmp_path, algo, 
     np.testing.assert_allclose(single, actions[0][0], rtol=0, atol=2e-6)
     saturated, _ = policy.predict(1e4 * observations[0], deterministic=False)
     assert np.abs(saturated).max() <= 1
+
+
+@pytest.mark.parametrize("algo", ["ppo", "recurrent_ppo"])
+def test_a_choice_of_levels_is_that_of_stable_baselines(tmp_path, algo):
+    folder, model = saved(tmp_path, algo=algo, levels=5)
+    policy = load_policy(folder)
+    levels = np.linspace(-1, 1, 5, dtype=np.float32)
+    observations = random_observations()
+    numbers, _ = model.predict(observations, deterministic=True)
+    actions, _ = policy.predict(observations, deterministic=True)
+    assert len(set(numbers.tolist())) == 5
+    np.testing.assert_array_equal(actions, levels[numbers][:, None])
+    np.testing.assert_array_equal(policy.predict(observations[0], deterministic=True)[0], actions[0])
+    if algo == "recurrent_ppo":
+        return
+    n = 20_000
+    drawn, _ = policy.predict(np.repeat(observations[:1], n, axis=0))
+    with torch.no_grad():
+        odds = model.policy.get_distribution(torch.from_numpy(observations[:1])).distribution.probs[0].numpy()
+    shares = (drawn == levels).mean(axis=0)
+    assert (np.abs(shares - odds) <= 4 * np.sqrt(odds * (1 - odds) / n) + 1e-6).all()
+    again, _ = load_policy(folder).predict(np.repeat(observations[:1], n, axis=0))
+    np.testing.assert_array_equal(again, drawn)
 
 
 def test_a_memory_is_forgotten_where_an_episode_starts(tmp_path):

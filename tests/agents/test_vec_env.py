@@ -170,6 +170,16 @@ def parameters(model):
     return np.concatenate([value.detach().numpy().ravel() for value in model.policy.parameters()])
 
 
+def test_an_action_by_its_number_is_that_input():
+    chosen, free = (DuffingVecEnv("duffing_env/Amplitude-v0", 3, seed=1, levels=levels) for levels in (5, 0))
+    assert chosen.action_space == gym.spaces.Discrete(5)
+    np.testing.assert_array_equal(chosen.reset(), free.reset())
+    for numbers in ([0, 1, 2], [3, 4, 0]):
+        actions = np.linspace(-1, 1, 5, dtype=np.float32)[numbers][:, None]
+        for one, other in zip(chosen.step(np.array(numbers))[:3], free.step(actions)[:3], strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
 def test_ppo_learns_on_it():
     envs = DuffingVecEnv(TRACK, 8, seed=0, **OPTIONS)
     model = PPO("MlpPolicy", envs, n_steps=64, batch_size=128, policy_kwargs={"net_arch": [8]}, seed=0, device="cpu")
