@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numba import prange
 
-from duffing_env import expectation, fisher, simulation
 from duffing_env.layout import ENDED, LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OSCILLATOR, SETTINGS, SUMMED
 from duffing_env.observation import observe
 from duffing_env.oscillator import draw_jump, draw_oscillator, jump_mass
@@ -169,6 +169,10 @@ def _compiled(plant: str, estimator: str, worked: str) -> Kernel:
     # Constants to the compiler, which leaves out what they make idle.
     is_fisher, is_free_energy = worked == "fisher", worked == "free_energy"
     is_expected, is_simulation = worked == "expected_free_energy", worked == "simulation_error"
+    # Nobody waits for what another reward needs.
+    fisher: Any = import_module("duffing_env.fisher") if is_fisher else None
+    expectation: Any = import_module("duffing_env.expectation") if is_expected else None
+    simulation: Any = import_module("duffing_env.simulation") if is_simulation else None
     # Eq. (2) takes the input at x_t. Between two actions of the plant ``sde`` that is the last one.
     takes_last_input = plant == "sde" and estimator != "ode"
     continuous = 1.0 if estimator == "ode" else 0.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from agents.analytic_gradient import AscentSettings, ascend_policy
 from agents.imitation import ImitationSettings, imitate
@@ -38,9 +38,6 @@ class AlgorithmSettings(ABC):
     """Discount factor."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
-
-    #: Evenly spaced inputs from -1 to 1 that the policy chooses from; 0 for all between.
-    levels: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}

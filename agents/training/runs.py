@@ -177,9 +177,13 @@ class _Training:
         self._clock -= self._progress.seconds
         begun = self._progress.steps
         seed = int(np.random.SeedSequence((config.seed, begun)).generate_state(1)[0]) if begun else config.seed
-        found = config.hyperparameters
         self._envs = DuffingVecEnv(
-            config.env, found.num_envs, seed=seed, levels=found.levels, reward=config.reward, **config.options
+            config.env,
+            config.hyperparameters.num_envs,
+            seed=seed,
+            levels=getattr(config.hyperparameters, "levels", 0),
+            reward=config.reward,
+            **config.options,
         )
         self._model = config.hyperparameters.make(self._envs, seed)
         if checkpoint is not None:

@@ -28,7 +28,7 @@ def make_model(hidden=(16, 8), algo="ppo", log_std=-0.5, **settings):
     if algo in ("tqc", "recurrent_ppo"):
         pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed; it is the extra contrib")
     found = ALGORITHMS[algo](num_envs=2, batch_size=64, hidden=hidden, **settings)
-    model = found.make(DuffingVecEnv("duffing_env/Amplitude-v0", 2, levels=found.levels), seed=0)
+    model = found.make(DuffingVecEnv("duffing_env/Amplitude-v0", 2, levels=settings.get("levels", 0)), seed=0)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for name, parameter in model.policy.named_parameters():
