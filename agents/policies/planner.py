@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy.special import ndtri
 
 from agents.policies.imagination import Terms
 from agents.policies.planning import plan
@@ -118,7 +118,7 @@ class Planner:
             amplitude=settings["max_input"],
             slew=settings["max_slew"],
             limit=settings["max_output"],
-            margin=float(stats.norm.isf(risk / env.horizon)),
+            margin=float(-ndtri(risk / env.horizon)),
             **{name: settings[name] for name in Terms._fields if name.startswith("walk")},
             price=float(input_cost),
             goal=float(goal),
