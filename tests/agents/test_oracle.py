@@ -146,7 +146,8 @@ def test_stored_oracles_keep_the_limits_of_their_tracks(track):
 
 
 def test_tracks_without_an_oracle_say_so():
-    with pytest.raises(ValueError, match="plant without jump"):
-        Systems.of("duffing_env/Drift-v0", 1)
+    for track in ("Drift-v0", "Continuous-v0"):
+        with pytest.raises(ValueError, match="difference equation without jump"):
+            Systems.of(f"duffing_env/{track}", 1)
     with pytest.raises(ValueError, match="inputs must have shape"):
         Systems.of(SHORT, 1).worth(np.zeros((2, 48)))
