@@ -70,11 +70,12 @@ class Task:
 
     @classmethod
     def of(cls, envs: DuffingVectorEnv) -> Task:
-        """The task of an environment; ValueError where it does not simulate a difference equation that stays as it is."""
+        """The task of an environment; ValueError where its plant is not a difference equation that stays as it is."""
         e: Any = envs.experiment
         if e.plant_kind != "difference" or e.jump or e.max_slew is not None:
             raise ValueError(
-                f"env must simulate the difference equation without jump and slew limit, but is {e}; choose another track"
+                f"env must simulate the difference equation without jump and slew limit, but is {e}; "
+                "choose another track"
             )
         spread = e.spread if e.plant_spread is None else e.plant_spread
         return cls(
