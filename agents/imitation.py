@@ -40,7 +40,7 @@ class ImitationSettings:
     num_envs: int = 128
     """Environments that are followed together."""
     fits: int = 12
-    """Times that every label is fitted in the round after which it was told, on average; later rounds fit it again."""
+    """Times that a label is fitted after its own round, on average; later rounds fit it again."""
     batch_size: int = 512
     """Labels of a gradient step."""
     learning_rate: float = 3e-3
