@@ -52,7 +52,7 @@ class TrainConfig(Subject):
     """What a training run is made from. Written to ``config.json`` of its folder."""
 
     reward: str = "information_gain"
-    """Name of the reward: information_gain, log_posterior, parameter_error, fisher or free_energy."""
+    """Name of the reward, such as information_gain, log_posterior or fisher (`duffing_env.rewards` has all)."""
     steps: int = 5_000_000
     """Samples to learn from, over all environments; 0 for none, after imitation or ascent."""
     seed: int = 0
