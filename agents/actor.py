@@ -6,15 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import torch
-from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from duffing_env.layout import OBSERVATION
-from duffing_env.vector_env import DuffingVectorEnv
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -82,19 +79,6 @@ class Standard:
         """Observations in standard deviations from the mean."""
         standard: FloatArray = (observations - self.mean) / self.std
         return standard
-
-
-def make_envs(env_id: str, num_envs: int, options: dict[str, Any]) -> DuffingVectorEnv:
-    """A batch whose rows begin together; ValueError as the environment's."""
-    envs = gym.make_vec(
-        env_id,
-        num_envs=num_envs,
-        vectorization_mode="vector_entry_point",
-        autoreset_mode=AutoresetMode.NEXT_STEP,
-        **options,
-    )
-    assert isinstance(envs, DuffingVectorEnv)
-    return envs
 
 
 def at_rest(observations: FloatArray) -> npt.NDArray[np.bool_]:

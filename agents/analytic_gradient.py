@@ -103,11 +103,12 @@ def ascend_policy(
     """
     import torch
 
-    from agents.actor import Actor, make_envs, turned
+    from agents.actor import Actor, turned
+    from agents.evaluation import make
 
     if settings.updates == 0:
         return
-    envs = make_envs(env_id, settings.num_envs, options)
+    envs = make(env_id, settings.num_envs, options)
     experiment: Any = envs.experiment
     if type(experiment).__name__ != "SimulatedExperiment" or experiment.jump:
         raise ValueError(

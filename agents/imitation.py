@@ -84,11 +84,12 @@ def imitate(
     Raises:
         ValueError: for a teacher that does not exist or cannot play this track.
     """
-    from agents.actor import Actor, make_envs
+    from agents.actor import Actor
+    from agents.evaluation import make
 
     if settings.labels == 0:
         return
-    envs = make_envs(env_id, settings.num_envs, options)
+    envs = make(env_id, settings.num_envs, options)
     teacher = make_policy(settings.teacher, envs, seed=seed)
     actor, rng = Actor(model), np.random.default_rng([seed, 1])
     steps = settings.labels // (settings.rounds * settings.num_envs)

@@ -8,7 +8,8 @@ import torch
 from stable_baselines3 import PPO
 
 from agents import make_policy
-from agents.actor import Actor, at_rest, make_envs, turned
+from agents.actor import Actor, at_rest, turned
+from agents.evaluation import make
 from agents.imitation import ImitationSettings, imitate
 from agents.vec_env import DuffingVecEnv
 
@@ -44,7 +45,7 @@ def pupil():
 
 def episode(act):
     """Gain of 64 systems (64,), and how often the action has the sign of the velocity-sign policy's."""
-    envs = make_envs(TRACK, 64, {**OPTIONS, "reward": "fisher"})
+    envs = make(TRACK, 64, {**OPTIONS, "reward": "fisher"})
     teacher = make_policy("velocity-sign", envs)
     observations, _ = envs.reset(seed=9)
     state, gains, agreed, running = None, np.zeros(64), [], np.ones(64, dtype=bool)
@@ -117,7 +118,7 @@ def test_a_standard_changes_the_weights_and_not_the_function():
 
 
 def test_what_is_turned_over_is_the_oscillator_in_motion():
-    envs = make_envs(TRACK, 200, OPTIONS)
+    envs = make(TRACK, 200, OPTIONS)
     rest, _ = envs.reset(seed=0)
     motion = envs.step(np.ones((200, 1), dtype=np.float32))[0]
     assert at_rest(rest).all()
