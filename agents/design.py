@@ -41,9 +41,18 @@ def roll(theta, q, r, limit, start, u, tape, F):
     for t in range(len(u)):
         now, after = tape[t], tape[t + 1]
         x, last_x = now[0], now[1]
-        _tell(theta, q, r, u[t], now, after, moved, F)
+        a = t1 + 3.0 * t2 * x * x
+        c0, _, variance = spread(a, t3, now[2], now[3], now[4], q)
+        weight = 1.0 / (variance + r)
+        regress(a, t3, now[5:9], now[9:13], x, last_x, u[t], moved)
+        for j in range(4):
+            for k in range(j + 1):
+                F[j, k] += weight * moved[j] * moved[k]
+            after[5 + j] = r * weight * moved[j]
+            after[9 + j] = now[5 + j] - c0 * weight * moved[j]
         after[0] = t1 * x + t2 * x * x * x + t3 * last_x + e * u[t]
         after[1] = x
+        after[2], after[3], after[4] = r * weight * variance, r * weight * c0, now[2] - c0 * c0 * weight
         size = abs(after[0])
         peak = max(peak, size)
         over = max(0.0, size / limit - 1.0)
@@ -51,34 +60,6 @@ def roll(theta, q, r, limit, start, u, tape, F):
         if not size < _LOST * limit:
             return t + 1, peak, excess
     return len(u), peak, excess
-
-
-@jit
-def retrace(theta, q, r, x, u, tape, F):
-    """As `roll` from rest, along displacements x (T + 1,) that were seen to follow the inputs u (T,)."""
-    F[:, :] = 0.0
-    tape[0] = 0.0
-    tape[0, 0] = x[0]
-    moved = np.empty(4)
-    for t in range(len(u)):
-        _tell(theta, q, r, u[t], tape[t], tape[t + 1], moved, F)
-        tape[t + 1, 0], tape[t + 1, 1] = x[t + 1], x[t]
-
-
-@jit
-def _tell(theta, q, r, u, now, after, moved, F):
-    """What one sample tells: F grows, and filter and sensitivities go from one step's start to the next one's."""
-    x, last_x, t3 = now[0], now[1], theta[2]
-    a = theta[0] + 3.0 * theta[1] * x * x
-    c0, _, variance = spread(a, t3, now[2], now[3], now[4], q)
-    weight = 1.0 / (variance + r)
-    regress(a, t3, now[5:9], now[9:13], x, last_x, u, moved)
-    for j in range(4):
-        for k in range(j + 1):
-            F[j, k] += weight * moved[j] * moved[k]
-        after[5 + j] = r * weight * moved[j]
-        after[9 + j] = now[5 + j] - c0 * weight * moved[j]
-    after[2], after[3], after[4] = r * weight * variance, r * weight * c0, now[2] - c0 * c0 * weight
 
 
 @jit
@@ -133,6 +114,7 @@ def worth(theta, precision, q, r, limit, penalty, start, u, tape, F):
 @jit
 def climb(theta, precision, q, r, limit, penalty, start, u, tape, F, gradient):
     """As `worth`, and ∂J/∂u (T,) [nats/V] into ``gradient``."""
+    t2, t3, e = theta[1], theta[2], theta[3]
     steps, peak, excess = roll(theta, q, r, limit, start, u, tape, F)
     for j in range(4):
         for k in range(j + 1):
@@ -140,18 +122,6 @@ def climb(theta, precision, q, r, limit, penalty, start, u, tape, F, gradient):
     value = half_log_det(F)
     G = np.empty((4, 4))
     invert(F, G)
-    descend(theta, q, r, limit, penalty, 1.0, steps, u, tape, G, gradient)
-    return value - penalty * excess, peak
-
-
-@jit
-def descend(theta, q, r, limit, penalty, fading, steps, u, tape, G, gradient):
-    """The backward pass: ∂J/∂u (T,) [nats/V] into ``gradient``, of the first ``steps`` inputs.
-
-    ``tape`` holds the steps' starts, G (4, 4) is (Λ + F)⁻¹. What an input does to later displacements and sensitivities
-    counts ``fading`` times less with every sample; 1 is exact.
-    """
-    t2, t3, e = theta[1], theta[2], theta[3]
     gradient[:] = 0.0
     # Names as in `roll`; a letter b at the end is the derivative of J by that quantity.
     moved, movedb, Gm = np.empty(4), np.empty(4), np.empty(4)
@@ -183,11 +153,12 @@ def descend(theta, q, r, limit, penalty, fading, steps, u, tape, G, gradient):
         for j in range(4):
             ab += movedb[j] * now[5 + j]
             # s becomes the earlier one in the next step, so both of its derivatives add up.
-            sb[j] = fading * (a * movedb[j] + last_sb[j])
-            last_sb[j] = fading * t3 * movedb[j]
+            sb[j] = a * movedb[j] + last_sb[j]
+            last_sb[j] = t3 * movedb[j]
         p00b, p01b, p11b = a * c0b + p11b, t3 * c0b + a * c1b, t3 * c1b
         gradient[t] = movedb[3] + e * xb
         xb, last_xb = (
-            fading * (a * xb + last_xb + movedb[0] + 3.0 * x * x * movedb[1] + 6.0 * t2 * x * ab),
-            fading * (t3 * xb + movedb[2]),
+            a * xb + last_xb + movedb[0] + 3.0 * x * x * movedb[1] + 6.0 * t2 * x * ab,
+            t3 * xb + movedb[2],
         )  # fmt: skip
+    return value - penalty * excess, peak

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from agents.policies.foresight import Foresight
+from duffing_env.layout import N_OBSERVATION
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
@@ -47,6 +49,8 @@ class Network:
         memory: name of the LSTM before the layers; None for none.
         levels: evenly spaced actions from -1 to 1, of which the last layer has the log probabilities, up to a constant;
             0 where it has the action itself.
+        foresight: whether the layers see the features of `agents.policies.foresight`, and give what it acts on; the
+            tensor ``foresight`` is that.
     """
 
     layers: tuple[str, ...]
@@ -55,6 +59,7 @@ class Network:
     spread: str | None = "log_std"
     memory: str | None = None
     levels: int = 0
+    foresight: bool = False
 
 
 class LearnedPolicy:
@@ -86,6 +91,7 @@ class LearnedPolicy:
         if network.spread is not None:
             self._spread = tensors[network.spread] if network.spread in tensors else layer(network.spread)
         self._features = (self._layers[0][0] if self._memory is None else self._memory.from_input).shape[1]
+        self._foresight = Foresight.from_array(tensors["foresight"]) if network.foresight else None
         self._rng = np.random.default_rng(seed)
 
     def predict(
@@ -101,8 +107,19 @@ class LearnedPolicy:
         forgets them where ``episode_start``; None is a memory of nothing. Without a memory it is handed on unused.
         """
         hidden = np.asarray(observation, dtype=np.float32)
-        if hidden.shape[-1:] != (self._features,):
-            raise ValueError(f"observation must have {self._features} entries, but has shape {hidden.shape}")
+        seen = self._features if self._foresight is None else N_OBSERVATION
+        if hidden.shape[-1:] != (seen,):
+            raise ValueError(f"observation must have {seen} entries, but has shape {hidden.shape}")
+        if self._foresight is not None:
+            view = self._foresight.look(np.atleast_2d(hidden))
+            choices, state = self._choose(view.features, state, episode_start, deterministic)
+            return self._foresight.act(choices[:, 0], view).reshape(*hidden.shape[:-1], 1), state
+        return self._choose(hidden, state, episode_start, deterministic)
+
+    def _choose(
+        self, hidden: FloatArray, state: Any, episode_start: npt.ArrayLike | None, deterministic: bool
+    ) -> tuple[FloatArray, Any]:
+        """What the network gives for what it sees, (n, 1) or (1,), and the next state."""
         if self._memory is not None:
             state = self._memory.update(np.atleast_2d(hidden), state, episode_start)
             hidden = state[0][-1].reshape(*hidden.shape[:-1], -1)
@@ -171,6 +188,9 @@ def save_policy(folder: Path, model: BaseAlgorithm, card: dict[str, Any]) -> Non
     if not hasattr(model.policy, "mlp_extractor"):
         tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
     network = _network_of(model.policy, tensors)
+    foresight = getattr(model.get_env(), "foresight", None)
+    if foresight is not None:
+        network, tensors["foresight"] = replace(network, foresight=True), foresight.to_array()
     write_atomically(folder / WEIGHTS, save(tensors))
     described = {"format": FORMAT, "network": asdict(network), **card}
     write_atomically(folder / CARD, json.dumps(described, indent=2).encode())

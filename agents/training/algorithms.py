@@ -7,19 +7,15 @@ batches, few gradient steps. `agents/hyperparameters/ALGORITHM.toml` has what di
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any
-
-from agents.analytic_gradient import AscentSettings, ascend_policy
-from agents.imitation import ImitationSettings, imitate
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecEnv
 
 # Hyperparameters by what they may be; whole numbers that are not named here are at least 1.
-_FROM_ZERO = ("learning_starts", "exploration_noise", "dropped_quantiles", "levels")
+_FROM_ZERO = ("learning_starts", "exploration_noise", "dropped_quantiles", "levels", "entropy_bonus")
 _POSITIVE = ("learning_rate", "entropy_weight")
 _SHARES = ("gamma", "gae_lambda", "tau")
 
@@ -38,13 +34,16 @@ class AlgorithmSettings(ABC):
     """Discount factor."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
+    foresight: bool = False
+    """Whether the network sees what its belief expects of simple inputs, is kept within the displacement limit, and
+    has rewards count what they are worth at the end (`agents.policies.foresight`)."""
 
     def __post_init__(self) -> None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values |= {f"hidden[{i}]": units for i, units in enumerate(values.pop("hidden"))}
         for name, value in values.items():
             least = 0 if name in _FROM_ZERO else 1
-            if (isinstance(value, int) or name in _FROM_ZERO) and value < least:
+            if (type(value) is int or name in _FROM_ZERO) and value < least:
                 raise ValueError(f"{name} must be at least {least}, but is {value}")
             if name in _POSITIVE and value <= 0:
                 raise ValueError(f"{name} must be positive, but is {value}")
@@ -59,16 +58,6 @@ class AlgorithmSettings(ABC):
     @abstractmethod
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """A model with these hyperparameters; ValueError where its package is not installed."""
-
-    @property
-    def has_start(self) -> bool:
-        """Whether a new model is taught anything before it learns by itself."""
-        return False
-
-    def start(  # noqa: B027  most algorithms have none
-        self, model: Any, env_id: str, options: dict[str, Any], seed: int, on_progress: Callable[[str], None]
-    ) -> None:
-        """Teach a new model what it is to know before it learns by itself."""
 
     @classmethod
     @abstractmethod
@@ -101,6 +90,8 @@ class OnPolicySettings(AlgorithmSettings):
     """Trade-off of bias and variance in the advantage (generalised advantage estimation)."""
     log_std_init: float = -0.5
     """Log standard deviation of the action at the start, where it is not one of some levels."""
+    entropy_bonus: float = 0.0
+    """Weight of the action's entropy at the start; it falls linearly to 0."""
     levels: int = 0
     """Evenly spaced inputs from one limit to the other that the policy chooses from; 0 for all between."""
 
@@ -141,35 +132,6 @@ class OnPolicySettings(AlgorithmSettings):
 @dataclass(frozen=True)
 class PPOSettings(OnPolicySettings):
     """Hyperparameters of PPO; chosen for a batched environment: large batches, few epochs."""
-
-    imitation: ImitationSettings = field(default_factory=ImitationSettings)
-    """What the network learns from a teacher, first of all."""
-    ascent: AscentSettings = field(default_factory=AscentSettings)
-    """How far it then climbs by exact derivatives, before PPO."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.levels and self.ascent.updates:
-            raise ValueError(f"levels must be 0 for ascent, but is {self.levels}; a choice has no derivative")
-
-    @property
-    def has_start(self) -> bool:
-        """Whether there is imitation or ascent."""
-        return self.imitation.labels > 0 or self.ascent.updates > 0
-
-    def start(
-        self, model: Any, env_id: str, options: dict[str, Any], seed: int, on_progress: Callable[[str], None]
-    ) -> None:
-        """Imitation, then ascent."""
-
-        def on_labels(labels: int, error: float) -> None:
-            on_progress(f"Imitation: {labels:,} of {self.imitation.labels:,} labels, mean squared error {error:.3f}")
-
-        def on_ascent(update: int, gain: float) -> None:
-            on_progress(f"Ascent: {update} of {self.ascent.updates} updates, {gain:.2f} nat of Fisher information")
-
-        imitate(model, env_id, options, self.imitation, seed, on_labels)
-        ascend_policy(model, env_id, options, self.ascent, seed, on_ascent)
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """Stable-Baselines3's PPO."""

@@ -21,10 +21,17 @@ class Watch(BaseCallback):
     Args:
         on_rollout: called with the samples so far and the mean return of the last episodes, before the update.
         on_update: called after the update.
+        entropy_bonus: of the algorithm at the start, where it is to fall linearly to 0; 0 leaves it as it is.
     """
 
-    def __init__(self, on_rollout: Callable[[int, float], None], on_update: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        on_rollout: Callable[[int, float], None],
+        on_update: Callable[[], None],
+        entropy_bonus: float = 0.0,
+    ) -> None:
         super().__init__()
+        self._entropy_bonus = entropy_bonus
         self._report, self._updated = on_rollout, on_update
         self._collected = False
 
@@ -37,6 +44,9 @@ class Watch(BaseCallback):
             self.num_timesteps, float(np.mean([episode["r"] for episode in episodes])) if episodes else float("nan")
         )
         self._collected = True
+        if self._entropy_bonus:
+            model: Any = self.model
+            model.ent_coef = self._entropy_bonus * model._current_progress_remaining
 
     def _on_rollout_start(self) -> None:
         if self._collected:

@@ -68,7 +68,13 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
         if is_dataclass(wanted) and isinstance(value, dict):
             value = settings_of(wanted, value)
         if type(value) is not wanted:
-            kinds = {int: "a whole number", float: "a number", tuple: "a list of whole numbers", str: "a name"}
+            kinds = {
+                int: "a whole number",
+                float: "a number",
+                tuple: "a list of whole numbers",
+                str: "a name",
+                bool: "true or false",
+            }
             kinds.setdefault(wanted, "a table")
             raise ValueError(f"{name} must be {kinds[wanted]}, but is {value!r}")
         values[name] = value

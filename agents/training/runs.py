@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from agents.training.checkpoints import (
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import read_settings, settings_of, track_of
 from estimator.files import write_atomically
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 _PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy", "stable-baselines3", "torch")
 
@@ -54,7 +57,7 @@ class TrainConfig(Subject):
     reward: str = "information_gain"
     """Name of the reward, such as information_gain, log_posterior or fisher (`duffing_env.rewards` has all)."""
     steps: int = 5_000_000
-    """Samples to learn from, over all environments; 0 for none, after imitation or ascent."""
+    """Samples to learn from, over all environments."""
     seed: int = 0
     """Seed of systems, noise, weights and exploration; the same seed gives the same policy."""
     options: JsonOptions = field(default_factory=dict)
@@ -73,7 +76,7 @@ class TrainConfig(Subject):
     """Hyperparameters; those that the file has for the track where they are not given."""
 
     def __post_init__(self) -> None:
-        for name in ("checkpoints", "torch_threads"):
+        for name in ("steps", "checkpoints", "torch_threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")
         if self.eval_every < 0:
@@ -90,9 +93,6 @@ class TrainConfig(Subject):
                 f"hyperparameters must be {ALGORITHMS[self.algo].__name__} for {self.algo}, "
                 f"but are {type(self.hyperparameters).__name__}"
             )
-        least = 0 if self.hyperparameters.has_start else 1
-        if self.steps < least:
-            raise ValueError(f"steps must be at least {least}, but is {self.steps}")
 
 
 @dataclass(frozen=True)
@@ -167,8 +167,6 @@ class _Training:
     ) -> None:
         import torch
 
-        from agents.vec_env import DuffingVecEnv
-
         self._clock = time.perf_counter()
         self._config, self._folder = config, folder
         torch.set_num_threads(config.torch_threads)
@@ -177,14 +175,7 @@ class _Training:
         self._clock -= self._progress.seconds
         begun = self._progress.steps
         seed = int(np.random.SeedSequence((config.seed, begun)).generate_state(1)[0]) if begun else config.seed
-        self._envs = DuffingVecEnv(
-            config.env,
-            config.hyperparameters.num_envs,
-            seed=seed,
-            levels=getattr(config.hyperparameters, "levels", 0),
-            reward=config.reward,
-            **config.options,
-        )
+        self._envs = _make_envs(config, seed)
         self._model = config.hyperparameters.make(self._envs, seed)
         if checkpoint is not None:
             restore(checkpoint, self._model)
@@ -208,24 +199,13 @@ class _Training:
             logs.append(self._board)
         with closing(Logger(str(self._folder), logs)) as logger:
             self._model.set_logger(logger)
-            if self._progress.steps == 0:
-                self._start()
-            if self._config.steps:
-                self._learn()
+            self._learn()
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
         draw_learning_curve(self._folder / "learning_curve.png", curve, self._config.reward)
         save_policy(self._folder, self._model, self._card())
         drop_states(self._folder)
         self._envs.close()
         return Run(self._config, self._folder, curve, self._seconds())
-
-    def _start(self) -> None:
-        """Teach the new model what its settings have for it."""
-        from rich.console import Console
-
-        config = self._config
-        with Console().status("Compiling") as status:
-            config.hyperparameters.start(self._model, config.env, config.options, config.seed, status.update)
 
     def _learn(self) -> None:
         """Learn with a progress bar."""
@@ -247,7 +227,9 @@ class _Training:
 
             self._model.learn(
                 total - begun,
-                callback=Watch(on_rollout, self._on_update),
+                callback=Watch(
+                    on_rollout, self._on_update, getattr(self._config.hyperparameters, "entropy_bonus", 0.0)
+                ),
                 log_interval=self._config.hyperparameters.log_interval,
                 reset_num_timesteps=begun == 0,
             )
@@ -276,13 +258,30 @@ class _Training:
     def _due_checkpoints(self) -> int:
         """How many checkpoints there should be by now."""
         done = min(self._model.num_timesteps, self._config.steps)
-        return done * self._config.checkpoints // max(1, self._config.steps)
+        return done * self._config.checkpoints // self._config.steps
 
     def _card(self) -> dict[str, Any]:
         return {"algorithm": self._config.algo, "steps": self._model.num_timesteps, **self._description}
 
     def _seconds(self) -> float:
         return time.perf_counter() - self._clock
+
+
+def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
+    """The environments of a run, seen as its hyperparameters say."""
+    from agents.vec_env import DuffingVecEnv
+
+    asked = config.hyperparameters
+    levels = getattr(asked, "levels", 0)
+    options = {"reward": config.reward, **config.options}
+    if not asked.foresight:
+        return DuffingVecEnv(config.env, asked.num_envs, seed=seed, levels=levels, **options)
+    from agents.policies.foresight import Foresight
+    from agents.training.foresight_env import ForesightVecEnv, example_rate
+
+    rate = example_rate(config.env, config.options, config.seed)
+    envs = DuffingVecEnv(config.env, asked.num_envs, seed=seed, **options)
+    return ForesightVecEnv(envs, Foresight.of(envs.envs, rate), levels)
 
 
 def _run_folder(config: TrainConfig) -> Path:

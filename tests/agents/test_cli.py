@@ -21,9 +21,7 @@ DECLARED = {
     "train.py": [("train.py", "Config", ""), ("agents/training/runs.py", "Subject", ""),
                  ("agents/training/runs.py", "TrainConfig", ""),
                  ("agents/training/algorithms.py", "AlgorithmSettings", "ppo."),
-                 ("agents/training/algorithms.py", "OnPolicySettings", "ppo."),
-                 ("agents/imitation.py", "ImitationSettings", "ppo.imitation."),
-                 ("agents/analytic_gradient.py", "AscentSettings", "ppo.ascent.")],
+                 ("agents/training/algorithms.py", "OnPolicySettings", "ppo.")],
     "evaluate.py": [("evaluate.py", "Config", "")],
 }  # fmt: skip
 

@@ -15,9 +15,7 @@ from safetensors.numpy import load_file
 
 import agents.vec_env
 from agents import make_policy
-from agents.analytic_gradient import AscentSettings
 from agents.evaluation import evaluate
-from agents.imitation import ImitationSettings
 from agents.leaderboard import summarise
 from agents.training import PPOSettings, TrainConfig, train
 from agents.training.hyperparameters import settings_of
@@ -164,23 +162,6 @@ def test_hyperparameters_reach_the_algorithm(tmp_path):
     assert int(rows[1]["train/n_updates"]) == 3
 
 
-def test_imitation_and_ascent_come_before_ppo_or_in_its_place(tmp_path):
-    """Each of them changes the policy that is saved; without PPO its critic is never trained."""
-    starts = {"imitation": ImitationSettings(256, "prbs", rounds=2, num_envs=16), "ascent": AscentSettings(1, 8)}
-    folders = [
-        tiny(tmp_path / name, steps=0, hyperparameters=replace(TINY, **{name: start})).folder
-        for name, start in starts.items()
-    ]
-    folders.append(tiny(tmp_path / "both", steps=0, hyperparameters=replace(TINY, **starts)).folder)
-    weights = [load_file(folder / "policy.safetensors") for folder in folders]
-    for one, other in ((0, 1), (0, 2), (1, 2)):
-        assert not np.array_equal(weights[one]["action_net.weight"], weights[other]["action_net.weight"])
-    for name in ("value_net.weight", "log_std"):
-        assert all(np.array_equal(weights[0][name], one[name]) for one in weights)
-    with pytest.raises(ValueError, match="steps must be at least 1, but is 0"):
-        tiny(tmp_path / "none", steps=0)
-
-
 @pytest.mark.parametrize(("checkpoints", "expected"), [(1, [512]), (2, [256, 512]), (4, [128, 256, 384, 512])])
 def test_checkpoints_are_evenly_spaced(tmp_path, checkpoints, expected):
     run = tiny(tmp_path / "run", steps=512, checkpoints=checkpoints)
@@ -214,10 +195,6 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch):
         ({"options": {"horizons": 3}}, "did you mean 'horizon'"),
         ({"reward": "information_gian"}, "did you mean 'information_gain'"),
         ({"seed": -1}, "[Ss]eed"),
-        (
-            {"steps": -1, "hyperparameters": PPOSettings(ascent=AscentSettings(updates=1))},
-            "steps must be at least 0, but is -1",
-        ),
     ],
 )
 def test_senseless_settings_are_refused_before_anything_is_written(tmp_path, settings, message):

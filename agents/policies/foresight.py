@@ -1,0 +1,138 @@
+"""Foresight: a network sees what its belief expects of simple inputs, and is kept from what would end the episode.
+
+The best input is a sharp function of the belief: it turns over where a push would come too late or lead too far. A
+network learns such a function poorly from means, deviations and displacements. It learns it well from what the believed
+oscillator does with a push up, none or a push down, and what that would teach (`agents.policies.prospects`). Three
+things are done for it:
+
+- **Features.** Observations are turned upright, so that x_t ≥ 0, and the action is turned back: the task is odd.
+- **A shield.** An action in whose direction no way is left to stay within the displacement limit is replaced by none,
+  or by a push the other way, whichever is safe. So also a policy that still tries its actions out seldom ends an
+  episode, and learns to go close to the limit.
+- **A drive**, where the energy is limited: the action is how hard to push along the motion (or against it), not the
+  input itself. Of all ways to swing an oscillator up, to push in proportion to its motion takes least energy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from agents.policies.prospects import FEATURES, Outlook, look_at
+from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment
+from duffing_env.layout import SETTINGS
+from estimator.parameters import FloatArray
+from estimator.record import COEFFICIENTS
+
+#: How hard the drive pushes, in parts of what the oscillator moves by itself in two samples: at action 0, and what an
+#: action of 1 adds. In oracles' bursts it is 0.05, and it hardly leaves 0..0.16.
+_DRIVE, _DRIVE_SPAN = 0.06, 0.1
+
+#: An oscillator that is within this part of the limit is at rest; it is pushed as if it moved by so much.
+_REST, _NUDGE = 0.007, 0.05
+
+
+@dataclass(frozen=True)
+class View:
+    """What n observations look like with foresight.
+
+    Attributes:
+        features: (n, len(FEATURES)) float32 what the network sees.
+        safe: (n, 3) whether a push up, none, a push down need not lead beyond the limit.
+        signs: (n,) -1.0 where the observation was turned over.
+        motions: (n,) the input that is all of the motion [V], upright.
+    """
+
+    features: npt.NDArray[np.float32]
+    safe: npt.NDArray[np.bool_]
+    signs: FloatArray
+    motions: FloatArray
+
+
+class Foresight:
+    """What turns observations into features, and what a network chooses into actions.
+
+    Args:
+        outlook: what observations are relative to, and what is ahead.
+    """
+
+    def __init__(self, outlook: Outlook) -> None:
+        self._outlook = outlook
+
+    @classmethod
+    def of(cls, env: Any, rate: FloatArray) -> Foresight:
+        """That of an environment of duffing_env, single or vector.
+
+        Args:
+            env: the unwrapped environment.
+            rate: (4, 4) information about the coefficients that a sample brings on average.
+
+        Raises:
+            ValueError: where the belief is not one of the difference equation with an unknown cubic coefficient, or an
+                action is held for several samples.
+        """
+        experiment = env.experiment
+        if not isinstance(experiment, SimulatedExperiment) or isinstance(experiment, ContinuousExperiment):
+            raise ValueError(
+                f"env must simulate the difference equation for foresight, but is {type(experiment).__name__}; "
+                "set foresight to false"
+            )
+        if experiment.hold != 1:
+            raise ValueError(f"hold must be 1 for foresight, but is {experiment.hold}; set foresight to false")
+        settings = dict(zip(SETTINGS, experiment.settings.tolist(), strict=True))
+        scales = np.array([settings[f"scale_{name}"] for name in COEFFICIENTS])
+        if not (scales > 0).all():
+            raise ValueError("env must have an unknown cubic coefficient for foresight; set foresight to false")
+        return cls(
+            Outlook(
+                center=np.array([settings[f"prior_{name}"] for name in COEFFICIENTS]),
+                std=1.0 / scales,
+                max_input=settings["max_input"],
+                max_output=settings["max_output"],
+                samples=float(env.horizon),
+                energy=np.inf if experiment.max_rms is None else env.horizon * experiment.max_rms**2,
+                variance=experiment.process_noise**2 + experiment.measurement_noise**2,
+                rate=np.asarray(rate, dtype=np.float64),
+            )
+        )
+
+    @classmethod
+    def from_array(cls, numbers: npt.ArrayLike) -> Foresight:
+        """That which `to_array` gave."""
+        n = len(COEFFICIENTS)
+        center, std, others, rate = np.split(np.asarray(numbers, dtype=np.float64), [n, 2 * n, 2 * n + 5])
+        max_input, max_output, samples, energy, variance = others.tolist()
+        return cls(Outlook(center, std, max_input, max_output, samples, energy, variance, rate.reshape(n, n)))
+
+    def to_array(self) -> FloatArray:
+        """All of it, flat, as a file holds it."""
+        return np.concatenate([np.ravel(entry) for entry in self._outlook])
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether an action is how hard to push along the motion."""
+        return bool(np.isfinite(self._outlook.energy))
+
+    def look(self, observations: npt.ArrayLike) -> View:
+        """What observations (n, features) look like."""
+        return View(*look_at(observations, self._outlook))
+
+    def act(self, choices: npt.ArrayLike, view: View) -> npt.NDArray[np.float32]:
+        """The actions (n, 1) in [-1, 1] that a network's choices (n,) in [-1, 1] stand for."""
+        chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
+        if self.is_drive:
+            outlook = self._outlook
+            x0, x1 = (outlook.max_output * view.features[:, FEATURES.index(name)] for name in ("state_x0", "state_x1"))
+            at_rest = np.maximum(np.abs(x0), np.abs(x1)) < _REST * outlook.max_output
+            nudge = _NUDGE * outlook.max_output / outlook.center[-1]
+            motions = np.where(at_rest, nudge, view.motions)
+            chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / outlook.max_input, -1.0, 1.0)
+        up, none, down = view.safe.T
+        chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -1.0), chosen)
+        chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, 1.0), chosen)
+        chosen = np.where((chosen == 0) & ~none, np.where(up, 1.0, -1.0), chosen)
+        actions: npt.NDArray[np.float32] = (chosen * view.signs).astype(np.float32)[:, None]
+        return actions
