@@ -1,0 +1,322 @@
+"""Foresight: its features against a plain twin, its shield and drive, its rewards, and policies that have it."""
+
+from dataclasses import replace
+from itertools import product
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents import make_policy
+from agents.evaluation import make
+from agents.policies.foresight import Foresight
+from agents.policies.prospects import BOUND, FEATURES, HORIZONS, MARGIN, Outlook
+from agents.training import PPOSettings, TrainConfig, train
+from agents.training.algorithms import SACSettings
+from agents.training.callbacks import Watch
+from agents.training.foresight_env import ForesightVecEnv, example_rate
+from agents.vec_env import DuffingVecEnv
+from duffing_env.layout import N_OBSERVATION, OBSERVATION
+
+PLACE = {name: i for i, name in enumerate(FEATURES)}
+AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
+RATE = np.diag([590.0, 150.0, 680.0, 240.0]) @ (0.5 * np.eye(4) + 0.5) @ np.diag([590.0, 150.0, 680.0, 240.0])
+
+
+def observations_of(env_id, samples=40, count=24):
+    """What a batch shows after some random pushes, gentle enough that most episodes go on."""
+    envs = make(env_id, count)
+    rng = np.random.default_rng(1)
+    shown, _ = envs.reset(seed=0)
+    seen = [shown.copy()]
+    for _ in range(samples):
+        shown, *_ = envs.step(rng.choice([-1.0, 0.0, 1.0], (count, 1)).astype(np.float32))
+        seen.append(shown.copy())
+    return envs, np.concatenate(seen[::8])
+
+
+def twin(o, outlook):
+    """Features, safety, sign and motion of one observation, with matrices."""
+    o = dict(zip(OBSERVATION, np.float64(o), strict=True))
+    names = ("t1", "t2", "t3", "e")
+    theta = outlook.center + outlook.std * [o[f"mean_{n}"] for n in names]
+    stds = outlook.std * np.exp([o[f"log_std_{n}"] for n in names])
+    correlation = (1 + 1e-6) * np.eye(4)
+    for (i, j), pair in {(0, 1): "12", (0, 2): "13", (0, 3): "1e", (1, 2): "23", (1, 3): "2e", (2, 3): "3e"}.items():
+        correlation[i, j] = correlation[j, i] = o[f"corr_{pair}"]
+    C = np.diag(stds) @ correlation @ np.diag(stds)
+    share, push = o["time_left"], outlook.max_input
+    if np.isfinite(outlook.energy):
+        left = max(1.0, share * outlook.samples)
+        push = min(push, 3 * np.sqrt(o["budget_left"] * outlook.energy / left))
+        share = (share + o["budget_left"]) / 2
+    J = share * outlook.samples * outlook.rate
+    W = np.linalg.inv(np.linalg.inv(C) + J)
+    sign = -1.0 if o["state_x0"] < 0 else 1.0
+    for name in ("state_x0", "state_x1", "last_input", "last_output"):
+        o[name] *= sign
+    limit = outlook.max_output
+    start = limit * o["state_x0"], limit * o["state_x1"]
+
+    def phi(x0, x1, u):
+        return np.array([x0, x0**3, x1, u])
+
+    def play(first, follow):
+        x0, x1 = start
+        total, brought, reach = 0.0, [], []
+        for t in range(max(HORIZONS)):
+            u = first if t == 0 else follow(t, x0, x1)
+            p = phi(x0, x1, u)
+            total += p @ W @ p / (2 * outlook.variance) * outlook.samples / 4
+            margin = MARGIN * np.sqrt(p @ C @ p + outlook.variance)
+            x0, x1 = np.clip(theta @ p, -2 * limit, 2 * limit), x0
+            reach.append(abs(x0) + margin)
+            total -= 500 * max(0.0, reach[-1] / limit - 1)
+            if t + 1 in HORIZONS:
+                brought.append(total)
+        return np.array(brought), max(reach[:8])
+
+    def pump(t, x0, x1):
+        u = push if x0 >= x1 else -push
+        return -u if abs(theta @ phi(x0, x1, u)) > 0.95 * limit else u
+
+    def signs_then_pump(signs):
+        return lambda t, x0, x1: push * signs[t - 1] if t <= 3 else pump(t, x0, x1)
+
+    ways = {
+        "best": [signs_then_pump(signs) for signs in product((-1, 1), repeat=3)],
+        "pump": [pump],
+        "brake": [lambda t, x0, x1: -push if x0 >= x1 else push],
+        "rest": [lambda t, x0, x1: 0.0],
+    }
+    features, lowest = list(o.values()), np.full(3, np.inf)
+    for follows in ways.values():
+        played = [[play(first, follow) for follow in follows] for first in (push, 0.0, -push)]
+        brought = np.array([np.max([b for b, _ in each], axis=0) for each in played])
+        peaks = np.array([min(peak for _, peak in each) for each in played])
+        for up, none, down in brought.T:
+            features += [np.arcsinh(up - down), np.arcsinh(none - max(up, down))]
+        features += list(peaks / limit)
+        lowest = np.minimum(lowest, peaks)
+        if follows is ways["best"]:
+            most = max(0.0, brought[:, -1].max())
+    x0, x1 = start
+    motion = (theta @ phi(x0, x1, 0.0) - x1) / max(theta[3], 0.1 * outlook.center[3])
+    free = []
+    for _ in range(3):
+        x0, x1 = np.clip(theta @ phi(x0, x1, 0.0), -2 * limit, 2 * limit), x0
+        free.append(x0 / limit)
+    to_come = 0.5 * np.linalg.slogdet(np.eye(4) + J @ C)[1]
+    open_ = np.log(0.25 * outlook.samples * np.trace(W @ outlook.rate) + 1e-3)
+    features += [np.log(most + 1e-3), *free, 5 * theta[3] * push / limit, to_come, open_]
+    safe = (lowest <= limit) | (lowest == lowest.min())
+    return np.clip(features, -BOUND, BOUND), safe, sign, motion
+
+
+@pytest.mark.parametrize("env_id", [AMPLITUDE, POWER, "duffing_env/Output-v0"])
+def test_features_are_those_of_the_twin(env_id):
+    envs, observations = observations_of(env_id)
+    foresight = Foresight.of(envs, RATE)
+    view = foresight.look(observations)
+    assert view.features.dtype == np.float32
+    turned = 0
+    for i, observation in enumerate(observations):
+        features, safe, sign, motion = twin(observation, foresight._outlook)
+        np.testing.assert_allclose(view.features[i], features, rtol=2e-5, atol=2e-5)
+        np.testing.assert_array_equal(view.safe[i], safe)
+        assert view.signs[i] == sign
+        np.testing.assert_allclose(view.motions[i], motion, rtol=1e-9, atol=1e-12)
+        turned += sign < 0
+    assert 0 < turned < len(observations)
+
+
+def test_an_observation_looks_the_same_alone_and_in_a_batch():
+    envs, observations = observations_of(AMPLITUDE)
+    foresight = Foresight.of(envs, RATE)
+    together = foresight.look(observations).features
+    alone = np.concatenate([foresight.look(one[None]).features for one in observations])
+    np.testing.assert_array_equal(together, alone)
+
+
+def test_turning_the_task_over_turns_the_action_over():
+    envs, observations = observations_of(AMPLITUDE)
+    foresight = Foresight.of(envs, RATE)
+    over = observations.copy()
+    over[:, [list(OBSERVATION).index(n) for n in ("state_x0", "state_x1", "last_input", "last_output")]] *= -1
+    moving = observations[:, list(OBSERVATION).index("state_x0")] != 0
+    one, other = foresight.look(observations[moving]), foresight.look(over[moving])
+    np.testing.assert_array_equal(one.features, other.features)
+    choices = np.random.default_rng(0).uniform(-1, 1, len(one.features))
+    np.testing.assert_array_equal(foresight.act(choices, one), -foresight.act(choices, other))
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_features_of_any_observation_are_finite_and_bounded(seed):
+    space = gym.make(AMPLITUDE).observation_space
+    rng = np.random.default_rng(seed)
+    observations = rng.uniform(space.low, space.high, (8, N_OBSERVATION)).astype(np.float32)
+    observations[0] = space.low
+    observations[1] = space.high
+    foresight = Foresight.of(make(AMPLITUDE, 1), RATE)
+    view = foresight.look(observations)
+    assert np.isfinite(view.features).all()
+    assert (np.abs(view.features) <= BOUND).all()
+    assert view.safe.any(axis=1).all()
+    assert np.isfinite(foresight.act(rng.uniform(-2, 2, 8), view)).all()
+
+
+def test_the_shield_keeps_even_random_pushes_within_the_limit():
+    """Of 64 systems that are pushed at random, hardly one leaves; without the shield most do."""
+    envs = make(AMPLITUDE, 64)
+    foresight = Foresight.of(envs, RATE)
+    ended = {}
+    for shielded in (True, False):
+        rng = np.random.default_rng(3)
+        observations, _ = envs.reset(seed=0)
+        gone = np.zeros(64, dtype=bool)
+        for _ in range(envs.horizon):
+            choices = rng.choice([-1.0, 1.0], 64)
+            actions = foresight.act(choices, foresight.look(observations)) if shielded else choices[:, None]
+            observations, _, terminated, _, _ = envs.step(actions.astype(np.float32))
+            gone |= terminated
+        ended[shielded] = gone.sum()
+    assert ended[True] <= 1
+    assert ended[False] >= 20
+
+
+def test_the_shield_takes_what_is_safe_and_nearest():
+    foresight = Foresight.of(make(AMPLITUDE, 1), RATE)
+    view = foresight.look(np.zeros((1, N_OBSERVATION), dtype=np.float32))
+    cases = [  # safe: up, none, down; choice; action
+        ((1, 1, 1), 0.4, 0.4), ((0, 1, 1), 0.4, 0.0), ((0, 0, 1), 0.4, -1.0), ((0, 0, 1), 0.0, -1.0),
+        ((0, 0, 1), -0.3, -0.3), ((1, 0, 0), -0.3, 1.0), ((1, 1, 0), -0.3, 0.0), ((1, 0, 1), 0.0, 1.0),
+    ]  # fmt: skip
+    for safe, choice, action in cases:
+        view.safe[:] = safe
+        assert foresight.act([choice], view)[0, 0] == np.float32(action), (safe, choice)
+
+
+def test_the_drive_pushes_along_the_motion_within_the_budget():
+    """A constant choice swings the oscillator up, and is worth far more than any signal of the same energy."""
+    envs = make(POWER, 32)
+    foresight = Foresight.of(envs, RATE)
+    assert foresight.is_drive
+    assert not Foresight.of(make(AMPLITUDE, 1), RATE).is_drive
+    observations, _ = envs.reset(seed=0)
+    prior = envs.belief(0).entropy()
+    gains = np.zeros(32)
+    for _ in range(envs.horizon):
+        observations, _, terminated, truncated, infos = envs.step(
+            foresight.act(np.zeros(32), foresight.look(observations))
+        )
+        for row in np.flatnonzero((terminated | truncated) & (gains == 0)):
+            gains[row] = prior - infos["belief"][row].entropy()
+    assert gains.mean() > 16.0  # the multisine of the record gains 11.2
+
+
+def test_it_survives_being_written():
+    for env_id in (AMPLITUDE, POWER):
+        envs, observations = observations_of(env_id, samples=8)
+        foresight = Foresight.of(envs, RATE)
+        again = Foresight.from_array(foresight.to_array())
+        assert isinstance(again._outlook, Outlook)
+        np.testing.assert_array_equal(again.look(observations).features, foresight.look(observations).features)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "message"),
+    [
+        ("duffing_env/Continuous-v0", {}, "must simulate the difference equation for foresight"),
+        (AMPLITUDE, {"hold": 2}, "hold must be 1 for foresight, but is 2"),
+    ],
+)
+def test_where_it_makes_no_sense_it_says_so(env_id, options, message):
+    with pytest.raises(ValueError, match=message):
+        Foresight.of(make(env_id, 1, options), RATE)
+
+
+def test_rewards_differ_from_the_environments_by_a_potential():
+    """Over an episode they add up to the plain return less what was to come at its start, whatever is done."""
+    options = {"horizon": 24, "max_output": 0.1}  # too narrow for the shield to keep all within
+    plain = DuffingVecEnv(AMPLITUDE, 6, seed=2, **options)
+    envs = ForesightVecEnv(DuffingVecEnv(AMPLITUDE, 6, seed=2, **options), Foresight.of(plain.envs, RATE))
+    features = envs.reset()
+    plain.reset()
+    start = features[:, PLACE["to_come"]].copy()
+    rng = np.random.default_rng(0)
+    returns, running, early = np.zeros(6), np.ones(6, dtype=bool), 0
+    for _ in range(24):
+        choices = rng.uniform(-1, 1, (6, 1)).astype(np.float32)
+        actions = envs.foresight.act(choices[:, 0], envs._view)
+        features, rewards, dones, infos = envs.step(choices)
+        observations, _, plain_dones, plain_infos = plain.step(actions)
+        np.testing.assert_array_equal(dones, plain_dones)
+        np.testing.assert_array_equal(features, envs.foresight.look(observations).features)
+        returns += running * rewards
+        for row in np.flatnonzero(dones):
+            assert infos[row]["TimeLimit.truncated"] is False
+            last = plain_infos[row]["terminal_observation"]
+            np.testing.assert_array_equal(
+                infos[row]["terminal_observation"], envs.foresight.look(last[None]).features[0]
+            )
+            if running[row]:
+                gained = plain_infos[row]["episode"]["r"]
+                assert returns[row] == pytest.approx(5 * (gained - start[row]), abs=1e-3)
+                early += not plain_infos[row]["TimeLimit.truncated"]
+                running[row] = False
+    assert not running.any()
+    assert 0 < early < 6
+
+
+def test_the_example_brings_about_as_much_as_the_oracle():
+    """In the volume of what a sample tells, within a factor of two."""
+    from agents.oracle import Oracle, Systems
+    from estimator.fisher import fisher_information
+    from estimator.parameters import to_coefficients
+
+    systems = Systems.of(AMPLITUDE, 32)
+    envs = make(AMPLITUDE, 32)
+    envs.reset(seed=0)
+    task = systems.task
+    told = fisher_information(
+        to_coefficients(envs.truth), Oracle.of(systems).inputs[:32], task.process_noise, task.measurement_noise
+    )
+    best = told.mean(axis=0) / task.samples
+    example = example_rate(AMPLITUDE, {}, seed=0)
+    ratio = np.exp((np.linalg.slogdet(example)[1] - np.linalg.slogdet(best)[1]) / 4)
+    assert 0.5 < ratio < 1.1
+
+
+@pytest.mark.parametrize("settings", [PPOSettings(levels=3), PPOSettings(), SACSettings(learning_starts=64)])
+def test_a_policy_that_was_trained_with_it_acts_the_same_from_its_file(tmp_path, settings):
+    settings = replace(settings, foresight=True, num_envs=8, batch_size=32, hidden=(4,))
+    algo = "sac" if isinstance(settings, SACSettings) else "ppo"
+    run = train(TrainConfig(algo, AMPLITUDE, steps=1024, output=tmp_path / "run", hyperparameters=settings))
+    envs = make(AMPLITUDE, 5)
+    policy = make_policy(str(run.folder), envs)
+    observations, _ = envs.reset(seed=1)
+    for _ in range(20):
+        actions, _ = policy.predict(observations, deterministic=True)
+        alone, _ = policy.predict(observations[2], deterministic=True)
+        assert actions.shape == (5, 1)
+        np.testing.assert_allclose(alone, actions[2], rtol=0, atol=1e-6)  # a product of matrices rounds by its size
+        observations, *_ = envs.step(actions)
+    with pytest.raises(ValueError, match="observation must have 22 entries"):
+        policy.predict(np.zeros((3, len(FEATURES)), dtype=np.float32))
+
+
+def test_entropy_counts_less_and_less(tmp_path):
+    settings = PPOSettings(foresight=True, num_envs=8, n_steps=16, batch_size=64, hidden=(4,), entropy_bonus=0.5)
+    seen = []
+    original = Watch._on_rollout_end
+
+    def spy(self):
+        original(self)
+        seen.append(self.model.ent_coef)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Watch, "_on_rollout_end", spy)
+        train(TrainConfig("ppo", AMPLITUDE, steps=512, output=tmp_path / "run", hyperparameters=settings))
+    assert seen == [pytest.approx(0.5 * (1 - k / 4)) for k in range(4)]
