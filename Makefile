@@ -7,7 +7,7 @@ READY := .venv/.ready
 
 demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
 	rm -rf runs/demo
-	$(BIN)/python train.py --output runs/demo
+	$(BIN)/python train.py --steps 1500000 --output runs/demo
 
 test: $(READY)  ## all tests but the slow evidence
 	$(BIN)/python -m pytest -m "not slow"

@@ -3,8 +3,9 @@
     python -m agents.study --steps 600000
 
 trains PPO on Amplitude-v0 with the mean-field and with the structured estimator, for each of the rewards
-`information_gain`, `log_posterior` and `fisher`, 5 seeds each, and evaluates all on the same systems. What is finished
-is not done again, so a study that was stopped goes on where it was.
+`information_gain`, `log_posterior` and `fisher`, 5 seeds each, and evaluates all on the same systems. PPO learns from
+the observation and the reward as they are, without foresight, which would tell it what the reward is to teach. What is
+finished is not done again, so a study that was stopped goes on where it was.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from agents.cli import run_script
 from agents.evaluation import AUDITOR, FACTORISATIONS, FloatArray, evaluate, pooled
 from agents.leaderboard import MEDIAN, METRICS, Metric, cell_of, center_and_interval, finite
 from agents.policies.learned import CARD
-from agents.training import TrainConfig, train
+from agents.training import PPOSettings, TrainConfig, train
 from estimator.files import write_atomically
 
 TRACK = "duffing_env/Amplitude-v0"
@@ -98,8 +99,17 @@ def learn(recipe: Recipe, config: Config, seed: int) -> Path:
         return folder
     if folder.exists():
         shutil.rmtree(folder)
-    options = {"factorisation": recipe.factorisation}
-    train(TrainConfig(env=TRACK, reward=recipe.reward, steps=config.steps, seed=seed, options=options, output=folder))
+    train(
+        TrainConfig(
+            env=TRACK,
+            reward=recipe.reward,
+            steps=config.steps,
+            seed=seed,
+            options={"factorisation": recipe.factorisation},
+            output=folder,
+            hyperparameters=PPOSettings(),
+        )
+    )
     return folder
 
 

@@ -33,7 +33,7 @@ PATIENCE = 120.0
 TARGET_SECONDS = 60.0
 #: Torch's own number of threads: one for each core.
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-OURS = "ours, train.py's settings"
+OURS = "ours, PPO's settings without foresight"
 DEFAULTS = {1: "SB3's defaults, DummyVecEnv of 1", 8: "SB3's defaults, DummyVecEnv of 8"}
 USEFUL = "from starting train.py to a useful policy"
 

@@ -28,9 +28,10 @@ def test_every_file_is_sound_for_every_track(algo, env_id):
 
 
 def test_ppo_is_as_its_class_says_where_its_file_is_silent():
-    assert read_settings("ppo", "duffing_env/Amplitude-v0") == PPOSettings()
-    assert read_settings("ppo", "duffing_env/Power-v0") == PPOSettings(gamma=0.998)
-    assert TrainConfig(env="duffing_env/Power-v0").hyperparameters.gamma == 0.998
+    assert read_settings("ppo", "duffing_env/Continuous-v0") == PPOSettings()
+    amplitude = read_settings("ppo", "duffing_env/Amplitude-v0")
+    assert (amplitude.foresight, amplitude.levels, amplitude.gamma) == (True, 3, 1.0)
+    assert TrainConfig(env="duffing_env/Amplitude-v0").hyperparameters == amplitude
 
 
 def test_a_track_goes_before_the_default(tmp_path):
