@@ -35,8 +35,7 @@ class AlgorithmSettings(ABC):
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
     foresight: bool = False
-    """Whether the network sees what its belief expects of simple inputs, is kept within the displacement limit, and
-    has rewards count what they are worth at the end (`agents.policies.foresight`)."""
+    """Whether the network sees what its belief expects of simple inputs, and is shielded (docs/training.md)."""
 
     def __post_init__(self) -> None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
