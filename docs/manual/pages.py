@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import json
 import re
 from typing import Any
 
@@ -16,6 +17,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from agents import POLICIES
+from agents.policies import TRAINED, trained_policies
 from duffing_env import TRACKS, rewards
 
 #: Page of the reference to the objects that stand on it.
@@ -38,6 +40,7 @@ REFERENCE = {
         "agents.training.TD3Settings",
         "agents.training.TQCSettings",
         "agents.training.RecurrentPPOSettings",
+        "agents.training.foresight_env.ForesightVecEnv",
         "agents.evaluation",
         "agents.vec_env",
     ],
@@ -145,14 +148,26 @@ def _policies() -> str:
             "| Name | |",
             "|---|---|",
             *rows,
+            *(f"| `{name}` | {_shipped(name)} |" for name in trained_policies()),
             "| a run folder | A trained policy; see [Training](../training.md). |",
             "",
             *(
                 f"::: agents.policies.{name}\n"
-                for name in ("make_policy", "Policy", "signals.SignalPolicy", "learned.LearnedPolicy")
+                for name in (
+                    *("make_policy", "Policy", "signals.SignalPolicy"),
+                    *("learned.LearnedPolicy", "foresight", "foresight.Foresight"),
+                )
             ),
         ]
     )
+
+
+def _shipped(name: str) -> str:
+    """What the card of a trained policy says."""
+    card = json.loads((TRAINED / name / "policy.json").read_text())
+    sight = ", with foresight" if card.get("network", {}).get("foresight") else ""
+    track = _title(card["config"]["env"])
+    return f"{card['algorithm'].upper()} trained on {track}{sight}; see [Training](../training.md)."
 
 
 def _reference(package: str, objects: list[str]) -> str:
