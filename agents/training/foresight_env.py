@@ -22,6 +22,9 @@ from estimator.parameters import FloatArray
 #: Rewards are scaled to returns of about 1, where a critic begins.
 _SCALE = 5.0
 
+#: Rewards that count information.
+IN_NATS = ("information_gain", "log_posterior", "fisher", "expected_free_energy")
+
 #: Systems whose episodes show how much a sample brings.
 _EXAMPLES = 64
 
@@ -43,10 +46,12 @@ class ForesightVecEnv(VecEnvWrapper):
         venv: the environments, with any input between the limits as an action.
         foresight: what they are seen with.
         levels: as of `DuffingVecEnv`; with a choice, an odd number of them has none as one.
+        in_nats: whether the reward counts information, so that Ψ is added to it.
     """
 
-    def __init__(self, venv: DuffingVecEnv, foresight: Foresight, levels: int = 0) -> None:
+    def __init__(self, venv: DuffingVecEnv, foresight: Foresight, levels: int = 0, *, in_nats: bool = True) -> None:
         self.foresight = foresight
+        self._weight = np.float32(in_nats)
         self._levels = np.linspace(-1.0, 1.0, levels) if levels else None
         space = gym.spaces.Box(-BOUND, BOUND, (len(FEATURES),), np.float32)
         super().__init__(venv, space, gym.spaces.Discrete(levels) if levels else venv.action_space)
@@ -71,7 +76,7 @@ class ForesightVecEnv(VecEnvWrapper):
                 infos[row] |= {"terminal_observation": features, "TimeLimit.truncated": False}
         features = self._see(observations)
         to_come = np.where(dones, np.float32(0), features[:, _TO_COME])
-        return features, _SCALE * (rewards + (to_come - before)), dones, infos
+        return features, _SCALE * (rewards + self._weight * (to_come - before)), dones, infos
 
     def _see(self, observations: Any) -> npt.NDArray[np.float32]:
         self._view = self.foresight.look(observations)

@@ -277,11 +277,11 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
     if not asked.foresight:
         return DuffingVecEnv(config.env, asked.num_envs, seed=seed, levels=levels, **options)
     from agents.policies.foresight import Foresight
-    from agents.training.foresight_env import ForesightVecEnv, example_rate
+    from agents.training.foresight_env import IN_NATS, ForesightVecEnv, example_rate
 
     rate = example_rate(config.env, config.options, config.seed)
     envs = DuffingVecEnv(config.env, asked.num_envs, seed=seed, **options)
-    return ForesightVecEnv(envs, Foresight.of(envs.envs, rate), levels)
+    return ForesightVecEnv(envs, Foresight.of(envs.envs, rate), levels, in_nats=config.reward in IN_NATS)
 
 
 def _run_folder(config: TrainConfig) -> Path:
