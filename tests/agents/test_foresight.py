@@ -270,6 +270,20 @@ def test_rewards_differ_from_the_environments_by_a_potential():
     assert 0 < early < 6
 
 
+def test_rewards_that_count_no_information_stay_as_they_are():
+    options = {"reward": "parameter_error", "horizon": 24}
+    plain = DuffingVecEnv(AMPLITUDE, 3, seed=2, **options)
+    envs = ForesightVecEnv(
+        DuffingVecEnv(AMPLITUDE, 3, seed=2, **options), Foresight.of(plain.envs, RATE), in_nats=False
+    )
+    envs.reset()
+    plain.reset()
+    for _ in range(5):
+        actions = envs.foresight.act([1.0, 0.0, -1.0], envs._view)
+        _, rewards, _, _ = envs.step(np.array([[1.0], [0.0], [-1.0]], dtype=np.float32))
+        np.testing.assert_allclose(rewards, 5 * plain.step(actions)[1], rtol=1e-6, atol=1e-9)
+
+
 def test_the_example_brings_about_as_much_as_the_oracle():
     """In the volume of what a sample tells, within a factor of two."""
     from agents.oracle import Oracle, Systems
