@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from safetensors.numpy import load_file
 
 from agents import make_policy
 from agents.evaluation import make
 from agents.policies.foresight import Foresight
 from agents.policies.prospects import BOUND, FEATURES, HORIZONS, MARGIN, Outlook
-from agents.training import PPOSettings, TrainConfig, train
+from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.algorithms import SACSettings
 from agents.training.callbacks import Watch
 from agents.training.foresight_env import ForesightVecEnv, example_rate
@@ -334,3 +335,22 @@ def test_entropy_counts_less_and_less(tmp_path):
         patch.setattr(Watch, "_on_rollout_end", spy)
         train(TrainConfig("ppo", AMPLITUDE, steps=512, output=tmp_path / "run", hyperparameters=settings))
     assert seen == [pytest.approx(0.5 * (1 - k / 4)) for k in range(4)]
+
+
+def test_a_run_that_was_stopped_goes_on_with_the_same_foresight(tmp_path):
+    settings = PPOSettings(foresight=True, levels=3, num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
+    config = TrainConfig(
+        env=AMPLITUDE, steps=512, checkpoints=2, eval_every=128, output=tmp_path / "run", hyperparameters=settings
+    )
+
+    def stop(steps, found):
+        if steps >= 384:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        train(config, stop)
+    before = load_file(tmp_path / "run" / "checkpoints" / "000000256" / "policy.safetensors")
+    run = resume(tmp_path / "run")
+    after = load_file(run.folder / "policy.safetensors")
+    np.testing.assert_array_equal(before["foresight"], after["foresight"])
+    assert not np.array_equal(before["action_net.weight"], after["action_net.weight"])
