@@ -240,7 +240,7 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
     try:
         network = _network_of_format_1(tensors) if found == 1 else Network(**card["network"])
         return LearnedPolicy(network, tensors, card, seed)
-    except (KeyError, TypeError, IndexError) as error:
+    except (KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(f"policy must be what its card says, but {folder} is not: {error!r}; copy it anew") from error
 
 

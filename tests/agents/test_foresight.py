@@ -1,5 +1,6 @@
 """Foresight: its features against a plain twin, its shield and drive, its rewards, and policies that have it."""
 
+import shutil
 from dataclasses import replace
 from itertools import product
 
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save_file
 
 from agents import make_policy
 from agents.evaluation import make
+from agents.policies import TRAINED
 from agents.policies.foresight import Foresight
+from agents.policies.learned import load_policy
 from agents.policies.prospects import BOUND, FEATURES, HORIZONS, MARGIN, Outlook
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.algorithms import SACSettings
@@ -354,3 +357,12 @@ def test_a_run_that_was_stopped_goes_on_with_the_same_foresight(tmp_path):
     after = load_file(run.folder / "policy.safetensors")
     np.testing.assert_array_equal(before["foresight"], after["foresight"])
     assert not np.array_equal(before["action_net.weight"], after["action_net.weight"])
+
+
+def test_a_damaged_foresight_is_refused(tmp_path):
+    shutil.copytree(TRAINED / "ppo" / "short", tmp_path / "copy")
+    file = tmp_path / "copy" / "policy.safetensors"
+    tensors = load_file(file)
+    save_file(tensors | {"foresight": tensors["foresight"][:-1]}, file)
+    with pytest.raises(ValueError, match=r"policy must be what its card says, but .*copy is not"):
+        load_policy(tmp_path / "copy")
