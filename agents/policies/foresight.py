@@ -27,12 +27,14 @@ from duffing_env.layout import SETTINGS
 from estimator.parameters import FloatArray
 from estimator.record import COEFFICIENTS
 
-#: How hard the drive pushes, in parts of what the oscillator moves by itself in two samples: at action 0, and what an
-#: action of 1 adds. In oracles' bursts it is 0.05, and it hardly leaves 0..0.16.
+#: How hard the drive pushes, in parts of what the oscillator moves by itself in two samples: at action 0, which swings
+#: it up, and what an action of 1 adds; an action of -1 brakes.
 _DRIVE, _DRIVE_SPAN = 0.06, 0.1
 
 #: An oscillator that is within this part of the limit is at rest; it is pushed as if it moved by so much.
 _REST, _NUDGE = 0.007, 0.05
+
+_X0, _X1 = FEATURES.index("state_x0"), FEATURES.index("state_x1")
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,7 @@ class Foresight:
         chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
         if self.is_drive:
             outlook = self._outlook
-            x0, x1 = (outlook.max_output * view.features[:, FEATURES.index(name)] for name in ("state_x0", "state_x1"))
-            at_rest = np.maximum(np.abs(x0), np.abs(x1)) < _REST * outlook.max_output
+            at_rest = np.abs(view.features[:, [_X0, _X1]]).max(axis=1) < _REST
             nudge = _NUDGE * outlook.max_output / outlook.center[-1]
             motions = np.where(at_rest, nudge, view.motions)
             chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / outlook.max_input, -1.0, 1.0)

@@ -36,9 +36,10 @@ class ForesightVecEnv(VecEnvWrapper):
 
     To the reward comes the increase of Ψ = ½ log det(I + C J), with C the covariance of the belief's coefficients and
     J the information that the rest of the episode will bring at an average rate; Ψ is 0 when the episode has ended.
-    It is a difference of potentials, so no policy gains by it (Ng, Harada and Russell 1999): over an episode it adds
-    up to the same number for all. But without it most information is gained in the first samples of an episode,
-    whatever the input, and the rest weighs little; with it a sample weighs what it adds to what is known *at the end*.
+    It is a difference of potentials, so without a discount no policy gains by it (Ng, Harada and Russell 1999): over an
+    episode it adds up to the same number for all. But without it most information is gained in the first samples of an
+    episode, whatever the input, and the rest weighs little; with it a sample weighs what it adds to what is known *at
+    the end*.
 
     The end of an episode is an end, by time too: there is nothing to gain after it, and the features show it coming.
 
