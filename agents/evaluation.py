@@ -43,7 +43,8 @@ class Evaluation:
     Attributes:
         policy: its name, or that of the recipe.
         metrics: name of a metric to its value for each system (systems,); see `agents.leaderboard.METRICS`.
-        curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats].
+        curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats]; what a jump of the
+            truth takes away is in it.
         inputs: (horizon, systems) inputs that the plant was given [V], NaN after the end of an episode.
         outputs: (horizon, systems) outputs [V], likewise.
         estimators: what others make of the same inputs and outputs: name of an estimator to its `metrics`.
@@ -76,12 +77,12 @@ def evaluate(
 
     Learned policies act by their mean. With ``hold`` in the options, inputs, outputs and what is made of them are those
     of every sample; a stored oracle is that of the track without it. An episode that a limit ends is never dropped: it
-    counts with what was known by then. Information at the truth, and what other estimators make of the inputs and
-    outputs, need a simulated plant whose truth stays as it is; what is measured by free runs or in samples of the
-    Silverbox regime, the difference equation. The arrow error is that of the difference equation identified on the
-    track's twin (``plant_spread=0``) in a free run over the real arrow record; it is left out without the record, and
-    for the differential equation: the simulated plant has no offsets, and those of the circuit, 8 mV at the input,
-    would be nearly all of its error (5.3 mV for the twin itself).
+    counts with what was known by then. Information at the truth, what other estimators make of the inputs and
+    outputs, and the arrow error need a simulated plant whose truth stays as it is; what is measured by free runs or
+    in samples of the Silverbox regime, the difference equation. The arrow error is that of the difference equation
+    identified on the track's twin (``plant_spread=0``) in a free run over the real arrow record; it is left out
+    without the record, and for the differential equation: the simulated plant has no offsets, and those of the
+    circuit, 8 mV at the input, would be nearly all of its error (5.3 mV for the twin itself).
 
     Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the
     entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.
@@ -148,20 +149,25 @@ def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
 def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]) -> Evaluation:
     """One policy."""
     evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
-    if isinstance(experiment, SimulatedExperiment) and experiment.jump == 0:
+    if not isinstance(experiment, SimulatedExperiment):
+        return evaluation
+    found, stays = evaluation.metrics, experiment.jump == 0
+    is_difference = not isinstance(experiment, ContinuousExperiment)
+    if stays:
         gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
-        evaluation.metrics["fisher_gain"] = gains
-        if not isinstance(experiment, ContinuousExperiment):
-            means = np.array([belief.coefficients_mean for belief in beliefs])
-            efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
-            if efficiency is not None:  # an oracle is stored, of the systems of seed 0
-                evaluation.metrics["efficiency"] = efficiency
-            evaluation.metrics["silverbox_equivalent"] = metrics.silverbox_equivalents(gains, truth, experiment, seed)
-            evaluation.metrics["simulation_rmse"] = metrics.simulation_errors(means, truth)
+        found["fisher_gain"] = gains
         evaluation.estimators.update(_audit(evaluation, truth, experiment))
-    if isinstance(experiment, SimulatedExperiment) and isinstance(beliefs[0], Belief) and record_available():
+    if stays and is_difference:
+        efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
+        if efficiency is not None:  # an oracle is stored, of the systems of seed 0
+            found["efficiency"] = efficiency
+        found["silverbox_equivalent"] = metrics.silverbox_equivalents(gains, truth, experiment, seed)
+    if is_difference:
+        means = np.array([belief.coefficients_mean for belief in beliefs])
+        found["simulation_rmse"] = metrics.simulation_errors(means, truth)
+    if stays and isinstance(beliefs[0], Belief) and record_available():
         _, twins, _, _ = roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
-        evaluation.metrics["arrow_rmse"] = metrics.arrow_errors(np.array([twin.coefficients_mean for twin in twins]))
+        found["arrow_rmse"] = metrics.arrow_errors(np.array([twin.coefficients_mean for twin in twins]))
     return evaluation
 
 
@@ -183,11 +189,11 @@ def roll_out(
         envs = make(env_id, systems, {**options, "hold": 1})
     observations, _ = envs.reset(seed=seed)
     prior, horizon = envs.belief(0), envs.horizon
-    curve = np.zeros((horizon + 1, systems))
+    began, curve = envs.truth, np.zeros((horizon + 1, systems))
     inputs, outputs = np.full((2, horizon, systems), np.nan)
     beliefs: list[RecordBelief] = [prior] * systems
-    truths = [envs.truth] * systems
-    ended_early = np.zeros(systems)
+    truths = [began] * systems
+    ended_early, jumped_at = np.zeros(systems), np.full(systems, horizon)
     running = np.ones(systems, dtype=np.bool_)
     state, episode_start = None, np.ones(systems, dtype=np.bool_)
     decisions, deciding = 0, 0.0
@@ -199,6 +205,7 @@ def roll_out(
             episode_start = np.zeros(systems, dtype=np.bool_)
         observations, _, terminated, truncated, infos = envs.step(actions)
         curve[t + 1] = curve[t] + np.where(running, infos["log_posterior_gain"], 0.0)
+        jumped_at[running & (jumped_at == horizon) & (envs.truth.m != began.m)] = t
         inputs[t, running] = envs.max_input * observations[running, _LAST_INPUT]
         outputs[t, running] = envs.experiment.max_output * observations[running, _LAST_OUTPUT]
         finished = running & (terminated | truncated)
@@ -214,6 +221,11 @@ def roll_out(
     truth = PhysicalParameters(*(np.array([getattr(t, p) for t in truths]) for p in OSCILLATOR))
     means = np.array([belief.coefficients_mean for belief in beliefs])
     covs = np.array([belief.coefficients_cov for belief in beliefs])
+    # The environment does not count what a jump of the truth takes away: what lacks at the end was lost there.
+    first, last = (type(prior).coefficients_of(oscillators) for oscillators in (began, truth))
+    for row in np.flatnonzero(jumped_at < horizon):
+        gain = beliefs[row].log_prob(last[row]) - prior.log_prob(first[row])
+        curve[jumped_at[row] + 1 :, row] += gain - curve[-1, row]
     values = {
         "information_gain": np.array([prior.entropy() - belief.entropy() for belief in beliefs]),
         "log_posterior_gain": curve[-1],

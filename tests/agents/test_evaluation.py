@@ -19,6 +19,7 @@ from estimator import NLARX, SAMPLING_STEP, OnlineEstimator, Prior
 
 TRACK = "duffing_env/Amplitude-v0"
 CONTINUOUS = "duffing_env/Continuous-v0"
+DRIFT = "duffing_env/Drift-v0"
 REPLAY = "duffing_env/SilverboxReplay-v0"
 SEED = 3
 SYSTEMS = 6
@@ -187,6 +188,31 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
         assert np.isnan(evaluation.outputs[length:, row]).all()
         ended_early += single.terminated
     assert ended_early in {"none": [0], "some": range(1, SYSTEMS), "all": [SYSTEMS]}[share_ended]
+
+
+def test_what_a_jump_of_the_truth_takes_away_is_counted(monkeypatch):
+    monkeypatch.setattr(agents.evaluation, "record_available", lambda: True)
+    (evaluation,) = evaluate(["prbs"], DRIFT, SYSTEMS, SEED, options={"horizon": HORIZON})
+    choose, steepest = act("prbs", {"horizon": HORIZON}), []
+    for row, seed in enumerate(spawn_seeds(SEED, SYSTEMS)):
+        env = gym.make(DRIFT, horizon=HORIZON).unwrapped
+        env.reset(seed=seed)
+        mass, gains, ended = env.truth.m, [log_density(env.belief, true_coefficients(env.truth))], False
+        while not ended:
+            _, _, terminated, truncated, _ = env.step(choose(len(gains) - 1, row, None))
+            gains.append(log_density(env.belief, true_coefficients(env.truth)))
+            ended = terminated or truncated
+        assert terminated or env.truth.m != mass
+        expected = np.subtract(gains, gains[0])
+        np.testing.assert_allclose(evaluation.curve[: len(gains), row], expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(evaluation.curve[len(gains) :, row], expected[-1], rtol=1e-6, atol=1e-6)
+        assert evaluation.metrics["log_posterior_gain"][row] == evaluation.curve[-1, row]
+        steepest.append(np.diff(gains).min())
+    assert min(steepest) < -100  # a jump that the belief does not know of
+    assert "simulation_rmse" in evaluation.metrics
+    # These are of one oscillator; here there are two.
+    assert not {"fisher_gain", "efficiency", "silverbox_equivalent", "arrow_rmse"} & set(evaluation.metrics)
+    assert evaluation.estimators == {}
 
 
 def test_all_policies_meet_the_same_systems_and_the_same_noise(without_record):
