@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from agents.leaderboard import Metric
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
+_STROKES = ("-", "--", ":")
 _RESONANCES = (49.5, 94.7)
 """Least and largest linear resonance of oscillators within ±30 % of the twin [Hz]."""
 
@@ -57,19 +58,24 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
     figure = _figure(7.5, 4.5)
     axes = figure.add_subplot()
     lowest = 0.0  # an over-confident posterior may lose
-    for evaluation, colour in zip(evaluations, cycle(_COLOURS), strict=False):
+    looks = product(_STROKES, _COLOURS)
+    for evaluation, (stroke, colour) in zip(evaluations, cycle(looks), strict=False):
         low, median, high = np.percentile(evaluation.curve, [25, 50, 75], axis=1)
         lowest = min(lowest, low.min())
         samples = np.arange(len(median))
         axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
-        axes.plot(samples, median, color=colour, label=evaluation.title)
+        axes.plot(samples, median, stroke, color=colour, label=evaluation.title)
     axes.set_xlabel("samples")
     axes.set_ylabel("log posterior gain of the truth / nat")
     axes.set_title(title)
     axes.set_xlim(0, None)
     axes.set_ylim(lowest, None)
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower right")
+    if len(evaluations) > len(_COLOURS):  # so many names would cover the curves
+        figure.set_figwidth(10)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)
+    else:
+        axes.legend(loc="lower right")
     return figure
 
 
