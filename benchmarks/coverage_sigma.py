@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.coverage import LENGTHS, QUANTILE
 from duffing_env.silverbox import synthesise_multisine
 from estimator import SAMPLING_STEP, DuffingODE, JointBelief, OnlineEstimator
-from estimator.filters import EXPECTATIONS
+from estimator.joint_filters import EXPECTATIONS
 from estimator.parameters import FloatArray
 
 LEAST = 0.1  # of their means: stiffness, damping, gain and cubic stiffness are drawn again where one is below

@@ -11,14 +11,10 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 from duffing_env.batch import Batch
-from duffing_env.experiment import (
-    Experiment,
-    ReplayExperiment,
-    SimulatedExperiment,
-    make_experiment,
-)
+from duffing_env.experiment import Experiment, SimulatedExperiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND
 from duffing_env.layout import OBSERVATION, SUMMED
+from duffing_env.replay import ReplayExperiment
 from estimator.belief import RecordBelief
 from estimator.parameters import FloatArray, PhysicalParameters
 

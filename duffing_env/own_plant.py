@@ -11,8 +11,8 @@ import numpy as np
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
 from duffing_env.rewards import NEED_THE_TRUTH
-from estimator.belief import Prior
 from estimator.parameters import PhysicalParameters
+from estimator.prior import Prior
 
 
 class Plant(Protocol):

@@ -1,8 +1,5 @@
 # The names of `estimator`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
-from .belief import (
-    Belief,
-    Prior,
-)
+from .belief import Belief
 from .continuous import (
     CONTINUOUS_TWIN,
     ContinuousBelief,
@@ -28,6 +25,7 @@ from .parameters import (
     to_coefficients,
     to_physical,
 )
+from .prior import Prior
 from .saving import (
     load_estimator,
     save_estimator,

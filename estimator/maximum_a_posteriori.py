@@ -19,11 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator import continuous_likelihood
-from estimator.belief import Prior
 from estimator.continuous import ContinuousBelief
 from estimator.fisher import regress, spread
 from estimator.lanes import kernel
 from estimator.parameters import FloatArray
+from estimator.prior import Prior
 
 #: Steps at most, and the step at which the search ends, in standard deviations of the posterior.
 _STEPS, _SMALL = 60, 1e-6

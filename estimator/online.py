@@ -7,15 +7,17 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import numpy.typing as npt
 
-from estimator.belief import Belief, Prior
+from estimator.belief import Belief
 from estimator.checks import scalar, series
 from estimator.ensemble import EnsembleFilter, Member, NoiseRatio
-from estimator.filters import EXPECTATIONS, Filter, NLARXFilter, ODEFilter, RegressorFilter
+from estimator.filters import Filter, NLARXFilter
 from estimator.gaussian import JointBelief
 from estimator.inference import DEFAULT_ITERATIONS
+from estimator.joint_filters import EXPECTATIONS, ODEFilter, RegressorFilter
 from estimator.models.nlarx import NLARX
 from estimator.models.ode import DuffingODE
 from estimator.parameters import FloatArray
+from estimator.prior import Prior
 
 _SAMPLES_BETWEEN_REPORTS = 5_000
 _AS_TERMS = "pass them as terms, regressors=PRESETS['paper'], for an estimator that can"

@@ -16,8 +16,8 @@ from agents.policies.export import draw_signal, export_signal
 from agents.policies.feedback import FEEDBACK, TURN
 from agents.policies.signals import Limits, SignalPolicy
 from duffing_env.experiment import SimulatedExperiment
-from estimator.belief import Prior
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters, to_coefficients
+from estimator.prior import Prior
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 RECORDED = ("silverbox-multisine", "silverbox-arrow")

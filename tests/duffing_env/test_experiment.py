@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from duffing_env.experiment import ContinuousExperiment, ReplayExperiment, SimulatedExperiment, make_experiment
+from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment, make_experiment
 from duffing_env.layout import SETTINGS
+from duffing_env.replay import ReplayExperiment
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Belief, ContinuousBelief, Prior, continuous_prior
 
 BAD = [

@@ -14,8 +14,8 @@ from test_vector_env import assert_same, random_actions, roll_out, without_empty
 from duffing_env.batch import spawn_seeds
 from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
-from duffing_env.experiment import ReplayExperiment
 from duffing_env.own_plant import PlantEnv
+from duffing_env.replay import ReplayExperiment
 from duffing_env.vector_env import ContinuousVectorEnv, DuffingVectorEnv
 
 TRACK = "duffing_env/Amplitude-v0"

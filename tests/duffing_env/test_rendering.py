@@ -19,8 +19,9 @@ from scipy import stats
 import duffing_env  # noqa: F401  registers the environments
 from duffing_env import rendering
 from duffing_env.rendering import HEIGHT, SPAN, WIDTH, Screen
-from estimator.belief import Belief, Prior
+from estimator.belief import Belief
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, propagate_to_physical
+from estimator.prior import Prior
 from estimator.record import RECORD
 
 PRIOR = Belief(Prior.silverbox_twin().to_record())

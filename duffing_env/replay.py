@@ -1,0 +1,93 @@
+"""What is fixed about the recorded Silverbox experiment, where a record takes the place of the plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from duffing_env.experiment import Experiment
+from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
+from estimator.parameters import FloatArray
+from estimator.prior import Prior
+
+_PRIORS = ("silverbox_twin", "published_run", "paper_text")
+
+
+@dataclass(frozen=True)
+class ReplayExperiment(Experiment):
+    """The recorded Silverbox experiment. A record can only answer the input that was applied.
+
+    Attributes:
+        regime: part of the record: ``multisine`` (the paper's training part) or ``arrow`` (its validation part).
+        prior: name of the prior: ``silverbox_twin``, ``published_run`` or ``paper_text``.
+        input_delay: samples between a recorded input and the output it acts on: 1 as Eq. (2) says, 0 as published.
+        nonlinear: whether the estimator's model has the cubic term.
+        as_published: mean field with the two departures of the published run.
+        data: file or folder of the record; searched for where it is None (`duffing_env.silverbox.load_record`).
+    """
+
+    regime: str = "multisine"
+    prior: str = "silverbox_twin"
+    input_delay: int = 1
+    nonlinear: bool = True
+    as_published: bool = False
+    data: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, choices in (("regime", REGIME_NAMES), ("prior", _PRIORS), ("input_delay", (0, 1))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {list(choices)}, but is {getattr(self, name)!r}")
+        for name in ("nonlinear", "as_published"):
+            self._check_flag(name)
+        if self.hold != 1:
+            raise ValueError(f"hold must be 1 for a record, which answers sample by sample, but is {self.hold}")
+        if self.reward == "fisher":
+            raise ValueError("reward must not be 'fisher' for a record, whose true oscillator nobody knows")
+        if self.as_published and self.factorisation != "mean_field":
+            raise ValueError(
+                f"as_published goes with factorisation='mean_field', but factorisation is {self.factorisation!r}"
+            )
+        peak = float(np.abs(self._regime.u).max())
+        if self.max_input < peak:
+            raise ValueError(
+                f"max_input must reach the record's largest input, {peak} V, but is {self.max_input}; pass 0.15"
+            )
+
+    @cached_property
+    def _regime(self) -> Regime:
+        regime: Regime = getattr(load_record(self.data), self.regime)
+        return regime
+
+    @property
+    def samples(self) -> int:
+        """The samples of the regime that have an output."""
+        return len(self._regime.u) - self.input_delay
+
+    @cached_property
+    def believed(self) -> Prior:
+        """The prior of that name."""
+        prior: Prior = getattr(Prior, self.prior)()
+        return prior
+
+    @property
+    def is_nonlinear(self) -> bool:
+        """As asked for."""
+        return self.nonlinear
+
+    @property
+    def recorded(self) -> tuple[FloatArray, FloatArray]:
+        """The regime's input and output [V]."""
+        return self._regime.u, self._regime.y
+
+    @property
+    def plant_kind(self) -> str:
+        """The record."""
+        return "replay"
+
+    @property
+    def plant_settings(self) -> dict[str, float]:
+        """How the record is played, and how the estimator departs from the model."""
+        return {"as_published": self.as_published, "delay": self.input_delay}
