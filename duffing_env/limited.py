@@ -130,7 +130,10 @@ class DriftEnv(DuffingEnv):
 
     As `DuffingEnv`. The posterior widens between samples, so the ``information_gain`` of a step can be negative;
     ``log_posterior`` and ``parameter_error`` are those of the oscillator as it is at that sample, and what the jump
-    itself does to them is not counted: they are set anew with the new mass.
+    itself does to them is not counted: they are set anew with the new mass. So they pay again for what was believed
+    and has to be unlearned, the more the surer it was, and are no rewards to train with here. Of ``information_gain``
+    only what is known at the end is left over an episode; with ``terminated_return=0`` nothing is gained by ending it
+    before the jump.
 
     ## Starting state, episode end
 
