@@ -73,7 +73,8 @@ class PlantEnv(DuffingEnv):
     As `DuffingEnv`, but the input goes to ``plant``, and the output comes from it. A plant is any object with two
     methods: ``reset()`` brings it to rest, and ``step(u)`` applies u volts for one sampling step and returns the output
     at its end, in volts. Estimator, reward and observation are the compiled step of the other tracks, so a policy that
-    was trained on them plays here as it is.
+    was trained on them plays here as it is; one with foresight keeps to ``max_output``, if `make_policy` is given the
+    environment.
 
     What the plant gets is what the estimator is told: the action in float32, clipped to [-1, 1], times ``max_input``.
     ``step`` has to keep the time: it returns when the sample is there. Nothing is applied between two calls of the

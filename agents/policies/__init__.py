@@ -70,8 +70,9 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0,
         name: A name in `POLICIES`, one of `trained_policies()` such as `"ppo/amplitude"`, or the path of a
             trained policy (`runs/...`).
         env: The environment it is for, single or vector, wrapped or not: it gives the amplitude
-            limit, the episode's length and, where it replays a record, the recorded input. None:
-            the limit is 0.15 V.
+            limit, the episode's length and, where it replays a record, the recorded input; to a
+            trained policy with foresight what it imagines. None: the limit is 0.15 V, and a trained
+            policy is in the environment it was trained in.
         seed: The seed of the policy's own randomness; of a trained policy, that of the actions it samples.
         options: Further options of a policy that has some, such as `horizon=8` of `"efe"`; a
             trained policy has none.
@@ -95,7 +96,10 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0,
     if name in trained_policies() or Path(name).exists():
         from agents.policies.learned import load_policy
 
-        return load_policy(TRAINED / name if name in trained_policies() else name, seed)
+        policy = load_policy(TRAINED / name if name in trained_policies() else name, seed)
+        if env is not None:
+            policy.move_to(env.unwrapped)
+        return policy
     nearest = difflib.get_close_matches(name, [*POLICIES, *trained_policies()], n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     raise ValueError(

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.policies.prospects import FEATURES, Outlook, look_at
-from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment
+from duffing_env.experiment import Experiment
 from duffing_env.layout import SETTINGS
 from estimator.parameters import FloatArray
 from estimator.record import COEFFICIENTS
@@ -66,7 +66,7 @@ class Foresight:
 
     @classmethod
     def of(cls, env: Any, rate: FloatArray) -> Foresight:
-        """That of an environment of duffing_env, single or vector.
+        """That of an environment of duffing_env, single or vector, to train with.
 
         Args:
             env: the unwrapped environment.
@@ -76,30 +76,14 @@ class Foresight:
             ValueError: where the belief is not one of the difference equation with an unknown cubic coefficient, or an
                 action is held for several samples.
         """
-        experiment = env.experiment
-        if not isinstance(experiment, SimulatedExperiment) or isinstance(experiment, ContinuousExperiment):
+        if not _is_believed(env.experiment):
             raise ValueError(
-                f"env must simulate the difference equation for foresight, but is {type(experiment).__name__}; "
-                "set foresight to false"
+                "env must believe the difference equation, with an unknown cubic coefficient, for foresight, but its "
+                f"experiment is {type(env.experiment).__name__}; set foresight to false"
             )
-        if experiment.hold != 1:
-            raise ValueError(f"hold must be 1 for foresight, but is {experiment.hold}; set foresight to false")
-        settings = dict(zip(SETTINGS, experiment.settings.tolist(), strict=True))
-        scales = np.array([settings[f"scale_{name}"] for name in COEFFICIENTS])
-        if not (scales > 0).all():
-            raise ValueError("env must have an unknown cubic coefficient for foresight; set foresight to false")
-        return cls(
-            Outlook(
-                center=np.array([settings[f"prior_{name}"] for name in COEFFICIENTS]),
-                std=1.0 / scales,
-                max_input=settings["max_input"],
-                max_output=settings["max_output"],
-                samples=float(env.horizon),
-                energy=np.inf if experiment.max_rms is None else env.horizon * experiment.max_rms**2,
-                variance=experiment.process_noise**2 + experiment.measurement_noise**2,
-                rate=np.asarray(rate, dtype=np.float64),
-            )
-        )
+        if env.experiment.hold != 1:
+            raise ValueError(f"hold must be 1 for foresight, but is {env.experiment.hold}; set foresight to false")
+        return cls(_outlook_of(env.experiment, rate))
 
     @classmethod
     def from_array(cls, numbers: npt.ArrayLike) -> Foresight:
@@ -112,6 +96,22 @@ class Foresight:
     def to_array(self) -> FloatArray:
         """All of it, flat, as a file holds it."""
         return np.concatenate([np.ravel(entry) for entry in self._outlook])
+
+    def moved_to(self, env: Any) -> Foresight:
+        """The same in another environment: with that one's prior, limits, noises and length.
+
+        What a sample brings is taken to grow with the squares of what it is made of, beside those of the noises. Where
+        the belief is another one than the difference equation's, or only one of the two inputs is limited in energy,
+        it stays as it is.
+        """
+        if not _is_believed(env.experiment):
+            return self
+        here, there = self._outlook, _outlook_of(env.experiment, self._outlook.rate)
+        if np.isfinite(here.energy) != np.isfinite(there.energy):
+            return self
+        x, u = there.max_output / here.max_output, there.max_input / here.max_input
+        growth = np.array([x, x**3, x, u]) * np.sqrt(here.variance / there.variance)
+        return Foresight(there._replace(rate=here.rate * np.outer(growth, growth)))
 
     @property
     def is_drive(self) -> bool:
@@ -137,3 +137,24 @@ class Foresight:
         chosen = np.where((chosen == 0) & ~none, np.where(up, 1.0, -1.0), chosen)
         actions: npt.NDArray[np.float32] = (chosen * view.signs).astype(np.float32)[:, None]
         return actions
+
+
+def _is_believed(experiment: Experiment) -> bool:
+    """Whether an experiment's belief is that of the difference equation with an unknown cubic coefficient."""
+    return experiment.estimator_kind != "ode" and experiment.is_nonlinear
+
+
+def _outlook_of(experiment: Experiment, rate: FloatArray) -> Outlook:
+    """What is ahead in an experiment."""
+    settings = dict(zip(SETTINGS, experiment.settings.tolist(), strict=True))
+    prior = experiment.believed
+    return Outlook(
+        center=np.array([settings[f"prior_{name}"] for name in COEFFICIENTS]),
+        std=1.0 / np.array([settings[f"scale_{name}"] for name in COEFFICIENTS]),
+        max_input=settings["max_input"],
+        max_output=settings["max_output"],
+        samples=settings["horizon"],
+        energy=settings["budget"],
+        variance=prior.gamma_rate / prior.gamma_shape + prior.xi_rate / prior.xi_shape,
+        rate=np.asarray(rate, dtype=np.float64),
+    )

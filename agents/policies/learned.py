@@ -94,6 +94,21 @@ class LearnedPolicy:
         self._foresight = Foresight.from_array(tensors["foresight"]) if network.foresight else None
         self._rng = np.random.default_rng(seed)
 
+    def move_to(self, env: Any) -> None:
+        """Let a foresight look out in this unwrapped environment, instead of that which it was trained in.
+
+        Raises:
+            ValueError: for a policy with foresight and an environment that is not one of duffing_env.
+        """
+        if self._foresight is None:
+            return
+        if not hasattr(env, "experiment"):
+            raise ValueError(
+                f"env must be an environment of duffing_env for a policy with foresight, but is {type(env).__name__}; "
+                "pass None for the environment it was trained in"
+            )
+        self._foresight = self._foresight.moved_to(env)
+
     def predict(
         self,
         observation: npt.ArrayLike,

@@ -23,9 +23,10 @@ from agents.training.callbacks import Watch
 from agents.training.foresight_env import ForesightVecEnv, example_rate
 from agents.vec_env import DuffingVecEnv
 from duffing_env.layout import N_OBSERVATION, OBSERVATION
+from estimator import Prior
 
 PLACE = {name: i for i, name in enumerate(FEATURES)}
-AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
+AMPLITUDE, POWER, OUTPUT = (f"duffing_env/{name}-v0" for name in ("Amplitude", "Power", "Output"))
 RATE = np.diag([590.0, 150.0, 680.0, 240.0]) @ (0.5 * np.eye(4) + 0.5) @ np.diag([590.0, 150.0, 680.0, 240.0])
 
 
@@ -119,7 +120,7 @@ def twin(o, outlook):
     return np.clip(features, -BOUND, BOUND), safe, sign, motion
 
 
-@pytest.mark.parametrize("env_id", [AMPLITUDE, POWER, "duffing_env/Output-v0"])
+@pytest.mark.parametrize("env_id", [AMPLITUDE, POWER, OUTPUT])
 def test_features_are_those_of_the_twin(env_id):
     envs, observations = observations_of(env_id)
     foresight = Foresight.of(envs, RATE)
@@ -232,13 +233,80 @@ def test_it_survives_being_written():
 @pytest.mark.parametrize(
     ("env_id", "options", "message"),
     [
-        ("duffing_env/Continuous-v0", {}, "must simulate the difference equation for foresight"),
+        ("duffing_env/Continuous-v0", {}, "must believe the difference equation"),
         (AMPLITUDE, {"hold": 2}, "hold must be 1 for foresight, but is 2"),
     ],
 )
 def test_where_it_makes_no_sense_it_says_so(env_id, options, message):
     with pytest.raises(ValueError, match=message):
         Foresight.of(make(env_id, 1, options), RATE)
+
+
+@pytest.mark.parametrize("env_id", [AMPLITUDE, POWER, "duffing_env/Drift-v0"])
+def test_in_its_own_environment_it_stays_as_it_is(env_id):
+    foresight = Foresight.of(make(env_id, 3), RATE)
+    for env in (make(env_id, 2), gym.make(env_id).unwrapped):
+        np.testing.assert_array_equal(foresight.moved_to(env).to_array(), foresight.to_array())
+
+
+def test_in_another_environment_it_takes_what_is_ahead_there():
+    foresight = Foresight.of(make(AMPLITUDE, 1), RATE)
+    options = {"horizon": 90, "max_input": 0.05, "max_output": 0.2, "spread": 0.2, "process_noise": 1e-3}
+    moved = foresight.moved_to(make(AMPLITUDE, 1, options))._outlook
+    there = Foresight.of(make(AMPLITUDE, 1, options), RATE)._outlook
+    for name, entry in moved._asdict().items():
+        if name != "rate":
+            np.testing.assert_array_equal(entry, getattr(there, name))
+    # x, x³, x and u are a third of what they were, or a third to its third power; the variance is 2.5 times as large.
+    third = np.array([1 / 3, 1 / 27, 1 / 3, 1 / 3])
+    np.testing.assert_allclose(moved.rate, RATE * np.outer(third, third) / 2.5, rtol=1e-12)
+
+
+def test_on_a_plant_of_ones_own_it_takes_the_prior_and_the_limits():
+    class Silent:
+        def reset(self):
+            pass
+
+        def step(self, u):
+            return 0.0
+
+    prior = Prior.silverbox_twin(0.1, 1e-4, 2e-4, noise_shape=5.0)
+    env = gym.make("duffing_env/Plant-v0", plant=Silent(), max_output=0.4, prior=prior).unwrapped
+    moved = Foresight.of(make(AMPLITUDE, 1), RATE).moved_to(env)._outlook
+    np.testing.assert_allclose(moved.center, [*prior.theta_mean, prior.eta_mean])
+    np.testing.assert_allclose(moved.std, np.sqrt(np.diag(prior.coefficients_cov)))
+    assert (moved.max_output, moved.energy) == (0.4, np.inf)
+    assert moved.variance == pytest.approx(1e-4**2 + 2e-4**2)
+
+
+@pytest.mark.parametrize(
+    ("trained_in", "env_id"),
+    [(AMPLITUDE, "duffing_env/Continuous-v0"), (AMPLITUDE, POWER), (POWER, AMPLITUDE)],
+)
+def test_where_its_network_could_not_be_meant_it_stays_as_it_is(trained_in, env_id):
+    foresight = Foresight.of(make(trained_in, 1), RATE)
+    assert foresight.moved_to(make(env_id, 1)) is foresight
+
+
+def test_a_policy_keeps_to_the_limit_of_another_track():
+    stays, moves = make_policy("ppo/amplitude"), make_policy("ppo/amplitude", make(OUTPUT, 16))
+    ended = {}
+    for name, policy in (("stays", stays), ("moves", moves)):
+        envs = make(OUTPUT, 16)
+        observations, _ = envs.reset(seed=0)
+        ended[name] = np.zeros(16, dtype=bool)
+        for _ in range(envs.horizon):
+            observations, _, terminated, _, _ = envs.step(policy.predict(observations, deterministic=True)[0])
+            ended[name] |= terminated
+    assert ended["stays"].all()
+    assert not ended["moves"].any()
+
+
+def test_a_policy_with_foresight_refuses_a_foreign_environment():
+    with pytest.raises(
+        ValueError, match="env must be an environment of duffing_env for a policy with foresight, but is"
+    ):
+        make_policy("ppo/amplitude", gym.make("Pendulum-v1"))
 
 
 def test_rewards_differ_from_the_environments_by_a_potential():
