@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -14,9 +13,8 @@ import numpy as np
 import tyro
 from scipy import stats
 
-from agents.evaluation import make
+from agents.evaluation import roll_out
 from agents.oracle import Oracle, Systems
-from agents.policies import make_policy
 from estimator.files import write_atomically
 from estimator.parameters import FloatArray
 
@@ -49,37 +47,17 @@ class Design:
 def measure(track: str, policy: str, systems: int = 256) -> Design:
     """One episode of every system that the track's oracle has, with seed 0."""
     oracle = Oracle.of(Systems.of(track, systems))
-    n = len(oracle.values)
-    envs = make(track, n)
-    player = make_policy(policy, envs, seed=0)
-    observations, _ = envs.reset(seed=0)
-    prior = envs.belief(0).entropy()
-    inputs, outputs = np.full((2, n, envs.horizon), np.nan)
-    gain = np.zeros(n)
-    running, start, state = np.ones(n, dtype=np.bool_), np.ones(n, dtype=np.bool_), None
-    seconds, early = 0.0, 0
-    for t in range(envs.horizon):
-        began = time.process_time()
-        actions, state = player.predict(observations, state, start, deterministic=True)
-        if t > 0:  # the first call compiles
-            seconds += time.process_time() - began
-        observations, _, terminated, truncated, infos = envs.step(actions)
-        start = terminated | truncated
-        inputs[running, t] = envs.max_input * observations[running, 18]  # what was applied, not what was asked for
-        outputs[running, t] = envs.experiment.max_output * observations[running, 19]
-        for row in np.flatnonzero(running & start):
-            gain[row] = prior - infos["belief"][row].entropy()
-        early += int((running & terminated).sum())
-        running &= ~start
+    evaluation, *_ = roll_out(policy, track, len(oracle.values), 0, {})
+    found = evaluation.metrics
     return Design(
         track,
         policy,
-        gain,
-        oracle.efficiency(inputs, outputs),
-        early,
-        float(np.nanmax(np.abs(outputs))),
-        float(np.sqrt(np.nanmean(inputs**2))),
-        1e6 * seconds / n / (envs.horizon - 1),
+        found["information_gain"],
+        oracle.efficiency(evaluation.inputs.T, evaluation.outputs.T),
+        int(found["ended_early"].sum()),
+        float(np.nanmax(np.abs(evaluation.outputs))),
+        float(np.sqrt(np.nanmean(evaluation.inputs**2))),
+        1e6 * float(found["decision_time"][0]),
     )
 
 
