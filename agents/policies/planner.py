@@ -58,8 +58,10 @@ class Planner:
         env: the unwrapped environment, single or vector, whose beliefs it reads: `predict` must be called between
             its steps, with its observations.
         seed: of the search.
-        horizon: samples to plan for; by default 24, and the whole episode where the energy is limited.
-        rounds: of changed copies, `estimator.lanes.LANES` each; of no effect on a plan of the whole episode.
+        horizon: samples to plan for; by default 24, and the whole episode where the energy is limited. No more than 20
+            of the last 48 of an episode.
+        rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 samples; of no
+            effect on a plan of the whole episode.
         risk: upper bound of the probability that an episode ends early, in (0, 1), where the belief is right.
         goal: mean of the goal prior of the displacement [V].
         goal_std: its standard deviation [V]; no goal where it is None.
@@ -77,7 +79,7 @@ class Planner:
         *,
         horizon: int | None = None,
         rounds: int = 4,
-        risk: float = 0.01,
+        risk: float = 0.05,
         goal: float = 0.0,
         goal_std: float | None = None,
         input_cost: float = 0.0,

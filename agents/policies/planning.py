@@ -21,6 +21,10 @@ from estimator.lanes import LANES, jit, kernel
 #: Cells of the map along each axis, from minus the displacement limit to plus.
 _CELLS = 24
 
+#: Towards the end of an episode, when so many samples are left, no later plan mends what a plan misses: the map is then
+#: finer, the rounds are more by this factor, and plans look no further than so many samples.
+_LATE, _LATE_CELLS, _LATE_ROUNDS, _LATE_HORIZON = 48, 32, 4, 20
+
 #: Inputs that are tried at every cell.
 _CHOICES = 3
 
@@ -30,7 +34,8 @@ _HOPELESS = 1.0
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
 
-_BLOCKS = -(-_CELLS * _CELLS // LANES)
+_MOST = _LATE_CELLS * _LATE_CELLS
+_BLOCKS = -(-_MOST // LANES)
 
 
 @kernel
@@ -84,8 +89,7 @@ def play(record, first, horizon, rounds, terms, u, words):
 def _memory(horizon):
     """What a search writes on: blocks of ways and of their continuations, where these come from, and candidates."""
     ways, continued = np.empty((_BLOCKS, SIZE)), np.empty((_CHOICES * _BLOCKS, SIZE))
-    cells = _CELLS * _CELLS
-    origins, inputs = np.empty((horizon, cells), np.int64), np.empty((horizon, cells))
+    origins, inputs = np.empty((horizon, _MOST), np.int64), np.empty((horizon, _MOST))
     return ways, continued, origins, inputs, np.empty((LANES, horizon))
 
 
@@ -93,6 +97,9 @@ def _memory(horizon):
 def _search(memory, record, left, steps, rounds, terms, last, best, rate, words):
     """Improve the plan ``best`` (horizon,), begun one sample ago, and ``rate``; gives the plan's score [nats]."""
     ways, continued, origins, inputs, candidates = memory
+    cells = _CELLS
+    if left <= _LATE:
+        cells, steps, rounds = _LATE_CELLS, min(steps, _LATE_HORIZON), _LATE_ROUNDS * rounds
     M = np.zeros((4, 4))
     _factor(rate, M)
     turned = -best[0]
@@ -102,7 +109,7 @@ def _search(memory, record, left, steps, rounds, terms, last, best, rate, words)
     candidates[0] = best
     candidates[1] = 0.0
     _bound(candidates[1], steps, last, terms)
-    _find_way(ways, continued, origins, inputs, record, left, steps, terms, last, M, candidates[2], words)
+    _find_way(cells, ways, continued, origins, inputs, record, left, steps, terms, last, M, candidates[2], words)
     for j in range(3, LANES):
         candidates[j] = candidates[2 * (j % 2)]
         _change(candidates[j], steps, terms.amplitude, words)
@@ -127,9 +134,9 @@ def _search(memory, record, left, steps, rounds, terms, last, best, rate, words)
 
 
 @jit
-def _find_way(ways, continued, origins, inputs, record, left, steps, terms, last, M, found, words):
+def _find_way(cells, ways, continued, origins, inputs, record, left, steps, terms, last, M, found, words):
     """Build a plan (steps,) by the best ways into the cells of the map, which is laid anew at random every time."""
-    best, ends = np.empty(_CELLS * _CELLS), np.empty(_CELLS * _CELLS, np.int64)
+    best, ends = np.empty(cells * cells), np.empty(cells * cells, np.int64)
     right, up = uniform(words), uniform(words)
     fill(ways[0], record)
     ways[0, U : U + LANES] = last
@@ -144,7 +151,8 @@ def _find_way(ways, continued, origins, inputs, record, left, steps, terms, last
             advance(W, record, terms)
             appraise(W, M, np.sqrt(left - h - 1))
             for j in range(min(LANES, count - b // _CHOICES * LANES)):
-                cell = _place(W[X0 + j], terms.limit, right) * _CELLS + _place(W[X1 + j], terms.limit, up)
+                cell = _place(W[X0 + j], terms.limit, cells, right) * cells
+                cell += _place(W[X1 + j], terms.limit, cells, up)
                 if W[SCORE + j] > best[cell]:
                     best[cell] = W[SCORE + j]
                     ends[cell] = b * LANES + j
@@ -191,10 +199,10 @@ def _choose(choice, last, terms):
 
 
 @jit
-def _place(x, limit, offset):
+def _place(x, limit, cells, offset):
     """The cell of a displacement along one axis."""
-    place = np.int64((x / limit + 1.0) * 0.5 * (_CELLS - 1) + offset)
-    return max(0, min(_CELLS - 1, place))
+    place = np.int64((x / limit + 1.0) * 0.5 * (cells - 1) + offset)
+    return max(0, min(cells - 1, place))
 
 
 @jit
