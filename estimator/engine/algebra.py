@@ -1,0 +1,346 @@
+"""The packed algebra of a filter, as assignments: what a sample does to a joint Gaussian, or to a path.
+
+With M, S, N of a sample (`estimator.engine.derive`) the joint covariance P of states and coefficients is predicted by
+Q = S P Sᵀ, and sensors are taken one after another: with h the derivative of what a sensor shows,
+
+    c = Q h,   s = hᵀ Q h,   e = y - prediction,   q = hᵀ N h / E[γ],   r = 1/E[ξ],
+
+for fixed E[γ], E[ξ] a Kalman step; minimising the free energy over q(γ) and q(ξ) needs the moments of both noises under
+that step's posterior, which depend on scalars only:
+
+    E[w²] = (q e/S)² + q (1 - q/S),   E[v²] = (r e/S)² + r (1 - r/S),   S = s + q + r.
+
+γ is learned from the first sensor that shows the process noise of the same sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sympy as sp
+
+from estimator.engine.derive import Assignments, Moved, calculus, input_at_end, pair, pairs, symbol
+from estimator.models.model import Model
+
+ZERO, ONE, HALF = sp.S.Zero, sp.S.One, sp.S.Half
+
+
+#: 1 where a number is there and 0 where it is NaN; and the second of three where the first is positive, else the third.
+present, select = sp.Function("present"), sp.Function("select")
+
+
+class Gaussian:
+    """The predicted joint Gaussian, while sensors are taken: symbols or expressions of its mean and covariance.
+
+    Args:
+        model: whose quantities.
+        moved: the motion over the sample.
+    """
+
+    def __init__(self, model: Model, moved: Moved) -> None:
+        self.model, self.moved = model, moved
+        self.names, self.states = list(model.names), list(model.states)
+        self.lines: Assignments = []
+        self.mean: dict[str, sp.Expr] = {
+            **dict(zip(self.states, moved.state, strict=True)),
+            **{c: symbol(c) for c in model.coefficients},
+        }
+        self.cov: dict[tuple[str, str], sp.Expr] = {}
+        self._predict()
+
+    def __getitem__(self, key: tuple[str, str]) -> sp.Expr:
+        i, j = key
+        return self.cov[(i, j) if self.names.index(i) <= self.names.index(j) else (j, i)]
+
+    def put(self, name: str, expression: sp.Expr) -> sp.Expr:
+        """Assign, where the expression is more than a name or a number; what stands for it from now on."""
+        if expression.is_Number or expression.is_Symbol:
+            return expression
+        self.lines.append((name, expression))
+        return symbol(name)
+
+    def _predict(self) -> None:
+        """Q = S P Sᵀ: the states' rows change, the coefficients' block stays."""
+        names, by = self.names, self.moved.by
+        rows = []
+        for i, slopes in zip(self.states, by, strict=True):
+            row = {}
+            for j in names:
+                total = sum((a * pair("P", k, j, names) for k, a in zip(names, slopes, strict=True)), ZERO)
+                row[j] = self.put(f"B_{i}_{j}", total)
+            rows.append(row)
+        n = len(self.states)
+        for a, i in enumerate(self.states):
+            for b in range(a, n):
+                total = sum((s * rows[a][k] for k, s in zip(names, by[b], strict=True)), ZERO)
+                self.cov[i, self.states[b]] = self.put(f"Q_{i}_{self.states[b]}", total)
+            for j in names[n:]:
+                self.cov[i, j] = rows[a][j]
+        for a, i in enumerate(names[n:]):
+            for j in names[n + a :]:
+                self.cov[i, j] = pair("P", i, j, names)
+
+    def expected(self, sensor: int, degree: int) -> tuple[sp.Expr, list[sp.Expr]]:
+        """What a sensor is expected to show, and its derivative h by all quantities, at the mean now."""
+        c = calculus(self.model)
+        at = {symbol(name): value for name, value in self.mean.items()} | {
+            symbol("u"): input_at_end(self.model, degree)
+        }
+        return c.outputs[sensor].xreplace(at), [slope.xreplace(at) for slope in c.readouts[sensor]]
+
+    def shown_noise(self, readout: Sequence[sp.Expr]) -> sp.Expr:
+        """hᵀ N h: the variance that unit process noise has in a sensor."""
+        n = len(self.states)
+        total = sum((readout[a] * readout[b] * self.moved.noise[a][b] for a in range(n) for b in range(n)), ZERO)
+        return sp.expand(total) if not total.free_symbols else total
+
+    def covariance_with(self, readout: Sequence[sp.Expr], tag: str) -> tuple[dict[str, sp.Expr], sp.Expr]:
+        """C = Q h and s = hᵀ c."""
+        c = {}
+        for i in self.names:
+            total = sum((h * self[i, j] for j, h in zip(self.names, readout, strict=True)), ZERO)
+            c[i] = self.put(f"C{tag}_{i}", total)
+        s = sum((h * c[i] for i, h in zip(self.names, readout, strict=True)), ZERO)
+        return c, self.put(f"S{tag}", s)
+
+    def add_noise(self, strength: sp.Expr) -> None:
+        """Q + N strength, of the states."""
+        for a, i in enumerate(self.states):
+            for b in range(a, len(self.states)):
+                k, spread = self.states[b], self.moved.noise[a][b]
+                if spread != 0:
+                    self.cov[i, k] = self.put(f"R_{i}_{k}", self.cov[i, k] + strength * spread)
+
+    def condition(
+        self, readout: Sequence[sp.Expr], c: dict[str, sp.Expr], weight: sp.Expr, step: sp.Expr, keep: sp.Expr, tag: str
+    ) -> None:
+        """Condition on a sensor: mean + c step, Q - c cᵀ weight; ``keep`` is r weight.
+
+        A quantity that the sensor shows as it is keeps its row times r/S, which cannot become negative by rounding.
+        """
+        seen = [i for i, h in zip(self.names, readout, strict=True) if h == 1]
+        exact = seen[0] if sum(h != 0 for h in readout) == 1 and seen else None
+        gain = {i: self.put(f"K{tag}_{i}", weight * c[i]) for i in self.names if i != exact}
+        for i in self.names:
+            if c[i] != 0 and step != 0:
+                self.mean[i] = self.put(f"M{tag}_{i}", self.mean[i] + c[i] * step)
+        for (i, j), value in list(self.cov.items()):
+            if exact in (i, j):
+                other = j if i == exact else i
+                self.cov[i, j] = self.put(f"P{tag}_{i}_{j}", keep * c[other])
+            elif c[i] != 0 and c[j] != 0:
+                self.cov[i, j] = self.put(f"P{tag}_{i}_{j}", value - gain[i] * c[j])
+
+    def results(self) -> dict[str, str]:
+        """Row of the belief to the name that holds its new value, where it has one."""
+        found = {name: _text(value) for name, value in self.mean.items()}
+        for i, j in self.cov:
+            found[f"P_{i}_{j}"] = _text(self.cov[i, j])
+        return {row: value for row, value in found.items() if row != value}
+
+
+def update(
+    model: Model, moved: Moved, degree: int, iterations: int, trace: bool, missing: bool
+) -> tuple[Assignments, dict[str, str]]:
+    """Condition on all sensors' outputs ``Y_<sensor>``, and learn the noises: assignments and results by row.
+
+    Args:
+        model: whose belief.
+        moved: the motion over the sample.
+        degree: of the input's polynomial, or taps less one.
+        iterations: variational iterations.
+        trace: also leave what the free energy of every iteration needs, see `traced`.
+        missing: an output that is NaN moves nothing but the state.
+    """
+    g = Gaussian(model, moved)
+    results: dict[str, str] = {}
+    learned = False
+    for k, sensor in enumerate(model.outputs):
+        tag = str(k)
+        y = symbol(f"Y_{sensor}")
+        expected, readout = g.expected(k, degree)
+        expected = g.put(f"Y{tag}", expected)
+        c, s = g.covariance_with(readout, tag)
+        shown = g.shown_noise(readout) if not learned else ZERO
+        innovation, seen = y - expected, None
+        if missing:
+            seen = g.put(f"Z{tag}", present(y))
+            innovation = select(seen, y - expected, ZERO)
+        e = g.put(f"E{tag}", innovation)
+        count = HALF if seen is None else g.put(f"H{tag}", HALF * seen)
+        g_shape, g_rate = symbol("GAMMA_SHAPE"), symbol("GAMMA_RATE")
+        n_shape, n_rate = symbol(f"XI_SHAPE_{sensor}"), symbol(f"XI_RATE_{sensor}")
+        has_noise = shown != 0
+        first_rate = g.put("F_g", shown * g_rate) if has_noise else ZERO
+        new_g_shape = g.put("F_s", g_shape + count) if has_noise else g_shape
+        new_n_shape = g.put(f"X{tag}", n_shape + count)
+        q = g.put(f"Q{tag}_0", first_rate / g_shape) if has_noise else ZERO
+        r = g.put(f"R{tag}_0", n_rate / n_shape)
+        next_q, next_r = q, r
+        new_g_rate, new_n_rate = first_rate, n_rate
+        for i in range(iterations):
+            q, r = next_q, next_r
+            weight = g.put(f"L{tag}_{i}", 1 / (s + q + r))
+            step = g.put(f"J{tag}_{i}", e * weight)
+            both = []
+            for letter, v in (("q", q), ("r", r)):
+                if v == 0:
+                    both.append(ZERO)
+                    continue
+                moment = HALF * ((v * step) ** 2 + v * (1 - v * weight))
+                both.append(g.put(f"A{tag}{letter}_{i}", moment if seen is None else seen * moment))
+            if has_noise:
+                new_g_rate = g.put(f"G{tag}_{i}", first_rate + both[0])
+                next_q = g.put(f"Q{tag}_{i + 1}", new_g_rate / new_g_shape)
+            new_n_rate = g.put(f"O{tag}_{i}", n_rate + both[1])
+            next_r = g.put(f"R{tag}_{i + 1}", new_n_rate / new_n_shape)
+            if trace:
+                for what, value in (("q", q), ("r", r)):
+                    results[f"TRACE_{tag}_{what}_{i}"] = str(value)
+        if has_noise:
+            strength = g.put("B_strength", q / shown)
+            along = {i: ZERO for i in g.names}
+            for a, i in enumerate(g.states):
+                along[i] = sum((readout[b] * moved.noise[a][b] for b in range(len(g.states))), ZERO)
+            c = {i: g.put(f"D{tag}_{i}", c[i] + strength * along[i]) if along[i] != 0 else c[i] for i in g.names}
+            g.add_noise(strength)
+            learned = True
+            results["GAMMA_SHAPE"] = str(new_g_shape)
+            results["GAMMA_RATE"] = str(g.put("F_e", new_g_rate / shown))
+        weight = symbol(f"L{tag}_{iterations - 1}")
+        step = symbol(f"J{tag}_{iterations - 1}")
+        if seen is not None:
+            weight, step = g.put(f"W{tag}_s", seen * weight), step
+        keep = g.put(f"H{tag}_k", r * weight if seen is None else 1 - (s + q) * weight)
+        g.condition(readout, c, weight, step, keep, tag)
+        results[f"XI_SHAPE_{sensor}"] = str(new_n_shape)
+        results[f"XI_RATE_{sensor}"] = str(new_n_rate)
+        if trace:
+            results |= {
+                f"TRACE_{tag}_mean": str(expected),
+                f"TRACE_{tag}_innovation": str(e),
+                f"TRACE_{tag}_variance": str(s),
+            }
+            results |= {f"TRACE_{tag}_shown": str(shown)}
+    results |= g.results()
+    return g.lines, results
+
+
+def expected_sample(model: Model, moved: Moved, degree: int) -> tuple[Assignments, dict[str, str]]:
+    """One imagined sample: `update` with outputs as expected and noise variances ``Q`` and ``R_<sensor>`` given.
+
+    Leaves what the first sensor is expected to show in ``SHOWN`` and its predictive variance in ``SPREAD``.
+    """
+    g = Gaussian(model, moved)
+    results: dict[str, str] = {}
+    g.add_noise(symbol("Q"))
+    for k, sensor in enumerate(model.outputs):
+        tag, r = str(k), symbol(f"R_{sensor}")
+        expected, readout = g.expected(k, degree)
+        c, s = g.covariance_with(readout, tag)
+        weight = g.put(f"L{tag}", 1 / (s + r))
+        if k == 0:
+            results |= {"SHOWN": _text(g.put("Y0", expected)), "SPREAD": _text(g.put("V0", s + r))}
+        g.condition(readout, c, weight, ZERO, g.put(f"H{tag}", r * weight), tag)
+    found = g.results()
+    return g.lines, results | {row: value for row, value in found.items() if row not in model.coefficients}
+
+
+def path_names(model: Model) -> list[str]:
+    """Where a path is: the filter's state, its covariance V, and its sensitivities Z to the coefficients."""
+    states = list(model.states)
+    return [*states, *pairs("V", states), *(f"Z_{i}_{c}" for i in states for c in model.coefficients)]
+
+
+def path_results(model: Model) -> list[str]:
+    """What a path adds up: minus the log likelihood, its slope, and the information (upper triangle)."""
+    coefficients = list(model.coefficients)
+    return ["LOSS", *(f"SLOPE_{c}" for c in coefficients), *pairs("F", coefficients)]
+
+
+def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tuple[Assignments, dict[str, str]]:
+    """One sample of the Kalman filter of the model linearised along its own trajectory, at known coefficients.
+
+    With Z the sensitivities of the state's mean, A its slope by the state and B by the coefficients (both in S),
+
+        V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
+
+    Names besides `path_names` and `path_results`: ``Q``, ``R_<sensor>`` and ``LIVE``, 0 where the series is over.
+
+    Args:
+        model: whose equation.
+        moved: the motion over the sample.
+        degree: of the input's polynomial.
+        observed: whether the filter follows the outputs ``Y_<sensor>``, or the response without noise.
+    """
+    states, coefficients = list(model.states), list(model.coefficients)
+    n, lines = len(states), []
+
+    def put(name: str, expression: sp.Expr) -> sp.Expr:
+        if expression.is_Number or expression.is_Symbol:
+            return expression
+        lines.append((name, expression))
+        return symbol(name)
+
+    mean = dict(zip(states, moved.state, strict=True))
+    cov: dict[tuple[str, str], sp.Expr] = {}
+    for a, i in enumerate(states):
+        row = {
+            k: put(f"B_{i}_{k}", sum((moved.by[a][m] * pair("V", states[m], k, states) for m in range(n)), ZERO))
+            for k in states
+        }
+        for b in range(a, n):
+            total = sum((moved.by[b][m] * row[states[m]] for m in range(n)), symbol("Q") * moved.noise[a][b])
+            cov[i, states[b]] = put(f"W_{i}_{states[b]}", total)
+    sense = {
+        (i, c): put(
+            f"X_{i}_{c}",
+            sum((moved.by[a][m] * symbol(f"Z_{states[m]}_{c}") for m in range(n)), moved.by[a][n + b]),
+        )
+        for a, i in enumerate(states)
+        for b, c in enumerate(coefficients)
+    }
+    at = lambda i, k: cov[(i, k) if states.index(i) <= states.index(k) else (k, i)]  # noqa: E731
+    found = calculus(model)
+    results: dict[str, str] = {}
+    totals = {name: symbol(name) for name in path_results(model)}
+    for k, sensor in enumerate(model.outputs):
+        tag = str(k)
+        here = {symbol(i): value for i, value in mean.items()} | {symbol("u"): input_at_end(model, degree)}
+        shown = put(f"Y{tag}", found.outputs[k].xreplace(here))
+        h = [slope.xreplace(here) for slope in found.readouts[k]]
+        c = {i: put(f"C{tag}_{i}", sum((h[m] * at(i, states[m]) for m in range(n)), ZERO)) for i in states}
+        variance = sum((h[m] * c[states[m]] for m in range(n)), symbol(f"R_{sensor}"))
+        weight = put(f"L{tag}", 1 / variance)
+        told = {
+            name: put(f"T{tag}_{name}", sum((h[m] * sense[states[m], name] for m in range(n)), h[n + b]))
+            for b, name in enumerate(coefficients)
+        }
+        counted = put(f"I{tag}", symbol("LIVE") * weight)
+        for b, name in enumerate(coefficients):
+            for other in coefficients[b:]:
+                totals[f"F_{name}_{other}"] += counted * told[name] * told[other]
+        error = put(f"E{tag}", symbol(f"Y_{sensor}") - shown) if observed else ZERO
+        if observed:
+            totals["LOSS"] += HALF * (counted * error**2 - symbol("LIVE") * sp.log(weight))
+            for name in coefficients:
+                totals[f"SLOPE_{name}"] -= counted * told[name] * error
+        else:
+            results[f"SHOWN_{sensor}"] = _text(shown)
+        gain = {i: put(f"K{tag}_{i}", weight * c[i]) for i in states}
+        mean = {i: put(f"J{tag}_{i}", mean[i] + gain[i] * error) for i in states}
+        sense = {(i, name): put(f"O{tag}_{i}_{name}", sense[i, name] - gain[i] * told[name]) for i, name in sense}
+        cov = {(i, j): put(f"P{tag}_{i}_{j}", value - gain[i] * c[j]) for (i, j), value in cov.items()}
+    results |= {i: _text(mean[i]) for i in states}
+    results |= {f"V_{i}_{j}": _text(value) for (i, j), value in cov.items()}
+    results |= {f"Z_{i}_{name}": _text(value) for (i, name), value in sense.items()}
+    for name, total in totals.items():
+        if total != symbol(name):
+            results[name] = _text(put(f"{name}_e", total))
+    return lines, results
+
+
+def _text(value: sp.Expr) -> str:
+    from estimator.engine.emit import text_of
+
+    return text_of(value)

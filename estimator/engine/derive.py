@@ -1,0 +1,310 @@
+"""From a model to assignments: the calculus, by SymPy.
+
+Everything that the engine compiles is a list of assignments ``(name, expression)`` in the order of execution: the
+model's own expressions with their derivatives, one Runge-Kutta step of them, the packed algebra of a Gaussian, and the
+reverse of all these. Names of the engine begin with a capital letter:
+
+==========  ===========================================================================================
+``M_i``     state i after the sample, before its process noise
+``S_i_j``   its derivative by quantity j (a state before the sample, or a coefficient)
+``N_i_k``   covariance of states i and k that process noise of unit strength brings
+``P_i_j``   covariance of quantities i and j, and ``Q_i_j`` the predicted one
+``U_k``     the input over the sample: taps of a difference equation, or coefficients of τ^k in [0, 1]
+==========  ===========================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations_with_replacement
+
+import sympy as sp
+
+from estimator.models.model import Model
+
+Assignments = list[tuple[str, sp.Expr]]
+
+_FUNCTIONS = {name: getattr(sp, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")}
+
+
+def symbol(name: str) -> sp.Symbol:
+    """The real symbol of a name."""
+    return sp.Symbol(name, real=True)
+
+
+def pair(letter: str, first: str, second: str, order: Sequence[str]) -> sp.Symbol:
+    """The symbol of a symmetric matrix's entry: of the two, the one that stands first in ``order`` comes first."""
+    if order.index(first) > order.index(second):
+        first, second = second, first
+    return symbol(f"{letter}_{first}_{second}")
+
+
+def pairs(letter: str, names: Sequence[str]) -> list[str]:
+    """Names of a symmetric matrix's entries: its upper triangle, row by row."""
+    return [f"{letter}_{i}_{j}" for i, j in combinations_with_replacement(names, 2)]
+
+
+@dataclass(frozen=True)
+class Calculus:
+    """A model's expressions and derivatives, in symbols.
+
+    Attributes:
+        moves: the rates or next states.
+        movers: quantities on which they depend, states first: the others need no sensitivity.
+        by: (n, movers) derivatives of ``moves`` by the movers.
+        noise: how unit noise moves each state.
+        outputs: what each sensor shows.
+        readouts: of each sensor, the derivatives by all quantities.
+    """
+
+    moves: tuple[sp.Expr, ...]
+    movers: tuple[str, ...]
+    by: tuple[tuple[sp.Expr, ...], ...]
+    noise: tuple[sp.Expr, ...]
+    outputs: tuple[sp.Expr, ...]
+    readouts: tuple[tuple[sp.Expr, ...], ...]
+
+
+@cache
+def calculus(model: Model) -> Calculus:
+    """Parse and differentiate a model.
+
+    Raises:
+        ValueError: for an expression that is none, or uses a name that the model does not have.
+    """
+    known = {name: symbol(name) for name in (*model.names, "u", *(["u1", "u2"] if not model.is_continuous else []))}
+    moves = tuple(parse(text, known, model.name) for text in model.moves)
+    without_input = {name: known[name] for name in model.names}
+    noise = tuple(parse(text, without_input, model.name) for text in model.noise)
+    outputs = tuple(parse(text, known, model.name) for text in model.outputs.values())
+    used = set().union(*(e.free_symbols for e in (*moves, *(noise if model.is_continuous else ()))))
+    movers = (*model.states, *(name for name in model.coefficients if known[name] in used))
+    by = tuple(tuple(sp.diff(move, known[name]) for name in movers) for move in moves)
+    readouts = tuple(tuple(sp.diff(shown, known[name]) for name in model.names) for shown in outputs)
+    return Calculus(moves, movers, by, noise, outputs, readouts)
+
+
+def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
+    """An expression in known names.
+
+    Raises:
+        ValueError: naming the text, for what is no expression, or a name that is not known.
+    """
+    if not isinstance(text, str) or "__" in text or len(text) > 10_000:
+        raise ValueError(f"expressions of {where} must be short strings without '__', but one is {text!r:.80}")
+    try:
+        code = compile(text, f"<{where}>", "eval")
+    except (SyntaxError, ValueError) as error:
+        raise ValueError(f"expressions of {where} must be formulas, but {text!r} is none: {error}") from error
+    unknown = sorted(set(code.co_names) - set(known) - set(_FUNCTIONS))
+    if unknown:
+        raise ValueError(
+            f"expressions of {where} may use {sorted(known)} and {sorted(_FUNCTIONS)}, but {text!r} uses {unknown}"
+        )
+    try:
+        parsed = sp.sympify(eval(code, {"__builtins__": {}}, {**_FUNCTIONS, **known}))
+    except (TypeError, AttributeError, sp.SympifyError) as error:
+        raise ValueError(f"expressions of {where} must be formulas, but {text!r} is none: {error}") from error
+    if not isinstance(parsed, sp.Expr):
+        raise ValueError(f"expressions of {where} must be numbers, but {text!r} is {parsed!r}")
+    return parsed
+
+
+def shared(named: Mapping[str, sp.Expr], prefix: str) -> Assignments:
+    """Assignments of ``named`` that calculate common subexpressions once, as ``prefix_0``, ``prefix_1``, ..."""
+    symbols = sp.numbered_symbols(f"{prefix}_", real=True)
+    parts, reduced = sp.cse(list(named.values()), symbols=symbols, optimizations=None)
+    return [*((str(name), expression) for name, expression in parts), *zip(named, reduced, strict=True)]
+
+
+def renamed(assignments: Iterable[tuple[str, sp.Expr]], names: Mapping[str, sp.Expr | str]) -> Assignments:
+    """Assignments with other names, or expressions in the place of names."""
+    mapping = {symbol(old): symbol(new) if isinstance(new, str) else new for old, new in names.items()}
+    return [(str(mapping.get(symbol(name), name)), expression.xreplace(mapping)) for name, expression in assignments]
+
+
+# ---------------------------------------------------------------------------------------------- moving over a sample
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Where a sample moves the state: names or numbers of M, S and N after it, in symbols."""
+
+    state: tuple[sp.Expr, ...]
+    by: tuple[tuple[sp.Expr, ...], ...]
+    noise: tuple[tuple[sp.Expr, ...], ...]
+
+
+def difference_step(model: Model) -> tuple[Assignments, Moved]:
+    """M, S and N of a difference equation: one evaluation of the next state and its derivatives."""
+    c = calculus(model)
+    inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
+    named = {f"M_{i}": move for i, move in zip(model.states, c.moves, strict=True)}
+    for i, row in zip(model.states, c.by, strict=True):
+        named |= {f"S_{i}_{j}": slope for j, slope in zip(c.movers, row, strict=True)}
+    lines = renamed(shared(named, "W"), inputs)
+    # What is a number or a bare name needs no line of its own.
+    plain = {name: e for name, e in lines if name[0] in "MS" and (e.is_Number or e.is_Symbol)}
+    lines = [(name, e) for name, e in lines if name not in plain]
+    value = lambda name: plain.get(name, symbol(name))  # noqa: E731
+    movers = dict.fromkeys(model.names, False) | dict.fromkeys(c.movers, True)
+    by = tuple(tuple(value(f"S_{i}_{j}") if movers[j] else sp.S.Zero for j in model.names) for i in model.states)
+    noise = tuple(tuple(a * b for b in c.noise) for a in c.noise)
+    return lines, Moved(tuple(value(f"M_{i}") for i in model.states), by, noise)
+
+
+def carried(model: Model) -> list[str]:
+    """Names that a differential equation carries over its Runge-Kutta steps: M, S and N, or D where noise is held."""
+    c = calculus(model)
+    names = [f"M_{i}" for i in model.states]
+    names += [f"S_{i}_{j}" for i in model.states for j in c.movers]
+    return names + ([f"D_{i}" for i in model.states] if model.held else pairs("N", list(model.states)))
+
+
+def carried_at_start(model: Model) -> dict[str, sp.Expr]:
+    """What is carried, at the begin of a sample."""
+    start: dict[str, sp.Expr] = dict.fromkeys(carried(model), sp.S.Zero)
+    for i in model.states:
+        start |= {f"M_{i}": symbol(i), f"S_{i}_{i}": sp.S.One}
+    return start
+
+
+def carried_at_end(model: Model) -> Moved:
+    """What is carried, as a sample leaves it."""
+    c, states = calculus(model), list(model.states)
+    by = tuple(tuple(symbol(f"S_{i}_{j}") if j in c.movers else sp.S.Zero for j in model.names) for i in states)
+    if model.held:
+        noise = tuple(tuple(symbol(f"D_{i}") * symbol(f"D_{k}") for k in states) for i in states)
+    else:
+        noise = tuple(tuple(pair("N", i, k, states) for k in states) for i in states)
+    return Moved(tuple(symbol(f"M_{i}") for i in states), by, noise)
+
+
+@cache
+def _stage(model: Model) -> Assignments:
+    """``K_<name>``, the time derivative of everything that is carried, at the carried values and the input u."""
+    c, states = calculus(model), list(model.states)
+    at = {symbol(i): symbol(f"M_{i}") for i in states}
+    n = len(states)
+    named = {f"K_M_{i}": move.xreplace(at) for i, move in zip(states, c.moves, strict=True)}
+    slopes = [[slope.xreplace(at) for slope in row] for row in c.by]
+    for a, i in enumerate(states):
+        for b, j in enumerate(c.movers):
+            through = sum(slopes[a][k] * symbol(f"S_{states[k]}_{j}") for k in range(n))
+            named[f"K_S_{i}_{j}"] = through + (slopes[a][b] if b >= n else 0)
+    noise = [e.xreplace(at) for e in c.noise]
+    if model.held:
+        for a, i in enumerate(states):
+            named[f"K_D_{i}"] = sum(slopes[a][k] * symbol(f"D_{states[k]}") for k in range(n)) + noise[a]
+    else:
+        for a in range(n):
+            for b in range(a, n):
+                spread = sum(
+                    slopes[a][k] * pair("N", states[k], states[b], states)
+                    + slopes[b][k] * pair("N", states[k], states[a], states)
+                    for k in range(n)
+                )
+                named[f"K_N_{states[a]}_{states[b]}"] = spread + noise[a] * noise[b]
+    return shared(named, "W")
+
+
+def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assignments:
+    """One step of order 4, of a ``substeps``-th of a sample: from ``names`` to ``<name>_e``.
+
+    Args:
+        names: what moves.
+        stage: assignments of its derivatives ``K_<name>`` in the names and the input ``u``.
+        substeps: per sample.
+    """
+    h = sp.Rational(1, substeps)
+    lines: Assignments = []
+    rates: list[dict[str, sp.Expr]] = []
+    for k, part in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):
+        tag = "abcd"[k]
+        at: dict[str, sp.Expr | str] = {"u": f"V_{tag if k != 2 else 'b'}"}
+        for name in names:
+            if k:
+                lines.append((f"{name}_{tag}", symbol(name) + part * h * rates[-1][name]))
+                at[name] = f"{name}_{tag}"
+        rename = {name: f"{name}_{tag}" for name, _ in stage}
+        found: dict[str, sp.Expr] = {}
+        for name, expression in renamed(stage, {**rename, **at}):
+            if name.startswith("K_") and (expression.is_Symbol or expression.is_Number):
+                found[name[2 : -len(tag) - 1]] = expression
+            else:
+                lines.append((name, expression))
+                if name.startswith("K_"):
+                    found[name[2 : -len(tag) - 1]] = symbol(name)
+        rates.append(found)
+    k1, k2, k3, k4 = rates
+    sixth = h / 6
+    return lines + [
+        (f"{name}_e", symbol(name) + sixth * (k1[name] + 2 * k2[name] + 2 * k3[name] + k4[name])) for name in names
+    ]
+
+
+def input_over_step(degree: int, substeps: int) -> Assignments:
+    """``V_a``, ``V_b``, ``V_d``: the input at begin, middle and end of a Runge-Kutta step, by its polynomial."""
+    h = sp.Rational(1, substeps)
+    lines = []
+    for tag, part in (("a", sp.S.Zero), ("b", sp.S.Half), ("d", sp.S.One)):
+        value: sp.Expr = symbol(f"U_{degree}")
+        if degree:
+            lines.append((f"T_{tag}", symbol("T") + part * h))
+        for k in range(degree - 1, -1, -1):
+            value = symbol(f"U_{k}") + symbol(f"T_{tag}") * value
+        lines.append((f"V_{tag}", value))
+    return lines
+
+
+def motion_step(model: Model, degree: int) -> Assignments:
+    """One Runge-Kutta step of the state with its sensitivities and noise."""
+    return input_over_step(degree, model.substeps) + runge_kutta(carried(model), _stage(model), model.substeps)
+
+
+def plain_stage(model: Model) -> Assignments:
+    """The time derivative of the state alone."""
+    c = calculus(model)
+    at = {symbol(i): symbol(f"M_{i}") for i in model.states}
+    return shared({f"K_M_{i}": move.xreplace(at) for i, move in zip(model.states, c.moves, strict=True)}, "W")
+
+
+def plain_step(model: Model, degree: int) -> Assignments:
+    """One Runge-Kutta step of the state alone."""
+    names = [f"M_{i}" for i in model.states]
+    return input_over_step(degree, model.substeps) + runge_kutta(names, plain_stage(model), model.substeps)
+
+
+def input_at_end(model: Model, degree: int) -> sp.Expr:
+    """The input that a sensor sees: the newest tap, or the polynomial's value at the end of the sample."""
+    return sum((symbol(f"U_{k}") for k in range(degree + 1)), sp.S.Zero) if model.is_continuous else symbol("U_0")
+
+
+def reverse(assignments: Assignments, wanted: Sequence[str], seeds: Mapping[str, str]) -> Assignments:
+    """The reverse derivative of assignments: adjoints ``G_<name>`` of ``wanted``, from those of the results.
+
+    Args:
+        assignments: forward, each name assigned once.
+        wanted: names whose adjoints are asked for.
+        seeds: result to the name that holds its adjoint.
+
+    Returns:
+        Assignments to run after the forward ones; those of ``wanted`` come last, as ``G_<name>``.
+    """
+    if len({name for name, _ in assignments}) < len(assignments):
+        raise ValueError("assignments must assign every name once, to be reversed")
+    adjoints: dict[str, list[sp.Expr]] = {name: [symbol(seed)] for name, seed in seeds.items()}
+    lines: Assignments = []
+    for name, expression in reversed(assignments):
+        parts = adjoints.pop(name, None)
+        if parts is None:
+            continue
+        own = symbol(f"G_{name}")
+        lines.append((str(own), sum(parts, sp.S.Zero)))
+        for used in sorted(expression.free_symbols, key=str):
+            slope = sp.diff(expression, used)
+            adjoints.setdefault(str(used), []).append(slope * own)
+    lines += [(f"G_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in wanted]
+    return lines

@@ -1,0 +1,125 @@
+"""From assignments to Python source that Numba compiles across lanes: the only module that knows how code is written.
+
+All quantities of some independent systems lie in one flat float64 array, the *block* ``W``: the quantity in row r of
+lane j is ``W[r * lanes + j]``. One array with constant offsets is what makes the loop over the lanes vectorise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import sympy as sp
+from sympy.printing.pycode import PythonCodePrinter
+
+from estimator.engine.derive import Assignments
+
+
+class _Printer(PythonCodePrinter):
+    """Floats for numbers, products for small powers, bare names for functions."""
+
+    def _print_Integer(self, expr: sp.Integer) -> str:
+        return f"{int(expr)}.0"
+
+    def _print_Rational(self, expr: sp.Rational) -> str:
+        return repr(float(expr))
+
+    def _print_Float(self, expr: sp.Float) -> str:
+        return repr(float(expr))
+
+    def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
+        base, exponent = expr.as_base_exp()
+        if exponent == sp.Rational(1, 2):
+            return f"sqrt({self._print(base)})"
+        if exponent == -sp.Rational(1, 2):
+            return f"(1.0/sqrt({self._print(base)}))"
+        if exponent.is_Integer and 1 <= abs(int(exponent)) <= 8:
+            inner = self._print(base) if base.is_Symbol else f"({self._print(base)})"
+            product = "*".join([inner] * abs(int(exponent)))
+            return f"(1.0/({product}))" if exponent < 0 else f"({product})" if exponent > 1 else product
+        return f"({self._print(base)})**({self._print(exponent)})"
+
+    def _print_Function(self, expr: sp.Function) -> str:
+        return f"{expr.func.__name__}({', '.join(self._print(a) for a in expr.args)})"
+
+    _print_sin = _print_cos = _print_tanh = _print_exp = _print_log = _print_Function
+
+
+_PRINTER = _Printer({"fully_qualified_modules": False})
+
+
+def text_of(expression: sp.Expr) -> str:
+    """Python source of an expression."""
+    return str(_PRINTER.doprint(expression))
+
+
+def lane_loop(
+    name: str,
+    lines: Assignments,
+    results: Mapping[str, str],
+    layout: Mapping[str, int],
+    lanes: int,
+    uniform: Sequence[str] = (),
+    doc: str = "",
+) -> str:
+    """Source of ``name(W, *uniform)``, which executes assignments in every lane of a block.
+
+    Args:
+        name: of the function.
+        lines: in the order of execution; those that no result needs are left out.
+        results: row to the name (or number) whose value it receives.
+        layout: row to its number. Rows that the assignments use are read first.
+        lanes: systems in a block; the loop is left out for 1.
+        uniform: names that are the same in all lanes, and become arguments.
+        doc: a line for the reader.
+
+    Raises:
+        ValueError: for a name that is neither assigned, nor a row, nor uniform.
+    """
+    kept = _needed(lines, {str(v) for v in results.values()})
+    assigned = {target for target, _ in kept}
+    used = {str(s) for _, e in kept for s in e.free_symbols} | {
+        str(v) for v in results.values() if not is_number(str(v))
+    }
+    read = sorted((used - assigned) - set(uniform), key=lambda row: (layout.get(row.removeprefix("G_"), -1), row))
+    adjoint = any(row not in layout and row.removeprefix("G_") in layout for row in (*read, *results))
+
+    def place(row: str) -> str:
+        """Where a row lies; the adjoint of a row, ``G_<row>``, lies in the same place of the block ``A``."""
+        block, bare = ("W", row) if row in layout else ("A", row.removeprefix("G_"))
+        if bare not in layout:
+            raise ValueError(f"{name} uses {row}, which no line assigns, no row holds and no argument brings")
+        return f"{block}[{layout[bare] * lanes}{' + j' if lanes > 1 else ''}]"
+
+    body = [f"{row} = {place(row)}" for row in read]
+    body += [f"{target} = {text_of(e)}" for target, e in kept]
+    body += [f"{place(row)} = {value}" for row, value in results.items()]
+    source = [f"def {name}({', '.join(['W', *(['A'] if adjoint else []), *uniform])}):", f'    """{doc}"""']
+    if lanes > 1:
+        source.append(f"    for j in range({lanes}):")
+    indent = "        " if lanes > 1 else "    "
+    return "\n".join(source + [indent + line for line in body]) + "\n"
+
+
+def _needed(lines: Assignments, wanted: set[str]) -> Assignments:
+    """The assignments that what is wanted depends on."""
+    kept: Assignments = []
+    needed = set(wanted)
+    for name, expression in reversed(lines):
+        if name in needed:
+            kept.append((name, expression))
+            needed |= {str(s) for s in expression.free_symbols}
+    return kept[::-1]
+
+
+def number(text: str) -> sp.Expr:
+    """The number that a text is."""
+    return sp.Float(float(text))
+
+
+def is_number(text: str) -> bool:
+    """Whether a text is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

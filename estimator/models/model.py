@@ -1,0 +1,153 @@
+"""What a model is: one equation, written once, from which everything else is derived.
+
+A model is a plain declaration. `estimator.engine` makes of it the plant that an environment steps, the filter, the
+Fisher information, what a planner imagines and the gradient that an oracle climbs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import keyword
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+
+#: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
+
+#: Names that stand for something else: the input and its older values, the sampling step, and functions.
+RESERVED = frozenset({"u", "u1", "u2", "step", "sin", "cos", "exp", "log", "sqrt", "tanh"})
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A plant with unknown coefficients, as a person would write it on paper.
+
+    Either ``rates`` (a differential equation; time is counted in samples) or ``next_state`` (a difference equation) is
+    given. All expressions are strings in the names of states and coefficients and the input ``u``, with ``sin``,
+    ``cos``, ``exp``, ``log``, ``sqrt`` and ``tanh``. In a difference equation ``u`` is the newest input that acts on
+    the next state, ``u1`` and ``u2`` are the inputs one and two samples before it.
+
+    Attributes:
+        name: of the model, for messages and for the names of generated files.
+        states: name to unit.
+        coefficients: name to unit; all of them are unknown and constant (or walk slowly, where an estimator drifts).
+        noise: per state, how process noise of unit strength moves it: for rates, its white intensity's root, or where
+            ``held`` a force that is constant over a sample; for a next state, what is added to it.
+        outputs: name of a sensor to what it shows without its own noise; at least one. The process noise's strength is
+            counted as the first sensor would show that of one sample.
+        rates: the states' derivatives by time.
+        next_state: the states one sample later.
+        held: whether the process noise of a differential equation is held over a sample, instead of white.
+        substeps: Runge-Kutta steps of order 4 per sample: enough that the error of integration stays below a tenth of
+            the standard deviation that a long record leaves.
+        physical: parameter of the plant to its expression in coefficients and the sampling ``step`` [s]; may be empty.
+        physical_units: their units.
+        inverse: coefficient to its expression in the parameters and ``step``; all of them, where ``physical`` is given.
+
+    Raises:
+        ValueError: naming the argument, for a name that is no lower-case identifier or stands twice, or expressions
+            that do not fit the names.
+
+    Example:
+        >>> from estimator.models.model import Model
+        >>> decay = Model("decay", {"x": "V"}, {"rate": "1"}, noise=("1",), outputs={"y": "x"}, rates=("u - rate*x",))
+        >>> decay.n_states, decay.n_coefficients, decay.is_continuous
+        (1, 1, True)
+    """
+
+    name: str
+    states: Mapping[str, str]
+    coefficients: Mapping[str, str]
+    noise: tuple[str, ...]
+    outputs: Mapping[str, str]
+    rates: tuple[str, ...] = ()
+    next_state: tuple[str, ...] = ()
+    held: bool = False
+    substeps: int = 1
+    physical: Mapping[str, str] = field(default_factory=dict)
+    physical_units: Mapping[str, str] = field(default_factory=dict)
+    inverse: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names = [*self.states, *self.coefficients, *self.outputs]
+        for name in (self.name, *names):
+            if not _NAME.fullmatch(name) or keyword.iskeyword(name) or name in RESERVED:
+                raise ValueError(
+                    f"names must be lower-case identifiers, none of {sorted(RESERVED)}, but one is {name!r}; rename it"
+                )
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise ValueError(f"states, coefficients and outputs must have different names, but share {repeated}")
+        if bool(self.rates) == bool(self.next_state):
+            raise ValueError("either rates or next_state must be given; rates for a differential equation")
+        for given, values in (("rates" if self.rates else "next_state", self.moves), ("noise", self.noise)):
+            if len(values) != len(self.states):
+                raise ValueError(
+                    f"{given} must have one expression per state, {len(self.states)}, but has {len(values)}"
+                )
+        if not self.states or not self.outputs:
+            raise ValueError("states and outputs must name at least one each, but one of them is empty")
+        if not isinstance(self.substeps, int) or not 1 <= self.substeps <= 1000:
+            raise ValueError(f"substeps must be a whole number from 1 to 1000, but is {self.substeps!r}")
+        if self.held and not self.is_continuous:
+            raise ValueError("held must be False for a difference equation, whose noise comes once a sample")
+        if bool(self.physical) != bool(self.inverse) or (self.inverse and set(self.inverse) != set(self.coefficients)):
+            raise ValueError(
+                f"physical and inverse go together, and inverse must give {list(self.coefficients)}, but gives "
+                f"{list(self.inverse)}"
+            )
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether the model is a differential equation."""
+        return bool(self.rates)
+
+    @property
+    def moves(self) -> tuple[str, ...]:
+        """The rates or the next state."""
+        return self.rates or self.next_state
+
+    @property
+    def n_states(self) -> int:
+        """Number of states n."""
+        return len(self.states)
+
+    @property
+    def n_coefficients(self) -> int:
+        """Number of coefficients K."""
+        return len(self.coefficients)
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of sensors."""
+        return len(self.outputs)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """States, then coefficients: the order of every joint mean and covariance."""
+        return (*self.states, *self.coefficients)
+
+    @cached_property
+    def taps(self) -> int:
+        """Inputs that a difference equation looks at: 1, or 2 or 3 where it names ``u1`` or ``u2``."""
+        text = " ".join((*self.moves, *self.outputs.values()))
+        return max(i + 1 for i in range(3) if i == 0 or re.search(rf"\bu{i}\b", text))
+
+    @cached_property
+    def digest(self) -> str:
+        """Twelve hexadecimal digits that tell models apart."""
+        described = json.dumps({key: dict(v) if isinstance(v, Mapping) else v for key, v in vars(self).items()})
+        return hashlib.sha256(described.encode()).hexdigest()[:12]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Model) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def to_dict(self) -> dict[str, object]:
+        """The declaration as JSON can hold it; ``Model(**d)`` makes the same model again."""
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}

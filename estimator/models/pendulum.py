@@ -1,0 +1,26 @@
+"""The conditionally linear stochastic pendulum of IO-SMC² (Iqbal et al., ICML 2024): q'' = -p1 sin q - p2 q' + p3 u."""
+
+from __future__ import annotations
+
+from estimator.models.model import Model
+
+#: Seconds between two samples.
+STEP = 0.05
+
+#: Diffusion of q'' in rad/s^1.5, and the prior of p1, p2 and p3 (s⁻², s⁻¹, s⁻²): means and variances.
+DIFFUSION, PRIOR_MEAN, PRIOR_VARIANCE = 0.1, (14.7, 0.0, 3.0), (0.1, 0.01, 0.1)
+
+#: Both states are seen. Time is counted in samples, so the angular velocity w is in rad per sample and the coefficients
+#: are p1 δ², p2 δ and p3 δ². Noise of unit strength would move q by 1 within a sample.
+PENDULUM = Model(
+    name="pendulum",
+    states={"q": "rad", "w": "rad"},
+    coefficients={"gravity": "1", "friction": "1", "torque": "1"},
+    rates=("w", "torque*u - friction*w - gravity*sin(q)"),
+    noise=("0", "sqrt(3)"),
+    outputs={"angle": "q", "velocity": "w"},
+    substeps=2,
+    physical={"p1": "gravity/step**2", "p2": "friction/step", "p3": "torque/step**2"},
+    physical_units={"p1": "s⁻²", "p2": "s⁻¹", "p3": "s⁻²"},
+    inverse={"gravity": "p1*step**2", "friction": "p2*step", "torque": "p3*step**2"},
+)
