@@ -1,0 +1,274 @@
+"""The belief: one Gaussian over states and coefficients of a model, and Gamma densities of its noises' precisions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.engine.tasks import belief_names
+from estimator.gaussian import GaussianCoefficients
+from estimator.models.model import Model
+from estimator.parameters import SAMPLING_STEP, FloatArray
+
+Self = TypeVar("Self", bound="Belief")
+
+
+@cache
+def covariance_places(model: Model) -> npt.NDArray[np.intp]:
+    """(d, d) places of the covariance's entries in a record, for d states and coefficients."""
+    d = len(model.names)
+    places = np.empty((d, d), dtype=np.intp)
+    upper = np.triu_indices(d)
+    places[upper] = places.T[upper] = d + np.arange(len(upper[0]))
+    return places
+
+
+@cache
+def record_size(model: Model) -> int:
+    """Numbers in a record."""
+    return len(belief_names(model))
+
+
+@dataclass(frozen=True, eq=False)
+class Belief(GaussianCoefficients):
+    """A prior or posterior: q(states, coefficients) Gaussian, q(γ) and q(ξ) of each sensor Gamma.
+
+    A copy: later updates do not change it. A coefficient of variance 0 is known. γ is the precision of what a sample's
+    process noise alone does to the first sensor.
+
+    Attributes:
+        model: whose states and coefficients these are.
+        record: (size,) the numbers, as `estimator.engine.tasks.belief_names` orders them: means, the upper triangle of
+            the covariance row by row, shape and rate of γ, then of each sensor's ξ. Time is counted in samples.
+        step: sampling step [s], for physical parameters.
+        factorisation: of the inference that made it; ``mean_field`` is the paper's.
+
+    Raises:
+        ValueError: naming the part, for a wrong size, numbers that are not finite, a covariance that is not positive
+            semi-definite, or a shape or rate that is not positive.
+    """
+
+    model: Model
+    record: FloatArray
+    step: float = SAMPLING_STEP
+    factorisation: str = "structured"
+
+    def __post_init__(self) -> None:
+        record = np.array(self.record, dtype=np.float64)
+        if record.shape != (record_size(self.model),):
+            raise ValueError(
+                f"record must have shape {(record_size(self.model),)} for the model {self.model.name!r}, but has "
+                f"{record.shape}; make it with Belief.of"
+            )
+        if not np.isfinite(record).all():
+            bad = belief_names(self.model)[int(np.argmin(np.isfinite(record)))]
+            raise ValueError(f"record must be finite, but {bad} is not; replace it")
+        noises = record[-2 - 2 * self.model.n_outputs :]
+        if (noises <= 0).any():
+            raise ValueError(f"shapes and rates of the noises must be positive, but are {noises.tolist()}")
+        if not 0 < self.step < np.inf:
+            raise ValueError(f"step must be positive and finite, but is {self.step}; give the seconds between samples")
+        cov = record[covariance_places(self.model)]
+        std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+        unit = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
+        if (np.diag(cov) < 0).any() or np.linalg.eigvalsh(cov / unit)[0] < -1e-9 * len(cov):
+            raise ValueError(f"covariance must be positive semi-definite, but has the diagonal {np.diag(cov).tolist()}")
+        record.flags.writeable = False
+        object.__setattr__(self, "record", record)
+
+    @classmethod
+    def of(
+        cls: type[Self],
+        model: Model,
+        mean: npt.ArrayLike,
+        cov: npt.ArrayLike,
+        gamma: tuple[float, float],
+        xi: tuple[float, float] | Sequence[tuple[float, float]],
+        **others: Any,
+    ) -> Self:
+        """From moments.
+
+        Args:
+            model: whose states and coefficients.
+            mean: (d,) of the states, then the coefficients.
+            cov: (d, d) their covariance.
+            gamma: shape and rate of the process precision.
+            xi: shape and rate of the measurement precision; one pair for each sensor where there are several.
+            others: ``step`` and ``factorisation``.
+
+        Raises:
+            ValueError: as the class, or for shapes that do not fit.
+        """
+        d = len(model.names)
+        first, second = np.array(mean, dtype=np.float64), np.array(cov, dtype=np.float64)
+        if first.shape != (d,) or second.shape != (d, d):
+            raise ValueError(
+                f"mean and cov must have shapes {(d,)} and {(d, d)} for the model {model.name!r}, but have "
+                f"{first.shape} and {second.shape}"
+            )
+        noises = np.ravel([gamma, *np.reshape(np.asarray(xi, dtype=np.float64), (-1, 2))])
+        record = np.empty(record_size(model))
+        if len(noises) != 2 + 2 * model.n_outputs:
+            raise ValueError(f"xi must have a pair for each of {list(model.outputs)}, but is {xi!r}")
+        if not np.allclose(second, second.T, rtol=1e-9, atol=0):
+            raise ValueError("cov must be symmetric; pass (C + C.T) / 2")
+        record[:d] = first
+        record[covariance_places(model)] = second
+        record[-len(noises) :] = noises
+        return cls(model, record, **others)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all numbers are the same, as Gymnasium's checker asks of two episodes of one seed."""
+        if not isinstance(other, Belief):
+            return NotImplemented
+        return self._kind == other._kind and np.array_equal(self.record, other.record)
+
+    def __hash__(self) -> int:
+        return hash((self._kind, self.record.tobytes()))
+
+    @property
+    def _kind(self) -> tuple[Any, ...]:
+        return (self.model.digest, self.step, self.factorisation)
+
+    def with_records(self: Self, records: FloatArray) -> list[Self]:
+        """Beliefs of the same kind with other records (n, size), which must not be written to any more."""
+        beliefs = []
+        for record in records:
+            # Past the checks, which take as long as 20 steps of one of a thousand environments.
+            belief = object.__new__(type(self))
+            belief.__dict__.update(self.__dict__, record=record)
+            beliefs.append(belief)
+        return beliefs
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the coefficients."""
+        return tuple(self.model.coefficients)
+
+    @property
+    def mean(self) -> FloatArray:
+        """(d,) means of states and coefficients."""
+        return self.record[: len(self.model.names)].copy()
+
+    @property
+    def cov(self) -> FloatArray:
+        """(d, d) their covariance."""
+        return self.record[covariance_places(self.model)]
+
+    @property
+    def state_mean(self) -> FloatArray:
+        """(n,) means of the states."""
+        return self.record[: self.model.n_states].copy()
+
+    @property
+    def state_cov(self) -> FloatArray:
+        """(n, n) covariance of the states."""
+        n = self.model.n_states
+        return self.record[covariance_places(self.model)[:n, :n]]
+
+    @property
+    def coefficients_mean(self) -> FloatArray:
+        """(K,) means of the coefficients."""
+        return self.record[self.model.n_states : len(self.model.names)].copy()
+
+    @property
+    def coefficients_cov(self) -> FloatArray:
+        """(K, K) covariance of the coefficients."""
+        n = self.model.n_states
+        return self.record[covariance_places(self.model)[n:, n:]]
+
+    @property
+    def noises(self) -> FloatArray:
+        """(2 + 2 sensors,) shape and rate of γ, then of each ξ."""
+        return self.record[-2 - 2 * self.model.n_outputs :].copy()
+
+    @property
+    def gamma_mean(self) -> float:
+        """E[γ], the process precision."""
+        return float(self.noises[0] / self.noises[1])
+
+    @property
+    def xi_mean(self) -> float:
+        """E[ξ], the measurement precision of the first sensor."""
+        return float(self.noises[2] / self.noises[3])
+
+    def coefficients(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of each coefficient, by name; time is counted in samples."""
+        stds = np.sqrt(np.diag(self.coefficients_cov)).tolist()
+        return dict(zip(self.names, zip(self.coefficients_mean.tolist(), stds, strict=True), strict=True))
+
+    def physical(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (p,) and covariance (p, p) of the physical parameters, to first order; the coefficients without any."""
+        return propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.step)
+
+    def parameters(self) -> dict[str, tuple[float, float, str]]:
+        """Mean, standard deviation and unit of each physical parameter, by name."""
+        mean, cov = self.physical()
+        units = self.model.physical_units or self.model.coefficients
+        rows = zip(self.model.physical or self.model.coefficients, mean.tolist(), np.sqrt(np.diag(cov)), strict=True)
+        return {name: (value, float(std), units[name]) for name, value, std in rows}
+
+
+def propagate(
+    model: Model, mean: FloatArray, cov: FloatArray, step: float = SAMPLING_STEP
+) -> tuple[FloatArray, FloatArray]:
+    """Moments (..., p) and (..., p, p) of the physical parameters from those of the coefficients, to first order."""
+    if not model.physical:
+        return mean.copy(), cov.copy()
+    values, slopes = _physical_code(model)
+    columns = [*np.moveaxis(mean, -1, 0)]
+    shape = mean.shape[:-1]
+    physical = np.stack([np.broadcast_to(v, shape) for v in values(*columns, step)], axis=-1)
+    flat = [np.broadcast_to(v, shape) for v in slopes(*columns, step)]
+    jacobian = np.stack(flat, axis=-1).reshape(*shape, len(model.physical), len(model.coefficients))
+    return physical, jacobian @ cov @ np.swapaxes(jacobian, -1, -2)
+
+
+def coefficients_of(model: Model, parameters: Mapping[str, Any], step: float = SAMPLING_STEP) -> FloatArray:
+    """(..., K) the coefficients of physical parameters of shape (...); themselves, for a model without any."""
+    if not model.inverse:
+        return np.stack([np.asarray(parameters[name], dtype=np.float64) for name in model.coefficients], axis=-1)
+    values, _ = _inverse_code(model)
+    found = values(*(parameters[name] for name in model.physical), step)
+    return np.stack(np.broadcast_arrays(*found), axis=-1).astype(np.float64)
+
+
+def _map_code(model: Model, which: str) -> tuple[Any, Any]:
+    """Values and slopes of a map between coefficients and parameters, as functions of all of them and the step."""
+    from estimator.engine import cache as stored
+
+    mapped = getattr(model, which)
+    names = list(model.coefficients if which == "physical" else model.physical)
+
+    def make() -> str:
+        from estimator.engine import derive, emit
+
+        known = {name: derive.symbol(name) for name in (*names, "step")}
+        expressions = [derive.parse(text, known, model.name) for text in mapped.values()]
+        slopes = [e.diff(known[name]) for e in expressions for name in names]
+        source = ""
+        for title, values in (("values", expressions), ("slopes", slopes)):
+            lines = derive.shared({f"V_{i}": e for i, e in enumerate(values)}, "W")
+            body = "".join(f"    {name} = {emit.text_of(e)}\n" for name, e in lines)
+            gathered = ", ".join(f"V_{i}" for i in range(len(values)))
+            source += f"def {title}({', '.join([*names, 'step'])}):\n{body}    return ({gathered},)\n"
+        return source
+
+    functions = {name: getattr(np, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")}
+    code = stored.load(model.name, which, model.digest, make, functions)
+    return code.values, code.slopes
+
+
+@cache
+def _physical_code(model: Model) -> tuple[Any, Any]:
+    return _map_code(model, "physical")
+
+
+@cache
+def _inverse_code(model: Model) -> tuple[Any, Any]:
+    return _map_code(model, "inverse")

@@ -1,0 +1,101 @@
+"""Priors: what is believed of a model's coefficients before the first sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.models.model import Model
+from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.posterior import Belief, coefficients_of
+
+#: Points of the quadrature over all parameters together, at most; with 20 along each of four, moments converge to 1e-10
+#: for every spread up to 0.999.
+_POINTS = 160_000
+
+
+def log_uniform_moments(
+    model: Model, center: Mapping[str, float], spread: float, step: float = SAMPLING_STEP
+) -> tuple[FloatArray, FloatArray]:
+    """Moments of the coefficients of a plant known only up to a factor.
+
+    The physical parameters (the coefficients, where the model has none) are independent, each log-uniform on
+    [center (1 - spread), center (1 + spread)]. Integrated by tensor Gauss-Legendre quadrature over the logarithms.
+
+    Args:
+        model: whose coefficients.
+        center: parameter to its middle; of any sign, but not 0.
+        spread: relative half-width of the intervals, in [0, 1).
+        step: sampling step [s].
+
+    Returns:
+        Mean (K,) and covariance (K, K).
+
+    Raises:
+        ValueError: for a spread out of range, or a center that is 0, missing or not finite.
+    """
+    names = list(model.physical or model.coefficients)
+    if not 0 <= spread < 1:
+        raise ValueError(f"spread must be in [0, 1), but is {spread}; log-uniform intervals do not reach 0")
+    for name in names:
+        if name not in center or not np.isfinite(center[name]) or center[name] == 0:
+            raise ValueError(f"center must have a finite {name} other than 0, but is {dict(center)}")
+    nodes_per_axis = max(2, min(20, int(_POINTS ** (1 / len(names)) + 1e-9)))
+    nodes, weights = np.polynomial.legendre.leggauss(nodes_per_axis)
+    # log(1 ± spread) = log(1 - spread²) / 2 ± artanh(spread)
+    factors = np.sqrt(1 - spread**2) * np.exp(np.arctanh(spread) * nodes)
+    grid = np.stack(np.meshgrid(*[factors] * len(names), indexing="ij")).reshape(len(names), -1)
+    probabilities = np.ones(1)
+    for _ in names:
+        probabilities = np.outer(probabilities, weights / 2).ravel()  # the weights sum to 2, the length of [-1, 1]
+    points = coefficients_of(model, {name: center[name] * row for name, row in zip(names, grid, strict=True)}, step)
+    # Plain sums, because the last digits of a BLAS product depend on its number of threads.
+    mean = np.array([(probabilities * column).sum() for column in points.T])
+    deviations = points - mean
+    cov = np.array([[(probabilities * (one * other)).sum() for one in deviations.T] for other in deviations.T])
+    return mean, cov
+
+
+def weak_prior(
+    model: Model,
+    mean: npt.ArrayLike,
+    cov: npt.ArrayLike,
+    process_noise: float = 5e-4,
+    measurement_noise: float | Sequence[float] = 5e-4,
+    noise_shape: float = 2.0,
+    state_std: float | Sequence[float] = 1e-3,
+    step: float = SAMPLING_STEP,
+) -> Belief:
+    """A prior of given coefficients, with weak Gamma priors of the noises and the plant near rest.
+
+    Args:
+        model: whose coefficients.
+        mean: (K,) of the coefficients.
+        cov: (K, K) their covariance.
+        process_noise: standard deviation, in the first sensor, of one sample's process noise, at which γ is centred.
+        measurement_noise: standard deviation at which ξ is centred: one number, or one for each sensor.
+        noise_shape: shape of the Gamma priors: 2 is worth four noises seen one by one. They never are, so that even
+            such a prior binds for thousands of samples (docs/coverage.md): centre it with care.
+        state_std: standard deviation of the states about 0: one number, or one for each.
+        step: sampling step [s].
+
+    Raises:
+        ValueError: for a value out of its range, or as `Belief`.
+    """
+    for name, value in (
+        ("process_noise", process_noise),
+        ("measurement_noise", measurement_noise),
+        ("noise_shape", noise_shape),
+        ("state_std", state_std),
+    ):
+        if not (np.all(np.asarray(value) > 0) and np.all(np.isfinite(value))):
+            raise ValueError(f"{name} must be positive and finite, but is {value}; pass a value above 0")
+    n, k = model.n_states, model.n_coefficients
+    joint_mean, joint = np.zeros(n + k), np.zeros((n + k, n + k))
+    joint_mean[n:], joint[n:, n:] = mean, cov
+    joint[:n, :n] = np.diag(np.broadcast_to(np.asarray(state_std, dtype=np.float64) ** 2, n))
+    sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
+    xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
+    return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, step=step)
