@@ -22,6 +22,8 @@ import numpy.typing as npt
 
 #: Unit of rounding of float32: half the distance from 1 to the next number.
 U32 = 2.0**-24
+#: The same of float64.
+U64 = 2.0**-53
 #: Error of an elementary function, in parts of its value.
 ELEMENTARY = 8 * U32
 

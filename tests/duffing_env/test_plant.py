@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rounding import U64
 
 from duffing_env.layout import LAYOUT, N_ROWS
 from duffing_env.plant import draw_noise, move_plant, play_record
@@ -30,9 +31,11 @@ def test_difference_plant_is_eq_2_with_a_noisy_sensor():
     flat, row = block(x=x, last_x=last_x, u=u, noise_w=w, noise_v=v, true_t1=t1, true_t2=t2, true_t3=t3, true_e=e)
     move_plant(flat, 3e-4, 2e-2)
     moved = t1 * x + t2 * x**3 + t3 * last_x + e * u + 3e-4 * w
-    np.testing.assert_allclose(row("x"), moved, rtol=0, atol=1e-15)
+    # Sums of five and six terms of up to three factors: no term is rounded more than eight times on a side.
+    size = sum(map(np.abs, (t1 * x, t2 * x**3, t3 * last_x, e * u, 3e-4 * w)))
+    assert (np.abs(row("x") - moved) <= 16 * U64 * size).all()
     np.testing.assert_array_equal(row("last_x"), x)
-    np.testing.assert_allclose(row("y"), moved + 2e-2 * v, rtol=0, atol=1e-15)
+    assert (np.abs(row("y") - moved - 2e-2 * v) <= 16 * U64 * (size + np.abs(2e-2 * v))).all()
     np.testing.assert_array_equal(row("u"), u)
 
 
