@@ -338,7 +338,7 @@ def test_loading_and_acting_needs_no_torch(tmp_path):
     observations = random_observations(4)
     finished = subprocess.run(
         [sys.executable, "-c", script, folder],
-        input=json.dumps(observations.tolist()), capture_output=True, text=True, timeout=60, check=True,
+        input=json.dumps(observations.tolist()), capture_output=True, text=True, timeout=600, check=True,
         cwd=Path(agents.__file__).parents[1],
     )  # fmt: skip
     actions, loaded = json.loads(finished.stdout)

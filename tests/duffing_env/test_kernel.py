@@ -2,24 +2,25 @@
 
 import numpy as np
 import pytest
+from rounding import U64
 from scipy import stats
-from twin import PARAMETERS, TwinEnv, assert_env_follows_twin
+from twin import PAIRS, PARAMETERS, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import OBSERVATION
-from duffing_env.rewards import REWARDS
 from estimator import SILVERBOX_TWIN, PhysicalParameters, to_coefficients
 
 CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
 
 
-@pytest.mark.parametrize("reward", REWARDS)
-@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+@pytest.mark.parametrize(("factorisation", "reward"), PAIRS)
 def test_env_follows_its_twin(factorisation, reward):
-    for seed in (0, 1, 2**40):
+    # The rewards meet the same episodes: one of them shows that seeds differ in nothing but their numbers.
+    seeds = (0, 1, 2**40) if reward == "information_gain" else (0,)
+    for seed in seeds:
         env = DuffingEnv(factorisation=factorisation, reward=reward)
         endings = assert_env_follows_twin(env, TwinEnv(seed, factorisation=factorisation), reward, seed)
         assert endings == [(False, True)] * 2
@@ -44,7 +45,7 @@ def test_env_follows_its_twin_with_other_options(factorisation, options):
             DuffingEnv(factorisation=factorisation, **options)
         return
     options = {"factorisation": factorisation, **options}
-    for seed in range(3):
+    for seed in range(2):
         endings = assert_env_follows_twin(DuffingEnv(**options), TwinEnv(seed, **options), "information_gain", seed, 4)
         if "max_output" in options:
             assert (True, False) in endings
@@ -73,13 +74,12 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
     assert np.abs(np.corrcoef(quantiles)[np.triu_indices(4, 1)]).max() < 4 / np.sqrt(size)
 
     expected = to_coefficients(PhysicalParameters(*drawn))
-    for name, values in (
-        ("t1", expected.theta1),
-        ("t2", expected.theta2),
-        ("t3", expected.theta3),
-        ("e", expected.eta),
-    ):
-        np.testing.assert_allclose(batch.quantity(f"true_{name}"), values, rtol=1e-13)
+    # θ₁ = 1 + m / (m + c h) - a η cancels; the others are products. None takes more than eight operations on a side.
+    values = np.stack([expected.theta1, expected.theta2, expected.theta3, expected.eta])
+    sizes = np.abs(values)
+    sizes[0] = 1 - expected.theta3 + drawn[2] * expected.eta
+    told = np.stack([batch.quantity(f"true_{name}") for name in ("t1", "t2", "t3", "e")])
+    assert (np.abs(told - values) <= 16 * U64 * sizes).all()
 
 
 def test_prior_has_the_moments_of_the_oscillators():
