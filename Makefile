@@ -2,15 +2,17 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+# Processes that run the tests. A file's tests stay together, so that few kernels are compiled twice.
+WORKERS ?= 2
 
-.PHONY: demo test docs lint format bench evidence lock clean
+.PHONY: demo test docs lint format bench evidence portability lock clean
 
 demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
 	rm -rf runs/demo
 	$(BIN)/python train.py --steps 1500000 --output runs/demo
 
-test: $(READY)  ## all tests but the slow evidence
-	$(BIN)/python -m pytest -m "not slow"
+test: $(READY)  ## all tests but the slow evidence, in WORKERS processes
+	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile
 
 docs: $(READY)  ## the manual, into build/manual; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file docs/manual/mkdocs.yml
@@ -19,6 +21,9 @@ docs: $(READY)  ## the manual, into build/manual; a warning is an error
 
 evidence: $(READY)  ## the slow evidence: coverage tables, reproduction
 	$(BIN)/python -m pytest -m slow -s
+
+portability: $(READY)  ## the tests that compute, under several instruction sets; about half an hour
+	$(BIN)/python -m benchmarks.portability --workers $(WORKERS)
 
 bench: $(READY)  ## timed comparisons, with peers in .venv-peers; about 15 minutes
 	$(BIN)/python -m benchmarks --json runs/benchmarks/results.json
