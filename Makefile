@@ -12,7 +12,7 @@ demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the 
 	$(BIN)/python train.py --steps 1500000 --output runs/demo
 
 test: $(READY)  ## all tests but the slow evidence, in WORKERS processes
-	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 docs: $(READY)  ## the manual, into build/manual; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file docs/manual/mkdocs.yml
