@@ -1,5 +1,7 @@
 """Rewards and endings against plain linear algebra."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -16,12 +18,18 @@ HORIZON, MAX_OUTPUT = 10, 0.6
 ACTIVE = {True: [0, 1, 2, 3], False: [0, 2, 3]}
 
 
+@cache
+def prior_record(nonlinear):
+    """The prior, which is a quadrature; hundreds of blocks start from it."""
+    return Prior.silverbox_twin().to_record(nonlinear=nonlinear)
+
+
 class Lanes:
     """A block of which every lane believes the prior and has the twin for its truth."""
 
     def __init__(self, nonlinear=True):
         self.rows = np.zeros((N_ROWS, LANES))
-        self.rows[:RECORD_SIZE] = Prior.silverbox_twin().to_record(nonlinear=nonlinear)[:, None]
+        self.rows[:RECORD_SIZE] = prior_record(nonlinear)[:, None]
         self.nonlinear = nonlinear
         self.set_truth(SILVERBOX_TWIN)
         self.appraise()
