@@ -19,7 +19,7 @@ docs: $(READY)  ## the manual, into build/manual; a warning is an error
 	@echo "The manual is in build/manual: open index.html, or see it with its search at localhost:8000 after"
 	@echo "  $(BIN)/python -m http.server --directory build/manual"
 
-evidence: $(READY)  ## the slow evidence: coverage tables, reproduction
+evidence: $(READY)  ## the slow evidence: coverage tables, trainings, times
 	$(BIN)/python -m pytest -m slow -s
 
 portability: $(READY)  ## the tests that compute, under several instruction sets; about half an hour
