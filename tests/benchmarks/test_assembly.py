@@ -1,23 +1,11 @@
-import platform
-
-import numba
 import pytest
+from targets import has_fused_multiply_add
 
 from benchmarks.assembly import NotCounted, Operations, count, count_text
 from benchmarks.roofline import divide, move, multiply_add, take_root
 from estimator.lanes import lanewise, rows
 
-
-def _has_fused_multiply_add() -> bool:
-    """Whether Numba compiles for an x86-64 with AVX and fused multiply-adds, which is what is counted."""
-    if platform.machine().lower() not in ("x86_64", "amd64"):
-        return False
-    signature = "float64(float64, float64, float64)"
-    probe = numba.njit(signature, fastmath={"contract"})(lambda a, b, c: a * b + c)
-    return "vfmadd" in next(iter(probe.inspect_asm().values()))
-
-
-on_x86 = pytest.mark.skipif(not _has_fused_multiply_add(), reason="counts x86-64 assembly with AVX and FMA")
+on_x86 = pytest.mark.skipif(not has_fused_multiply_add(), reason="counts x86-64 assembly with AVX and FMA")
 
 UNROLLED_TWICE = """
         vmovupd (%rdi,%rax,8), %zmm0
