@@ -64,5 +64,9 @@ lock: $(LOCKED)  ## write the versions that are installed now into the lock, kee
 	sed -E '/^(cuda|nvidia|triton)/d; s/\+cpu$$//' requirements.lock.tmp > requirements.lock
 	rm requirements.lock.tmp
 
+.PHONY: lock-check
+lock-check: $(READY)  ## every line of the lock has a binary file for every Python version
+	$(BIN)/python .ci/check_lock.py $(VERSIONS)
+
 clean:
 	rm -rf .venv build dist

@@ -1,5 +1,6 @@
 """The Python versions that work are said the same everywhere, and the commands keep to them."""
 
+import importlib.util
 import os
 import re
 import shutil
@@ -96,3 +97,18 @@ def test_lock_names_nothing_twice():
     names = [re.sub(r"[-_.]+", "-", line.split("==")[0].lower()) for line in lines if not line.startswith("#")]
     assert len(names) == len(set(names))
     assert "pygame" not in names, "pygame and pygame-ce are installed to the same place"
+
+
+def test_lock_check_finds_what_is_missing():
+    specification = importlib.util.spec_from_file_location("check_lock", ROOT / ".ci" / "check_lock.py")
+    check_lock = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(check_lock)
+    lines = ["a>=2", "b[x]", 'c; python_version >= "3.13"', "nvidia-a==1"]
+    packages = [
+        {"name": "a", "version": "1.0", "requires_dist": lines},
+        {"name": "b", "version": "1.0", "requires_dist": ['d; extra == "x"', 'e; extra == "y"']},
+    ]
+    faults = set(check_lock.missing(packages, "3.12"))
+    found = {fault for fault in faults if not fault.startswith("pyproject.toml")}
+    assert found == {"a needs a>=2, not 1.0", 'b needs d; extra == "x"'}
+    assert set(check_lock.missing(packages, "3.13")) - faults == {'a needs c; python_version >= "3.13"'}
