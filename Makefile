@@ -37,15 +37,41 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-$(READY): requirements.lock pyproject.toml
-	$(PYTHON) -m venv .venv
+# The Python versions are those of the classifiers in pyproject.toml.
+VERSIONS := $(shell sed -n 's/.*"Programming Language :: Python :: \(3\.[0-9]*\)".*/\1/p' pyproject.toml)
+WORKS := duffing-env works with Python $(firstword $(VERSIONS)) to $(lastword $(VERSIONS))
+VERSION = $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+$(info $(WORKS).)
+
+LOCKED := .venv/.locked
+# Where PYTHON is named, and .venv has another version, .venv is built anew.
+ifneq ($(origin PYTHON),file)
+ifneq ($(VERSION),$(shell cat $(LOCKED) 2>/dev/null))
+.PHONY: $(LOCKED)
+endif
+endif
+
+# From nothing, so that what has left the lock leaves .venv too.
+$(LOCKED): requirements.lock
+	$(if $(filter $(VERSION),$(VERSIONS)),,$(error $(WORKS); $(PYTHON) is $(or \
+		$(addprefix Python ,$(VERSION)),not to be found). Name another: make PYTHON=python$(lastword $(VERSIONS))))
+	$(PYTHON) -m venv --clear .venv
 	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	echo $(VERSION) > $(LOCKED)
+
+$(READY): $(LOCKED) pyproject.toml
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $(READY)
 
-lock: $(READY)  ## write the versions that are installed now into the lock, keeping its head
-	{ grep '^#' requirements.lock; $(BIN)/pip freeze --exclude-editable | sed 's/+cpu$$//'; } > requirements.lock.tmp
-	mv requirements.lock.tmp requirements.lock
+lock: $(LOCKED)  ## write the versions that are installed now into the lock, keeping its head
+	grep '^#' requirements.lock > requirements.lock.tmp
+	$(BIN)/pip freeze --all --exclude pip --exclude-editable >> requirements.lock.tmp
+	sed -E '/^(cuda|nvidia|triton)/d; s/\+cpu$$//' requirements.lock.tmp > requirements.lock
+	rm requirements.lock.tmp
+
+.PHONY: lock-check
+lock-check: $(READY)  ## every line of the lock has a binary file for every Python version
+	$(BIN)/python .ci/check_lock.py $(VERSIONS)
 
 clean:
 	rm -rf .venv build dist
