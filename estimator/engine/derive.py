@@ -105,10 +105,12 @@ def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
         )
     try:
         parsed = sp.sympify(eval(code, {"__builtins__": {}}, {**_FUNCTIONS, **known}))
-    except (TypeError, AttributeError, sp.SympifyError) as error:
+    except (ArithmeticError, NameError, TypeError, AttributeError, sp.SympifyError) as error:
         raise ValueError(f"expressions of {where} must be formulas, but {text!r} is none: {error}") from error
     if not isinstance(parsed, sp.Expr):
         raise ValueError(f"expressions of {where} must be numbers, but {text!r} is {parsed!r}")
+    if parsed.has(sp.I, sp.nan, sp.zoo, sp.oo, -sp.oo):
+        raise ValueError(f"expressions of {where} must be finite and real, but {text!r} is {parsed}")
     return parsed
 
 
@@ -182,6 +184,11 @@ def carried_at_end(model: Model) -> Moved:
     return Moved(tuple(symbol(f"M_{i}") for i in states), by, noise)
 
 
+def moved(model: Model) -> tuple[Assignments, Moved]:
+    """What is left to assign at the end of a sample, and where it moved the state."""
+    return ([], carried_at_end(model)) if model.is_continuous else difference_step(model)
+
+
 @cache
 def _stage(model: Model) -> Assignments:
     """``K_<name>``, the time derivative of everything that is carried, at the carried values and the input u."""
@@ -211,7 +218,9 @@ def _stage(model: Model) -> Assignments:
 
 
 def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assignments:
-    """One step of order 4, of a ``substeps``-th of a sample: from ``names`` to ``<name>_e``.
+    """One step of order 4, of a ``substeps``-th of a sample: from ``names`` to ``<name>_E``.
+
+    What belongs to its four stages ends with ``_A`` to ``_D``, which no name of a model does.
 
     Args:
         names: what moves.
@@ -222,8 +231,8 @@ def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assi
     lines: Assignments = []
     rates: list[dict[str, sp.Expr]] = []
     for k, part in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):
-        tag = "abcd"[k]
-        at: dict[str, sp.Expr | str] = {"u": f"V_{tag if k != 2 else 'b'}"}
+        tag = "ABCD"[k]
+        at: dict[str, sp.Expr | str] = {"u": f"V_{tag if k != 2 else 'B'}"}
         for name in names:
             if k:
                 lines.append((f"{name}_{tag}", symbol(name) + part * h * rates[-1][name]))
@@ -241,15 +250,15 @@ def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assi
     k1, k2, k3, k4 = rates
     sixth = h / 6
     return lines + [
-        (f"{name}_e", symbol(name) + sixth * (k1[name] + 2 * k2[name] + 2 * k3[name] + k4[name])) for name in names
+        (f"{name}_E", symbol(name) + sixth * (k1[name] + 2 * k2[name] + 2 * k3[name] + k4[name])) for name in names
     ]
 
 
 def input_over_step(degree: int, substeps: int) -> Assignments:
-    """``V_a``, ``V_b``, ``V_d``: the input at begin, middle and end of a Runge-Kutta step, by its polynomial."""
+    """``V_A``, ``V_B``, ``V_D``: the input at begin, middle and end of a Runge-Kutta step, by its polynomial."""
     h = sp.Rational(1, substeps)
     lines = []
-    for tag, part in (("a", sp.S.Zero), ("b", sp.S.Half), ("d", sp.S.One)):
+    for tag, part in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
         value: sp.Expr = symbol(f"U_{degree}")
         if degree:
             lines.append((f"T_{tag}", symbol("T") + part * h))

@@ -88,14 +88,14 @@ def lane_loop(
         block, bare = ("W", row) if row in layout else ("A", row.removeprefix("G_"))
         if bare not in layout:
             raise ValueError(f"{name} uses {row}, which no line assigns, no row holds and no argument brings")
-        return f"{block}[{layout[bare] * lanes}{' + j' if lanes > 1 else ''}]"
+        return f"{block}[{layout[bare] * lanes}{' + LANE' if lanes > 1 else ''}]"
 
     body = [f"{row} = {place(row)}" for row in read]
     body += [f"{target} = {text_of(e)}" for target, e in kept]
     body += [f"{place(row)} = {value}" for row, value in results.items()]
     source = [f"def {name}({', '.join(['W', *(['A'] if adjoint else []), *uniform])}):", f'    """{doc}"""']
     if lanes > 1:
-        source.append(f"    for j in range({lanes}):")
+        source.append(f"    for LANE in range({lanes}):")
     indent = "        " if lanes > 1 else "    "
     return "\n".join(source + [indent + line for line in body]) + "\n"
 

@@ -136,10 +136,7 @@ def _structured(
     def make() -> str:
         from estimator.engine import algebra, derive, emit
 
-        if model.is_continuous:
-            lines, moved = [], derive.carried_at_end(model)
-        else:
-            lines, moved = derive.difference_step(model)
+        lines, moved = derive.moved(model)
         more, results = algebra.update(model, moved, degree, iterations, trace, missing)
         source = _motion_source(model, degree, place, lanes)
         source += "@jit\n" + emit.lane_loop("finish", lines + more, results, place, lanes, doc="Predict and condition.")
@@ -166,7 +163,7 @@ def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
     if not model.is_continuous:
         return ""
     start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
-    moved = {name: f"{name}_e" for name in derive.carried(model)}
+    moved = {name: f"{name}_E" for name in derive.carried(model)}
     source = "@jit\n" + emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
     step = derive.motion_step(model, degree)
     return source + "@jit\n" + emit.lane_loop(
@@ -234,10 +231,7 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, g
     def make() -> str:
         from estimator.engine import algebra, derive, emit
 
-        if model.is_continuous:
-            lines, moved = [], derive.carried_at_end(model)
-        else:
-            lines, moved = derive.difference_step(model)
+        lines, moved = derive.moved(model)
         more, results = algebra.path_sample(model, moved, degree, observed)
         lines += more
         source = _motion_source(model, degree, place, lanes)
@@ -250,7 +244,7 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, g
             before = derive.carried(model) if model.is_continuous else []
             source += _reversed_source("finish_back", lines, results, [*states, *before], inputs, place, noises)
             if model.is_continuous:
-                moves = {name: f"{name}_e" for name in before}
+                moves = {name: f"{name}_E" for name in before}
                 step = derive.motion_step(model, degree)
                 source += _reversed_source("move_back", step, moves, before, inputs, place, ("T",))
         return source

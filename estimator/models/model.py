@@ -17,8 +17,10 @@ from functools import cached_property
 #: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
-#: Names that stand for something else: the input and its older values, the sampling step, and functions.
-RESERVED = frozenset({"u", "u1", "u2", "step", "sin", "cos", "exp", "log", "sqrt", "tanh"})
+#: Names that stand for something else: the input and its older values, the sampling step, and what generated code calls.
+RESERVED = frozenset(
+    {"u", "u1", "u2", "step", "sin", "cos", "exp", "log", "sqrt", "tanh", "present", "select", "below", "range"}
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,11 @@ class Model:
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"states, coefficients and outputs must have different names, but share {repeated}")
+        # Of x, x_a, a_b and b, the pairs (x, a_b) and (x_a, b) would share the row P_x_a_b.
+        joined = [f"{i}_{j}" for i in self.names for j in self.names]
+        shared = sorted({pair for pair in joined if joined.count(pair) > 1})
+        if shared:
+            raise ValueError(f"pairs of names must be told apart when joined by '_', but {shared} stand twice; rename")
         if bool(self.rates) == bool(self.next_state):
             raise ValueError("either rates or next_state must be given; rates for a differential equation")
         for given, values in (("rates" if self.rates else "next_state", self.moves), ("noise", self.noise)):
