@@ -61,9 +61,14 @@ class Gaussian:
         return symbol(name)
 
     def _predict(self) -> None:
-        """Q = S P Sᵀ: the states' rows change, the coefficients' block stays."""
+        """Q = S P Sᵀ, or Q as it is where no S is given: the states' rows change, the coefficients' block stays."""
         names, by = self.names, self.moved.by
         rows = []
+        for a, i in enumerate(names):
+            for j in names[a:]:
+                self.cov[i, j] = pair("P" if i not in self.states else "Q", i, j, names)
+        if not by:
+            return
         for i, slopes in zip(self.states, by, strict=True):
             row = {}
             for j in names:
@@ -77,9 +82,6 @@ class Gaussian:
                 self.cov[i, self.states[b]] = self.put(f"Q_{i}_{self.states[b]}", total)
             for j in names[n:]:
                 self.cov[i, j] = rows[a][j]
-        for a, i in enumerate(names[n:]):
-            for j in names[n + a :]:
-                self.cov[i, j] = pair("P", i, j, names)
 
     def expected(self, sensor: int, degree: int) -> tuple[sp.Expr, list[sp.Expr]]:
         """What a sensor is expected to show, and its derivative h by all quantities, at the mean now."""
@@ -212,8 +214,8 @@ def _learn(
 ) -> list[Learned]:
     """The iterations over both noises, from s, e, hᵀ N h and whether the output is there.
 
-    Both moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). That of the process noise is counted for unit
-    strength, so that nothing is divided by hᵀ N h, which may be 0 where the noise depends on the state.
+    Both moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). That of the process noise is counted for
+    unit strength, so that nothing is divided by hᵀ N h, which may be 0 where the noise depends on the state.
     """
     s, e, shown, seen = scalars
     g_rate, n_rate = symbol("GAMMA_RATE"), symbol(f"XI_RATE_{sensor}")
@@ -351,4 +353,3 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
         if total != symbol(name):
             results[name] = text_of(put(f"{name}_e", total))
     return lines, results
-

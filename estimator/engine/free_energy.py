@@ -26,7 +26,8 @@ def precision_part(half_power, variance, shape, rate):
     Args:
         half_power: half of the noise's second moment.
         variance: of the noise, as the iteration assumed it.
-        shape, rate: of the precision before the sample.
+        shape: of the precision before the sample.
+        rate: of the precision before the sample.
     """
     after = rate + half_power
     moved = half_power * ((shape + 0.5) / after - 1 / variance)
@@ -50,7 +51,12 @@ def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str
 
     def make() -> str:
         at = lambda row: f"W[{layout[row] * lanes} + lane]"  # noqa: E731
-        source = ["@jit", "def free_energy(W, lane, out):", f"    for i in range({iterations}):", "        out[i] = 0.0"]
+        source = [
+            "@jit",
+            "def free_energy(W, lane, out):",
+            f"    for i in range({iterations}):",
+            "        out[i] = 0.0",
+        ]
         for k, sensor in enumerate(model.outputs):
             source += [
                 f"    if {at(f'Y_{sensor}')} == {at(f'Y_{sensor}')}:",

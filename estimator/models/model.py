@@ -17,7 +17,7 @@ from functools import cached_property
 #: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
-#: Names that stand for something else: the input and its older values, the sampling step, and what generated code calls.
+#: Names that stand for something else: the input and its older values, the sampling step, what generated code calls.
 RESERVED = frozenset(
     {"u", "u1", "u2", "step", "sin", "cos", "exp", "log", "sqrt", "tanh", "present", "select", "below", "range"}
 )
@@ -142,6 +142,12 @@ class Model:
         """Inputs that a difference equation looks at: 1, or 2 or 3 where it names ``u1`` or ``u2``."""
         text = " ".join((*self.moves, *self.outputs.values()))
         return max(i + 1 for i in range(3) if i == 0 or re.search(rf"\bu{i}\b", text))
+
+    @cached_property
+    def movers(self) -> tuple[str, ...]:
+        """The states, and the coefficients on which the motion depends: a sensor's alone do not move anything."""
+        used = set(re.findall(r"[a-z]\w*", " ".join(self.moves)))
+        return (*self.states, *(name for name in self.coefficients if name in used))
 
     @cached_property
     def digest(self) -> str:

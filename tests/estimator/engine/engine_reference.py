@@ -128,7 +128,7 @@ def first_order(plant: Plant, n: int, belief: Belief, inputs: Sequence[float]):
 
 def cubature(plant: Plant, n: int, belief: Belief, inputs: Sequence[float], movers: Sequence[int]):
     """The same by the cubature rule over the unknown of the ``movers``, the others being conditionally Gaussian."""
-    m, cov = len(belief.mean), belief.cov
+    cov = belief.cov
     unknown: list[int] = []
     for i in movers:
         trial = [*unknown, i]
@@ -136,27 +136,21 @@ def cubature(plant: Plant, n: int, belief: Belief, inputs: Sequence[float], move
         given = sub[-1, -1] - (sub[-1, :-1] @ np.linalg.solve(sub[:-1, :-1], sub[:-1, -1]) if unknown else 0.0)
         if given > 1e-12 * sub[-1, -1]:
             unknown = trial
-    P = cov[np.ix_(unknown, unknown)]
-    factor = np.sqrt(len(unknown)) * np.linalg.cholesky(P)
-    onto = np.linalg.solve(P, cov[unknown]).T  # regression of all quantities on the unknown
-    onto[unknown] = np.eye(len(unknown))
-    points = belief.mean[:, None] + onto @ np.hstack([factor, -factor])
-    rest = cov - onto @ P @ onto.T
+    factor = np.linalg.cholesky(cov[np.ix_(unknown, unknown)])
+    along = np.sqrt(len(unknown)) * np.linalg.solve(factor, cov[unknown]).T  # how all quantities go along with them
+    points = belief.mean[:, None] + np.hstack([along, -along])
     images = points.copy()
     images[:n] = np.column_stack([moved(plant, p[:n], p[n:], inputs) for p in points.T])
     mean = images.mean(axis=1)
     deviations = images - mean[:, None]
     predicted = deviations @ deviations.T / points.shape[1]
     predicted[n:, n:] = cov[n:, n:]
-    assert np.abs(rest[n:, :n]).max() <= 1e-9 * np.abs(cov).max()  # the states are among the movers
-    size = np.abs(deviations) @ np.abs(deviations).T / points.shape[1]
-    enlarged = np.abs(images).max(axis=1) / np.sqrt(np.where(np.diag(predicted) > 0, np.diag(predicted), np.inf))
-    return mean, predicted, size * max(1.0, enlarged.max()) * np.linalg.cond(_scaled(P))
-
-
-def _scaled(P: np.ndarray) -> np.ndarray:
-    std = np.sqrt(np.diag(P))
-    return P / np.outer(std, std)
+    # The factor is as good as a rounding of the covariance; differences of images lose the digits of their mean.
+    std = np.sqrt(np.diag(predicted))
+    sure = std <= 10 * EPS * np.abs(images).max(axis=1)  # all images are the same
+    std[sure] = predicted[sure, :] = predicted[:, sure] = 0.0
+    lost = np.max(np.abs(images).max(axis=1)[std > 0] / std[std > 0], initial=0.0)
+    return mean, predicted, (1 + lost) * np.outer(std, std)
 
 
 def update(
@@ -221,13 +215,15 @@ def update(
             cov, size = cov + q / shown * N, size + q / shown * np.abs(N)
             if seen:
                 gamma = g_shape, g_rate / shown
-        scale = np.maximum(scale, np.sqrt(np.diag(cov)))
+        scale = np.maximum(scale, np.sqrt(np.maximum(np.diag(cov), 0.0)))
         known = np.where(scale > 0, scale, np.inf)
         condition = max(condition, (size / np.outer(known, known)).max())
         if seen:
             xi[k] = n_shape, n_rate
             S = h @ cov @ h + r
-            condition *= max(1.0, (np.abs(h) @ size @ np.abs(h) + r) / S, (np.abs(y[k]) + np.abs(expected)) / np.sqrt(S))
+            condition *= max(
+                1.0, (np.abs(h) @ size @ np.abs(h) + r) / S, (np.abs(y[k]) + np.abs(expected)) / np.sqrt(S)
+            )
             gain = cov @ h / S
             mean = mean + gain * e
             cov = cov - np.outer(gain, gain) * S

@@ -5,7 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from engine_cases import (
-    CASES, Case, assert_agrees, block, get_belief, interpreted, put, put_belief, random_belief, random_inputs,
+    CASES,
+    Case,
+    assert_agrees,
+    block,
+    get_belief,
+    interpreted,
+    put,
+    put_belief,
+    random_belief,
+    random_inputs,
 )  # fmt: skip
 from engine_reference import EPS, Plant, update
 
