@@ -167,6 +167,7 @@ def lanes_run(prior, u, y, iterations):
         yield np.delete(moments.mean, 2), cov, np.array([*moments.gamma, *moments.xi]), trace
 
 
+@pytest.mark.slow  # both have twins of their own; eleven seconds of compilation
 def test_on_the_paper_s_model_it_is_the_lanes_update():
     """Over 400 samples that a twin of the circuit made, and from beliefs of any kind over a few."""
     rng = np.random.default_rng(22)
