@@ -1,72 +1,171 @@
-"""The layout of an environment: its quantities in a block, what it is told, what a step leaves behind.
+"""What an experiment is compiled for, the rows of its block, and what its kernel is told.
 
-Environments lie in blocks of `estimator.lanes.LANES`. A block holds an estimator's rows first (`estimator.record`),
-then those of `LAYOUT` below, so that the estimator's functions run on it as they are.
+Environments lie in blocks of `estimator.lanes.LANES`. A block holds the rows of the estimator first
+(`estimator.engine.tasks.layout`), then those of the plant and of the episode.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cache
+from itertools import combinations, combinations_with_replacement
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.engine.tasks import belief_names, carried_names, layout, trace_names
 from estimator.lanes import rows
-from estimator.record import LAYOUT as BELIEF_LAYOUT
-from estimator.record import N_ROWS as N_BELIEF_ROWS
-from estimator.record import RECORD, SCRATCH_BEGIN
-
-#: Entries of the observation, in order, with their bounds; the environment's docstring says what they are.
-OBSERVATION = {
-    **{f"mean_{c}": (-10.0, 10.0) for c in ("t1", "t2", "t3", "e")},
-    **{f"log_std_{c}": (-20.0, 5.0) for c in ("t1", "t2", "t3", "e")},
-    **{f"corr_{pair}": (-1.0, 1.0) for pair in ("12", "13", "1e", "23", "2e", "3e")},
-    **{f"log_{noise}": (-20.0, 20.0) for noise in ("gamma", "xi")},
-    **{f"state_{lag}": (-2.0, 2.0) for lag in ("x0", "x1")},
-    "last_input": (-1.0, 1.0),
-    "last_output": (-2.0, 2.0),
-    "time_left": (0.0, 1.0),
-    "budget_left": (0.0, 1.0),
-}
-N_OBSERVATION = len(OBSERVATION)
-
-#: What the kernel is told about a track: (len(SETTINGS),) float64, the same for all environments.
-SETTINGS = rows(
-    "max_input max_output horizon hold process_noise measurement_noise spread center_m center_c center_a center_b step",
-    "budget max_slew input_cost jump walk_t1 walk_t2 walk_t3 walk_e",
-    "reward terminal forfeits terminated_return iterations as_published nonlinear delay",
-    "prior_t1 prior_t2 prior_t3 prior_e scale_t1 scale_t2 scale_t3 scale_e prior_log_gamma prior_log_xi",
-)
+from estimator.models.model import Model
 
 #: What a step leaves for an environment's face, in adjacent rows of its block.
 OUTCOME = (
-    *("reward", "information_gain", "log_posterior_gain"),
-    *("terminated", "truncated", "diverged", "off_record"),
+    *("REWARD", "INFORMATION_GAIN", "LOG_POSTERIOR_GAIN"),
+    *("TERMINATED", "TRUNCATED", "DIVERGED", "OFF_RECORD"),
 )
-N_OUTCOME = len(OUTCOME)
 
 #: Those of them that add up over the samples of a step; the others are as the last sample leaves them.
-SUMMED = ("reward", "information_gain", "log_posterior_gain")
+SUMMED = ("REWARD", "INFORMATION_GAIN", "LOG_POSTERIOR_GAIN")
 
-#: The covariance that one who knows the truth would have, for the reward ``fisher``; the third lag is not needed.
-IDEAL = tuple(f"ideal_{name}" for name in RECORD if name.startswith("P_") and "x2" not in name)
 
-#: The true oscillator.
-OSCILLATOR = ("m", "c", "a", "b")
+class Kind(NamedTuple):
+    """What a kernel is compiled for.
 
-#: Name of a quantity to its row. The observation, which is written last, lies in rows that only an estimator's update
-#: uses: the fewer rows a step touches, the less memory it waits for.
-LAYOUT = {
-    **BELIEF_LAYOUT,
-    **rows(
-        "stream_a stream_b stream_c stream_d noise_w noise_v",
-        " ".join(OSCILLATOR),
-        "true_t1 true_t2 true_t3 true_e",
-        "x last_x velocity elapsed waiting recorded_u recorded_y",
-        "asked spent jump_at jump_factor",
-        "log_det log_density error misfit surprise fisher_gain earned ideal_log_det",
-        " ".join(IDEAL),
-        " ".join(OUTCOME),
-        start=N_BELIEF_ROWS,
-    ),
-    **rows(" ".join(f"obs_{name}" for name in OBSERVATION), start=SCRATCH_BEGIN),
-}
-N_ROWS = N_BELIEF_ROWS + len(LAYOUT) - len(BELIEF_LAYOUT) - N_OBSERVATION
+    Attributes:
+        belief: the model that is believed.
+        plant: the model that is simulated; None where a record is replayed.
+        degree: of the input over a sample of a differential equation: 0 held, 1 linear from the last input to this one.
+        factorisation: ``structured``, or the paper's ``mean_field``.
+        iterations: variational iterations per sample.
+        reward: its name.
+        drifts: whether the coefficients are believed to walk.
+        normal: whether plants are drawn from a Gaussian, instead of log-uniformly about a centre.
+    """
 
-#: What is kept of an episode that ended, where the next one began in the same step: its record and its oscillator.
-ENDED = rows(" ".join(RECORD), " ".join(OSCILLATOR))
+    belief: Model
+    plant: Model | None
+    degree: int = 0
+    factorisation: str = "structured"
+    iterations: int = 3
+    reward: str = "information_gain"
+    drifts: bool = False
+    normal: bool = False
+
+    @property
+    def truth(self) -> Model:
+        """The model whose parameters the truth has."""
+        return self.plant or self.belief
+
+
+class Setup(NamedTuple):
+    """What a kernel is told about an experiment, the same for all environments.
+
+    Attributes:
+        max_input: input of the action 1.
+        max_output: limit of the first sensor.
+        horizon: samples of an episode.
+        hold: samples of an action.
+        process_noise: standard deviation of what a sample's process noise does to the first sensor.
+        measurement_noise: (sensors,) standard deviations.
+        step: sampling step [s].
+        center: (p,) parameters in the middle of the range, or their means.
+        width: (p,) their standard deviations, for plants from a Gaussian.
+        spread: relative half width of the range.
+        budget: of the energy Σ u²; inf for none.
+        max_slew: largest change of the input; inf for none.
+        input_cost: per u².
+        jump: of the first parameter, in parts of it; 0 for none.
+        walk: (K,) variances of the coefficients' walk in a sample.
+        terminal: whether a reward is paid at the end.
+        forfeits: whether an episode that is terminated returns ``terminated_return``.
+        terminated_return: see there.
+        as_published: whether mean field departs from the paper as its published run did.
+        delay: samples between a recorded input and the output it acts on.
+        prior: (size,) record that episodes start from.
+        inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
+        log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
+    """
+
+    max_input: float
+    max_output: float
+    horizon: float
+    hold: int
+    process_noise: float
+    measurement_noise: npt.NDArray[np.float64]
+    step: float
+    center: npt.NDArray[np.float64]
+    width: npt.NDArray[np.float64]
+    spread: float
+    budget: float
+    max_slew: float
+    input_cost: float
+    jump: float
+    walk: npt.NDArray[np.float64]
+    terminal: bool
+    forfeits: bool
+    terminated_return: float
+    as_published: bool
+    delay: int
+    prior: npt.NDArray[np.float64]
+    inverse_std: npt.NDArray[np.float64]
+    log_precisions: npt.NDArray[np.float64]
+
+
+def observation_bounds(model: Model) -> dict[str, tuple[float, float]]:
+    """Entries of the observation of a belief, in order, with their bounds; `duffing_env.env` says what they are.
+
+    For K coefficients, n states and s sensors there are 2 K + K (K - 1) / 2 + n + 2 s + 4 entries.
+    """
+    names = list(model.coefficients)
+    return {
+        **{f"mean_{c}": (-10.0, 10.0) for c in names},
+        **{f"log_std_{c}": (-20.0, 5.0) for c in names},
+        **{f"corr_{c}_{d}": (-1.0, 1.0) for c, d in combinations(names, 2)},
+        "log_gamma": (-20.0, 20.0),
+        **{f"log_xi_{y}": (-20.0, 20.0) for y in model.outputs},
+        **{f"state_{x}": (-2.0, 2.0) for x in model.states},
+        "last_input": (-1.0, 1.0),
+        **{f"last_{y}": (-2.0, 2.0) for y in model.outputs},
+        "time_left": (0.0, 1.0),
+        "budget_left": (0.0, 1.0),
+    }
+
+
+def parameter_names(model: Model) -> tuple[str, ...]:
+    """What is drawn for an episode: the physical parameters, or the coefficients of a model without any."""
+    return tuple(model.physical or model.coefficients)
+
+
+@cache
+def layout_of(kind: Kind) -> Mapping[str, int]:
+    """Name of a quantity to its row in a block of this kind."""
+    belief, truth = kind.belief, kind.truth
+    place = layout(belief, kind.degree)
+    wanted = [f"U_{k}" for k in range(3)]  # whichever of the two models needs most
+    wanted += [f"Y_{y}" for y in truth.outputs]
+    wanted += [f"PARAM_{p}" for p in parameter_names(truth)]
+    wanted += [f"X_{x}" for x in truth.states]
+    wanted += [f"TRUE_{c}" for model in {truth: None, belief: None} for c in model.coefficients]
+    wanted += ["STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d", "NOISE_w", "NOISE_v"]
+    wanted += ["INPUT", "LAST_INPUT", "OLDER_INPUT", "ASKED", "SPENT", "JUMP_AT", "JUMP_FACTOR"]
+    wanted += ["ELAPSED", "WAITING", "RECORDED_u", "RECORDED_y", "LOG_DET", "LOG_DENSITY", "ERROR", "WORK", "EARNED"]
+    wanted += OUTCOME
+    wanted += [f"OBS_{name}" for name in observation_bounds(belief)]
+    if kind.reward == "fisher":
+        wanted += [f"I_{name}" for name in belief_names(belief) if name.startswith("P_")]
+    if kind.reward == "simulation_error":
+        wanted += [f"{who}_{x}" for who in ("MODEL", "TWIN") for x in belief.states]
+        wanted += ["DEVIATION", "POWER", "MISFIT"]
+    if kind.factorisation == "mean_field":
+        from estimator.record import MEAN_FIELD_SCRATCH
+
+        wanted += [f"MF_{name}" for name in (*MEAN_FIELD_SCRATCH, "prior_g_rate", "prior_n_rate", "x2")]
+        if "theta2" not in belief.coefficients:
+            paper = ("x1", "x2", "theta1", "theta2", "theta3", "eta")
+            both = [f"MF_P_{i}_{j}" for i, j in combinations_with_replacement(paper, 2) if "theta2" in (i, j)]
+            wanted += ["MF_theta2", *both]
+    wanted += [name for name in carried_names(belief) if name not in place]
+    if kind.reward == "free_energy" and kind.factorisation == "structured":
+        wanted += [*trace_names(belief, kind.iterations), "PRIOR_RATE_g", "PRIOR_RATE_n"]
+    missing = [name for name in dict.fromkeys(wanted) if name not in place]
+    return place | rows(" ".join(missing), start=len(place))

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from duffing_env.experiment import Experiment
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
 from estimator.parameters import FloatArray
-from estimator.prior import Prior
+from estimator.models.difference import difference
+from estimator.models.model import Model
+from estimator.posterior import Belief
+from estimator.priors import silverbox_prior
 
 _PRIORS = ("silverbox_twin", "published_run", "paper_text")
 
@@ -66,16 +70,15 @@ class ReplayExperiment(Experiment):
         """The samples of the regime that have an output."""
         return len(self._regime.u) - self.input_delay
 
-    @cached_property
-    def believed(self) -> Prior:
-        """The prior of that name."""
-        prior: Prior = getattr(Prior, self.prior)()
-        return prior
-
     @property
-    def is_nonlinear(self) -> bool:
-        """As asked for."""
-        return self.nonlinear
+    def model(self) -> Model:
+        """The paper's, with the cubic term or without."""
+        return difference("paper" if self.nonlinear else "linear")
+
+    @cached_property
+    def believed(self) -> Belief:
+        """The prior of that name."""
+        return silverbox_prior(self.prior, self.model, self.factorisation)
 
     @property
     def recorded(self) -> tuple[FloatArray, FloatArray]:
@@ -83,11 +86,6 @@ class ReplayExperiment(Experiment):
         return self._regime.u, self._regime.y
 
     @property
-    def plant_kind(self) -> str:
-        """The record."""
-        return "replay"
-
-    @property
-    def plant_settings(self) -> dict[str, float]:
+    def plant_setup(self) -> dict[str, Any]:
         """How the record is played, and how the estimator departs from the model."""
         return {"as_published": self.as_published, "delay": self.input_delay}

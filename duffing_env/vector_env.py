@@ -18,8 +18,9 @@ from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv, SilverboxReplayEnv, action_space, observation_space
 from duffing_env.experiment import Experiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
-from estimator.belief import RecordBelief
 from estimator.parameters import FloatArray, PhysicalParameters
+from estimator.posterior import Belief
+from estimator.truth import Parameters
 
 _RESET_MODES = {
     AutoresetMode.DISABLED: RESET_BY_HAND,
@@ -91,14 +92,14 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         self.num_envs = int(num_envs)
         self.metadata = {**type(self).metadata, "autoreset_mode": self._autoreset_mode}
         self.render_mode = None
-        self.single_observation_space = observation_space()
-        self.single_action_space = action_space()
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
         if max_episode_steps is not None and max_episode_steps * self.experiment.hold < self.experiment.samples:
             options["horizon"] = max_episode_steps * self.experiment.hold
             self.experiment = make_experiment(self.single.experiment_kind, options)
+        self.single_observation_space = observation_space(self.experiment.model)
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
         reset_mode = _RESET_MODES[self._autoreset_mode]
         self._batch = Batch(self.experiment, self.num_envs, reset_mode, int(threads), self.experiment.hold)
         self._copy = copy
@@ -118,15 +119,15 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
 
     @property
     def records(self) -> FloatArray:
-        """(num_envs, RECORD_SIZE) the posteriors now, as the flat records of `estimator.record`; a copy."""
+        """(num_envs, size) the posteriors now, as the flat records of `estimator.Belief`; a copy."""
         return self._batch.records()
 
     @property
-    def truth(self) -> PhysicalParameters:
+    def truth(self) -> PhysicalParameters | Parameters:
         """The oscillators that are to be identified, a batch of ``num_envs``."""
         return self._batch.truth()
 
-    def belief(self, index: int) -> RecordBelief:
+    def belief(self, index: int) -> Belief:
         """The posterior of row ``index`` now."""
         return self._batch.belief(index)
 
@@ -172,12 +173,12 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
             raise ResetNeeded(f"rows {rows} have finished or not begun: reset them with options={{'reset_mask': mask}}")
         batch = self._batch
         batch.step(actions[:, 0])
-        terminated = batch.quantity("terminated") != 0.0
-        truncated = batch.quantity("truncated") != 0.0
+        terminated = batch.quantity("TERMINATED") != 0.0
+        truncated = batch.quantity("TRUNCATED") != 0.0
         finished = terminated | truncated
         infos = self._infos(was_finished=self._finished, finished=finished)
         self._finished = finished
-        return self._observations(), batch.quantity("reward"), terminated, truncated, infos
+        return self._observations(), batch.quantity("REWARD"), terminated, truncated, infos
 
     def _observations(self) -> Observations:
         return self._batch.observations.copy() if self._copy else self._batch.observations
@@ -235,10 +236,10 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
     def _step_infos(self, mask: Flags) -> dict[str, Any]:
         infos: dict[str, Any] = {}
         for name in self.single._reported:
-            infos[name] = self._batch.quantity(name)
+            infos[name] = self._batch.quantity(name.upper())
             infos[f"_{name}"] = mask.copy()
         for name in self.single._flags:
-            infos[name] = self._batch.quantity(name) != 0.0
+            infos[name] = self._batch.quantity(name.upper()) != 0.0
             infos[f"_{name}"] = mask.copy()
         return infos
 
@@ -248,7 +249,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
         rows = np.flatnonzero(finished)
         beliefs[rows] = self._batch.beliefs(rows, final=same_step)
-        truths[rows] = self._batch.oscillators(rows, final=same_step)
+        truths[rows] = self._batch.truths(rows, final=same_step)
         return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.posterior import Belief, coefficients_of
 
 #: Points of the quadrature over all parameters together, at most; with 20 along each of four, moments converge to 1e-10
@@ -67,6 +67,7 @@ def weak_prior(
     noise_shape: float = 2.0,
     state_std: float | Sequence[float] = 1e-3,
     step: float = SAMPLING_STEP,
+    factorisation: str = "structured",
 ) -> Belief:
     """A prior of given coefficients, with weak Gamma priors of the noises and the plant near rest.
 
@@ -80,6 +81,8 @@ def weak_prior(
             such a prior binds for thousands of samples (docs/coverage.md): centre it with care.
         state_std: standard deviation of the states about 0: one number, or one for each.
         step: sampling step [s].
+        factorisation: of the inference that starts from it; for ``mean_field`` the parts of the paper's coefficients, θ
+            and η, are independent.
 
     Raises:
         ValueError: for a value out of its range, or as `Belief`.
@@ -95,7 +98,46 @@ def weak_prior(
     n, k = model.n_states, model.n_coefficients
     joint_mean, joint = np.zeros(n + k), np.zeros((n + k, n + k))
     joint_mean[n:], joint[n:, n:] = mean, cov
+    if factorisation == "mean_field":
+        joint[n:-1, -1] = joint[-1, n:-1] = 0.0
     joint[:n, :n] = np.diag(np.broadcast_to(np.asarray(state_std, dtype=np.float64) ** 2, n))
     sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
     xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
-    return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, step=step)
+    return Belief.of(
+        model,
+        joint_mean,
+        joint,
+        (noise_shape, noise_shape * process_noise**2),
+        xi,
+        step=step,
+        factorisation=factorisation,
+    )
+
+
+def silverbox_prior(name: str, model: Model, factorisation: str = "structured") -> Belief:
+    """A prior of the paper's equation by name.
+
+    Args:
+        name: ``silverbox_twin``, that of the environments; ``published_run``, with which the paper's published numbers
+            were computed; or ``paper_text``, as the paper's section 4 states it, with the state's of the published run.
+        model: `difference("paper")`, or ``"linear"``, which has no θ2.
+        factorisation: of the inference that starts from it.
+
+    Raises:
+        ValueError: for another name.
+    """
+    if name == "silverbox_twin":
+        center = {p: float(getattr(SILVERBOX_TWIN, p)) for p in model.physical}
+        mean, cov = log_uniform_moments(model, center, 0.3)
+        return weak_prior(model, mean, cov, factorisation=factorisation)
+    noises = {
+        "published_run": (2.0, 1e-2, (1e8, 1e3), (1e8, 1e1)),
+        "paper_text": (1.0, 10.0, (1e3, 1e1), (1e8, 1e3)),
+    }
+    if name not in noises:
+        raise ValueError(f"name must be one of {['silverbox_twin', *noises]}, but is {name!r}")
+    eta_mean, eta_var, gamma, xi = noises[name]
+    n, k = model.n_states, model.n_coefficients
+    mean = np.concatenate([np.zeros(n), np.ones(k - 1), [eta_mean]])
+    cov = np.diag([10.0] * (n + k - 1) + [eta_var])
+    return Belief.of(model, mean, cov, gamma, xi, factorisation=factorisation)

@@ -60,6 +60,7 @@ def lane_loop(
     lanes: int,
     uniform: Sequence[str] = (),
     doc: str = "",
+    one: bool = False,
 ) -> str:
     """Source of ``name(W, *uniform)``, which executes assignments in every lane of a block.
 
@@ -71,12 +72,16 @@ def lane_loop(
         lanes: systems in a block; the loop is left out for 1.
         uniform: names that are the same in all lanes, and become arguments.
         doc: a line for the reader.
+        one: write ``name(W, j, *uniform)``, for lane j alone.
 
     Raises:
         ValueError: for a name that is neither assigned, nor a row, nor uniform.
     """
     kept = _needed(lines, {str(v) for v in results.values()})
     assigned = {target for target, _ in kept}
+    taken = sorted(assigned & set(layout))
+    if taken:
+        raise ValueError(f"{name} assigns {taken}, which are rows; give the results other names first")
     used = {str(s) for _, e in kept for s in e.free_symbols} | {
         str(v) for v in results.values() if not is_number(str(v))
     }
@@ -93,10 +98,11 @@ def lane_loop(
     body = [f"{row} = {place(row)}" for row in read]
     body += [f"{target} = {text_of(e)}" for target, e in kept]
     body += [f"{place(row)} = {value}" for row, value in results.items()]
-    source = [f"def {name}({', '.join(['W', *(['A'] if adjoint else []), *uniform])}):", f'    """{doc}"""']
-    if lanes > 1:
+    blocks = ["W", *(["A"] if adjoint else []), *(["j"] if one else [])]
+    source = [f"def {name}({', '.join([*blocks, *uniform])}):", f'    """{doc}"""']
+    if lanes > 1 and not one:
         source.append(f"    for j in range({lanes}):")
-    indent = "        " if lanes > 1 else "    "
+    indent = "        " if lanes > 1 and not one else "    "
     return "\n".join(source + [indent + line for line in body]) + "\n"
 
 

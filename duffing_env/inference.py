@@ -1,0 +1,86 @@
+"""The belief update within an environment's block: structured for any model, or the paper's mean field."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from typing import Any
+
+from duffing_env.layout import Kind, layout_of
+from estimator.engine.tasks import structured
+from estimator.inference import mean_field
+from estimator.inference.noise import sample_free_energy
+from estimator.lanes import LANES, at_lane, jit, relaid
+from estimator.record import MEAN_FIELD_SCRATCH
+
+#: Old name of a quantity of the paper's belief to its name in a block.
+_PAPER = {"x0": "x1", "x1": "x2", "t1": "theta1", "t2": "theta2", "t3": "theta3", "e": "eta"}
+
+
+def updater(kind: Kind) -> Any:
+    """``update(W, as_published)``: every lane's belief, with its input and outputs in their rows."""
+    if kind.factorisation == "mean_field":
+        return _mean_field(kind)
+    compiled = structured(
+        kind.belief, kind.degree, iterations=kind.iterations, within=layout_of(kind), trace=kind.reward == "free_energy"
+    )
+    plain = compiled.update
+
+    @jit
+    def update(W, as_published):
+        plain(W)
+
+    return update
+
+
+def free_energy_of(kind: Kind) -> Any:
+    """``free_energy(W, j)``: what the last update left lane j with [nats]."""
+    place = layout_of(kind)
+    if kind.factorisation == "mean_field":
+        function, _, outputs, uniform = _declaration(mean_field.free_energy)
+        return at_lane(_paper_layout(kind), outputs, uniform)(function)
+    last = kind.iterations - 1
+    sensor = next(iter(kind.belief.outputs))
+    names = ("TRACE_0_innovation", "TRACE_0_variance", f"TRACE_0_q_{last}", f"TRACE_0_r_{last}")
+    innovation, variance, q, r = (place[name] * LANES for name in names)
+    prior_g, prior_n, shown = (place[n] * LANES for n in ("PRIOR_RATE_g", "PRIOR_RATE_n", "TRACE_0_shown"))
+    g_shape, n_shape = place["GAMMA_SHAPE"] * LANES, place[f"XI_SHAPE_{sensor}"] * LANES
+
+    @jit
+    def free_energy(W, j):
+        return sample_free_energy(
+            W[innovation + j], W[variance + j], W[q + j], W[r + j], W[g_shape + j], W[shown + j] * W[prior_g + j],
+            W[n_shape + j], W[prior_n + j],
+        )  # fmt: skip
+
+    return free_energy
+
+
+def _declaration(loop: Any) -> Any:
+    return loop.declaration
+
+
+def _paper_layout(kind: Kind) -> dict[str, int]:
+    """The rows of mean field's own names; those of a θ2 that the model does not have hold zeros."""
+    place = layout_of(kind)
+    layout = {old: place[new] if new in place else place["MF_theta2"] for old, new in _PAPER.items()}
+    for first, second in combinations_with_replacement(_PAPER, 2):
+        name = f"P_{_PAPER[first]}_{_PAPER[second]}"
+        layout[f"P_{first}_{second}"] = place[name] if name in place else place[f"MF_{name}"]
+    layout |= {"x2": place["MF_x2"], "u": place["U_0"], "y": place["Y_y"]}
+    layout |= {"g_shape": place["GAMMA_SHAPE"], "g_rate": place["GAMMA_RATE"]}
+    layout |= {"n_shape": place["XI_SHAPE_y"], "n_rate": place["XI_RATE_y"]}
+    return layout | {name: place[f"MF_{name}"] for name in (*MEAN_FIELD_SCRATCH, "prior_g_rate", "prior_n_rate")}
+
+
+def _mean_field(kind: Kind) -> Any:
+    layout, iterations = _paper_layout(kind), kind.iterations
+    begin, iterate, end = (relaid(f, layout) for f in (mean_field.begin, mean_field.iterate, mean_field.end))
+
+    @jit
+    def update(W, as_published):
+        begin(W)
+        for _ in range(iterations):
+            iterate(W, as_published)
+        end(W)
+
+    return update
