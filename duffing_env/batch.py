@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.experiment import Experiment
-from duffing_env.kernel import compiled
+from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, observation_bounds, parameter_names
 from duffing_env.noise import stream_words
 from estimator.lanes import LANES
@@ -38,6 +38,7 @@ class Batch:
         self._reset_mode = reset_mode
         self._threads = threads
         self._kind = experiment.kind
+        self._kernel = compiled(self._kind)
         self._place = layout_of(self._kind)
         self._setup = experiment.setup._replace(hold=hold)
         self._prior = experiment.believed
@@ -51,7 +52,7 @@ class Batch:
         self._flat_blocks = self._blocks.reshape(n_blocks, -1)
         self._ended = np.zeros_like(self._blocks)
         self._flat_ended = self._ended.reshape(n_blocks, -1)
-        self._saved = np.zeros((threads, n_rows * LANES))
+        self._saved = np.zeros((threads, 2 * n_rows * LANES))
         self._actions = np.zeros(padded, dtype=np.float32)
         self._observations = np.zeros((padded, n_observation), dtype=np.float32)
         self._final_observations = np.zeros_like(self._observations)
@@ -74,29 +75,25 @@ class Batch:
         self._reset()
 
     def _reset(self) -> None:
-        compiled(self._kind).reset(self._flat_blocks, self._mask, self._setup, self._observations)
+        self._call(RESET_NOW)
 
     def step(self, actions: npt.ArrayLike) -> None:
         """Apply actions (n,) for a step: in parts of the largest input, clipped to [-1, 1], in float32's range."""
         self._actions[: self.size] = actions
-        kernel = compiled(self._kind)
-        step = kernel.step
+        self._call(self._reset_mode)
+
+    def _call(self, reset_mode: int) -> None:
+        told = (
+            self._actions, self._setup, *self._recorded, reset_mode, self._mask, self._observations,
+            self._final_observations, self._flat_ended,
+        )  # fmt: skip
         if self._threads > 1:
             import numba
 
             numba.set_num_threads(self._threads)
-            step = kernel.step_parallel
-        step(
-            self._flat_blocks,
-            self._saved,
-            self._actions,
-            self._setup,
-            *self._recorded,
-            self._reset_mode,
-            self._observations,
-            self._final_observations,
-            self._flat_ended,
-        )
+            self._kernel.step_parallel(self._flat_blocks, self._saved, *told)
+        else:
+            self._kernel.step(0, len(self._flat_blocks), self._flat_blocks, self._saved[0], *told)
 
     def measure(self, u: float, y: float) -> None:
         """Let the next step play this input and output [V], of an experiment that replays a record of one sample."""
@@ -165,12 +162,13 @@ class Batch:
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles must not share memory through the views."""
         state = self.__dict__.copy()
-        for view in ("observations", "final_observations", "_flat_blocks", "_flat_ended"):
+        for view in ("observations", "final_observations", "_flat_blocks", "_flat_ended", "_kernel"):
             del state[view]
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
+        self._kernel = compiled(self._kind)
         self._flat_blocks = self._blocks.reshape(len(self._blocks), -1)
         self._flat_ended = self._ended.reshape(len(self._ended), -1)
         self.observations = self._observations[: self.size]

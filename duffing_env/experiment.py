@@ -132,6 +132,7 @@ class Experiment:
         return Kind(
             self.model, self.plant, self.degree, self.factorisation,
             int(self.iterations or DEFAULT_ITERATIONS[self.factorisation]), self.reward,
+            pays=self.terminal or self.terminated_return is not None,
         )  # fmt: skip
 
     @property
@@ -257,7 +258,7 @@ class SimulatedExperiment(Experiment):
     @property
     def kind(self) -> Kind:
         """What the kernel is compiled for."""
-        return super().kind._replace(drifts=self.drift > 0)
+        return super().kind._replace(drifts=self.drift > 0, jumps=self.jump > 0)
 
 
 @dataclass(frozen=True)

@@ -17,19 +17,13 @@ _PAPER = {"x0": "x1", "x1": "x2", "t1": "theta1", "t2": "theta2", "t3": "theta3"
 
 
 def updater(kind: Kind) -> Any:
-    """``update(W, as_published)``: every lane's belief, with its input and outputs in their rows."""
+    """Every lane's belief, with its input and outputs in their rows: ``update(W)``, or of mean field
+    ``update(W, as_published)``."""
     if kind.factorisation == "mean_field":
         return _mean_field(kind)
-    compiled = structured(
+    return structured(
         kind.belief, kind.degree, iterations=kind.iterations, within=layout_of(kind), trace=kind.reward == "free_energy"
-    )
-    plain = compiled.update
-
-    @jit
-    def update(W, as_published):
-        plain(W)
-
-    return update
+    ).update
 
 
 def free_energy_of(kind: Kind) -> Any:

@@ -22,8 +22,8 @@ from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
 from estimator.engine.tasks import belief_names
 from estimator.lanes import LANES, at_lane, jit, kernel, lanewise, part
 
-#: How finished environments are reset: by hand, in the step after, or in the same step.
-RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP = 0, 1, 2
+#: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.
+RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP, RESET_NOW = 0, 1, 2, 3
 
 # A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).
 _FLOAT32_ROUNDING = 2.0**-22
@@ -49,7 +49,7 @@ def _limit_input(ASKED, INPUT, LAST_INPUT, SPENT, budget, max_slew):
     given = min(max(ASKED, INPUT - max_slew), INPUT + max_slew)
     left = np.sqrt(max(budget - SPENT, 0.0))
     given = min(max(given, -left), left)
-    return given, INPUT, LAST_INPUT, SPENT + given * given
+    return given, INPUT, LAST_INPUT, given - INPUT, SPENT + given * given
 
 
 def _play_record(INPUT, RECORDED_u, RECORDED_y, max_input):
@@ -86,23 +86,21 @@ def _draw_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
 class Kernel:
     """The entry points of one kind of experiment.
 
-    They work on ``blocks`` (n_blocks, rows * LANES), the environments, of which there are n = n_blocks * LANES; are told
-    ``setup`` (`duffing_env.layout.Setup`); and write ``observations`` (n, entries) float32.
+    They work on ``blocks`` (n_blocks, rows * LANES), the environments, of which there are n = n_blocks * LANES, and are
+    told ``setup`` (`duffing_env.layout.Setup`).
 
     Attributes:
-        reset: ``reset(blocks, mask, setup, observations)`` starts episodes in the environments of ``mask`` (n,), and
-            writes all observations.
-        step: ``step(blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, observations,
-            final_observations, ended)`` steps all blocks on the calling thread. ``saved`` (n_threads, rows * LANES) is
-            work space, ``actions`` (n,) are inputs in parts of the largest, ``recorded_u`` and ``recorded_y`` (T,) the
-            record that is replayed and one sample elsewhere, ``reset_mode`` is RESET_BY_HAND, RESET_NEXT_STEP or
-            RESET_SAME_STEP. What the step leaves is in the rows `OUTCOME` of the blocks. Where environments were reset
-            in this very step, it writes ``final_observations``, like ``observations``, and ``ended`` (n_blocks, rows *
-            LANES), their rows as the episode left them.
-        step_parallel: the same on ``n_threads`` of Numba's threads.
+        step: ``step(first, stop, blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, mask, observations,
+            final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the calling thread. ``saved``
+            (2 rows * LANES,) is work space, ``actions`` (n,) are inputs in parts of the largest, ``recorded_u`` and
+            ``recorded_y`` (T,) the record that is replayed and one sample elsewhere, ``reset_mode`` says how finished
+            environments are reset; RESET_NOW does nothing but start episodes in those of ``mask`` (n,). It writes
+            ``observations`` (n, entries) float32; what else the step leaves is in the rows `OUTCOME` of the blocks.
+            Where environments were reset in this very step, it writes ``final_observations``, like ``observations``,
+            and ``ended`` (n_blocks, rows * LANES), their rows as the episode left them.
+        step_parallel: all blocks on Numba's threads, as many as ``saved`` (threads, 2 rows * LANES) has rows.
     """
 
-    reset: Any
     step: Any
     step_parallel: Any
 
@@ -115,20 +113,20 @@ def compiled(kind: Kind) -> Kernel:
     row = {name: number * LANES for name, number in place.items()}
     n_record, n_parameters = len(belief_names(kind.belief)), len(parameter_names(kind.truth))
     n_observation, n_outcome = len(observation_bounds(kind.belief)), len(OUTCOME)
+    n_saved = n_record * LANES
     stream, drawn = row["STREAM_a"], row[f"PARAM_{parameter_names(kind.truth)[0]}"]
-    asked, given, elapsed, waiting = row["ASKED"], row["INPUT"], row["ELAPSED"], row["WAITING"]
+    asked, elapsed, waiting = row["ASKED"], row["ELAPSED"], row["WAITING"]
     terminated, truncated, diverged, off_record = (row[name] for name in OUTCOME[3:])
     outcome, observed = row["REWARD"], row[f"OBS_{next(iter(observation_bounds(kind.belief)))}"]
     recorded_u_row, recorded_y_row = row["RECORDED_u"], row["RECORDED_y"]
-    jump_at, jump_factor, work = row["JUMP_AT"], row["JUMP_FACTOR"], row["WORK"]
+    jump_at, jump_factor = row["JUMP_AT"], row["JUMP_FACTOR"]
     summed = tuple(row[name] for name in SUMMED)
     sensors = [f"Y_{y}" for y in kind.truth.outputs]
     cleared = ["INPUT", "LAST_INPUT", "OLDER_INPUT", "SPENT", "EARNED", "ELAPSED", "WAITING", "WORK"]
     at_rest = tuple(row[name] for name in [*cleared, *sensors, *(f"X_{x}" for x in kind.truth.states)])
-    first_output = row[sensors[0]]
 
     draw_noise = lanewise(place, "STREAM_a STREAM_b STREAM_c STREAM_d NOISE_w NOISE_v")(_draw_noise)
-    limit_input = lanewise(place, "INPUT LAST_INPUT OLDER_INPUT SPENT", uniform="budget max_slew")(_limit_input)
+    limit_input = lanewise(place, "INPUT LAST_INPUT OLDER_INPUT RISE SPENT", uniform="budget max_slew")(_limit_input)
     play_record = lanewise(place, f"INPUT {sensors[0]} OFF_RECORD", uniform="max_input")(_play_record)
     pay = lanewise(place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(_pay)
     streams = "STREAM_a STREAM_b STREAM_c STREAM_d"
@@ -141,7 +139,7 @@ def compiled(kind: Kind) -> Kernel:
     hooks = Hooks(nothing_in_lane, nothing, nothing, nothing) if make_hooks is None else make_hooks(kind, code)
     begin_work, before, expect, after = hooks
     is_worked = make_hooks is not None
-    feed_plant, feed_belief = code.feed_plant, code.feed_belief
+    is_structured, jumps, pays = kind.factorisation == "structured", kind.jumps, kind.pays
     settle_truth, appraise, settle, observe = code.settle_truth, code.appraise, code.settle, code.observe
     walk = code.walk if drifts else None
     digests = (kind.belief.digest, kind.plant.digest if kind.plant else "replay")
@@ -167,215 +165,169 @@ def compiled(kind: Kind) -> Kernel:
         W[stream + 2 * LANES + j], W[stream + 3 * LANES + j] = as_bits(c), as_bits(d)
 
     @inner
-    def meet_truth(W, j, setup):
-        """Where lane j's plant is new."""
+    def reset_lane(W, j, setup, is_new):
+        """Start an episode in lane j: draw its plant, put it at rest, and put the belief to the prior.
+
+        With ``is_new`` False only its true coefficients are settled anew, after its parameters changed.
+        """
+        if is_new:
+            for i in range(n_record):
+                W[i * LANES + j] = setup.prior[i]
+            draw_plant(W, j, setup)
+            W[jump_at + j] = -1.0
+            if jumps:
+                draw_jump(W, j, setup.jump, setup.horizon)
+            for r in at_rest:
+                W[r + j] = 0.0
         settle_truth(W, j, setup.step)
         appraise(W, j, setup.step)
         if is_worked:
             begin_work(W, j, setup)
 
-    @inner
-    def reset_lane(W, j, setup):
-        """Start an episode in lane j: draw its plant, put it at rest, and put the belief to the prior."""
-        for i in range(n_record):
-            W[i * LANES + j] = setup.prior[i]
-        draw_plant(W, j, setup)
-        W[jump_at + j] = -1.0
-        if setup.jump > 0.0:
-            draw_jump(W, j, setup.jump, setup.horizon)
-        for r in at_rest:
-            W[r + j] = 0.0
-        meet_truth(W, j, setup)
-
-    @inner
-    def act(W, actions, setup):
-        """The inputs that are given, of actions (LANES,), and what else happens before a sample."""
-        for j in range(LANES):
-            W[asked + j] = setup.max_input * max(-1.0, min(1.0, actions[j]))
-        limit_input(W, setup.budget, setup.max_slew)
-        if setup.jump > 0.0:
-            for j in range(LANES):
-                if W[elapsed + j] == W[jump_at + j]:
-                    W[drawn + j] *= W[jump_factor + j]
-                    meet_truth(W, j, setup)
-
-    @inner
-    def sample(W, saved, setup, recorded_u, recorded_y):
-        """Plant, measurement, belief and reward for all lanes of a block; their inputs stand in row ``INPUT``."""
-        draw_noise(W)
-        feed_plant(W)
-        if is_worked:
-            before(W, setup)
-        if simulated:
-            move(W, setup)
-        else:
-            last = len(recorded_y) - 1
-            for j in range(LANES):
-                t = np.int64(W[elapsed + j])
-                W[recorded_u_row + j] = recorded_u[min(t, last)]
-                W[recorded_y_row + j] = recorded_y[min(t + setup.delay, last)]
-            play_record(W, setup.max_input)
-        # What to return to if the update breaks the belief.
-        saved[: n_record * LANES] = W[: n_record * LANES]
-        if drifts:
-            walk(W, setup.walk)
-        feed_belief(W)
-        if is_worked:
-            expect(W, setup)
-        infer(W, setup.as_published)
-        if is_worked:
-            after(W, setup)
-        settle(W, setup.step, setup.max_output, setup.horizon, setup.input_cost)
-        if setup.terminal or setup.forfeits:
-            pay(W, setup.terminal, setup.forfeits, setup.terminated_return)
-        void = 0
-        for j in range(LANES):
-            void += (W[diverged + j] != 0.0) | (W[off_record + j] != 0.0)
-        if void:
-            for j in range(LANES):
-                if W[diverged + j] != 0.0 or W[off_record + j] != 0.0:
-                    for i in range(n_record):
-                        W[i * LANES + j] = saved[i * LANES + j]
-
-    @inner
-    def play(W, saved, actions, setup, recorded_u, recorded_y):
-        """Apply the actions for as many samples as they hold; an environment that ends meanwhile stays as it ended."""
-        for s in range(setup.hold):
-            kept = W.copy() if s > 0 else W[:0]
-            act(W, actions, setup)
-            sample(W, saved, setup, recorded_u, recorded_y)
-            if s > 0:
-                for j in range(LANES):
-                    if kept[terminated + j] + kept[truncated + j] != 0.0:
-                        for i in range(n_rows):
-                            W[i * LANES + j] = kept[i * LANES + j]
-                    else:
-                        for r in summed:
-                            W[r + j] += kept[r + j]
-
-    @inner
-    def begin_or_end(W, setup, reset_mode):
-        """Start the episodes that are due, and mark those that have finished; gives their number."""
-        concerned = 0
-        for j in range(LANES):
-            concerned += (W[waiting + j] != 0.0) | (W[terminated + j] != 0.0) | (W[truncated + j] != 0.0)
-        finished = 0
-        if concerned:
-            for j in range(LANES):
-                if W[waiting + j] != 0.0 and reset_mode == RESET_NEXT_STEP:
-                    reset_lane(W, j, setup)
-                    for k in range(n_outcome):
-                        W[outcome + k * LANES + j] = 0.0
-                elif W[terminated + j] + W[truncated + j] != 0.0:
-                    W[waiting + j] = 1.0
-                    finished += 1
-        return finished
-
-    @inner
-    def show(W, setup, observations):
-        """Write the observations (LANES, entries) of a block."""
-        observe(
-            W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output, 1.0 / setup.max_input,
-            1.0 / setup.horizon, 1.0 / setup.budget,
-        )  # fmt: skip
-        for j in range(LANES):
-            for k in range(n_observation):
-                observations[j, k] = W[observed + k * LANES + j]
-
-    @inner
-    def step_block(
-        W, saved, actions, setup, recorded_u, recorded_y, reset_mode, observations, final_observations, ended
-    ):  # fmt: skip
-        """One step of a block: actions (LANES,), observations (LANES, entries)."""
-        idle = 0
-        for j in range(LANES):
-            idle += W[waiting + j] != 0.0
-        if idle < LANES:
-            play(W, saved, actions, setup, recorded_u, recorded_y)
-        finished = begin_or_end(W, setup, reset_mode)
-        show(W, setup, observations)
-        if reset_mode == RESET_SAME_STEP and finished:
-            for j in range(LANES):
-                if W[waiting + j] != 0.0:
-                    for k in range(n_observation):
-                        final_observations[j, k] = observations[j, k]
-                    for i in range(n_rows):
-                        ended[i * LANES + j] = W[i * LANES + j]
-                    reset_lane(W, j, setup)
-            show(W, setup, observations)
-
-    @entry
-    def reset(blocks, mask, setup, observations):
-        for b in range(len(blocks)):
-            for j in range(LANES):
-                if mask[b * LANES + j]:
-                    reset_lane(blocks[b], j, setup)
-            show(blocks[b], setup, observations[b * LANES : (b + 1) * LANES])
-
-    @inner
     def step_blocks(
-        first, last, blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, observations,
+        first, stop, blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, mask, observations,
         final_observations, ended,
     ):  # fmt: skip
-        for b in range(first, last):
-            lanes = slice(b * LANES, (b + 1) * LANES)
-            step_block(
-                blocks[b], saved, actions[lanes], setup, recorded_u, recorded_y, reset_mode, observations[lanes],
-                final_observations[lanes], ended[b],
-            )  # fmt: skip
+        """Step some blocks, or start episodes in them.
 
-    @entry
-    def step(
-        blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, observations, final_observations, ended
-    ):  # fmt: skip
-        step_blocks(
-            0, len(blocks), blocks, saved[0], actions, setup, recorded_u, recorded_y, reset_mode, observations,
-            final_observations, ended,
-        )  # fmt: skip
+        Few functions and no more layers: every layer is compiled, and everything below it once more with it.
+        """
+        for b in range(first, stop):
+            W = blocks[b]
+            lane = b * LANES
+            idle = 0
+            for j in range(LANES):
+                idle += W[waiting + j] != 0.0
+            # Apply the actions for as many samples as they hold; an environment that ends meanwhile stays as it ended.
+            for s in range(setup.hold if idle < LANES and reset_mode != RESET_NOW else 0):
+                if s > 0:
+                    for i in range(n_rows * LANES):
+                        saved[n_saved + i] = W[i]
+                for j in range(LANES):
+                    W[asked + j] = setup.max_input * max(-1.0, min(1.0, actions[lane + j]))
+                limit_input(W, setup.budget, setup.max_slew)
+                if jumps:
+                    for j in range(LANES):
+                        if W[elapsed + j] == W[jump_at + j]:
+                            W[drawn + j] *= W[jump_factor + j]
+                            reset_lane(W, j, setup, False)
+                draw_noise(W)
+                if is_worked:
+                    before(W, setup)
+                if simulated:
+                    move(W, setup)
+                else:
+                    last = len(recorded_y) - 1
+                    for j in range(LANES):
+                        t = np.int64(W[elapsed + j])
+                        W[recorded_u_row + j] = recorded_u[min(t, last)]
+                        W[recorded_y_row + j] = recorded_y[min(t + setup.delay, last)]
+                    play_record(W, setup.max_input)
+                # What to return to if the update breaks the belief.
+                for i in range(n_saved):
+                    saved[i] = W[i]
+                if drifts:
+                    walk(W, setup.walk)
+                if is_worked:
+                    expect(W, setup)
+                if is_structured:
+                    infer(W)
+                else:
+                    infer(W, setup.as_published)
+                if is_worked:
+                    after(W, setup)
+                settle(W, setup.step, setup.max_output, setup.horizon, setup.input_cost)
+                if pays:
+                    pay(W, setup.terminal, setup.forfeits, setup.terminated_return)
+                void = 0
+                for j in range(LANES):
+                    void += (W[diverged + j] != 0.0) | (W[off_record + j] != 0.0)
+                if void:
+                    for j in range(LANES):
+                        if W[diverged + j] != 0.0 or W[off_record + j] != 0.0:
+                            for i in range(n_record):
+                                W[i * LANES + j] = saved[i * LANES + j]
+                if s > 0:
+                    for j in range(LANES):
+                        if saved[n_saved + terminated + j] + saved[n_saved + truncated + j] != 0.0:
+                            for i in range(n_rows):
+                                W[i * LANES + j] = saved[n_saved + i * LANES + j]
+                        else:
+                            for r in summed:
+                                W[r + j] += saved[n_saved + r + j]
+            # Start the episodes that are due, and mark those that have finished.
+            finished = 0
+            for j in range(LANES):
+                if (
+                    mask[lane + j]
+                    if reset_mode == RESET_NOW
+                    else W[waiting + j] != 0.0 and reset_mode == RESET_NEXT_STEP
+                ):
+                    reset_lane(W, j, setup, True)
+                    for k in range(n_outcome):
+                        W[outcome + k * LANES + j] = 0.0
+                elif reset_mode != RESET_NOW and W[terminated + j] + W[truncated + j] != 0.0:
+                    W[waiting + j] = 1.0
+                    finished += 1
+            for again in range(2):
+                observe(
+                    W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output, 1.0 / setup.max_input,
+                    1.0 / setup.horizon, 1.0 / setup.budget,
+                )  # fmt: skip
+                for j in range(LANES):
+                    for k in range(n_observation):
+                        observations[lane + j, k] = W[observed + k * LANES + j]
+                if again or reset_mode != RESET_SAME_STEP or not finished:
+                    break
+                for j in range(LANES):
+                    if W[waiting + j] != 0.0:
+                        for k in range(n_observation):
+                            final_observations[lane + j, k] = observations[lane + j, k]
+                        for i in range(n_rows):
+                            ended[b, i * LANES + j] = W[i * LANES + j]
+                        reset_lane(W, j, setup, True)
+
+    step, inner_step = entry(step_blocks), inner(step_blocks)
 
     @entry(parallel=True)
     def step_parallel(
-        blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, observations, final_observations, ended
+        blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, mask, observations, final_observations, ended
     ):  # fmt: skip
         n = len(saved)
         for t in prange(n):
-            step_blocks(
+            inner_step(
                 t * len(blocks) // n, (t + 1) * len(blocks) // n, blocks, saved[t], actions, setup, recorded_u,
-                recorded_y, reset_mode, observations, final_observations, ended,
+                recorded_y, reset_mode, mask, observations, final_observations, ended,
             )  # fmt: skip
 
-    del work, given, first_output
-    return Kernel(reset, step, step_parallel)
+    return Kernel(step, step_parallel)
 
 
 def _plant_of(kind: Kind, code: Any, draw_noise: Any) -> Any:
     """``move(W, setup)``: the simulated plant over a sample with its noise, and its sensors. Noise has been drawn."""
     assert kind.plant is not None
     model, n_outputs = kind.plant, kind.plant.n_outputs
-    plant_move, plant_kick = code.plant_move, code.plant_kick
-    steps, continuous = model.substeps, model.is_continuous
-    white = continuous and not model.held
-    length, root, root_3 = 1.0 / steps, math.sqrt(1.0 / steps), math.sqrt(3.0)
-    sense_0 = code.sense_0
-    sense_1 = getattr(code, "sense_1", sense_0)
-    sense_2 = getattr(code, "sense_2", sense_0)
     if n_outputs > 3:
         raise ValueError(f"outputs must be at most 3 in an environment, but {model.name!r} has {n_outputs}")
+    plant, steps, white = code.plant, model.substeps, model.is_continuous and not model.held
+    length, root, root_3 = 1.0 / steps, math.sqrt(1.0 / steps), math.sqrt(3.0)
+    sense_0 = getattr(code, "sense_0", None)
+    sense_1 = getattr(code, "sense_1", sense_0)
+    sense_2 = getattr(code, "sense_2", sense_0)
+    continuous = model.is_continuous
 
     @jit
     def move(W, setup):
         if continuous:
             for s in range(steps):
-                plant_move(W, s / steps)
                 if white:
-                    plant_kick(W, setup.process_noise, length, root, root_3)
+                    plant(W, s / steps, setup.process_noise, length, root, root_3)
                     draw_noise(W)
-            if not white:
-                plant_kick(W, setup.process_noise)
+                else:
+                    plant(W, s / steps, setup.process_noise if s == steps - 1 else 0.0)
+            sense_0(W, setup.measurement_noise[0])
         else:
-            plant_move(W)
-            plant_kick(W, setup.process_noise)
-        sense_0(W, setup.measurement_noise[0])
+            plant(W, setup.measurement_noise[0], setup.process_noise)
         if n_outputs > 1:
             draw_noise(W)
             sense_1(W, setup.measurement_noise[1])

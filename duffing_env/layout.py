@@ -40,6 +40,8 @@ class Kind(NamedTuple):
         reward: its name.
         drifts: whether the coefficients are believed to walk.
         normal: whether plants are drawn from a Gaussian, instead of log-uniformly about a centre.
+        jumps: whether the first parameter jumps within an episode.
+        pays: whether rewards are paid at the end, or an episode that is terminated forfeits them.
     """
 
     belief: Model
@@ -50,6 +52,8 @@ class Kind(NamedTuple):
     reward: str = "information_gain"
     drifts: bool = False
     normal: bool = False
+    jumps: bool = False
+    pays: bool = False
 
     @property
     def truth(self) -> Model:
@@ -140,14 +144,14 @@ def parameter_names(model: Model) -> tuple[str, ...]:
 def layout_of(kind: Kind) -> Mapping[str, int]:
     """Name of a quantity to its row in a block of this kind."""
     belief, truth = kind.belief, kind.truth
-    place = layout(belief, kind.degree)
-    wanted = [f"U_{k}" for k in range(3)]  # whichever of the two models needs most
-    wanted += [f"Y_{y}" for y in truth.outputs]
+    place = {name: row for name, row in layout(belief, kind.degree).items() if not name.startswith("U_")}
+    place = {name: row for row, name in enumerate(place)}
+    wanted = [f"Y_{y}" for y in truth.outputs]
     wanted += [f"PARAM_{p}" for p in parameter_names(truth)]
     wanted += [f"X_{x}" for x in truth.states]
     wanted += [f"TRUE_{c}" for model in {truth: None, belief: None} for c in model.coefficients]
     wanted += ["STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d", "NOISE_w", "NOISE_v"]
-    wanted += ["INPUT", "LAST_INPUT", "OLDER_INPUT", "ASKED", "SPENT", "JUMP_AT", "JUMP_FACTOR"]
+    wanted += ["INPUT", "LAST_INPUT", "OLDER_INPUT", "RISE", "ASKED", "SPENT", "JUMP_AT", "JUMP_FACTOR"]
     wanted += ["ELAPSED", "WAITING", "RECORDED_u", "RECORDED_y", "LOG_DET", "LOG_DENSITY", "ERROR", "WORK", "EARNED"]
     wanted += OUTCOME
     wanted += [f"OBS_{name}" for name in observation_bounds(belief)]
@@ -168,4 +172,18 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
     if kind.reward == "free_energy" and kind.factorisation == "structured":
         wanted += [*trace_names(belief, kind.iterations), "PRIOR_RATE_g", "PRIOR_RATE_n"]
     missing = [name for name in dict.fromkeys(wanted) if name not in place]
-    return place | rows(" ".join(missing), start=len(place))
+    place |= rows(" ".join(missing), start=len(place))
+    return place | inputs_of(kind, belief, place)
+
+
+def inputs_of(kind: Kind, model: Model, place: Mapping[str, int]) -> dict[str, int]:
+    """Rows of the input over a sample as a model takes it, ``U_0``, ``U_1``, ...: they stand in rows that are there."""
+    if model.is_continuous:
+        names = ["INPUT"] if kind.degree == 0 else ["LAST_INPUT", "RISE"]
+    elif kind.truth.is_continuous and kind.degree == 1:
+        # A difference equation takes the input at the sample before; where the input goes linearly from one action to
+        # the next, that is the last action.
+        names = ["LAST_INPUT", "OLDER_INPUT"]
+    else:
+        names = ["INPUT", "LAST_INPUT", "OLDER_INPUT"]
+    return {f"U_{k}": place[name] for k, name in enumerate(names)}

@@ -44,13 +44,15 @@ def source(kind: Kind, loop: Any) -> str:
     """``model_move`` and ``twin_move``: the believed and the true plant alone; ``compare`` adds up, ``conclude`` ends."""
     import sympy as sp
 
-    from duffing_env.sources import motion
+    from duffing_env.sources import moved
     from estimator.engine.derive import calculus, renamed, symbol
 
     model = kind.belief
     believed = {x: f"MODEL_{x}" for x in model.states} | {c: c for c in model.coefficients}
     true = {x: f"TWIN_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
-    text = motion(model, kind.degree, loop, "model", believed) + motion(model, kind.degree, loop, "twin", true)
+    at = ("T",) if model.is_continuous else ()
+    text = loop("model_move", "The believed plant moves.", *moved(model, kind.degree, believed), *at)
+    text += loop("twin_move", "The true plant moves.", *moved(model, kind.degree, true), *at)
     shown = calculus(model).outputs[0].subs(symbol("u"), 0)
     ours, theirs = (renamed([("", shown)], names)[0][1] for names in (believed, true))
     lines = [("E_d", symbol("DEVIATION") + (ours - theirs) ** 2), ("E_p", symbol("POWER") + theirs**2)]
@@ -66,11 +68,11 @@ def hooks(kind: Kind, code: Any) -> Hooks:
     """It compares where an episode begins, and after every update."""
     place, model = layout_of(kind), kind.belief
     first, last = place[f"MODEL_{next(iter(model.states))}"] * LANES, (place["POWER"] + 1) * LANES
-    inputs = tuple(place[f"U_{k}"] * LANES for k in range(3))
+    saved_rows = model.taps if not model.is_continuous else kind.degree + 1
+    inputs = tuple(place[f"U_{k}"] * LANES for k in range(saved_rows))
     work, misfit = place["WORK"] * LANES, place["MISFIT"] * LANES
     model_move, twin_move, compare, conclude = code.model_move, code.twin_move, code.compare, code.conclude
     steps, continuous, degree, taps = model.substeps, model.is_continuous, kind.degree, model.taps
-    saved_rows = model.taps if not continuous else degree + 1
 
     @jit
     def run(W, max_input):

@@ -7,37 +7,12 @@ from functools import cache
 from itertools import combinations
 from typing import Any
 
-from duffing_env.layout import Kind, layout_of, observation_bounds, parameter_names
+from duffing_env.layout import Kind, inputs_of, layout_of, observation_bounds, parameter_names
 from duffing_env.rewards import REWARDS
 from estimator.engine import cache as stored
 from estimator.engine.tasks import NAMES, belief_names
 from estimator.lanes import LANES, inlined
 from estimator.models.model import Model
-
-
-@inlined
-def positive(value):
-    """1 above 0, else 0, as for NaN."""
-    return 1.0 if value > 0.0 else 0.0
-
-
-@inlined
-def reaches(value, limit):
-    """1 at the limit or above, else 0."""
-    return 1.0 if value >= limit else 0.0
-
-
-@inlined
-def finite(value):
-    """1 for a finite number, else 0."""
-    return 1.0 if value - value == 0.0 else 0.0
-
-
-@inlined
-def clip(value, low, high):
-    """A value within its bounds; NaN becomes the lower one."""
-    value = value if value > low else low
-    return value if value < high else high
 
 
 @inlined
@@ -47,7 +22,7 @@ def capped(ratio):
     return deviation if deviation < 1.0 else 1.0
 
 
-_NAMES = {**NAMES, "positive": positive, "reaches": reaches, "finite": finite, "clip": clip, "capped": capped}
+_NAMES = {**NAMES, "capped": capped}
 
 #: Bounds of a determinant that has a logarithm: below, numbers lose digits.
 _SMALLEST, _LARGEST = 2.0**-1000, 2.0**1000
@@ -71,9 +46,13 @@ def _source(kind: Kind) -> str:
     def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str, one: bool = False) -> str:
         return "@jit\n" + lane_loop(name, lines, results, place, LANES, uniform, doc=doc, one=one)
 
-    source = _feeds(kind, loop) + _truth(kind, loop) + _judgement(kind, loop) + _observation(kind, loop)
+    def plant_loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
+        within = {**place, **inputs_of(kind, kind.truth, place)}
+        return "@jit\n" + lane_loop(name, lines, results, within, LANES, uniform, doc=doc)
+
+    source = _truth(kind, loop) + _judgement(kind, loop) + _observation(kind, loop)
     if kind.plant is not None:
-        source += _plant(kind.plant, kind.degree, loop)
+        source += _plant(kind.plant, kind.degree, plant_loop)
     if kind.drifts:
         source += _walk(kind.belief, loop)
     own = REWARDS[kind.reward].source
@@ -92,82 +71,66 @@ def _walk(model: Model, loop: Any) -> str:
     return source + f"@jit\ndef walk(W, variances):\n    walk_lanes(W, {told})\n"
 
 
-def motion(model: Model, degree: int, loop: Any, prefix: str, names: Mapping[str, str]) -> str:
-    """Source of ``<prefix>_begin``, ``<prefix>_move``: the state alone over a sample, of renamed quantities.
+def moved(model: Model, degree: int, names: Mapping[str, str]) -> tuple[Any, dict[str, str]]:
+    """Assignments of the state alone over a sample, or over a Runge-Kutta step of it, of renamed quantities.
 
-    A difference equation has ``<prefix>_move(W)`` alone. The states are renamed by ``names``, as the coefficients.
+    Returns:
+        The assignments, and what each of the renamed states becomes.
     """
     from estimator.engine import derive
 
     if model.is_continuous:
         mapping = {**names, **{f"M_{x}": names[x] for x in model.states}}
         lines = derive.renamed(derive.plain_step(model, degree), mapping)
-        results = {names[x]: f"M_{x}_e" for x in model.states}
-        return loop(f"{prefix}_move", "One Runge-Kutta step of the state.", lines, results, "T")
-    lines, moved = derive.difference_step(model)
-    lines = derive.renamed(lines, names)
+        return lines, {names[x]: f"M_{x}_e" for x in model.states}
+    lines, motion = derive.difference_step(model)
     results = {}
-    for x, value in zip(model.states, moved.state, strict=True):
-        lines.append((f"NEXT_{x}", derive.renamed([("", value)], names)[0][1]))
+    for x, value in zip(model.states, motion.state, strict=True):
+        lines.append((f"NEXT_{x}", value))
         results[names[x]] = f"NEXT_{x}"
-    return loop(f"{prefix}_move", "The next state.", lines, results)
-
-
-def _feeds(kind: Kind, loop: Any) -> str:
-    """``feed_plant(W)`` and ``feed_belief(W)``: the input over the sample, as each of the two models takes it."""
-    from estimator.engine.derive import symbol
-
-    def lines(model: Model, follows: bool) -> tuple[Any, dict[str, str]]:
-        now, last, older = symbol("INPUT"), symbol("LAST_INPUT"), symbol("OLDER_INPUT")
-        if model.is_continuous:
-            values = [now] if kind.degree == 0 else [last, now - last]
-        else:
-            # A difference equation takes the input at the sample before; on a plant whose input goes linearly from one
-            # action to the next that is the last one.
-            values = ([last, older, older] if follows else [now, last, older])[: model.taps]
-        return [(f"V_{k}", value) for k, value in enumerate(values)], {f"U_{k}": f"V_{k}" for k in range(len(values))}
-
-    source = ""
-    for name, model in (("feed_plant", kind.truth), ("feed_belief", kind.belief)):
-        follows = kind.truth.is_continuous and kind.degree == 1 and not model.is_continuous
-        source += loop(name, "The input over the sample.", *lines(model, follows))
-    return source
+    return derive.renamed(lines, names), results
 
 
 def _plant(model: Model, degree: int, loop: Any) -> str:
-    """``plant_move``, ``plant_kick`` and ``sense_<k>``: the plant over a sample with its noise, and its sensors."""
+    """``plant``: the plant over a sample with its noise, or over a Runge-Kutta step of it; and its sensors.
+
+    A difference equation shows its first sensor as well; other sensors are ``sense_<k>``.
+    """
     from estimator.engine import derive
 
     names = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
-    source = motion(model, degree, loop, "plant", names)
+    lines, results = moved(model, degree, names)
     found, symbol = derive.calculus(model), derive.symbol
-    strength, w, v = symbol("PROCESS_NOISE"), symbol("NOISE_w"), symbol("NOISE_v")
-    lines, results = [], {}
+    strength, w, v = symbol("process_noise"), symbol("NOISE_w"), symbol("NOISE_v")
+    white = model.is_continuous and not model.held
+    after: dict[str, Any] = {}
     for a, x in enumerate(model.states):
-        kick = strength * found.noise[a]
-        if model.is_continuous and not model.held:
-            # The increment of the noise over a sub-step of length h, and where it reaches a state only through others,
-            # its integral; the two are drawn jointly.
-            h = symbol("LENGTH")
+        kick = strength * found.noise[a] * w
+        if white:
+            # The increment of the noise over a step of length h, and where it reaches a state only through others, its
+            # integral; the two are drawn jointly.
+            h = symbol("length")
             through = sum(found.by[a][k] * strength * found.noise[k] for k in range(model.n_states))
-            direct, integral = symbol("ROOT") * w, h * symbol("ROOT") / 2 * (w + v / symbol("ROOT_3"))
-            kick = kick * direct if found.noise[a] != 0 else through * integral
-        else:
-            kick = kick * w
-        if kick != 0:
-            renamed = derive.renamed([("", symbol(x) + kick)], names)[0][1]
-            lines.append((f"K_{x}", renamed))
-            results[f"X_{x}"] = f"K_{x}"
-    arguments = (
-        ("PROCESS_NOISE", "LENGTH", "ROOT", "ROOT_3") if model.is_continuous and not model.held else ("PROCESS_NOISE",)
-    )
-    source += loop("plant_kick", "The process noise moves the state.", lines, results, *arguments)
+            direct, integral = symbol("root") * w, h * symbol("root") / 2 * (w + v / symbol("root_3"))
+            kick = strength * found.noise[a] * direct if found.noise[a] != 0 else through * integral
+        kick = derive.renamed([("", kick)], names)[0][1]
+        lines.append((f"K_{x}", symbol(results[names[x]]) + kick))
+        after[x] = symbol(f"K_{x}")
+    results = {names[x]: f"K_{x}" for x in model.states}
     end = derive.input_at_end(model, degree)
+    source = ""
     for k, (y, shown) in enumerate(zip(model.outputs, found.outputs, strict=True)):
-        noise = (v, w)[k % 2] * symbol("MEASUREMENT_NOISE")
-        value = derive.renamed([("", shown)], {**names, "u": end})[0][1] + noise
-        source += loop(f"sense_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"}, "MEASUREMENT_NOISE")
-    return source
+        noise = (v, w)[k % 2] * symbol("measurement_noise")
+        now = names if model.is_continuous or k else {**names, **after}
+        value = derive.renamed([("", shown)], {**now, "u": end})[0][1] + noise
+        if model.is_continuous or k:
+            source += loop(f"sense_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"}, "measurement_noise")
+        else:
+            lines.append(("SHOWN", value))
+            results |= {f"Y_{y}": "SHOWN"}
+    arguments = ["T"] if model.is_continuous else ["measurement_noise"]
+    arguments += ["process_noise", *(["length", "root", "root_3"] if white else [])]
+    return source + loop("plant", "The plant moves.", lines, results, *arguments)
 
 
 def _truth(kind: Kind, loop: Any) -> str:
@@ -270,7 +233,8 @@ def _judgement(kind: Kind, loop: Any) -> str:
     every += [f"X_{x}" for x in kind.truth.states] + [f"Y_{y}" for y in model.outputs]
     total = sum((symbol(name) for name in every), symbol("NEW_LOG_DENSITY") + symbol("NEW_ERROR") + symbol("WORK"))
     spreads = [symbol(f"P_{x}_{x}") for x in model.states] if kind.factorisation == "structured" else []
-    good = sound * is_finite(total) * sp.Mul(*(check(s + sp.Float(1e-300)) for s in spreads))
+    lines.append(("TOTAL", total))
+    good = sound * is_finite(symbol("TOTAL")) * sp.Mul(*(check(s + sp.Float(1e-300)) for s in spreads))
     good *= sp.Mul(*(check(symbol(name)) for name in belief_names(model)[-2 - 2 * model.n_outputs :]))
     off = symbol("OFF_RECORD")
     lines += [("SOUND", good), ("BROKEN", 1 - symbol("SOUND")), ("VOID", symbol("BROKEN") + off)]
@@ -327,7 +291,9 @@ def _observation(kind: Kind, loop: Any) -> str:
     values["budget_left"] = 1 - symbol("SPENT") * symbol("per_budget")
     clip = sp.Function("clip")
     bounds = observation_bounds(model)
-    lines += [(f"V_{name}", clip(value, *map(sp.Float, bounds[name]))) for name, value in values.items()]
+    for name, value in values.items():
+        low, high = (sp.Float(bound) for bound in bounds[name])
+        lines += [(f"B_{name}", value), (f"V_{name}", clip(symbol(f"B_{name}"), low, high))]
     uniform = [f"{letter}_{c}" for letter in ("PRIOR", "SCALE") for c in coefficients]
     uniform += ["LOG_gamma", *(f"LOG_xi_{y}" for y in model.outputs)]
     scales = ["per_output", "per_input", "per_horizon", "per_budget"]

@@ -14,6 +14,18 @@ from sympy.printing.pycode import PythonCodePrinter
 from estimator.engine.derive import Assignments
 
 
+#: Functions that are written out: a call is compiled on its own, and costs more than what it does. Arguments that stand
+#: there twice must be names.
+_INLINE = {
+    "present": "(1.0 if {0} == {0} else 0.0)",
+    "finite": "(1.0 if {0} - {0} == 0.0 else 0.0)",
+    "positive": "(1.0 if {0} > 0.0 else 0.0)",
+    "reaches": "(1.0 if {0} >= {1} else 0.0)",
+    "select": "({1} if {0} > 0.0 else {2})",
+    "clip": "({1} if not {0} > {1} else ({0} if {0} < {2} else {2}))",
+}
+
+
 class _Printer(PythonCodePrinter):
     """Floats for numbers, products for small powers, bare names for functions."""
 
@@ -39,7 +51,10 @@ class _Printer(PythonCodePrinter):
         return f"({self._print(base)})**({self._print(exponent)})"
 
     def _print_Function(self, expr: sp.Function) -> str:
-        return f"{expr.func.__name__}({', '.join(self._print(a) for a in expr.args)})"
+        name, given = expr.func.__name__, [self._print(argument) for argument in expr.args]
+        if name in _INLINE:
+            return _INLINE[name].format(*given)
+        return f"{name}({', '.join(given)})"
 
     _print_sin = _print_cos = _print_tanh = _print_exp = _print_log = _print_Function
 

@@ -21,18 +21,6 @@ from estimator.models.model import Model
 
 
 @inlined
-def present(value):
-    """1 for a number, 0 for NaN."""
-    return 1.0 if value == value else 0.0
-
-
-@inlined
-def select(condition, first, second):
-    """``first`` where the condition is positive."""
-    return first if condition > 0.0 else second
-
-
-@inlined
 def sqrt(value):
     """Square root."""
     return np.sqrt(value)
@@ -40,7 +28,7 @@ def sqrt(value):
 
 #: What generated code may use.
 NAMES = {
-    "jit": jit, "present": present, "select": select, "sqrt": sqrt, "log": elementary.log,
+    "jit": jit, "sqrt": sqrt, "log": elementary.log,
     **{name: getattr(elementary, name) for name in ("sin", "cos", "exp", "tanh")},
 }  # fmt: skip
 
@@ -142,8 +130,9 @@ def _structured(
             lines, moved = derive.difference_step(model)
         more, results = algebra.update(model, moved, degree, iterations, trace, missing)
         source = _motion_source(model, degree, place, lanes)
-        source += "@jit\n" + emit.lane_loop("finish", lines + more, results, place, lanes, doc="Predict and condition.")
-        return source + _composed("update", model)
+        name = "finish" if model.is_continuous else "update"
+        source += "@jit\n" + emit.lane_loop(name, lines + more, results, place, lanes, doc="Predict and condition.")
+        return source + (_composed("update", model) if model.is_continuous else "")
 
     key = repr((model.digest, degree, iterations, lanes, sorted(place.items()), trace, missing))
     code = stored.load(model.name, "update", key, make, NAMES)
