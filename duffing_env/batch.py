@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from duffing_env.experiment import Experiment
 from duffing_env.kernel import RESET_NOW, compiled
-from duffing_env.layout import OUTCOME, layout_of, observation_bounds, parameter_names
+from duffing_env.layout import OUTCOME, layout_of, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, PhysicalParameters
@@ -30,6 +30,7 @@ class Batch:
     Attributes:
         observations: (n, entries) float32, overwritten by every step.
         final_observations: the same, for what was reset within the step.
+        outcomes: (len(OUTCOME), n), overwritten by every step.
     """
 
     def __init__(self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1, hold: int = 1) -> None:
@@ -40,7 +41,7 @@ class Batch:
         self._kind = experiment.kind
         self._kernel = compiled(self._kind)
         self._place = layout_of(self._kind)
-        self._setup = experiment.setup._replace(hold=hold)
+        self._packed = pack(experiment.setup._replace(hold=hold))
         self._prior = experiment.believed
         self._parameters = parameter_names(experiment.truth_model)
         n_rows, n_observation = max(self._place.values()) + 1, len(observation_bounds(experiment.model))
@@ -56,6 +57,8 @@ class Batch:
         self._actions = np.zeros(padded, dtype=np.float32)
         self._observations = np.zeros((padded, n_observation), dtype=np.float32)
         self._final_observations = np.zeros_like(self._observations)
+        self._outcomes = np.zeros((len(OUTCOME), padded))
+        self.outcomes = self._outcomes[:, :size]
         self.observations = self._observations[:size]
         self.final_observations = self._final_observations[:size]
         # Lanes beyond the last environment do the same work as the others, so that none of them runs wild.
@@ -84,7 +87,7 @@ class Batch:
 
     def _call(self, reset_mode: int) -> None:
         told = (
-            self._actions, self._setup, *self._recorded, reset_mode, self._mask, self._observations,
+            self._actions, self._packed, *self._recorded, reset_mode, self._mask, self._observations, self._outcomes,
             self._final_observations, self._flat_ended,
         )  # fmt: skip
         if self._threads > 1:
@@ -102,10 +105,8 @@ class Batch:
 
     def outcome(self, index: int) -> dict[str, float]:
         """What the last step left behind for one environment, by its names in lower case."""
-        block, lane = divmod(index, LANES)
-        first = self._place["REWARD"]
         names = (name.lower() for name in OUTCOME)
-        return dict(zip(names, self._blocks[block, first : first + len(OUTCOME), lane].tolist(), strict=True))
+        return dict(zip(names, self._outcomes[:, index].tolist(), strict=True))
 
     def quantity(self, name: str) -> FloatArray:
         """(n,) current values of a row, such as what the last step left behind; a copy."""
@@ -162,7 +163,7 @@ class Batch:
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles must not share memory through the views."""
         state = self.__dict__.copy()
-        for view in ("observations", "final_observations", "_flat_blocks", "_flat_ended", "_kernel"):
+        for view in ("observations", "final_observations", "outcomes", "_flat_blocks", "_flat_ended", "_kernel"):
             del state[view]
         return state
 
@@ -173,6 +174,7 @@ class Batch:
         self._flat_ended = self._ended.reshape(len(self._ended), -1)
         self.observations = self._observations[: self.size]
         self.final_observations = self._final_observations[: self.size]
+        self.outcomes = self._outcomes[:, : self.size]
 
 
 def spawn_seeds(seed: int | None, count: int) -> list[int]:

@@ -16,7 +16,7 @@ from numba import prange
 
 from duffing_env import sources
 from duffing_env.inference import updater
-from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, observation_bounds, parameter_names
+from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, observation_bounds, parameter_names, unpacker
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
 from estimator.engine.tasks import belief_names
@@ -87,15 +87,15 @@ class Kernel:
     """The entry points of one kind of experiment.
 
     They work on ``blocks`` (n_blocks, rows * LANES), the environments, of which there are n = n_blocks * LANES, and are
-    told ``setup`` (`duffing_env.layout.Setup`).
+    told ``packed``, the `duffing_env.layout.Setup` as one array.
 
     Attributes:
-        step: ``step(first, stop, blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, mask, observations,
-            final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the calling thread. ``saved``
+        step: ``step(first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations,
+            outcomes, final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the calling thread. ``saved``
             (2 rows * LANES,) is work space, ``actions`` (n,) are inputs in parts of the largest, ``recorded_u`` and
             ``recorded_y`` (T,) the record that is replayed and one sample elsewhere, ``reset_mode`` says how finished
             environments are reset; RESET_NOW does nothing but start episodes in those of ``mask`` (n,). It writes
-            ``observations`` (n, entries) float32; what else the step leaves is in the rows `OUTCOME` of the blocks.
+            ``observations`` (n, entries) float32, and ``outcomes`` (len(OUTCOME), n).
             Where environments were reset in this very step, it writes ``final_observations``, like ``observations``,
             and ``ended`` (n_blocks, rows * LANES), their rows as the episode left them.
         step_parallel: all blocks on Numba's threads, as many as ``saved`` (threads, 2 rows * LANES) has rows.
@@ -143,6 +143,7 @@ def compiled(kind: Kind) -> Kernel:
     settle_truth, appraise, settle, observe = code.settle_truth, code.appraise, code.settle, code.observe
     walk = code.walk if drifts else None
     digests = (kind.belief.digest, kind.plant.digest if kind.plant else "replay")
+    unpack = unpacker(kind)
     name = "_".join(str(word) for word in (*digests, *kind[2:]))
     inner, entry = part(name), kernel(kind=name)
 
@@ -185,13 +186,14 @@ def compiled(kind: Kind) -> Kernel:
             begin_work(W, j, setup)
 
     def step_blocks(
-        first, stop, blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, mask, observations,
+        first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations, outcomes,
         final_observations, ended,
     ):  # fmt: skip
         """Step some blocks, or start episodes in them.
 
         Few functions and no more layers: every layer is compiled, and everything below it once more with it.
         """
+        setup = unpack(packed)
         for b in range(first, stop):
             W = blocks[b]
             lane = b * LANES
@@ -269,6 +271,9 @@ def compiled(kind: Kind) -> Kernel:
                 elif reset_mode != RESET_NOW and W[terminated + j] + W[truncated + j] != 0.0:
                     W[waiting + j] = 1.0
                     finished += 1
+            for k in range(n_outcome):
+                for j in range(LANES):
+                    outcomes[k, lane + j] = W[outcome + k * LANES + j]
             for again in range(2):
                 observe(
                     W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output, 1.0 / setup.max_input,
@@ -291,13 +296,14 @@ def compiled(kind: Kind) -> Kernel:
 
     @entry(parallel=True)
     def step_parallel(
-        blocks, saved, actions, setup, recorded_u, recorded_y, reset_mode, mask, observations, final_observations, ended
+        blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations, outcomes,
+        final_observations, ended,
     ):  # fmt: skip
         n = len(saved)
         for t in prange(n):
             inner_step(
-                t * len(blocks) // n, (t + 1) * len(blocks) // n, blocks, saved[t], actions, setup, recorded_u,
-                recorded_y, reset_mode, mask, observations, final_observations, ended,
+                t * len(blocks) // n, (t + 1) * len(blocks) // n, blocks, saved[t], actions, packed, recorded_u,
+                recorded_y, reset_mode, mask, observations, outcomes, final_observations, ended,
             )  # fmt: skip
 
     return Kernel(step, step_parallel)

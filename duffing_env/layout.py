@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from itertools import combinations, combinations_with_replacement
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from estimator.engine.tasks import belief_names, carried_names, layout, trace_names
-from estimator.lanes import rows
+from estimator.lanes import inlined, rows
 from estimator.models.model import Model
 
 #: What a step leaves for an environment's face, in adjacent rows of its block.
@@ -113,6 +113,29 @@ class Setup(NamedTuple):
     prior: npt.NDArray[np.float64]
     inverse_std: npt.NDArray[np.float64]
     log_precisions: npt.NDArray[np.float64]
+
+
+def pack(setup: Setup) -> npt.NDArray[np.float64]:
+    """A setup as one array: a compiled function takes that in a tenth of the time that it takes the tuple."""
+    return np.concatenate([np.ravel(np.asarray(value, dtype=np.float64)) for value in setup])
+
+
+@cache
+def unpacker(kind: Kind) -> Any:
+    """``unpack(packed)``: the setup again, compiled."""
+    sensors, parameters = kind.truth.n_outputs, len(parameter_names(kind.truth))
+    sizes = {"measurement_noise": sensors, "center": parameters, "width": parameters}
+    sizes |= dict.fromkeys(("walk", "inverse_std"), kind.belief.n_coefficients)
+    sizes |= {"prior": len(belief_names(kind.belief)), "log_precisions": 1 + kind.belief.n_outputs}
+    told, at = [], 0
+    for name, annotation in Setup.__annotations__.items():
+        size = sizes.get(name)
+        place = f"packed[{at}]" if size is None else f"packed[{at}:{at + size}]"
+        told.append({"int": f"int({place})", "bool": f"{place} != 0.0"}.get(str(annotation), place))
+        at += 1 if size is None else size
+    namespace: dict[str, Any] = {"Setup": Setup}
+    exec(f"def unpack(packed):\n    return Setup({', '.join(told)})\n", namespace)
+    return inlined(namespace["unpack"])
 
 
 def observation_bounds(model: Model) -> dict[str, tuple[float, float]]:
