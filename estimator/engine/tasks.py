@@ -204,7 +204,7 @@ class Path:
 
 def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
     """Rows of a path's block."""
-    shown = [f"{'Y' if observed else 'SHOWN'}_{y}" for y in model.outputs]
+    shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
     states, coefficients = list(model.states), list(model.coefficients)
     upper = combinations_with_replacement
     return rows(
@@ -248,7 +248,8 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, g
             inputs = input_rows(model, degree)
             states = algebra.path_names(model)
             before = derive.carried(model) if model.is_continuous else []
-            source += _reversed_source("finish_back", lines, results, [*states, *before], inputs, place, noises)
+            followed = {row: value for row, value in results.items() if row != "SPREAD"}
+            source += _reversed_source("finish_back", lines, followed, [*states, *before], inputs, place, noises)
             if model.is_continuous:
                 moves = {name: f"{name}_e" for name in before}
                 step = derive.motion_step(model, degree)
