@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
@@ -14,6 +14,7 @@ from estimator.engine.tasks import belief_names
 from estimator.gaussian import GaussianCoefficients
 from estimator.models.model import Model
 from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.physical import propagate
 
 Self = TypeVar("Self", bound="Belief")
 
@@ -212,63 +213,3 @@ class Belief(GaussianCoefficients):
         units = self.model.physical_units or self.model.coefficients
         rows = zip(self.model.physical or self.model.coefficients, mean.tolist(), np.sqrt(np.diag(cov)), strict=True)
         return {name: (value, float(std), units[name]) for name, value, std in rows}
-
-
-def propagate(
-    model: Model, mean: FloatArray, cov: FloatArray, step: float = SAMPLING_STEP
-) -> tuple[FloatArray, FloatArray]:
-    """Moments (..., p) and (..., p, p) of the physical parameters from those of the coefficients, to first order."""
-    if not model.physical:
-        return mean.copy(), cov.copy()
-    values, slopes = _physical_code(model)
-    columns = [*np.moveaxis(mean, -1, 0)]
-    shape = mean.shape[:-1]
-    physical = np.stack([np.broadcast_to(v, shape) for v in values(*columns, step)], axis=-1)
-    flat = [np.broadcast_to(v, shape) for v in slopes(*columns, step)]
-    jacobian = np.stack(flat, axis=-1).reshape(*shape, len(model.physical), len(model.coefficients))
-    return physical, jacobian @ cov @ np.swapaxes(jacobian, -1, -2)
-
-
-def coefficients_of(model: Model, parameters: Mapping[str, Any], step: float = SAMPLING_STEP) -> FloatArray:
-    """(..., K) the coefficients of physical parameters of shape (...); themselves, for a model without any."""
-    if not model.inverse:
-        return np.stack([np.asarray(parameters[name], dtype=np.float64) for name in model.coefficients], axis=-1)
-    values, _ = _inverse_code(model)
-    found = values(*(parameters[name] for name in model.physical), step)
-    return np.stack(np.broadcast_arrays(*found), axis=-1).astype(np.float64)
-
-
-def _map_code(model: Model, which: str) -> tuple[Any, Any]:
-    """Values and slopes of a map between coefficients and parameters, as functions of all of them and the step."""
-    from estimator.engine import cache as stored
-
-    mapped = getattr(model, which)
-    names = list(model.coefficients if which == "physical" else model.physical)
-
-    def make() -> str:
-        from estimator.engine import derive, emit
-
-        known = {name: derive.symbol(name) for name in (*names, "step")}
-        expressions = [derive.parse(text, known, model.name) for text in mapped.values()]
-        slopes = [e.diff(known[name]) for e in expressions for name in names]
-        source = ""
-        for title, values in (("values", expressions), ("slopes", slopes)):
-            lines = derive.shared({f"V_{i}": e for i, e in enumerate(values)}, "W")
-            body = "".join(f"    {name} = {emit.text_of(e)}\n" for name, e in lines)
-            gathered = ", ".join(f"V_{i}" for i in range(len(values)))
-            source += f"def {title}({', '.join([*names, 'step'])}):\n{body}    return ({gathered},)\n"
-        return source
-
-    functions = {name: getattr(np, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")}
-    code = stored.load(model.name, which, model.digest, make, functions)
-    return code.values, code.slopes
-
-
-@cache
-def _physical_code(model: Model) -> tuple[Any, Any]:
-    return _map_code(model, "physical")
-
-
-@cache
-def _inverse_code(model: Model) -> tuple[Any, Any]:
-    return _map_code(model, "inverse")

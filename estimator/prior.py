@@ -84,6 +84,11 @@ class Prior:
         object.__setattr__(self, name, value if shape else float(value))
         return value
 
+    @property
+    def coefficients_mean(self) -> FloatArray:
+        """(4,) means of (θ, η)."""
+        return np.append(self.theta_mean, self.eta_mean)
+
     @classmethod
     def published_run(cls) -> Prior:
         """The prior that the paper's published numbers were computed with (it differs from the paper's text)."""

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from estimator.models.model import Model
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
-from estimator.posterior import Belief, coefficients_of
+from estimator.physical import coefficients_of
+from estimator.posterior import Belief
 
 #: Points of the quadrature over all parameters together, at most; with 20 along each of four, moments converge to 1e-10
 #: for every spread up to 0.999.

@@ -271,7 +271,8 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
         model: whose equation.
         moved: the motion over the sample.
         degree: of the input's polynomial.
-        observed: whether the filter follows the outputs ``Y_<sensor>``, or the response without noise.
+        observed: whether the filter follows the outputs ``Y_<sensor>``, or the response without noise. The latter
+            leaves what the sensors show in ``SHOWN_<sensor>``, and the first one's predictive variance in ``SPREAD``.
     """
     states, coefficients = list(model.states), list(model.coefficients)
     n, lines = len(states), []
@@ -310,7 +311,7 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
         shown = put(f"Y{tag}", found.outputs[k].xreplace(here))
         h = [slope.xreplace(here) for slope in found.readouts[k]]
         c = {i: put(f"C{tag}_{i}", sum((h[m] * at(i, states[m]) for m in range(n)), ZERO)) for i in states}
-        variance = sum((h[m] * c[states[m]] for m in range(n)), symbol(f"R_{sensor}"))
+        variance = put(f"S{tag}", sum((h[m] * c[states[m]] for m in range(n)), symbol(f"R_{sensor}")))
         weight = put(f"L{tag}", 1 / variance)
         told = {
             name: put(f"T{tag}_{name}", sum((h[m] * sense[states[m], name] for m in range(n)), h[n + b]))
@@ -327,6 +328,8 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
                 totals[f"SLOPE_{name}"] -= counted * told[name] * error
         else:
             results[f"SHOWN_{sensor}"] = _text(shown)
+            if k == 0:
+                results["SPREAD"] = _text(variance)
         gain = {i: put(f"K{tag}_{i}", weight * c[i]) for i in states}
         mean = {i: put(f"J{tag}_{i}", mean[i] + gain[i] * error) for i in states}
         sense = {(i, name): put(f"O{tag}_{i}_{name}", sense[i, name] - gain[i] * told[name]) for i, name in sense}

@@ -16,7 +16,7 @@ import numpy as np
 
 from estimator import elementary
 from estimator.engine import cache as stored
-from estimator.lanes import LANES, inlined, jit, rows
+from estimator.lanes import LANES, inlined, rows
 from estimator.models.model import Model
 
 
@@ -28,7 +28,7 @@ def sqrt(value):
 
 #: What generated code may use.
 NAMES = {
-    "jit": jit, "sqrt": sqrt, "log": elementary.log,
+    "sqrt": sqrt, "log": elementary.log,
     **{name: getattr(elementary, name) for name in ("sin", "cos", "exp", "tanh")},
 }  # fmt: skip
 
@@ -193,7 +193,7 @@ class Path:
 
 def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
     """Rows of a path's block."""
-    shown = [f"{'Y' if observed else 'SHOWN'}_{y}" for y in model.outputs]
+    shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
     states, coefficients = list(model.states), list(model.coefficients)
     upper = combinations_with_replacement
     return rows(
@@ -237,7 +237,8 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, g
             inputs = input_rows(model, degree)
             states = algebra.path_names(model)
             before = derive.carried(model) if model.is_continuous else []
-            source += _reversed_source("finish_back", lines, results, [*states, *before], inputs, place, noises)
+            followed = {row: value for row, value in results.items() if row != "SPREAD"}
+            source += _reversed_source("finish_back", lines, followed, [*states, *before], inputs, place, noises)
             if model.is_continuous:
                 moves = {name: f"{name}_e" for name in before}
                 step = derive.motion_step(model, degree)
