@@ -1,8 +1,8 @@
 """The reward ``fisher``: what the outputs say of the coefficients to one who knows the truth.
 
-The covariance recursion of the structured update, linearised not at the belief but at the true plant, where it truly is,
-and with the true noises: its covariance of the coefficients is (Λ0 + F)⁻¹ with Λ0 the prior's precision and F the Fisher
-information of the outputs so far. The recursion needs no output, so no estimator can talk it into anything.
+The covariance recursion of the structured update, linearised not at the belief but at the true plant, where it truly
+is, and with the true noises: its covariance of the coefficients is (Λ0 + F)⁻¹ with Λ0 the prior's precision and F the
+Fisher information of the outputs so far. The recursion needs no output, so no estimator can talk it into anything.
 """
 
 from __future__ import annotations

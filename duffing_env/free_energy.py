@@ -16,22 +16,12 @@ def source(kind: Kind, loop: Any) -> str:
 
 
 def hooks(kind: Kind, code: Any) -> Hooks:
-    """It keeps the noises' rates before the update, and reads the update's trace."""
-    free_energy, place = free_energy_of(kind), layout_of(kind)
-    work, sensor = place["WORK"] * LANES, next(iter(kind.belief.outputs))
-    structured = kind.factorisation == "structured"
-    rates = (place["GAMMA_RATE"] * LANES, place[f"XI_RATE_{sensor}"] * LANES)
-    kept = tuple(place[f"PRIOR_RATE_{n}"] * LANES for n in "gn") if structured else rates
-
-    @jit
-    def expect(W, setup):
-        for j in range(LANES):
-            W[kept[0] + j] = W[rates[0] + j]
-            W[kept[1] + j] = W[rates[1] + j]
+    """It reads what the update leaves."""
+    free_energy, work = free_energy_of(kind), layout_of(kind)["WORK"] * LANES
 
     @jit
     def after(W, setup):
         for j in range(LANES):
             W[work + j] = -free_energy(W, j)
 
-    return Hooks(nothing_in_lane, nothing, expect, after)
+    return Hooks(nothing_in_lane, nothing, nothing, after)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from itertools import combinations_with_replacement
 from typing import Any
 
+import numpy as np
+
 from duffing_env.layout import Kind, layout_of
+from estimator.engine.free_energy import free_energies
 from estimator.engine.tasks import structured
 from estimator.inference import mean_field
-from estimator.inference.noise import sample_free_energy
 from estimator.lanes import LANES, at_lane, jit, relaid
 from estimator.record import MEAN_FIELD_SCRATCH
 
@@ -17,8 +19,10 @@ _PAPER = {"x0": "x1", "x1": "x2", "t1": "theta1", "t2": "theta2", "t3": "theta3"
 
 
 def updater(kind: Kind) -> Any:
-    """Every lane's belief, with its input and outputs in their rows: ``update(W)``, or of mean field
-    ``update(W, as_published)``."""
+    """Update every lane's belief, with its input and outputs in their rows.
+
+    ``update(W)``, or of mean field ``update(W, as_published)``.
+    """
     if kind.factorisation == "mean_field":
         return _mean_field(kind)
     return structured(
@@ -30,27 +34,16 @@ def free_energy_of(kind: Kind) -> Any:
     """``free_energy(W, j)``: what the last update left lane j with [nats]."""
     place = layout_of(kind)
     if kind.factorisation == "mean_field":
-        function, _, outputs, uniform = _declaration(mean_field.free_energy)
-        return at_lane(_paper_layout(kind), outputs, uniform)(function)
-    last = kind.iterations - 1
-    sensor = next(iter(kind.belief.outputs))
-    names = ("TRACE_0_innovation", "TRACE_0_variance", f"TRACE_0_q_{last}", f"TRACE_0_r_{last}")
-    innovation, variance, q, r = (place[name] * LANES for name in names)
-    prior_g, prior_n, shown = (place[n] * LANES for n in ("PRIOR_RATE_g", "PRIOR_RATE_n", "TRACE_0_shown"))
-    g_shape, n_shape = place["GAMMA_SHAPE"] * LANES, place[f"XI_SHAPE_{sensor}"] * LANES
+        return at_lane(_paper_layout(kind))(mean_field.free_energy.scalar)
+    traced, last = free_energies(kind.belief, kind.iterations, LANES, place), kind.iterations - 1
 
     @jit
     def free_energy(W, j):
-        return sample_free_energy(
-            W[innovation + j], W[variance + j], W[q + j], W[r + j], W[g_shape + j], W[shown + j] * W[prior_g + j],
-            W[n_shape + j], W[prior_n + j],
-        )  # fmt: skip
+        after = np.empty(last + 1)
+        traced(W, j, after)
+        return after[last]
 
     return free_energy
-
-
-def _declaration(loop: Any) -> Any:
-    return loop.declaration
 
 
 def _paper_layout(kind: Kind) -> dict[str, int]:

@@ -193,7 +193,7 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
             wanted += ["MF_theta2", *both]
     wanted += [name for name in carried_names(belief) if name not in place]
     if kind.reward == "free_energy" and kind.factorisation == "structured":
-        wanted += [*trace_names(belief, kind.iterations), "PRIOR_RATE_g", "PRIOR_RATE_n"]
+        wanted += trace_names(belief, kind.iterations)
     missing = [name for name in dict.fromkeys(wanted) if name not in place]
     place |= rows(" ".join(missing), start=len(place))
     return place | inputs_of(kind, belief, place)

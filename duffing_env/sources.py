@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 from duffing_env.layout import Kind, inputs_of, layout_of, observation_bounds, parameter_names
 from duffing_env.rewards import REWARDS
 from estimator.engine import cache as stored
 from estimator.engine.tasks import NAMES, belief_names
-from estimator.lanes import LANES, inlined
+from estimator.lanes import LANES, inlined, source_digest
 from estimator.models.model import Model
 
 
@@ -32,7 +33,7 @@ _SMALLEST, _LARGEST = 2.0**-1000, 2.0**1000
 def parts(kind: Kind) -> Any:
     """The compiled functions of a kind of experiment: see `_source` for their names."""
     reward = REWARDS[kind.reward]
-    key = repr((kind._replace(belief=None, plant=None), kind.belief.digest, kind.plant and kind.plant.digest))
+    key = source_digest(Path(__file__).parent) + repr((kind._replace(belief=None, plant=None), kind.belief.digest, kind.plant and kind.plant.digest))
     names = {**_NAMES, "reward": reward.value}
     return stored.load(kind.belief.name, "environment", key, lambda: _source(kind), names)
 

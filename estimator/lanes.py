@@ -97,7 +97,9 @@ def at_lane(layout: Mapping[str, int], outputs: str = "", uniform: str = "") -> 
             f"def {function.__name__}({', '.join(['W', 'j', *uniform.split()])}):\n"
             f"    {targets + ' =' if outputs else 'return'} scalar({arguments})\n"
         )
-        return jit(_define(source, function, scalar=jit(function)))
+        loop = jit(_define(source, function, scalar=jit(function)))
+        loop.scalar = function
+        return loop
 
     return decorate
 
@@ -130,7 +132,7 @@ def kernel(function: Callable[..., Any] | None = None, *, kind: str = "", **opti
         return partial(kernel, kind=kind, **options)
     dispatcher = numba.njit(cache=True, **OPTIONS, **options)(_renamed(function, kind))
     stored = dispatcher._cache
-    stored._cache_file._source_stamp = _source_digest(Path(function.__code__.co_filename).parent)
+    stored._cache_file._source_stamp = source_digest(Path(function.__code__.co_filename).parent)
     if kind:
         # Numba would add a pickle of what the function has from around, which is another one in every process.
         stored._index_key = lambda signature, codegen: (signature, codegen.magic_tuple())
@@ -152,7 +154,8 @@ def _renamed(function: Callable[..., Any], kind: str) -> Callable[..., Any]:
 
 
 @cache
-def _source_digest(package: Path) -> str:
+def source_digest(package: Path) -> str:
+    """Of the sources of a package, and of this one."""
     digest = hashlib.sha256()
     for folder in sorted({Path(__file__).parent, package}):
         for path in sorted(folder.rglob("*.py")):

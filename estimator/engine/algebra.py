@@ -10,20 +10,21 @@ that step's posterior, which depend on scalars only:
 
     E[w²] = (q e/S)² + q (1 - q/S),   E[v²] = (r e/S)² + r (1 - r/S),   S = s + q + r.
 
-γ is learned from the first sensor that shows the process noise of the same sample.
+γ is learned from the first sensor that shows the process noise of the same sample; where none does, γ stays.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import sympy as sp
 
 from estimator.engine.derive import Assignments, Moved, calculus, input_at_end, pair, pairs, symbol
+from estimator.engine.emit import text_of
 from estimator.models.model import Model
 
 ZERO, ONE, HALF = sp.S.Zero, sp.S.One, sp.S.Half
-
 
 #: 1 where a number is there and 0 where it is NaN; and the second of three where the first is positive, else the third.
 present, select = sp.Function("present"), sp.Function("select")
@@ -60,9 +61,14 @@ class Gaussian:
         return symbol(name)
 
     def _predict(self) -> None:
-        """Q = S P Sᵀ: the states' rows change, the coefficients' block stays."""
+        """Q = S P Sᵀ, or Q as it is where no S is given: the states' rows change, the coefficients' block stays."""
         names, by = self.names, self.moved.by
         rows = []
+        for a, i in enumerate(names):
+            for j in names[a:]:
+                self.cov[i, j] = pair("P" if i not in self.states else "Q", i, j, names)
+        if not by:
+            return
         for i, slopes in zip(self.states, by, strict=True):
             row = {}
             for j in names:
@@ -76,9 +82,6 @@ class Gaussian:
                 self.cov[i, self.states[b]] = self.put(f"Q_{i}_{self.states[b]}", total)
             for j in names[n:]:
                 self.cov[i, j] = rows[a][j]
-        for a, i in enumerate(names[n:]):
-            for j in names[n + a :]:
-                self.cov[i, j] = pair("P", i, j, names)
 
     def expected(self, sensor: int, degree: int) -> tuple[sp.Expr, list[sp.Expr]]:
         """What a sensor is expected to show, and its derivative h by all quantities, at the mean now."""
@@ -133,9 +136,9 @@ class Gaussian:
 
     def results(self) -> dict[str, str]:
         """Row of the belief to the name that holds its new value, where it has one."""
-        found = {name: _text(value) for name, value in self.mean.items()}
+        found = {name: text_of(value) for name, value in self.mean.items()}
         for i, j in self.cov:
-            found[f"P_{i}_{j}"] = _text(self.cov[i, j])
+            found[f"P_{i}_{j}"] = text_of(self.cov[i, j])
         return {row: value for row, value in found.items() if row != value}
 
 
@@ -149,81 +152,93 @@ def update(
         moved: the motion over the sample.
         degree: of the input's polynomial, or taps less one.
         iterations: variational iterations.
-        trace: also leave what the free energy of every iteration needs, see `traced`.
+        trace: also leave what the free energy of every iteration needs, in rows ``TRACE_<sensor's number>_<what>``.
         missing: an output that is NaN moves nothing but the state.
     """
     g = Gaussian(model, moved)
     results: dict[str, str] = {}
-    learned = False
+    showing = [k for k in range(model.n_outputs) if g.shown_noise(g.expected(k, degree)[1]) != 0][:1]
+    if not showing:  # no sensor tells of γ: the noise moves the states as it is believed to
+        g.add_noise(g.put("Q_unseen", symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")))
     for k, sensor in enumerate(model.outputs):
-        tag = str(k)
-        y = symbol(f"Y_{sensor}")
+        tag, y = str(k), symbol(f"Y_{sensor}")
         expected, readout = g.expected(k, degree)
         expected = g.put(f"Y{tag}", expected)
         c, s = g.covariance_with(readout, tag)
-        shown = g.shown_noise(readout) if not learned else ZERO
-        innovation, seen = y - expected, None
-        if missing:
-            seen = g.put(f"Z{tag}", present(y))
-            innovation = select(seen, y - expected, ZERO)
-        e = g.put(f"E{tag}", innovation)
-        count = HALF if seen is None else g.put(f"H{tag}", HALF * seen)
-        g_shape, g_rate = symbol("GAMMA_SHAPE"), symbol("GAMMA_RATE")
-        n_shape, n_rate = symbol(f"XI_SHAPE_{sensor}"), symbol(f"XI_RATE_{sensor}")
-        has_noise = shown != 0
-        first_rate = g.put("F_g", shown * g_rate) if has_noise else ZERO
-        new_g_shape = g.put("F_s", g_shape + count) if has_noise else g_shape
-        new_n_shape = g.put(f"X{tag}", n_shape + count)
-        q = g.put(f"Q{tag}_0", first_rate / g_shape) if has_noise else ZERO
-        r = g.put(f"R{tag}_0", n_rate / n_shape)
-        next_q, next_r = q, r
-        new_g_rate, new_n_rate = first_rate, n_rate
-        for i in range(iterations):
-            q, r = next_q, next_r
-            weight = g.put(f"L{tag}_{i}", 1 / (s + q + r))
-            step = g.put(f"J{tag}_{i}", e * weight)
-            both = []
-            for letter, v in (("q", q), ("r", r)):
-                if v == 0:
-                    both.append(ZERO)
-                    continue
-                moment = HALF * ((v * step) ** 2 + v * (1 - v * weight))
-                both.append(g.put(f"A{tag}{letter}_{i}", moment if seen is None else seen * moment))
-            if has_noise:
-                new_g_rate = g.put(f"G{tag}_{i}", first_rate + both[0])
-                next_q = g.put(f"Q{tag}_{i + 1}", new_g_rate / new_g_shape)
-            new_n_rate = g.put(f"O{tag}_{i}", n_rate + both[1])
-            next_r = g.put(f"R{tag}_{i + 1}", new_n_rate / new_n_shape)
-            if trace:
-                for what, value in (("q", q), ("r", r)):
-                    results[f"TRACE_{tag}_{what}_{i}"] = str(value)
-        if has_noise:
-            strength = g.put("B_strength", q / shown)
-            along = {i: ZERO for i in g.names}
-            for a, i in enumerate(g.states):
-                along[i] = sum((readout[b] * moved.noise[a][b] for b in range(len(g.states))), ZERO)
-            c = {i: g.put(f"D{tag}_{i}", c[i] + strength * along[i]) if along[i] != 0 else c[i] for i in g.names}
-            g.add_noise(strength)
-            learned = True
-            results["GAMMA_SHAPE"] = str(new_g_shape)
-            results["GAMMA_RATE"] = str(g.put("F_e", new_g_rate / shown))
-        weight = symbol(f"L{tag}_{iterations - 1}")
-        step = symbol(f"J{tag}_{iterations - 1}")
-        if seen is not None:
-            weight, step = g.put(f"W{tag}_s", seen * weight), step
-        keep = g.put(f"H{tag}_k", r * weight if seen is None else 1 - (s + q) * weight)
-        g.condition(readout, c, weight, step, keep, tag)
-        results[f"XI_SHAPE_{sensor}"] = str(new_n_shape)
-        results[f"XI_RATE_{sensor}"] = str(new_n_rate)
+        shown = g.put(f"N{tag}", g.shown_noise(readout)) if k in showing else ZERO
+        seen = g.put(f"Z{tag}", present(y)) if missing else ONE
+        e = g.put(f"E{tag}", select(seen, y - expected, ZERO) if missing else y - expected)
+        learned = _learn(g, tag, sensor, (s, e, shown, seen), iterations)
+        last = learned[-1]
+        if shown != 0:
+            along = {i: sum((readout[b] * n for b, n in enumerate(row)), ZERO)
+                     for i, row in zip(g.states, moved.noise, strict=True)}  # fmt: skip
+            c |= {i: g.put(f"D{tag}_{i}", c[i] + last.strength * part) for i, part in along.items() if part != 0}
+            g.add_noise(last.strength)
+            results |= {"GAMMA_SHAPE": text_of(last.gamma_shape), "GAMMA_RATE": text_of(last.gamma_rate)}
+        results |= {f"XI_SHAPE_{sensor}": text_of(last.xi_shape), f"XI_RATE_{sensor}": text_of(last.xi_rate)}
+        keep = last.r * last.weight
+        weight = g.put(f"W{tag}", seen * last.weight)
+        g.condition(readout, c, weight, last.step, g.put(f"H{tag}", select(seen, keep, ONE) if missing else keep), tag)
         if trace:
-            results |= {
-                f"TRACE_{tag}_mean": str(expected),
-                f"TRACE_{tag}_innovation": str(e),
-                f"TRACE_{tag}_variance": str(s),
-            }
-            results |= {f"TRACE_{tag}_shown": str(shown)}
-    results |= g.results()
-    return g.lines, results
+            left = {"mean": expected, "innovation": e, "variance": s, "shown": shown}
+            for i, one in enumerate(learned):
+                left |= {f"q_{i}": one.q, f"r_{i}": one.r}
+            results |= {f"TRACE_{tag}_{what}": text_of(value) for what, value in left.items()}
+    return g.lines, results | g.results()
+
+
+class Learned(NamedTuple):
+    """What an iteration assumes and finds, in symbols.
+
+    Attributes:
+        strength: E[w²] of unit process noise that it assumes, 1/E[γ].
+        q, r: variances of both noises in the output that it assumes.
+        weight, step: 1/S, and the innovation times it.
+        gamma_shape, gamma_rate, xi_shape, xi_rate: the beliefs that it finds.
+    """
+
+    strength: sp.Expr
+    q: sp.Expr
+    r: sp.Expr
+    weight: sp.Expr
+    step: sp.Expr
+    gamma_shape: sp.Expr
+    gamma_rate: sp.Expr
+    xi_shape: sp.Expr
+    xi_rate: sp.Expr
+
+
+def _learn(
+    g: Gaussian, tag: str, sensor: str, scalars: tuple[sp.Expr, sp.Expr, sp.Expr, sp.Expr], iterations: int
+) -> list[Learned]:
+    """The iterations over both noises, from s, e, hᵀ N h and whether the output is there.
+
+    Both moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). That of the process noise is counted for
+    unit strength, so that nothing is divided by hᵀ N h, which may be 0 where the noise depends on the state.
+    """
+    s, e, shown, seen = scalars
+    g_rate, n_rate = symbol("GAMMA_RATE"), symbol(f"XI_RATE_{sensor}")
+    g_shape, n_shape = symbol("GAMMA_SHAPE"), symbol(f"XI_SHAPE_{sensor}")
+    count = g.put(f"U{tag}", HALF * seen)
+    new_g_shape = g.put(f"F{tag}", g_shape + count) if shown != 0 else g_shape
+    new_n_shape = g.put(f"X{tag}", n_shape + count)
+    strength = g.put(f"B{tag}_0", g_rate / g_shape) if shown != 0 else ZERO
+    r = g.put(f"R{tag}_0", n_rate / n_shape)
+    found = []
+    for i in range(iterations):
+        q = g.put(f"Q{tag}_{i}", shown * strength)
+        weight = g.put(f"L{tag}_{i}", 1 / (s + q + r))
+        step = g.put(f"J{tag}_{i}", e * weight)
+        square = g.put(f"T{tag}_{i}", step**2)
+        new_g_rate, new_n_rate = (
+            g.put(f"{letter}{tag}_{i}", rate + count * variance * (v * square + (1 - v * weight))) if v != 0 else rate
+            for letter, rate, variance, v in (("G", g_rate, strength, q), ("O", n_rate, r, r))
+        )
+        found.append(Learned(strength, q, r, weight, step, new_g_shape, new_g_rate, new_n_shape, new_n_rate))
+        strength = g.put(f"B{tag}_{i + 1}", new_g_rate / new_g_shape) if shown != 0 else ZERO
+        r = g.put(f"R{tag}_{i + 1}", new_n_rate / new_n_shape)
+    return found
 
 
 def expected_sample(model: Model, moved: Moved, degree: int) -> tuple[Assignments, dict[str, str]]:
@@ -240,7 +255,7 @@ def expected_sample(model: Model, moved: Moved, degree: int) -> tuple[Assignment
         c, s = g.covariance_with(readout, tag)
         weight = g.put(f"L{tag}", 1 / (s + r))
         if k == 0:
-            results |= {"SHOWN": _text(g.put("Y0", expected)), "SPREAD": _text(g.put("V0", s + r))}
+            results |= {"SHOWN": text_of(g.put("Y0", expected)), "SPREAD": text_of(g.put("V0", s + r))}
         g.condition(readout, c, weight, ZERO, g.put(f"H{tag}", r * weight), tag)
     found = g.results()
     return g.lines, results | {row: value for row, value in found.items() if row not in model.coefficients}
@@ -327,23 +342,17 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
             for name in coefficients:
                 totals[f"SLOPE_{name}"] -= counted * told[name] * error
         else:
-            results[f"SHOWN_{sensor}"] = _text(shown)
+            results[f"SHOWN_{sensor}"] = text_of(shown)
             if k == 0:
-                results["SPREAD"] = _text(variance)
+                results["SPREAD"] = text_of(variance)
         gain = {i: put(f"K{tag}_{i}", weight * c[i]) for i in states}
         mean = {i: put(f"J{tag}_{i}", mean[i] + gain[i] * error) for i in states}
         sense = {(i, name): put(f"O{tag}_{i}_{name}", sense[i, name] - gain[i] * told[name]) for i, name in sense}
         cov = {(i, j): put(f"P{tag}_{i}_{j}", value - gain[i] * c[j]) for (i, j), value in cov.items()}
-    results |= {i: _text(mean[i]) for i in states}
-    results |= {f"V_{i}_{j}": _text(value) for (i, j), value in cov.items()}
-    results |= {f"Z_{i}_{name}": _text(value) for (i, name), value in sense.items()}
+    results |= {i: text_of(mean[i]) for i in states}
+    results |= {f"V_{i}_{j}": text_of(value) for (i, j), value in cov.items()}
+    results |= {f"Z_{i}_{name}": text_of(value) for (i, name), value in sense.items()}
     for name, total in totals.items():
         if total != symbol(name):
-            results[name] = _text(put(f"{name}_e", total))
+            results[name] = text_of(put(f"{name}_e", total))
     return lines, results
-
-
-def _text(value: sp.Expr) -> str:
-    from estimator.engine.emit import text_of
-
-    return text_of(value)

@@ -52,15 +52,13 @@ class Calculus:
 
     Attributes:
         moves: the rates or next states.
-        movers: quantities on which they depend, states first: the others need no sensitivity.
-        by: (n, movers) derivatives of ``moves`` by the movers.
+        by: (n, movers) derivatives of ``moves`` by `Model.movers`; the others need no sensitivity.
         noise: how unit noise moves each state.
         outputs: what each sensor shows.
         readouts: of each sensor, the derivatives by all quantities.
     """
 
     moves: tuple[sp.Expr, ...]
-    movers: tuple[str, ...]
     by: tuple[tuple[sp.Expr, ...], ...]
     noise: tuple[sp.Expr, ...]
     outputs: tuple[sp.Expr, ...]
@@ -79,11 +77,9 @@ def calculus(model: Model) -> Calculus:
     without_input = {name: known[name] for name in model.names}
     noise = tuple(parse(text, without_input, model.name) for text in model.noise)
     outputs = tuple(parse(text, known, model.name) for text in model.outputs.values())
-    used = set().union(*(e.free_symbols for e in (*moves, *(noise if model.is_continuous else ()))))
-    movers = (*model.states, *(name for name in model.coefficients if known[name] in used))
-    by = tuple(tuple(sp.diff(move, known[name]) for name in movers) for move in moves)
+    by = tuple(tuple(sp.diff(move, known[name]) for name in model.movers) for move in moves)
     readouts = tuple(tuple(sp.diff(shown, known[name]) for name in model.names) for shown in outputs)
-    return Calculus(moves, movers, by, noise, outputs, readouts)
+    return Calculus(moves, by, noise, outputs, readouts)
 
 
 def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
@@ -105,10 +101,12 @@ def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
         )
     try:
         parsed = sp.sympify(eval(code, {"__builtins__": {}}, {**_FUNCTIONS, **known}))
-    except (TypeError, AttributeError, sp.SympifyError) as error:
+    except (ArithmeticError, NameError, TypeError, AttributeError, sp.SympifyError) as error:
         raise ValueError(f"expressions of {where} must be formulas, but {text!r} is none: {error}") from error
     if not isinstance(parsed, sp.Expr):
         raise ValueError(f"expressions of {where} must be numbers, but {text!r} is {parsed!r}")
+    if parsed.has(sp.I, sp.nan, sp.zoo, sp.oo, -sp.oo):
+        raise ValueError(f"expressions of {where} must be finite and real, but {text!r} is {parsed}")
     return parsed
 
 
@@ -130,7 +128,10 @@ def renamed(assignments: Iterable[tuple[str, sp.Expr]], names: Mapping[str, sp.E
 
 @dataclass(frozen=True)
 class Moved:
-    """Where a sample moves the state: names or numbers of M, S and N after it, in symbols."""
+    """Where a sample moves the state: names or numbers of M, S and N after it, in symbols.
+
+    ``by`` is empty where the predicted covariance is not S P Sᵀ but stands in ``Q_i_j``.
+    """
 
     state: tuple[sp.Expr, ...]
     by: tuple[tuple[sp.Expr, ...], ...]
@@ -143,13 +144,13 @@ def difference_step(model: Model) -> tuple[Assignments, Moved]:
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
     named = {f"M_{i}": move for i, move in zip(model.states, c.moves, strict=True)}
     for i, row in zip(model.states, c.by, strict=True):
-        named |= {f"S_{i}_{j}": slope for j, slope in zip(c.movers, row, strict=True)}
+        named |= {f"S_{i}_{j}": slope for j, slope in zip(model.movers, row, strict=True)}
     lines = renamed(shared(named, "W"), inputs)
     # What is a number or a bare name needs no line of its own.
     plain = {name: e for name, e in lines if name[0] in "MS" and (e.is_Number or e.is_Symbol)}
     lines = [(name, e) for name, e in lines if name not in plain]
     value = lambda name: plain.get(name, symbol(name))  # noqa: E731
-    movers = dict.fromkeys(model.names, False) | dict.fromkeys(c.movers, True)
+    movers = dict.fromkeys(model.names, False) | dict.fromkeys(model.movers, True)
     by = tuple(tuple(value(f"S_{i}_{j}") if movers[j] else sp.S.Zero for j in model.names) for i in model.states)
     noise = tuple(tuple(a * b for b in c.noise) for a in c.noise)
     return lines, Moved(tuple(value(f"M_{i}") for i in model.states), by, noise)
@@ -159,7 +160,7 @@ def carried(model: Model) -> list[str]:
     """Names that a differential equation carries over its Runge-Kutta steps: M, S and N, or D where noise is held."""
     c = calculus(model)
     names = [f"M_{i}" for i in model.states]
-    names += [f"S_{i}_{j}" for i in model.states for j in c.movers]
+    names += [f"S_{i}_{j}" for i in model.states for j in model.movers]
     return names + ([f"D_{i}" for i in model.states] if model.held else pairs("N", list(model.states)))
 
 
@@ -174,12 +175,17 @@ def carried_at_start(model: Model) -> dict[str, sp.Expr]:
 def carried_at_end(model: Model) -> Moved:
     """What is carried, as a sample leaves it."""
     c, states = calculus(model), list(model.states)
-    by = tuple(tuple(symbol(f"S_{i}_{j}") if j in c.movers else sp.S.Zero for j in model.names) for i in states)
+    by = tuple(tuple(symbol(f"S_{i}_{j}") if j in model.movers else sp.S.Zero for j in model.names) for i in states)
     if model.held:
         noise = tuple(tuple(symbol(f"D_{i}") * symbol(f"D_{k}") for k in states) for i in states)
     else:
         noise = tuple(tuple(pair("N", i, k, states) for k in states) for i in states)
     return Moved(tuple(symbol(f"M_{i}") for i in states), by, noise)
+
+
+def moved(model: Model) -> tuple[Assignments, Moved]:
+    """What is left to assign at the end of a sample, and where it moved the state."""
+    return ([], carried_at_end(model)) if model.is_continuous else difference_step(model)
 
 
 @cache
@@ -191,7 +197,7 @@ def _stage(model: Model) -> Assignments:
     named = {f"K_M_{i}": move.xreplace(at) for i, move in zip(states, c.moves, strict=True)}
     slopes = [[slope.xreplace(at) for slope in row] for row in c.by]
     for a, i in enumerate(states):
-        for b, j in enumerate(c.movers):
+        for b, j in enumerate(model.movers):
             through = sum(slopes[a][k] * symbol(f"S_{states[k]}_{j}") for k in range(n))
             named[f"K_S_{i}_{j}"] = through + (slopes[a][b] if b >= n else 0)
     noise = [e.xreplace(at) for e in c.noise]
@@ -211,7 +217,9 @@ def _stage(model: Model) -> Assignments:
 
 
 def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assignments:
-    """One step of order 4, of a ``substeps``-th of a sample: from ``names`` to ``<name>_e``.
+    """One step of order 4, of a ``substeps``-th of a sample: from ``names`` to ``<name>_E``.
+
+    What belongs to its four stages ends with ``_A`` to ``_D``, which no name of a model does.
 
     Args:
         names: what moves.
@@ -222,8 +230,8 @@ def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assi
     lines: Assignments = []
     rates: list[dict[str, sp.Expr]] = []
     for k, part in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):
-        tag = "abcd"[k]
-        at: dict[str, sp.Expr | str] = {"u": f"V_{tag if k != 2 else 'b'}"}
+        tag = "ABCD"[k]
+        at: dict[str, sp.Expr | str] = {"u": f"V_{tag if k != 2 else 'B'}"}
         for name in names:
             if k:
                 lines.append((f"{name}_{tag}", symbol(name) + part * h * rates[-1][name]))
@@ -241,15 +249,15 @@ def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assi
     k1, k2, k3, k4 = rates
     sixth = h / 6
     return lines + [
-        (f"{name}_e", symbol(name) + sixth * (k1[name] + 2 * k2[name] + 2 * k3[name] + k4[name])) for name in names
+        (f"{name}_E", symbol(name) + sixth * (k1[name] + 2 * k2[name] + 2 * k3[name] + k4[name])) for name in names
     ]
 
 
 def input_over_step(degree: int, substeps: int) -> Assignments:
-    """``V_a``, ``V_b``, ``V_d``: the input at begin, middle and end of a Runge-Kutta step, by its polynomial."""
+    """``V_A``, ``V_B``, ``V_D``: the input at begin, middle and end of a Runge-Kutta step, by its polynomial."""
     h = sp.Rational(1, substeps)
     lines = []
-    for tag, part in (("a", sp.S.Zero), ("b", sp.S.Half), ("d", sp.S.One)):
+    for tag, part in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
         value: sp.Expr = symbol(f"U_{degree}")
         if degree:
             lines.append((f"T_{tag}", symbol("T") + part * h))

@@ -19,6 +19,7 @@ from estimator.engine.derive import Assignments
 _INLINE = {
     "present": "(1.0 if {0} == {0} else 0.0)",
     "finite": "(1.0 if {0} - {0} == 0.0 else 0.0)",
+    "below": "(0.0 if {0} >= 0.0 else 1.0)",
     "positive": "(1.0 if {0} > 0.0 else 0.0)",
     "reaches": "(1.0 if {0} >= {1} else 0.0)",
     "select": "({1} if {0} > 0.0 else {2})",
@@ -71,7 +72,7 @@ def lane_loop(
     name: str,
     lines: Assignments,
     results: Mapping[str, str],
-    layout: Mapping[str, int],
+    layout: Mapping[str, int | str],
     lanes: int,
     uniform: Sequence[str] = (),
     doc: str = "",
@@ -83,7 +84,8 @@ def lane_loop(
         name: of the function.
         lines: in the order of execution; those that no result needs are left out.
         results: row to the name (or number) whose value it receives.
-        layout: row to its number. Rows that the assignments use are read first.
+        layout: row to its number, or to an expression of it in uniform names. Rows that the assignments use are read
+            first.
         lanes: systems in a block; the loop is left out for 1.
         uniform: names that are the same in all lanes, and become arguments.
         doc: a line for the reader.
@@ -100,7 +102,7 @@ def lane_loop(
     used = {str(s) for _, e in kept for s in e.free_symbols} | {
         str(v) for v in results.values() if not is_number(str(v))
     }
-    read = sorted((used - assigned) - set(uniform), key=lambda row: (layout.get(row.removeprefix("G_"), -1), row))
+    read = sorted((used - assigned) - set(uniform), key=lambda row: (str(layout.get(row.removeprefix("G_"))), row))
     adjoint = any(row not in layout and row.removeprefix("G_") in layout for row in (*read, *results))
 
     def place(row: str) -> str:
@@ -108,15 +110,17 @@ def lane_loop(
         block, bare = ("W", row) if row in layout else ("A", row.removeprefix("G_"))
         if bare not in layout:
             raise ValueError(f"{name} uses {row}, which no line assigns, no row holds and no argument brings")
-        return f"{block}[{layout[bare] * lanes}{' + j' if lanes > 1 else ''}]"
+        row_number = layout[bare]
+        start = str(row_number * lanes) if isinstance(row_number, int) else f"({row_number}) * {lanes}"
+        return f"{block}[{start}{' + LANE' if lanes > 1 else ''}]"
 
     body = [f"{row} = {place(row)}" for row in read]
     body += [f"{target} = {text_of(e)}" for target, e in kept]
     body += [f"{place(row)} = {value}" for row, value in results.items()]
-    blocks = ["W", *(["A"] if adjoint else []), *(["j"] if one else [])]
+    blocks = ["W", *(["A"] if adjoint else []), *(["LANE"] if one else [])]
     source = [f"def {name}({', '.join([*blocks, *uniform])}):", f'    """{doc}"""']
     if lanes > 1 and not one:
-        source.append(f"    for j in range({lanes}):")
+        source.append(f"    for LANE in range({lanes}):")
     indent = "        " if lanes > 1 and not one else "    "
     return "\n".join(source + [indent + line for line in body]) + "\n"
 

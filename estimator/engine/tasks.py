@@ -54,7 +54,7 @@ def carried_names(model: Model) -> list[str]:
     if not model.is_continuous:
         return []
     names = [f"M_{i}" for i in model.states]
-    names += [f"S_{i}_{j}" for i in model.states for j in model.names]
+    names += [f"S_{i}_{j}" for i in model.states for j in model.movers]
     if model.held:
         return [*names, *(f"D_{i}" for i in model.states)]
     return [*names, *(f"N_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2))]
@@ -74,13 +74,16 @@ class Update:
         update: ``update(W)``: every lane's belief, with its rows ``U_k`` and ``Y_<sensor>``.
         layout: rows of the block.
         lanes: systems in it.
-        traced: rows that hold, per iteration and sensor, what the free energy needs; see `free_energies`.
+        traced: rows that hold, per iteration and sensor, what `estimator.engine.free_energy` needs.
+        check: with sigma points, ``check(W)``: counts in the row ``UNSOUND`` whether a lane's covariance is none. The
+            update does so with the belief that it is given.
     """
 
     update: Any
     layout: Mapping[str, int]
     lanes: int
     traced: Sequence[str] = ()
+    check: Any = None
 
 
 def structured(
@@ -92,8 +95,9 @@ def structured(
     within: Mapping[str, int] | None = None,
     trace: bool = False,
     missing: bool = False,
+    expectations: str = "first_order",
 ) -> Update:
-    """The structured update to first order: q(states, coefficients) Gaussian, q(γ) and q(ξ) Gamma.
+    """The structured update: q(states, coefficients) Gaussian, q(γ) and q(ξ) Gamma.
 
     Args:
         model: whose belief.
@@ -103,8 +107,13 @@ def structured(
         within: a layout that holds all rows of `layout`; its own where it is None.
         trace: leave what the free energy of every iteration needs, in further rows.
         missing: outputs that are NaN move the state and teach nothing.
+        expectations: how the belief is moved: ``first_order`` or ``sigma_points`` (`estimator.engine.points`). The
+            latter counts in the row ``UNSOUND`` where it meets a covariance that is none.
+
+    Raises:
+        ValueError: for iterations out of range, or other expectations.
     """
-    return _structured(model, degree, iterations, lanes, _frozen(within), trace, missing)
+    return _structured(model, degree, iterations, lanes, _frozen(within), trace, missing, expectations)
 
 
 def _frozen(within: Mapping[str, int] | None) -> tuple[tuple[str, int], ...] | None:
@@ -113,30 +122,97 @@ def _frozen(within: Mapping[str, int] | None) -> tuple[tuple[str, int], ...] | N
 
 @cache
 def _structured(
-    model: Model, degree: int, iterations: int, lanes: int, within: Any, trace: bool, missing: bool
+    model: Model,
+    degree: int,
+    iterations: int,
+    lanes: int,
+    within: Any,
+    trace: bool,
+    missing: bool,
+    expectations: str = "first_order",
 ) -> Update:
     if not 1 <= iterations <= 100:
         raise ValueError(f"iterations must be from 1 to 100, but is {iterations}; 3 are enough")
+    if expectations not in ("first_order", "sigma_points"):
+        raise ValueError(f"expectations must be 'first_order' or 'sigma_points', but is {expectations!r}")
+    points = expectations == "sigma_points"
     place = dict(within) if within is not None else layout(model, degree)
     traced = trace_names(model, iterations) if trace else []
-    place |= rows(" ".join(t for t in traced if t not in place), start=max(place.values()) + 1)
+    more_rows = [*traced, *(point_names(model) if points else ())]
+    place |= rows(" ".join(t for t in more_rows if t not in place), start=max(place.values()) + 1)
 
     def make() -> str:
         from estimator.engine import algebra, derive, emit
 
-        if model.is_continuous:
-            lines, moved = [], derive.carried_at_end(model)
-        else:
-            lines, moved = derive.difference_step(model)
-        more, results = algebra.update(model, moved, degree, iterations, trace, missing)
-        source = _motion_source(model, degree, place, lanes)
-        name = "finish" if model.is_continuous else "update"
-        source += "@jit\n" + emit.lane_loop(name, lines + more, results, place, lanes, doc="Predict and condition.")
-        return source + (_composed("update", model) if model.is_continuous else "")
+        lines, moved = derive.moved(model)
+        if points:
+            from estimator.engine.points import moments
 
-    key = repr((model.digest, degree, iterations, lanes, sorted(place.items()), trace, missing))
+            lines, moved = moments(model)
+        more, results = algebra.update(model, moved, degree, iterations, trace, missing)
+        # Every layer of functions is compiled: what a difference equation finishes is all of its update.
+        whole = not (points or model.is_continuous)
+        name = "update" if whole else "finish"
+        finish = "@jit\n" + emit.lane_loop(name, lines + more, results, place, lanes, doc="Predict and condition.")
+        if whole:
+            return finish
+        if points:
+            return finish + _points_source(model, degree, place, lanes)
+        return _motion_source(model, degree, place, lanes) + finish + _composed("update", model)
+
+    key = repr((model.digest, degree, iterations, lanes, sorted(place.items()), trace, missing, expectations))
     code = stored.load(model.name, "update", key, make, NAMES)
-    return Update(code.update, place, lanes, tuple(traced))
+    return Update(code.update, place, lanes, tuple(traced), code.spread if points else None)
+
+
+def point_names(model: Model) -> list[str]:
+    """Rows of the sigma points (`estimator.engine.points`)."""
+    columns, movers = range(len(model.movers)), model.movers
+    names = [*movers, *(i for i in model.names if i not in movers)]
+    images = [f"I_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
+    at_point = [f"X_{i}" for i in movers if i not in model.states]
+    return [*(f"L_{c}_{i}" for c in columns for i in names), *(f"WEIGHT_{c}" for c in columns), *at_point, *images,
+            "UNSOUND"]  # fmt: skip
+
+
+def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
+    """Source of ``spread(W)``, and of ``update(W)`` that takes all points through the sample."""
+    from estimator.engine import derive, emit, points
+
+    names = points.order(model)
+    by_point: dict[str, int | str] = dict(place)
+    by_point |= {f"L_C_{i}": f"{place[f'L_0_{names[0]}']} + C*{len(names)} + {k}" for k, i in enumerate(names)}
+    first = place[f"I_0_{next(iter(model.states))}"]
+    by_point |= {f"I_P_{i}": f"{first} + P*{model.n_states} + {k}" for k, i in enumerate(model.states)}
+
+    def loop(name: str, lines: Any, results: Any, uniform: tuple[str, ...], doc: str) -> str:
+        return "@jit\n" + emit.lane_loop(name, lines, results, by_point, lanes, uniform, doc)
+
+    source = loop("spread", *points.spread(model), (), "Columns of the covariance's factor, and their weights.")
+    if not model.is_continuous:
+        sample = points.point_sample(model)
+        source += loop("carry", *sample, ("C", "SIGN", "P"), "One point over the sample.")
+        return source + _looped(model, "", "        carry(W, P // 2, 1.0 - 2.0 * (P % 2), P)\n")
+    noise = [name for name in derive.carried(model) if name[0] != "S"]
+    start = {i: emit.text_of(value) for i, value in derive.carried_at_start(model).items() if i in noise}
+    source += loop("begin", [], start, (), "The mean, and its process noise.")
+    step = derive.motion_step(model, degree)
+    source += loop("drift", step, {i: f"{i}_E" for i in noise}, ("T",), "One Runge-Kutta step of mean and noise.")
+    source += loop("place", *points.point(model), ("C", "SIGN"), "A point at the begin of the sample.")
+    step, moved = points.point_step(model, degree), {f"M_{i}": f"M_{i}_E" for i in model.states}
+    source += loop("move", step, moved, ("T",), "One Runge-Kutta step of a point.")
+    source += loop("keep", [], {f"I_P_{i}": f"M_{i}" for i in model.states}, ("P",), "A point at the end.")
+    n = model.substeps
+    noisy = f"    begin(W)\n    for s in range({n}):\n        drift(W, s / {n})\n"
+    body = "        place(W, P // 2, 1.0 - 2.0 * (P % 2))\n"
+    body += f"        for s in range({n}):\n            move(W, s / {n})\n        keep(W, P)\n"
+    return source + _looped(model, noisy, body)
+
+
+def _looped(model: Model, before: str, body: str) -> str:
+    """Source of ``update(W)`` over all sigma points."""
+    head = f"@jit\ndef update(W):\n    spread(W)\n{before}    for P in range({2 * len(model.movers)}):\n"
+    return head + body + "    finish(W)\n"
 
 
 def trace_names(model: Model, iterations: int) -> list[str]:
@@ -155,7 +231,7 @@ def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
     if not model.is_continuous:
         return ""
     start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
-    moved = {name: f"{name}_e" for name in derive.carried(model)}
+    moved = {name: f"{name}_E" for name in derive.carried(model)}
     source = "@jit\n" + emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
     step = derive.motion_step(model, degree)
     return source + "@jit\n" + emit.lane_loop(
@@ -223,10 +299,7 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, g
     def make() -> str:
         from estimator.engine import algebra, derive, emit
 
-        if model.is_continuous:
-            lines, moved = [], derive.carried_at_end(model)
-        else:
-            lines, moved = derive.difference_step(model)
+        lines, moved = derive.moved(model)
         more, results = algebra.path_sample(model, moved, degree, observed)
         lines += more
         source = _motion_source(model, degree, place, lanes)
@@ -240,7 +313,7 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, g
             followed = {row: value for row, value in results.items() if row != "SPREAD"}
             source += _reversed_source("finish_back", lines, followed, [*states, *before], inputs, place, noises)
             if model.is_continuous:
-                moves = {name: f"{name}_e" for name in before}
+                moves = {name: f"{name}_E" for name in before}
                 step = derive.motion_step(model, degree)
                 source += _reversed_source("move_back", step, moves, before, inputs, place, ("T",))
         return source

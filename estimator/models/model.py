@@ -17,8 +17,10 @@ from functools import cached_property
 #: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
-#: Names that stand for something else: the input and its older values, the sampling step, and functions.
-RESERVED = frozenset({"u", "u1", "u2", "step", "sin", "cos", "exp", "log", "sqrt", "tanh"})
+#: Names that stand for something else: the input and its older values, the sampling step, what generated code calls.
+RESERVED = frozenset(
+    {"u", "u1", "u2", "step", "sin", "cos", "exp", "log", "sqrt", "tanh", "present", "select", "below", "range"}
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,11 @@ class Model:
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"states, coefficients and outputs must have different names, but share {repeated}")
+        # Of x, x_a, a_b and b, the pairs (x, a_b) and (x_a, b) would share the row P_x_a_b.
+        joined = [f"{i}_{j}" for i in self.names for j in self.names]
+        shared = sorted({pair for pair in joined if joined.count(pair) > 1})
+        if shared:
+            raise ValueError(f"pairs of names must be told apart when joined by '_', but {shared} stand twice; rename")
         if bool(self.rates) == bool(self.next_state):
             raise ValueError("either rates or next_state must be given; rates for a differential equation")
         for given, values in (("rates" if self.rates else "next_state", self.moves), ("noise", self.noise)):
@@ -135,6 +142,12 @@ class Model:
         """Inputs that a difference equation looks at: 1, or 2 or 3 where it names ``u1`` or ``u2``."""
         text = " ".join((*self.moves, *self.outputs.values()))
         return max(i + 1 for i in range(3) if i == 0 or re.search(rf"\bu{i}\b", text))
+
+    @cached_property
+    def movers(self) -> tuple[str, ...]:
+        """The states, and the coefficients on which the motion depends: a sensor's alone do not move anything."""
+        used = set(re.findall(r"[a-z]\w*", " ".join(self.moves)))
+        return (*self.states, *(name for name in self.coefficients if name in used))
 
     @cached_property
     def digest(self) -> str:

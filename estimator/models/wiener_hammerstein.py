@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from estimator.models.model import Model
 
-#: The gain of the first filter is 1 at rest, and that of the cubic at small signals: otherwise gains could move from one
-#: block to the next, and no input could tell them apart.
+#: The gain of the first filter is 1 at rest, and that of the cubic at small signals: otherwise gains could move from
+#: one block to the next, and no input could tell them apart.
 WIENER_HAMMERSTEIN = Model(
     name="wiener_hammerstein",
     states={"x": "V", "v": "V", "z": "V"},

@@ -1,0 +1,80 @@
+"""The free energy of a sample, from what the generated update leaves in its trace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
+from estimator.engine import cache as stored
+from estimator.inference.noise import half_noise_powers
+from estimator.lanes import jit
+from estimator.models.model import Model
+
+
+@jit
+def gaussian_part(innovation, total):
+    """½ log 2πS + e²/2S: the Gaussian's own evidence at the noise variances of an iteration."""
+    return 0.5 * (LOG_2PI + math.log(total) + innovation * innovation / total)
+
+
+@jit
+def precision_part(half_power, variance, shape, rate):
+    """What the belief in a precision adds: the moment and logarithm it moved to, and its divergence from the prior.
+
+    Args:
+        half_power: half of the noise's second moment.
+        variance: of the noise, as the iteration assumed it.
+        shape: of the precision before the sample.
+        rate: of the precision before the sample.
+    """
+    after = rate + half_power
+    moved = half_power * ((shape + 0.5) / after - 1 / variance)
+    moved -= 0.5 * (math.log(variance) + expected_log_gamma(shape + 0.5, after))
+    return moved + gamma_step_divergence(shape, rate, half_power)
+
+
+def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str, int]) -> Any:
+    """Compile ``f(W, lane, out)``: the free energy [nats] that the last update left a lane with, after each iteration.
+
+    It is that of `estimator.inference.noise.sample_free_energy`, summed over the sensors: the first that shows the
+    process noise counts for γ and its own ξ, each further one for its ξ. A missing output counts for nothing. ``out``
+    is (iterations,).
+
+    Args:
+        model: whose belief.
+        iterations: of the update.
+        lanes: systems in a block.
+        layout: of the update, `estimator.engine.tasks.structured` with ``trace=True``.
+    """
+
+    def make() -> str:
+        at = lambda row: f"W[{layout[row] * lanes} + lane]"  # noqa: E731
+        source = [
+            "@jit",
+            "def free_energy(W, lane, out):",
+            f"    for i in range({iterations}):",
+            "        out[i] = 0.0",
+        ]
+        for k, sensor in enumerate(model.outputs):
+            source += [
+                f"    if {at(f'Y_{sensor}')} == {at(f'Y_{sensor}')}:",
+                f"        e, s = {at(f'TRACE_{k}_innovation')}, {at(f'TRACE_{k}_variance')}",
+                "        # Shapes and rates before the sample; that of the process noise as the sensor shows it.",
+                f"        g, n = {at('GAMMA_SHAPE')} - 0.5, {at(f'XI_SHAPE_{sensor}')} - 0.5",
+                f"        g_rate, n_rate = g * {at(f'TRACE_{k}_q_0')}, n * {at(f'TRACE_{k}_r_0')}",
+            ]
+            for i in range(iterations):
+                source += [
+                    f"        q, r = {at(f'TRACE_{k}_q_{i}')}, {at(f'TRACE_{k}_r_{i}')}",
+                    "        half_w, half_v = half_noise_powers(e, s, q, r)",
+                    f"        out[{i}] += gaussian_part(e, s + q + r) + precision_part(half_v, r, n, n_rate)",
+                    "        if q > 0.0:",
+                    f"            out[{i}] += precision_part(half_w, q, g, g_rate)",
+                ]
+        return "\n".join(source) + "\n"
+
+    names = {f.__name__: f for f in (gaussian_part, precision_part, half_noise_powers)}
+    key = repr((model.digest, iterations, lanes, sorted(layout.items())))
+    return stored.load(model.name, "free-energy", key, make, names).free_energy

@@ -1,0 +1,258 @@
+"""The generated path against its equations with matrices, and its gradient by the inputs against differences."""
+
+import numpy as np
+import pytest
+from engine_cases import CASES, FIVE, block, interpreted, put, random_inputs
+from engine_reference import EPS, moved, path, spread
+
+from estimator.engine import tasks
+
+SAMPLES = 12
+#: Variances of unit process noise and of the sensors.
+NOISE = 1e-4
+
+
+def some_walk(case, seed):
+    """Start, coefficients, inputs and noises; and outputs that follow the plant at about the noise."""
+    rng = np.random.default_rng(seed)
+    n, sensors = case.model.n_states, case.model.n_outputs
+    z, c = np.array(case.center[:n]), np.array(case.center[n:])
+    inputs = [0.2 * random_inputs(case, rng) for _ in range(SAMPLES)]  # larger ones let the cubes run away
+    V = NOISE * np.cov(rng.standard_normal((n, 4 * n)))
+    V = V.reshape(n, n)
+    R = NOISE * rng.uniform(0.5, 2.0, sensors)
+    y, state = [], z
+    for taps in inputs:
+        state = moved(case.plant, state, c, taps)
+        u = sum(taps) if case.plant.substeps else taps[0]
+        y.append(np.array(case.plant.show(state, c, u)) + np.sqrt(R) * rng.standard_normal(sensors))
+    return z, V, c, inputs, R, y
+
+
+def start(case, layout, z, V, c, W, lane=0, lanes=1):
+    states = list(case.model.states)
+    values = dict(zip((*states, *case.model.coefficients), (*z, *c), strict=True)) | {"LIVE": 1.0}
+    values |= {f"V_{i}_{k}": V[a, b] for a, i in enumerate(states) for b, k in enumerate(states) if a <= b}
+    put(W, layout, lanes, lane, values)
+
+
+def feed(case, layout, taps, y, W, lane=0, lanes=1):
+    values = dict(zip(tasks.input_rows(case.model, case.degree), taps, strict=True))
+    if y is not None:
+        values |= dict(zip((f"Y_{s}" for s in case.model.outputs), y, strict=True))
+    put(W, layout, lanes, lane, values)
+
+
+def table(W, layout, lanes, lane, rows, columns):
+    """Rows ``<letter>_i_k`` as a matrix; the upper triangle twice where only that is there."""
+    letter, first = rows
+    at = lambda i, k: W[layout[f"{letter}_{i}_{k}"] * lanes + lane]  # noqa: E731
+    if letter == "Z":
+        return np.array([[at(i, k) for k in columns] for i in first])
+    return np.array([[at(first[min(a, b)], first[max(a, b)]) for b in range(len(first))] for a in range(len(first))])
+
+
+def walked(case, task, walks, observed):
+    """Run lanes over their samples: the block, and what was shown by sample."""
+    lanes = task.lanes
+    W, shown = block(task.layout, lanes), []
+    for lane, (z, V, c, *_) in enumerate(walks):
+        start(case, task.layout, z, V, c, W, lane, lanes)
+    for t in range(SAMPLES):
+        for lane, (_, _, _, inputs, _, y) in enumerate(walks):
+            feed(case, task.layout, inputs[t], y[t] if observed else None, W, lane, lanes)
+        task.sample(W, NOISE, *walks[0][4])
+        if not observed:
+            shown.append([W[task.layout[f"SHOWN_{s}"] * lanes] for s in case.model.outputs])
+    return W, np.array(shown)
+
+
+@pytest.mark.parametrize("observed", [True, False], ids=["along outputs", "without noise"])
+@pytest.mark.parametrize("name", CASES)
+def test_a_path_equals_its_equations(name, observed, monkeypatch):
+    interpreted(monkeypatch)
+    case = CASES[name]
+    task = tasks.path.__wrapped__(case.model, case.degree, observed=observed, lanes=1)
+    assert_equals_reference(case, task, observed)
+
+
+def test_a_compiled_path_equals_its_equations():
+    case = CASES["pendulum"]
+    assert_equals_reference(case, tasks.path(case.model, case.degree, observed=True, lanes=4), True)
+
+
+def assert_equals_reference(case, task, observed):
+    walk = some_walk(case, 1)
+    z, V, c, inputs, R, y = walk
+    W, shown = walked(case, task, [walk] * task.lanes, observed)
+    expected = path(case.plant, z, V, c, inputs, NOISE, R, y if observed else None)
+    lanes, lane, layout = task.lanes, task.lanes - 1, task.layout
+    at = lambda row: W[layout[row] * lanes + lane]  # noqa: E731
+    states, names = list(case.model.states), list(case.model.coefficients)
+    # Every sample rounds, and what it rounds grows as the plant lets it; sensitivities sum over so many samples.
+    tolerance = EPS * case.operations * SAMPLES * expected.growth**2
+    assert tolerance < 1e-8
+    F = expected.information
+    size = np.sqrt(np.diag(F))
+    assert (np.abs(table(W, layout, lanes, lane, ("F", names), names) - F) <= tolerance * np.outer(size, size)).all()
+    np.testing.assert_allclose([at(i) for i in states], expected.state, rtol=tolerance, atol=tolerance)
+    std = np.sqrt(np.diag(expected.cov))
+    V_end = table(W, layout, lanes, lane, ("V", states), states)
+    assert (np.abs(V_end - expected.cov) <= tolerance * np.outer(std, std)).all()
+    reach = np.abs(expected.sensitivity).max()
+    Z_end = table(W, layout, lanes, lane, ("Z", states), names)
+    np.testing.assert_allclose(Z_end, expected.sensitivity, atol=tolerance * reach, rtol=0)
+    if observed:
+        # An error of the innovations e counts 1/√S: they are 1e2 of what is rounded.
+        enlarged = tolerance / np.sqrt(R.min())
+        total = SAMPLES * len(R) * (1 + abs(np.log(R.min())))
+        assert at("LOSS") == pytest.approx(expected.loss, abs=enlarged * total)
+        slope = np.array([at(f"SLOPE_{i}") for i in names])
+        assert (np.abs(slope - expected.slope) <= enlarged * size * np.sqrt(total)).all()
+        assert np.abs(expected.slope / size).max() > 0.1
+    else:
+        np.testing.assert_allclose(shown, expected.shown, rtol=tolerance, atol=tolerance)
+
+
+def central(f, x, step):
+    """Derivative of f at x by central differences of order 4, one column per entry."""
+    columns = []
+    for e in step * np.eye(len(x)):
+        near, far = f(x + e) - f(x - e), f(x + 2 * e) - f(x - 2 * e)
+        columns.append((8 * near - far) / (12 * step))
+    return np.moveaxis(np.array(columns), 0, -1)
+
+
+@pytest.mark.parametrize("name", FIVE)
+def test_the_information_is_that_of_the_responses_slopes(name, monkeypatch):
+    """Without process noise and from a known state, F is the sum of slopes of what is shown, over r."""
+    interpreted(monkeypatch)
+    case = CASES[name]
+    z, V, c, inputs, R, _ = some_walk(case, 2)
+    task = tasks.path.__wrapped__(case.model, case.degree, observed=False, lanes=1)
+    W = block(task.layout, 1)
+    start(case, task.layout, z, 0 * V, c, W)
+    for taps in inputs:
+        feed(case, task.layout, taps, None, W)
+        task.sample(W, 0.0, *R)
+
+    def response(c):
+        state, shown = z, []
+        for taps in inputs:
+            state = moved(case.plant, state, c, taps)
+            shown.append(case.plant.show(state, c, sum(taps) if case.plant.substeps else taps[0]))
+        return np.array(shown)
+
+    # Order 4 leaves the fifth derivative times the step's fourth power, 1e-12, and rounding over the step, 1e-13.
+    slopes = central(response, c, 1e-3)
+    expected = np.einsum("tsi,tsj,s->ij", slopes, slopes, 1 / R)
+    names = list(case.model.coefficients)
+    found = table(W, task.layout, 1, 0, ("F", names), names)
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", FIVE)
+def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
+    """Of a weighted sum of all that the path leaves, with process noise and an uncertain start."""
+    interpreted(monkeypatch)
+    case = CASES[name]
+    task = tasks.path.__wrapped__(case.model, case.degree, observed=False, lanes=1, gradient=True)
+    assert_gradient(case, task)
+
+
+def test_the_compiled_gradient_equals_differences():
+    case = CASES["paper"]
+    assert_gradient(case, tasks.path(case.model, case.degree, observed=False, lanes=1, gradient=True))
+
+
+def assert_gradient(case, task):
+    z, V, c, inputs, R, _ = some_walk(case, 3)
+    layout, noises, continuous = task.layout, (NOISE, *R), case.model.is_continuous
+    names = tasks.input_rows(case.model, case.degree)
+    states, rng = list(case.model.states), np.random.default_rng(4)
+    rows = [r for r in layout if r[:2] in ("F_", "Z_", "V_") or r in states]
+    shown = [f"SHOWN_{s}" for s in case.model.outputs]
+
+    def forward(flat, keep=None):
+        """The path of inputs; the block before every piece goes to ``keep``."""
+        W, seen = block(layout, 1), []
+        start(case, layout, z, V, c, W)
+        for taps in flat.reshape(SAMPLES, -1):
+            feed(case, layout, taps, None, W)
+            if continuous:
+                task.pieces.begin(W)
+                for s in range(case.model.substeps):
+                    if keep is not None:
+                        keep.append(W.copy())
+                    task.pieces.move(W, s / case.model.substeps)
+            if keep is not None:
+                keep.append(W.copy())
+            task.pieces.finish(W, *noises)
+            seen.append([W[layout[r]] for r in shown])
+        return W, np.array(seen)
+
+    flat, kept = np.concatenate(inputs), []
+    end, seen = forward(flat, kept)
+    # Weights of a size that lets everything count alike.
+    weights = {r: rng.standard_normal() / max(abs(end[layout[r]]), 1e-3) for r in rows}
+    seen_weights = rng.standard_normal(seen.shape)
+
+    def value(flat):
+        W, seen = forward(flat)
+        return np.array([sum(w * W[layout[r]] for r, w in weights.items()) + (seen_weights * seen).sum()])
+
+    A = block(layout, 1)
+    for r, w in weights.items():
+        A[layout[r]] = w
+    gradient = np.zeros((SAMPLES, len(names)))
+    for t in reversed(range(SAMPLES)):
+        for r, w in zip(shown, seen_weights[t], strict=True):
+            A[layout[r]] = w
+        for r in names:
+            A[layout[r]] = 0.0
+        task.pieces.finish_back(kept.pop(), A, *noises)
+        if continuous:
+            for s in reversed(range(case.model.substeps)):
+                task.pieces.move_back(kept.pop(), A, s / case.model.substeps)
+            for i in states:  # the sample began at the state
+                A[layout[i]] = A[layout[f"M_{i}"]]
+        gradient[t] = [A[layout[r]] for r in names]
+    assert not kept
+    expected = central(value, flat, 1e-3)[0]
+    assert np.abs(expected).max() > 1.0
+    np.testing.assert_allclose(gradient.ravel(), expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_a_lane_that_is_over_counts_nothing(monkeypatch):
+    interpreted(monkeypatch)
+    case = CASES["paper"]
+    task = tasks.path.__wrapped__(case.model, case.degree, observed=True, lanes=1)
+    z, V, c, inputs, R, y = some_walk(case, 5)
+    W = block(task.layout, 1)
+    start(case, task.layout, z, V, c, W)
+    W[task.layout["LIVE"]] = 0.0
+    feed(case, task.layout, inputs[0], y[0], W)
+    task.sample(W, NOISE, *R)
+    totals = [W[place] for row, place in task.layout.items() if row == "LOSS" or row[:2] == "F_" or row[:5] == "SLOPE"]
+    np.testing.assert_array_equal(totals, 0.0)
+
+
+def test_a_gradient_is_of_one_response_without_noise():
+    for options in ({"observed": True, "lanes": 1}, {"observed": False, "lanes": 4}):
+        with pytest.raises(ValueError, match="gradient is for the response without noise of one system"):
+            tasks.path(CASES["paper"].model, gradient=True, **options)
+
+
+def test_the_noise_of_a_linear_oscillator_is_the_integral_of_its_response():
+    """The reference itself: N = ∫ Φ(τ) g gᵀ Φ(τ)ᵀ dτ, with the matrix exponential for Φ."""
+    from scipy.linalg import expm
+
+    case = CASES["duffing"]
+    c = np.array([0.45, 0.0, 0.08, 0.5])
+    A, g = np.array([[0.0, 1.0], [-c[0], -c[2]]]), np.array([0.0, np.sqrt(3.0)])
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    flows = [expm(A * (1 + x) / 2) @ g for x in nodes]
+    expected = sum(w / 2 * np.outer(f, f) for w, f in zip(weights, flows, strict=True))
+    # Runge and Kutta's error is h⁴/120 of the fifth derivative, which is at most (2 |A|)⁴ |g|², with |A| about 1.
+    np.testing.assert_allclose(spread(case.plant, np.zeros(2), c, [0.0, 0.0]), expected, rtol=1e-4)

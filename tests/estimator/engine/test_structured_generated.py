@@ -1,0 +1,151 @@
+"""The generated structured update against its equations with matrices."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from engine_cases import (
+    CASES,
+    Case,
+    assert_agrees,
+    block,
+    get_belief,
+    interpreted,
+    put,
+    put_belief,
+    random_belief,
+    random_inputs,
+)  # fmt: skip
+from engine_reference import EPS, Plant, update
+
+from estimator.engine import tasks
+from estimator.models.model import Model
+
+LANES = 8
+
+
+def some_samples(case, seed):
+    """A belief, inputs and outputs per lane."""
+    rng = np.random.default_rng(seed)
+    samples = []
+    for _ in range(LANES):
+        belief, inputs = random_belief(case, rng), random_inputs(case, rng)
+        samples.append((belief, inputs, rng.uniform(-0.5, 0.5, case.model.n_outputs)))
+    return samples
+
+
+def updated(case, task, samples):
+    """What the generated update makes of samples, one per lane: the block."""
+    W = block(task.layout, LANES)
+    for lane, (belief, inputs, y) in enumerate(samples):
+        put_belief(W, task.layout, LANES, lane, case, belief)
+        rows = tasks.input_rows(case.model, case.degree)
+        put(W, task.layout, LANES, lane, dict(zip(rows, inputs, strict=True)))
+        put(W, task.layout, LANES, lane, dict(zip((f"Y_{s}" for s in case.model.outputs), y, strict=True)))
+    task.update(W)
+    return W
+
+
+def assert_equals_reference(case, task, samples, iterations):
+    W = updated(case, task, samples)
+    for lane, (belief, inputs, y) in enumerate(samples):
+        expected = update(case.plant, case.model.n_states, belief, inputs, y, iterations)
+        assert_agrees(get_belief(W, task.layout, LANES, lane, case), expected, case.operations)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_an_update_equals_its_equations(name, iterations, monkeypatch):
+    interpreted(monkeypatch)
+    case = CASES[name]
+    task = tasks._structured.__wrapped__(case.model, case.degree, iterations, LANES, None, False, False)
+    assert_equals_reference(case, task, some_samples(case, 1), iterations)
+
+
+@pytest.mark.parametrize("name", ["duffing, all terms", "pendulum", "cubic"])
+def test_a_compiled_update_equals_its_equations_with_missing_outputs(name):
+    """Of two sensors none, the first, the second or both are missing."""
+    case = CASES[name]
+    task = tasks.structured(case.model, case.degree, iterations=2, lanes=LANES, missing=True)
+    samples = some_samples(case, 2)
+    for lane, (_, _, y) in enumerate(samples):
+        y[[bool(lane & bit) for bit in (1, 2)][: len(y)]] = np.nan
+    assert_equals_reference(case, task, samples, 2)
+
+
+def test_a_missing_output_leaves_the_belief_bit_by_bit_as_predicted():
+    """And one that is there keeps the digits of its own variance, however much smaller than the predicted one it is."""
+    case = CASES["paper"]
+    task = tasks.structured(case.model, lanes=LANES, missing=True)
+    belief, inputs, y = some_samples(case, 6)[0]
+    precise = replace(belief, gamma=(100.0, 100.0), xi=[(100.0, 1e-16)])
+    W = updated(case, task, [(precise, inputs, y), (belief, inputs, [np.nan])] + [(belief, inputs, y)] * (LANES - 2))
+    exact = get_belief(W, task.layout, LANES, 0, case)
+    # r/S is 1e-18: 1 - (s + q)/S would be 0, or a few 1e-16.
+    r = exact.xi[0][1] / exact.xi[0][0]
+    assert exact.cov[0, 0] == pytest.approx(r, rel=0.5)
+    still = get_belief(W, task.layout, LANES, 1, case)
+    np.testing.assert_array_equal(still.mean[2:], belief.mean[2:])
+    np.testing.assert_array_equal(still.cov[2:, 2:], belief.cov[2:, 2:])
+    assert (still.gamma, still.xi) == (belief.gamma, belief.xi)
+
+
+def test_noise_that_no_sensor_shows_widens_the_state_and_is_not_learned(monkeypatch):
+    interpreted(monkeypatch)
+    hidden = Model(
+        "hidden", {"x": "1", "w": "1"}, {"k": "1"}, noise=("0", "1"), outputs={"y": "x"}, next_state=("k*x + w", "w/2")
+    )
+    plant = Plant(lambda z, c, u: [c[0] * z[0] + z[1], z[1] / 2], lambda z, c, u: [z[0]], lambda z, c: [0.0, 1.0])
+    case = Case(hidden, plant, (0.5, 0.2, 0.9))
+    task = tasks._structured.__wrapped__(hidden, 0, 3, LANES, None, True, False)
+    samples = some_samples(case, 7)
+    assert_equals_reference(case, task, samples, 3)
+    W = updated(case, task, samples)
+    assert get_belief(W, task.layout, LANES, 0, case).gamma == samples[0][0].gamma
+
+
+def test_noise_that_depends_on_the_state_may_vanish(monkeypatch):
+    interpreted(monkeypatch)
+    growing = Model("growing", {"x": "1"}, {"k": "1"}, noise=("x",), outputs={"y": "x"}, next_state=("k*x + u",))
+    plant = Plant(lambda z, c, u: [c[0] * z[0] + u[0]], lambda z, c, u: [z[0]], lambda z, c: [z[0]])
+    case = Case(growing, plant, (0.5, 0.9))
+    task = tasks._structured.__wrapped__(growing, 0, 3, LANES, None, True, False)
+    samples = some_samples(case, 8)
+    assert_equals_reference(case, task, samples, 3)
+    at_rest = replace(samples[0][0], mean=np.array([0.0, 0.9]))
+    W = updated(case, task, [(at_rest, *samples[0][1:])] * LANES)
+    assert np.isfinite(W).all()
+    # A sample that shows nothing of γ leaves its expectation.
+    shape, rate = get_belief(W, task.layout, LANES, 0, case).gamma
+    assert rate / shape == pytest.approx(at_rest.gamma[1] / at_rest.gamma[0], rel=4 * EPS)
+
+
+def test_what_is_generated_names_nothing_twice(monkeypatch):
+    """Names of a model that look like those of stages, lanes and loops."""
+    interpreted(monkeypatch)
+    model = Model(
+        "odd", {"j": "1", "j_a": "1", "j_e": "1"}, {"s": "1", "lane": "1"}, noise=("1", "0", "0"), outputs={"w": "j"},
+        rates=("j_a - s*j", "lane*u - j", "j - j_e"), substeps=2,
+    )  # fmt: skip
+    plant = Plant(
+        lambda z, c, u: [z[1] - c[0] * z[0], c[1] * u - z[0], z[0] - z[2]], lambda z, c, u: [z[0]],
+        lambda z, c: [1.0, 0.0, 0.0], substeps=2,
+    )  # fmt: skip
+    case = Case(model, plant, (0.1, 0.2, 0.3, 0.4, 0.5))
+    task = tasks._structured.__wrapped__(model, 0, 2, LANES, None, False, False)
+    assert_equals_reference(case, task, some_samples(case, 9), 2)
+
+
+def test_lanes_do_not_know_one_another():
+    case = CASES["pendulum"]
+    task = tasks.structured(case.model, case.degree, iterations=2, lanes=LANES, missing=True)
+    samples = some_samples(case, 10)
+    W = updated(case, task, samples).reshape(-1, LANES)
+    alone = updated(case, task, samples[3:4] * LANES).reshape(-1, LANES)
+    np.testing.assert_array_equal(alone, np.repeat(W[:, 3:4], LANES, axis=1))
+
+
+@pytest.mark.parametrize("iterations", [0, 101])
+def test_iterations_out_of_range_are_refused(iterations):
+    with pytest.raises(ValueError, match=f"iterations must be from 1 to 100, but is {iterations}"):
+        tasks.structured(CASES["paper"].model, iterations=iterations)
