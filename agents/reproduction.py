@@ -26,9 +26,10 @@ from rich.table import Table
 
 from agents.policies import make_policy
 from duffing_env.silverbox import Regime, SilverboxRecord, load_record
-from estimator import NLARX, OnlineEstimator, Prior
+from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.offline import PEMNARX
 from estimator.parameters import FloatArray
+from estimator.posterior import Belief
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,7 +50,7 @@ EVERY = 80
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to run the experiment. All start from `Prior.published_run`, with the default number of iterations.
+    """One way to run the experiment. All start from `published_run_prior`, with the default number of iterations.
 
     Attributes:
         summary: what it is, for the reader of the table.
@@ -207,21 +208,31 @@ def run(setting: Setting, model: str, record: SilverboxRecord, data: Path | None
         else:
             coefficients = train_online(setting, nonlinear, training)
         seconds = perf_counter() - start
-        nlarx = NLARX(nonlinear, setting.input_delay)
-        prediction, simulation = nlarx.predict(coefficients, u, y), nlarx.simulate(coefficients, u, y[:2])
+        trained = estimator_at(coefficients, setting.input_delay)
+        prediction, simulation = trained.predict(u, y), trained.simulate(u, y[:2])
     return Run(prediction, simulation, prediction_mse(prediction, y), simulation_mse(simulation, y), seconds)
 
 
 def train_online(setting: Setting, nonlinear: bool, training: Regime) -> FloatArray:
     """Posterior means (4,) of θ1, θ2, θ3, η after the whole training part."""
     estimator = OnlineEstimator(
-        NLARX(nonlinear, setting.input_delay),
-        Prior.published_run(),
+        difference(),
+        published_run_prior(nonlinear),
+        Rig(interpolation="zero_order", delay=setting.input_delay),
         factorisation=setting.factorisation,
         as_published=setting.as_published,
     )
     estimator.run(training.u, training.y)
     return estimator.belief.coefficients_mean
+
+
+def estimator_at(coefficients: FloatArray, input_delay: int) -> OnlineEstimator:
+    """An estimator that believes the coefficients (4,): for predictions and free runs with them."""
+    prior = published_run_prior()
+    record = prior.record.copy()
+    record[2:6] = coefficients
+    believed = Belief(difference(), record, prior.step)
+    return OnlineEstimator(difference(), believed, Rig(interpolation="zero_order", delay=input_delay))
 
 
 def train_through_environment(setting: Setting, nonlinear: bool, data: Path | None) -> FloatArray:

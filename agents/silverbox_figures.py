@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator import DuffingODE, JointBelief
+from estimator import duffing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,27 +90,28 @@ def _draw_learning(outcomes: Mapping[str, Outcome]) -> Figure:
 def _draw_parameters(outcomes: Mapping[str, Outcome]) -> Figure:
     """Posterior means and 90 % intervals of the physical parameters over the number of training samples."""
     figure = _figure(11, 5.5)
-    panels = dict(zip(DuffingODE.names, figure.subplots(2, 4, sharex=True).flat, strict=True))
+    units = duffing(offsets=True, cubic_damping=True, feedthrough=True).physical_units
+    panels = dict(zip(units, figure.subplots(2, 4, sharex=True).flat, strict=True))
     limits: dict[str, list[float]] = {parameter: [] for parameter in panels}
     for name, outcome in outcomes.items():
-        beliefs = {n: belief for n, belief in outcome.beliefs.items() if isinstance(belief, JointBelief)}
-        for parameter in panels if name.startswith("ODE") else ():
-            mean, std = np.array([belief.parameters()[parameter][:2] for belief in beliefs.values()]).T
-            if not std.any():
+        told = {n: belief.parameters() for n, belief in outcome.beliefs.items() if name.startswith("ODE")}
+        for parameter in panels:
+            if not all(parameter in parameters for parameters in told.values()) or not told:
                 continue  # it is known
-            low, high, samples = mean - _NINETY * std, mean + _NINETY * std, np.array(list(beliefs))
+            mean, std = np.array([parameters[parameter][:2] for parameters in told.values()]).T
+            low, high, samples = mean - _NINETY * std, mean + _NINETY * std, np.array(list(told))
             panels[parameter].fill_between(samples, low, high, color=_COLOURS[name], alpha=0.2, linewidth=0)
             panels[parameter].plot(samples, mean, color=_COLOURS[name], label=name, linewidth=1)
             limits[parameter] += [low[samples >= _SHOWN_FROM].min(), high[samples >= _SHOWN_FROM].max()]
-    for (parameter, axes), unit in zip(panels.items(), DuffingODE.units, strict=True):
+    for place, ((parameter, axes), unit) in enumerate(zip(panels.items(), units.values(), strict=True)):
         low, high = min(limits[parameter], default=0.0), max(limits[parameter], default=1.0)
         axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
         axes.set_xscale("log")
-        axes.set_title(f"{parameter.replace('_', ' ')} / {unit}", fontsize=9)
+        axes.set_title(f"{parameter} / {unit}", fontsize=9)
         axes.grid(alpha=0.3)
-        if parameter in DuffingODE.names[4:]:
+        if place >= 4:
             axes.set_xlabel("training samples")
-    handles, labels = panels["stiffness"].get_legend_handles_labels()
+    handles, labels = panels["m"].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return figure
 

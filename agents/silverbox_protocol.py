@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -20,8 +20,17 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from duffing_env.silverbox import Regime, SilverboxRecord
-from estimator import NLARX, Belief, DuffingODE, JointBelief, OnlineEstimator, Prior
+from estimator import (
+    Model,
+    OnlineEstimator,
+    Rig,
+    difference,
+    duffing,
+    published_run_prior,
+    silverbox_prior,
+)
 from estimator.parameters import FloatArray
+from estimator.posterior import Belief
 
 MULTISINE = slice(40_650, 127_400)
 TRAINING_SAMPLES = 65_062
@@ -52,57 +61,59 @@ class Setting:
 
     Attributes:
         model: what is identified.
+        rig: what the inputs do.
         prior: None is the model's default.
         factorisation: ``structured`` or ``mean_field``.
         as_published: with the published run's two departures from the derived messages.
         passes: how often the training section is gone through; more than once is no longer online.
-        expectations: ``first_order`` or ``sigma_points``.
         noise_hypotheses: ratios of the noises that are weighed by their evidence.
     """
 
-    model: NLARX | DuffingODE
-    prior: Prior | JointBelief | None = None
+    model: Model
+    rig: Rig
+    prior: Belief | None = None
     factorisation: str = "structured"
     as_published: bool = False
     passes: int = 1
-    expectations: str = "first_order"
     noise_hypotheses: int = 1
 
     def estimator(self) -> OnlineEstimator:
         """An estimator that has seen nothing yet."""
         return OnlineEstimator(
-            self.model, self.prior, self.factorisation, as_published=self.as_published,
-            expectations=self.expectations, noise_hypotheses=self.noise_hypotheses,
+            self.model, self.prior, self.rig, factorisation=self.factorisation, as_published=self.as_published,
+            noise_hypotheses=self.noise_hypotheses,
         )  # fmt: skip
 
 
-def _without_feedthrough(model: DuffingODE) -> Setting:
-    prior = model.prior()
-    place = prior.names.index("feedthrough") - len(prior.names)
-    cov = prior.cov.copy()
-    cov[place, :] = cov[:, place] = 0.0  # known to be 0
-    return Setting(model, replace(prior, cov=cov))
+def _ode(interpolation: str, feedthrough: bool = True, cubic_damping: bool = False, passes: int = 1) -> Setting:
+    """Eq. (1) with both offsets, and noise that is an acceleration held over a sample."""
+    model = duffing(offsets=True, feedthrough=feedthrough, cubic_damping=cubic_damping, noise="held")
+    return Setting(model, Rig.silverbox(interpolation), passes=passes)
 
+
+#: A difference equation with one tap, on which the input acts a sample later; and with taps of its own.
+_ONE_TAP, _OWN_TAPS = Rig.silverbox("zero_order", 1), Rig.silverbox("zero_order", 0)
+
+_PUBLISHED = published_run_prior()
 
 SETTINGS = {
-    "paper as published": Setting(NLARX(input_delay=0), Prior.published_run(), "mean_field", as_published=True),
-    "paper, delay 1": Setting(NLARX(), Prior.published_run(), "mean_field"),
-    "paper structured": Setting(NLARX(), Prior.silverbox_twin(state_std=0.1)),  # the section begins in motion
-    "NLARX offset": Setting(NLARX(regressors="offset")),
-    "NLARX three-tap": Setting(NLARX(regressors="three-tap")),
-    "NLARX three-tap, 9 ratios": Setting(NLARX(regressors="three-tap"), noise_hypotheses=9),
-    "NLARX cubic": Setting(NLARX(regressors="cubic")),
-    "ODE linear, d = 0": _without_feedthrough(DuffingODE()),
-    "ODE linear": Setting(DuffingODE()),
-    "ODE linear +e": Setting(DuffingODE(cubic_damping=True)),
-    "ODE look-ahead": Setting(DuffingODE("look_ahead")),
-    "ODE look-ahead +e": Setting(DuffingODE("look_ahead", cubic_damping=True)),
-    "ODE spline, d = 0": _without_feedthrough(DuffingODE("spline")),
-    "ODE spline": Setting(DuffingODE("spline")),
-    "ODE spline +e": Setting(DuffingODE("spline", cubic_damping=True)),
-    "ODE linear, sigma points": Setting(DuffingODE(), expectations="sigma_points"),
-    "ODE spline, 2 passes": Setting(DuffingODE("spline"), passes=2),
-    "ODE spline +e, 2 passes": Setting(DuffingODE("spline", cubic_damping=True), passes=2),
+    "paper as published": Setting(difference(), _OWN_TAPS, _PUBLISHED, "mean_field", as_published=True),
+    "paper, delay 1": Setting(difference(), _ONE_TAP, _PUBLISHED, "mean_field"),
+    "paper structured": Setting(difference(), _ONE_TAP, silverbox_prior(state_std=0.1)),  # it begins in motion
+    "NLARX offset": Setting(difference("offset"), _ONE_TAP),
+    "NLARX three-tap": Setting(difference("three-tap"), _OWN_TAPS),
+    "NLARX three-tap, 9 ratios": Setting(difference("three-tap"), _OWN_TAPS, noise_hypotheses=9),
+    "NLARX cubic": Setting(difference("cubic"), _OWN_TAPS),
+    "ODE linear, d = 0": _ode("linear", feedthrough=False),
+    "ODE linear": _ode("linear"),
+    "ODE linear +e": _ode("linear", cubic_damping=True),
+    "ODE look-ahead": _ode("look_ahead"),
+    "ODE look-ahead +e": _ode("look_ahead", cubic_damping=True),
+    "ODE spline, d = 0": _ode("spline", feedthrough=False),
+    "ODE spline": _ode("spline"),
+    "ODE spline +e": _ode("spline", cubic_damping=True),
+    "ODE spline, 2 passes": _ode("spline", passes=2),
+    "ODE spline +e, 2 passes": _ode("spline", cubic_damping=True, passes=2),
 }
 
 
@@ -138,7 +149,7 @@ class Outcome:
     seconds: float
     free_energy: float
     learning: dict[int, float]
-    beliefs: dict[int, Belief | JointBelief]
+    beliefs: dict[int, Belief]
     arrow_error: FloatArray
 
     @property
@@ -221,8 +232,7 @@ def coverage(estimator: OnlineEstimator, training: Regime, test: Regime) -> floa
     """
     copy = deepcopy(estimator)
     copy.run(test.u, test.y)
-    waited = getattr(copy.model, "look_ahead", 0)
-    y = np.concatenate([training.y[len(training.y) - waited :], test.y])[: len(copy.forecasts)]
+    y = np.concatenate([training.y[len(training.y) - copy.waits :], test.y])[: len(copy.forecasts)]
     return coverage_of(copy.forecasts, y)
 
 

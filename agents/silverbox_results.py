@@ -5,7 +5,6 @@ from __future__ import annotations
 import json as json_format
 import platform
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,8 @@ from agents.silverbox_protocol import (
     progress_bar,
 )
 from duffing_env.silverbox import load_record
-from estimator import Belief, JointBelief
 from estimator.files import write_atomically
+from estimator.posterior import Belief
 
 TARGETS = {
     "ODE linear": (0.36, 0.45, 0.36),
@@ -107,8 +106,10 @@ def summarise(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
     """The results as `run_protocol` returns them: plain dictionaries, fit for JSON."""
     rows = {
         name: {
-            "model": type(SETTINGS[name].model).__name__,
-            "options": asdict(SETTINGS[name].model),
+            "model": SETTINGS[name].model.name,
+            "coefficients": list(SETTINGS[name].model.coefficients),
+            "interpolation": SETTINGS[name].rig.interpolation,
+            "delay": SETTINGS[name].rig.delay,
             "passes": SETTINGS[name].passes,
             "rmse": {test: _finite(error) for test, error in outcome.rmse.items()},
             "prediction_rmse": _finite(outcome.prediction_rmse),
@@ -133,13 +134,9 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _parameters(belief: Belief | JointBelief) -> dict[str, dict[str, Any]]:
-    """Mean and standard deviation of each coefficient, by name."""
-    if isinstance(belief, JointBelief):
-        return {name: dict(zip(("mean", "std", "unit"), row, strict=True)) for name, row in belief.parameters().items()}
-    stds = np.sqrt(np.diag(belief.coefficients_cov))
-    rows = zip(("theta1", "theta2", "theta3", "eta"), belief.coefficients_mean.tolist(), stds.tolist(), strict=True)
-    return {name: {"mean": mean, "std": std} for name, mean, std in rows}
+def _parameters(belief: Belief) -> dict[str, dict[str, Any]]:
+    """Mean, standard deviation and unit of each physical parameter, or coefficient where there is none, by name."""
+    return {name: dict(zip(("mean", "std", "unit"), row, strict=True)) for name, row in belief.parameters().items()}
 
 
 def targets(outcomes: Mapping[str, Outcome]) -> Iterator[tuple[str, bool]]:

@@ -22,7 +22,7 @@ from agents.silverbox_protocol import (
     simulation_error,
 )
 from duffing_env.silverbox import Regime, load_record
-from estimator import DuffingODE
+from estimator import recorded_prior
 
 VALIDATION_SAMPLES = TRAINING_SAMPLES // 4
 """At the end of the training section; the samples before identify."""
@@ -50,17 +50,17 @@ def select(data: Path | None = None) -> dict[str, dict[str, tuple[float, float]]
     first = Regime("first", training.u[:split], training.y[:split])
     last = Regime("last", training.u[split:], training.y[split:])
     scores: dict[str, dict[str, tuple[float, float]]] = {}
-    models = {
-        name: setting.model
+    settings = {
+        name: setting
         for name, setting in SETTINGS.items()
-        if isinstance(setting.model, DuffingODE) and setting.passes == 1 and setting.prior is None
+        if "feedthrough" in setting.model.coefficients and setting.passes == 1
     }
     with progress_bar() as progress:
-        task = progress.add_task("", total=len(models))
-        for name, model in models.items():
+        task = progress.add_task("", total=len(settings))
+        for name, setting in settings.items():
             progress.update(task, description=name)
             scores[name] = {}
-            for label, candidate in _candidates(model):
+            for label, candidate in _candidates(setting):
                 estimator, _, _ = identify(candidate, first, split)
                 scores[name][label] = rmse(simulation_error(estimator, last)), coverage(estimator, first, last)
             progress.advance(task)
@@ -68,13 +68,13 @@ def select(data: Path | None = None) -> dict[str, dict[str, tuple[float, float]]
     return scores
 
 
-def _candidates(model: DuffingODE) -> Iterator[tuple[str, Setting]]:
-    """The model with its default prior, and with one thing changed at a time."""
-    yield "default", Setting(model)
+def _candidates(setting: Setting) -> Iterator[tuple[str, Setting]]:
+    """The setting with its default prior, and with one thing changed at a time."""
+    yield "default", setting
     for noise in PROCESS_NOISES:
-        yield f"{1e6 * noise:g} µV", Setting(model, model.prior(process_noise=noise))
+        yield f"{1e6 * noise:g} µV", replace(setting, prior=recorded_prior(setting.model, process_noise=noise))
     for substeps in SUBSTEPS:
-        yield f"{substeps} steps", Setting(replace(model, substeps=substeps))
+        yield f"{substeps} steps", replace(setting, model=replace(setting.model, substeps=substeps))
 
 
 def _report(scores: dict[str, dict[str, tuple[float, float]]]) -> None:

@@ -34,7 +34,8 @@ def free_energy_of(kind: Kind) -> Any:
     """``free_energy(W, j)``: what the last update left lane j with [nats]."""
     place = layout_of(kind)
     if kind.factorisation == "mean_field":
-        return at_lane(_paper_layout(kind))(mean_field.free_energy.scalar)
+        function, _, outputs, uniform = mean_field.free_energy.declaration
+        return at_lane(_paper_layout(kind), outputs, uniform)(function)
     traced, last = free_energies(kind.belief, kind.iterations, LANES, place), kind.iterations - 1
 
     @jit

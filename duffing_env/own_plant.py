@@ -15,7 +15,7 @@ from estimator.parameters import PhysicalParameters
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.posterior import Belief
-from estimator.priors import silverbox_prior
+from estimator.priors import named_prior
 
 
 class Plant(Protocol):
@@ -70,7 +70,7 @@ class PlantExperiment(Experiment):
     @cached_property
     def believed(self) -> Belief:
         """The prior as given, or that of Amplitude-v0."""
-        return self.prior or silverbox_prior("silverbox_twin", difference(), self.factorisation)
+        return self.prior or named_prior("silverbox_twin", difference(), self.factorisation)
 
 
 class PlantEnv(DuffingEnv):

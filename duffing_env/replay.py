@@ -14,7 +14,7 @@ from estimator.parameters import FloatArray
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.posterior import Belief
-from estimator.priors import silverbox_prior
+from estimator.priors import named_prior
 
 _PRIORS = ("silverbox_twin", "published_run", "paper_text")
 
@@ -78,7 +78,7 @@ class ReplayExperiment(Experiment):
     @cached_property
     def believed(self) -> Belief:
         """The prior of that name."""
-        return silverbox_prior(self.prior, self.model, self.factorisation)
+        return named_prior(self.prior, self.model, self.factorisation)
 
     @property
     def recorded(self) -> tuple[FloatArray, FloatArray]:

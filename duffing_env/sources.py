@@ -33,7 +33,9 @@ _SMALLEST, _LARGEST = 2.0**-1000, 2.0**1000
 def parts(kind: Kind) -> Any:
     """The compiled functions of a kind of experiment: see `_source` for their names."""
     reward = REWARDS[kind.reward]
-    key = source_digest(Path(__file__).parent) + repr((kind._replace(belief=None, plant=None), kind.belief.digest, kind.plant and kind.plant.digest))
+    key = source_digest(Path(__file__).parent) + repr(
+        (kind._replace(belief=None, plant=None), kind.belief.digest, kind.plant and kind.plant.digest)
+    )
     names = {**_NAMES, "reward": reward.value}
     return stored.load(kind.belief.name, "environment", key, lambda: _source(kind), names)
 

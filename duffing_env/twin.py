@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from duffing_env.silverbox import SilverboxRecord, load_record
-from estimator import DuffingODE, OnlineEstimator
-from estimator.parameters import Coefficients, PhysicalParameters, to_physical
+from estimator import OnlineEstimator, Rig, duffing
+from estimator.parameters import SAMPLING_STEP, Coefficients, PhysicalParameters, to_physical
 
 
 def identify_twin(record: SilverboxRecord) -> tuple[PhysicalParameters, float]:
@@ -28,12 +28,15 @@ def identify_twin(record: SilverboxRecord) -> tuple[PhysicalParameters, float]:
 def identify_continuous_twin(record: SilverboxRecord) -> dict[str, float]:
     """Stiffness, damping, gain and cubic stiffness of the differential equation, from the record's multisine part.
 
-    By `DuffingODE` with the spline through all inputs. Its offsets and feedthrough are identified along, and left away:
-    they are the circuit's and the sensor's, not the oscillator's.
+    By `duffing` with the spline through all inputs. Its offsets and feedthrough are identified along, and left away:
+    they are the circuit's and the sensor's, not the oscillator's. In seconds and volts.
     """
-    estimator = OnlineEstimator(DuffingODE("spline"))
+    model = duffing(offsets=True, feedthrough=True, noise="held")
+    estimator = OnlineEstimator(model, rig=Rig.silverbox("spline"))
     estimator.run(record.multisine.u, record.multisine.y)
-    return dict(zip(DuffingODE.names, estimator.belief.coefficients_mean.tolist(), strict=True))
+    scales = {"stiffness": -2, "damping": -1, "gain": -2, "cubic": -2}
+    found = estimator.belief.coefficients()
+    return {name: found[name][0] * SAMPLING_STEP**power for name, power in scales.items()}
 
 
 def main() -> None:

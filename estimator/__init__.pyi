@@ -13,6 +13,9 @@ from .fisher import (
     relative_covariance,
 )
 from .gaussian import JointBelief
+from .models.difference import difference
+from .models.duffing import duffing
+from .models.model import Model
 from .models.nlarx import NLARX
 from .models.ode import DuffingODE
 from .offline import PEMNARX
@@ -26,6 +29,14 @@ from .parameters import (
     to_physical,
 )
 from .prior import Prior
+from .priors import (
+    paper_text_prior,
+    published_run_prior,
+    recorded_prior,
+    silverbox_prior,
+    weak_prior,
+)
+from .rig import Rig
 from .saving import (
     load_estimator,
     save_estimator,
@@ -42,17 +53,26 @@ __all__ = [
     "ContinuousBelief",
     "DuffingODE",
     "JointBelief",
+    "Model",
     "NoiseRatio",
     "OnlineEstimator",
     "PhysicalParameters",
     "Prior",
+    "Rig",
     "continuous_prior",
     "cramer_rao",
+    "difference",
+    "duffing",
     "fisher_information",
     "load_estimator",
     "ode_information",
+    "paper_text_prior",
+    "published_run_prior",
+    "recorded_prior",
     "relative_covariance",
     "save_estimator",
+    "silverbox_prior",
     "to_coefficients",
     "to_physical",
+    "weak_prior",
 ]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.belief import RecordBelief
-from estimator.parameters import SAMPLING_STEP, FloatArray, PhysicalParameters
+from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, FloatArray, PhysicalParameters
 from estimator.record import RECORD, RECORD_SIZE
 
 #: Coefficients with their physical units, in the order of the record's rows t1, t2, t3, e.
@@ -21,13 +21,6 @@ COEFFICIENTS = {"stiffness": "s⁻²", "cubic": "V⁻² s⁻²", "damping": "s�
 
 #: Factors from units per sample to physical ones.
 _SCALES = SAMPLING_STEP ** np.array([-2.0, -2.0, -1.0, -2.0])
-
-_GAIN_TWIN = 186_015.0  # s⁻²
-
-CONTINUOUS_TWIN = PhysicalParameters(
-    m=1 / _GAIN_TWIN, c=41.8992 / _GAIN_TWIN, a=184_255.0 / _GAIN_TWIN, b=730_155.0 / _GAIN_TWIN
-)
-"""The Silverbox circuit as the differential equation sees it (``python -m duffing_env.twin`` identifies it)."""
 
 
 def continuous_prior(

@@ -76,44 +76,52 @@ def relaid(loop: Any, layout: Mapping[str, int]) -> Any:
     return lanewise(layout, outputs, uniform)(function)
 
 
-def alone(loop: Any) -> Any:
-    """A function of `lanewise` for the first lane only, with the same arguments: for a single system."""
-    function, layout, outputs, uniform = loop.declaration
-    first = at_lane(layout, outputs, uniform)(function)
+def alone(loop: Any, layout: Mapping[str, int] | None = None, lanes: int = LANES) -> Any:
+    """A function of `lanewise` for the first lane only, with the same arguments: for a single system.
+
+    Args:
+        loop: the function.
+        layout: other rows of the block, where it is given.
+        lanes: systems in the block.
+    """
+    function, own, outputs, uniform = loop.declaration
+    first = at_lane(own if layout is None else layout, outputs, uniform, lanes)(function)
     arguments = ", ".join(uniform.split())
     source = f"def {function.__name__}(W{', ' * bool(arguments)}{arguments}):\n    first(W, 0, {arguments})\n"
     return jit(_define(source, function, first=first))
 
 
-def at_lane(layout: Mapping[str, int], outputs: str = "", uniform: str = "") -> Callable[[Callable[..., Any]], Any]:
+def at_lane(
+    layout: Mapping[str, int], outputs: str = "", uniform: str = "", lanes: int = LANES
+) -> Callable[[Callable[..., Any]], Any]:
     """Compile a scalar function to run on one lane: ``f(W, j, *uniform)``, otherwise as `lanewise`.
 
-    Without ``outputs`` it writes nothing, and returns its results.
+    Without ``outputs`` it writes nothing, and returns its results. A block holds ``lanes`` systems.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        arguments, targets = _places(function, layout, outputs, uniform)
+        arguments, targets = _places(function, layout, outputs, uniform, lanes)
         source = (
             f"def {function.__name__}({', '.join(['W', 'j', *uniform.split()])}):\n"
             f"    {targets + ' =' if outputs else 'return'} scalar({arguments})\n"
         )
-        loop = jit(_define(source, function, scalar=jit(function)))
-        loop.scalar = function
-        return loop
+        compiled = jit(_define(source, function, scalar=jit(function)))
+        compiled.declaration = (function, layout, outputs, uniform)
+        return compiled
 
     return decorate
 
 
 def _places(
-    function: Callable[..., Any], layout: Mapping[str, int], outputs: str, uniform: str
-) -> tuple[str, str]:  # fmt: skip
+    function: Callable[..., Any], layout: Mapping[str, int], outputs: str, uniform: str, lanes: int = LANES
+) -> tuple[str, str]:
     """The arguments of a scalar function, and the places of its results, as source text."""
     names = list(inspect.signature(function).parameters)
     for name in names:
         if (name in layout) == (name in uniform.split()):
             raise ValueError(f"{name} of {function.__name__} must be a row or uniform, and not both; rename it")
-    arguments = ", ".join(f"W[{layout[n] * LANES} + j]" if n in layout else n for n in names)
-    targets = ", ".join(f"W[{layout[n] * LANES} + j]" for n in outputs.split())
+    arguments = ", ".join(f"W[{layout[n] * lanes} + j]" if n in layout else n for n in names)
+    targets = ", ".join(f"W[{layout[n] * lanes} + j]" for n in outputs.split())
     return arguments, targets
 
 

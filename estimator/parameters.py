@@ -380,3 +380,10 @@ def _reject(bad: npt.ArrayLike, name: str, values: FloatOrArray, *, rule: str, r
 
 SILVERBOX_TWIN = PhysicalParameters(m=6.4568e-6, c=2.5717e-4, a=1.1747, b=3.7672)
 """The Silverbox circuit as the difference equation sees it (``python -m duffing_env.twin`` identifies it)."""
+
+_GAIN_TWIN = 186_015.0  # s⁻²
+
+CONTINUOUS_TWIN = PhysicalParameters(
+    m=1 / _GAIN_TWIN, c=41.8992 / _GAIN_TWIN, a=184_255.0 / _GAIN_TWIN, b=730_155.0 / _GAIN_TWIN
+)
+"""The Silverbox circuit as the differential equation sees it (``python -m duffing_env.twin`` identifies it)."""

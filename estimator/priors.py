@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.physical import coefficients_of
 from estimator.posterior import Belief
 
@@ -115,7 +118,127 @@ def weak_prior(
     )
 
 
-def silverbox_prior(name: str, model: Model, factorisation: str = "structured") -> Belief:
+#: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.twin`` identifies them).
+_TWINS = {"difference": SILVERBOX_TWIN, "duffing": CONTINUOUS_TWIN}
+
+
+def silverbox_prior(
+    model: Model | None = None,
+    spread: float = 0.3,
+    process_noise: float = 5e-4,
+    measurement_noise: float = 5e-4,
+    noise_shape: float = 2.0,
+    state_std: float = 1e-3,
+) -> Belief:
+    """The prior of the environments: an oscillator near the Silverbox circuit, at rest.
+
+    Args:
+        model: with the parameters m, c, a and b; `difference`, the paper's, where it is None.
+        spread: m, c, a and b are log-uniform on the twin's times [1 - spread, 1 + spread]; in (0, 1).
+        process_noise: what a sample's process noise does to the output: standard deviation [V] at which γ is centred.
+        measurement_noise: standard deviation [V] at which ξ is centred.
+        noise_shape: see `weak_prior`.
+        state_std: standard deviation of the states about rest [V].
+
+    Raises:
+        ValueError: for a model with other parameters, or a value out of its range.
+    """
+    model = difference() if model is None else model
+    if set(model.physical) != {"m", "c", "a", "b"} or model.name not in _TWINS:
+        raise ValueError(f"model must have the parameters m, c, a and b, but {model.name} has {list(model.physical)}")
+    if not 0 < spread < 1:
+        raise ValueError(f"spread must be above 0 and below 1, but is {spread}; pass the range's relative half width")
+    return weak_prior(model, *_twin_moments(model, spread), process_noise, measurement_noise, noise_shape, state_std)
+
+
+@cache
+def _twin_moments(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
+    twin = _TWINS[model.name]
+    return log_uniform_moments(model, {name: float(getattr(twin, name)) for name in model.physical}, spread)
+
+
+def published_run_prior(nonlinear: bool = True) -> Belief:
+    """The prior that the paper's published numbers were computed with (it differs from the paper's text).
+
+    Without ``nonlinear`` θ2 is known to be 0: the paper's FEM-LARX.
+    """
+    return _paper_prior(2.0, 1e-2, (1e8, 1e3), (1e8, 1e1), nonlinear)
+
+
+def paper_text_prior(nonlinear: bool = True) -> Belief:
+    """The prior as the paper's section 4 states it; the state's, not given there, is that of the published run."""
+    return _paper_prior(1.0, 10.0, (1e3, 1e1), (1e8, 1e3), nonlinear)
+
+
+def _paper_prior(
+    eta: float, variance: float, gamma: tuple[float, float], xi: tuple[float, float], nonlinear: bool
+) -> Belief:
+    mean = np.array([0.0, 0.0, 1.0, float(nonlinear), 1.0, eta])
+    return Belief.of(difference(), mean, np.diag([10.0, 10.0, 10.0, 10.0 * nonlinear, 10.0, variance]), gamma, xi)
+
+
+def recorded_prior(
+    model: Model,
+    spread: float = 0.3,
+    process_noise: float = 5e-6,
+    measurement_noise: float = 1e-3,
+    noise_shape: float = 2.0,
+) -> Belief:
+    """A weak prior about the Silverbox twin, for recorded data that begin in motion: 0.1 V in every state.
+
+    Args:
+        model: `estimator.models.duffing.duffing` with any terms, or `estimator.models.difference.difference`.
+        spread: relative standard deviation of stiffness, cubic, damping and gain; the offsets are 0 with one of 20 mV,
+            feedthrough and cubic damping (per sample) 0 with one of 0.1. Of a difference equation: standard deviation
+            of the coefficients of lags and inputs, which are centred on those of Eq. (2) where that has them; those of
+            products have 1 + spread about 0, an offset a tenth of it in volts.
+        process_noise: see `silverbox_prior`.
+        measurement_noise: see `silverbox_prior`.
+        noise_shape: see `weak_prior`.
+
+    Raises:
+        ValueError: for another model, or a value out of its range.
+    """
+    if model.name not in _TWINS:
+        raise ValueError(f"model must be a duffing or difference equation, but is {model.name}; use weak_prior")
+    moments = _recorded_duffing(model, spread) if model.name == "duffing" else _recorded_difference(model, spread)
+    mean, cov = moments
+    n = model.n_states
+    joint_mean = np.concatenate([np.zeros(n), mean])
+    joint = np.zeros((len(joint_mean), len(joint_mean)))
+    joint[:n, :n], joint[n:, n:] = 0.1**2 * np.eye(n), cov
+    if "output_offset" in model.coefficients:  # the state is the displacement with its offset
+        place = n + list(model.coefficients).index("output_offset")
+        joint[0, :] += joint[place, :]
+        joint[:, 0] += joint[:, place]
+    noises = (noise_shape, noise_shape * process_noise**2), (noise_shape, noise_shape * measurement_noise**2)
+    return Belief.of(model, joint_mean, joint, *noises)
+
+
+def _recorded_duffing(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
+    twin = coefficients_of(duffing(), {name: getattr(SILVERBOX_TWIN, name) for name in ("m", "c", "a", "b")})
+    main = dict(zip(duffing().coefficients, twin, strict=True))
+    mean = np.array([main.get(name, 0.0) for name in model.coefficients])
+    others = {"force": 0.0, "output_offset": 0.02, "cubic_damping": 0.1, "feedthrough": 0.1}
+    cov = np.diag([(spread * main[name] if name in main else others[name]) ** 2 for name in model.coefficients])
+    if "force" in model.coefficients:  # stiffness y0 - gain u0, of independent u0 and y0
+        force, offset = (list(model.coefficients).index(name) for name in ("force", "output_offset"))
+        cov[force, force] = (0.02 * main["stiffness"]) ** 2 + (0.02 * main["gain"]) ** 2
+        cov[force, offset] = cov[offset, force] = main["stiffness"] * 0.02**2
+    return mean, cov
+
+
+def _recorded_difference(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
+    twin = coefficients_of(difference(), {name: getattr(SILVERBOX_TWIN, name) for name in ("m", "c", "a", "b")})
+    centers = dict(zip(("x1", "x1**3", "x2"), twin[:3], strict=True))
+    centers["u" if model.taps == 1 else "u1"] = twin[3]
+    terms = [part.split("*", 1)[1] for part in model.next_state[0].split(" + ")]
+    stds = {"V": 0.1 * spread, "1": spread}
+    std = [stds.get(unit, 1 + spread) for unit in model.coefficients.values()]
+    return np.array([centers.get(term, 0.0) for term in terms]), np.diag(np.square(std))
+
+
+def named_prior(name: str, model: Model, factorisation: str = "structured") -> Belief:
     """A prior of the paper's equation by name.
 
     Args:
