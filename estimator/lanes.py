@@ -156,7 +156,9 @@ def _source_digest(package: Path) -> str:
     digest = hashlib.sha256()
     for folder in sorted({Path(__file__).parent, package}):
         for path in sorted(folder.rglob("*.py")):
-            digest.update(path.read_bytes())
+            # What the engine generated stands there too, and follows from the rest.
+            if path.parent.name != "__pycache__":
+                digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

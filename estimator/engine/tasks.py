@@ -16,7 +16,7 @@ import numpy as np
 
 from estimator import elementary
 from estimator.engine import cache as stored
-from estimator.lanes import LANES, inlined, jit, rows
+from estimator.lanes import LANES, inlined, rows
 from estimator.models.model import Model
 
 
@@ -40,7 +40,7 @@ def sqrt(value):
 
 #: What generated code may use.
 NAMES = {
-    "jit": jit, "present": present, "select": select, "sqrt": sqrt, "log": elementary.log,
+    "present": present, "select": select, "sqrt": sqrt, "log": elementary.log,
     **{name: getattr(elementary, name) for name in ("sin", "cos", "exp", "tanh")},
 }  # fmt: skip
 
