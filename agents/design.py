@@ -64,9 +64,12 @@ def roll(theta, q, r, limit, start, u, tape, F):
 
 @jit
 def half_log_det(A):
-    """½ log det of a symmetric positive definite matrix (4, 4), whose lower triangle is overwritten by its factor."""
+    """½ log det of a symmetric positive definite matrix, whose lower triangle is overwritten by its factor.
+
+    Minus infinity where it is not positive definite.
+    """
     total = 0.0
-    for j in range(4):
+    for j in range(len(A)):
         for k in range(j):
             total_jk = A[j, k]
             for i in range(k):
@@ -84,20 +87,21 @@ def half_log_det(A):
 
 @jit
 def invert(L, inverse):
-    """The inverse (4, 4) of L Lᵀ, from the lower triangle of L."""
-    column = np.empty(4)
-    for j in range(4):
-        for i in range(4):
+    """The inverse of L Lᵀ, from the lower triangle of L."""
+    size = len(L)
+    column = np.empty(size)
+    for j in range(size):
+        for i in range(size):
             total = 1.0 if i == j else 0.0
             for k in range(i):
                 total -= L[i, k] * column[k]
             column[i] = total / L[i, i]
-        for i in range(3, -1, -1):
+        for i in range(size - 1, -1, -1):
             total = column[i]
-            for k in range(i + 1, 4):
+            for k in range(i + 1, size):
                 total -= L[k, i] * column[k]
             column[i] = total / L[i, i]
-        for i in range(4):
+        for i in range(size):
             inverse[i, j] = column[i]
 
 

@@ -1,39 +1,24 @@
-"""What a plan would teach, imagined: belief propagation along its trajectory, compiled across lanes.
+"""What a plan would teach and cost, imagined on a belief of any model, compiled across lanes.
 
-A plan is imagined by the structured update (`estimator.inference.structured`) with E[γ] and E[ξ] fixed and every output
-as it is expected: the means follow the trajectory without noise, and the joint covariance of (x_t, x_{t-1}) and (θ, η)
-contracts as it would. So what one sample teaches is not counted again by the next.
-
-Plans lie in the lanes of a block, so that the compiler imagines several at a time.
+What it teaches is `estimator.engine.imagination`'s: belief propagation along the plan's trajectory. Here stands what a
+plan is judged by besides. Plans lie in the lanes of a block, so that the compiler imagines several at a time.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from agents.design import half_log_det, invert
-from estimator.elementary import log
-from estimator.lanes import LANES, inlined, jit, lanewise, rows
-from estimator.record import COEFFICIENTS, RECORD
+from estimator.engine.imagination import LOST, imagination
+from estimator.engine.tasks import belief_names
+from estimator.lanes import LANES, lanewise, part
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
 
-_JOINT = ("x0", "x1", *COEFFICIENTS)
-_PAIRS = [(i, j) for n, i in enumerate(_JOINT) for j in _JOINT[n:]]
-_COVARIANCES = " ".join(f"P_{i}_{j}" for i, j in _PAIRS)
-LAYOUT = rows("x0 x1", _COVARIANCES, "u cost score")
-
-# Where the record's entries go in a block.
-_LOADED = np.array([(RECORD.index(name), LAYOUT[name]) for name in ("x0", "x1", *_COVARIANCES.split())])
-_COEFFICIENTS = RECORD.index("t1")
-_NOISES = RECORD.index("g_shape")
-_FIRST, _COST = LAYOUT["P_t1_t1"] * LANES, LAYOUT["cost"] * LANES
-
-#: Numbers in a block, and where its rows begin that a search touches by index.
-SIZE = len(LAYOUT) * LANES
-X0, X1, U, SCORE = (LAYOUT[name] * LANES for name in ("x0", "x1", "u", "score"))
-
-#: Nats that a displacement beyond its limit costs, per limit that it is beyond: more than any plan can teach.
+#: Nats that an output beyond its limit costs, per limit that it is beyond: more than any plan can teach.
 _BEYOND = 1e4
 
 
@@ -41,157 +26,129 @@ class Terms(NamedTuple):
     """What a plan is judged by besides the belief, and what bounds its inputs.
 
     Attributes:
-        amplitude: largest input [V].
-        slew: largest change of the input from sample to sample [V]; inf where there is none.
-        limit: of the displacement [V].
+        amplitude: largest input.
+        slew: largest change of the input from sample to sample; inf where there is none.
+        limit: of the first sensor.
         margin: predictive standard deviations that a plan keeps from it.
-        walk_t1: variance of the random walk of θ1 in a sample; 0 for a constant. The others likewise.
-        walk_t2: of θ2 [1/V⁴].
-        walk_t3: of θ3.
-        walk_e: of η.
-        price: nats for a V² of input energy.
-        goal: mean of the goal prior of the displacement [V].
-        goal_weight: half its precision [1/V²]; 0 for no goal.
+        walk: (K,) variances of the coefficients' random walk in a sample; zeros for constants.
+        scales: (n,) sizes of the states when the first sensor is at its limit.
+        price: nats for the square of an input.
+        goal: mean of the goal prior of what the first sensor shows.
+        goal_weight: half its precision; 0 for no goal.
     """
 
     amplitude: float
     slew: float
     limit: float
     margin: float
-    walk_t1: float = 0.0
-    walk_t2: float = 0.0
-    walk_t3: float = 0.0
-    walk_e: float = 0.0
+    walk: FloatArray
+    scales: FloatArray
     price: float = 0.0
     goal: float = 0.0
     goal_weight: float = 0.0
 
 
-@lanewise(
-    LAYOUT,
-    f"x0 x1 {_COVARIANCES} cost",
-    uniform=("t1 t2 t3 e q r limit margin walk_t1 walk_t2 walk_t3 walk_e price goal goal_weight"),
-)
-def imagine(
-    x0, x1, u,
-    P_x0_x0, P_x0_x1, P_x0_t1, P_x0_t2, P_x0_t3, P_x0_e,
-    P_x1_x1, P_x1_t1, P_x1_t2, P_x1_t3, P_x1_e,
-    P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e, cost,
-    t1, t2, t3, e, q, r, limit, margin, walk_t1, walk_t2, walk_t3, walk_e, price, goal, goal_weight,
-):  # fmt: skip
-    """One expected sample: the structured update of an output that is what was predicted, and what it costs."""
-    P_t1_t1, P_t2_t2, P_t3_t3, P_e_e = P_t1_t1 + walk_t1, P_t2_t2 + walk_t2, P_t3_t3 + walk_t3, P_e_e + walk_e
-    cube = x0 * x0 * x0
-    a = t1 + 3 * t2 * x0 * x0
-    c_x0 = a * P_x0_x0 + t3 * P_x0_x1 + x0 * P_x0_t1 + cube * P_x0_t2 + x1 * P_x0_t3 + u * P_x0_e
-    c_x1 = a * P_x0_x1 + t3 * P_x1_x1 + x0 * P_x1_t1 + cube * P_x1_t2 + x1 * P_x1_t3 + u * P_x1_e
-    c_t1 = a * P_x0_t1 + t3 * P_x1_t1 + x0 * P_t1_t1 + cube * P_t1_t2 + x1 * P_t1_t3 + u * P_t1_e
-    c_t2 = a * P_x0_t2 + t3 * P_x1_t2 + x0 * P_t1_t2 + cube * P_t2_t2 + x1 * P_t2_t3 + u * P_t2_e
-    c_t3 = a * P_x0_t3 + t3 * P_x1_t3 + x0 * P_t1_t3 + cube * P_t2_t3 + x1 * P_t3_t3 + u * P_t3_e
-    c_e = a * P_x0_e + t3 * P_x1_e + x0 * P_t1_e + cube * P_t2_e + x1 * P_t3_e + u * P_e_e
-    predicted = t1 * x0 + t2 * cube + t3 * x1 + e * u
-    variance = a * c_x0 + t3 * c_x1 + x0 * c_t1 + cube * c_t2 + x1 * c_t3 + u * c_e + q
-    w = 1.0 / (variance + r)
-    keep = r * w
-    over = abs(predicted) + margin * np.sqrt(variance + r) - limit
-    over = over if over > 0.0 else 0.0
-    off = predicted - goal
-    cost += _BEYOND / limit * over + price * u * u + goal_weight * (off * off + variance)
-    return (
-        predicted, x0,
-        keep * variance, keep * c_x0, keep * c_t1, keep * c_t2, keep * c_t3, keep * c_e,
-        P_x0_x0 - w * c_x0 * c_x0, P_x0_t1 - w * c_x0 * c_t1, P_x0_t2 - w * c_x0 * c_t2,
-        P_x0_t3 - w * c_x0 * c_t3, P_x0_e - w * c_x0 * c_e,
-        P_t1_t1 - w * c_t1 * c_t1, P_t1_t2 - w * c_t1 * c_t2, P_t1_t3 - w * c_t1 * c_t3, P_t1_e - w * c_t1 * c_e,
-        P_t2_t2 - w * c_t2 * c_t2, P_t2_t3 - w * c_t2 * c_t3, P_t2_e - w * c_t2 * c_e,
-        P_t3_t3 - w * c_t3 * c_t3, P_t3_e - w * c_t3 * c_e, P_e_e - w * c_e * c_e, cost,
-    )  # fmt: skip
+class Mind(NamedTuple):
+    """Compiled functions of one model, on a block ``W`` of `LANES` plans.
 
-
-@inlined
-def determinant(a11, a12, a13, a14, a22, a23, a24, a33, a34, a44):
-    """Of a symmetric positive definite matrix."""
-    l2, l3, l4 = a12 / a11, a13 / a11, a14 / a11
-    d2 = a22 - l2 * a12
-    b23, b24 = a23 - l2 * a13, a24 - l2 * a14
-    k3, k4 = b23 / d2, b24 / d2
-    d3 = a33 - l3 * a13 - k3 * b23
-    b34 = a34 - l3 * a14 - k3 * b24
-    return a11 * d2 * d3 * (a44 - l4 * a14 - k4 * b24 - b34 * b34 / d3)
-
-
-@lanewise(LAYOUT, "score", uniform="m11 m21 m22 m31 m32 m33 m41 m42 m43 m44")
-def judge(
-    P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e, cost,
-    m11, m21, m22, m31, m32, m33, m41, m42, m43, m44,
-):  # fmt: skip
-    """Minus the expected free energy, up to a constant: ½ log det(C⁻¹ + M Mᵀ), less the cost.
-
-    C is the coefficients' covariance, and M, lower triangular, the factor of the information that is still to come. The
-    determinant is that of I + Mᵀ C M, divided by that of C.
+    Attributes:
+        size: numbers in a block.
+        kept: of these, from the first on, that stand for a plan between two samples.
+        u: where the row of the newest input begins; before a sample, the input to apply.
+        score: where the row of the scores begins.
+        fill: ``fill(W, record, lasts)``: put a belief into every lane, and the last inputs, newest first (2,).
+        collect: ``collect(W, record)``: take the belief of the first lane.
+        advance: ``advance(W, record, terms)``: one expected sample in every lane, and its cost; the coefficients and the
+            noises are those of a record.
+        appraise: ``appraise(W, M, scale)``: the scores, minus the expected free energy up to a constant, with (scale M)
+            (scale M)ᵀ (K, K) of information still to come.
+        precision: ``precision(W, inverse)``: inverse (K, K) of the coefficients' covariance in the first lane.
     """
-    c21, c22 = P_t2_t2 * m21 + P_t2_t3 * m31 + P_t2_e * m41, P_t2_t2 * m22 + P_t2_t3 * m32 + P_t2_e * m42
-    c31, c32 = P_t2_t3 * m21 + P_t3_t3 * m31 + P_t3_e * m41, P_t2_t3 * m22 + P_t3_t3 * m32 + P_t3_e * m42
-    c41, c42 = P_t2_e * m21 + P_t3_e * m31 + P_e_e * m41, P_t2_e * m22 + P_t3_e * m32 + P_e_e * m42
-    c11 = P_t1_t1 * m11 + P_t1_t2 * m21 + P_t1_t3 * m31 + P_t1_e * m41
-    c21, c31, c41 = c21 + P_t1_t2 * m11, c31 + P_t1_t3 * m11, c41 + P_t1_e * m11
-    c33, c43 = P_t3_t3 * m33 + P_t3_e * m43, P_t3_e * m33 + P_e_e * m43
-    to_come = determinant(
-        1.0 + m11 * c11 + m21 * c21 + m31 * c31 + m41 * c41,
-        m22 * c21 + m32 * c31 + m42 * c41, m33 * c31 + m43 * c41, m44 * c41,
-        1.0 + m22 * c22 + m32 * c32 + m42 * c42, m33 * c32 + m43 * c42, m44 * c42,
-        1.0 + m33 * c33 + m43 * c43, m44 * c43,
-        1.0 + m44 * P_e_e * m44,
-    )  # fmt: skip
-    now = determinant(P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
-    return 0.5 * log(to_come / now) - cost if now > 0.0 else -1e300
+
+    size: int
+    kept: int
+    u: int
+    score: int
+    fill: Any
+    collect: Any
+    advance: Any
+    appraise: Any
+    precision: Any
 
 
-@jit
-def fill(W, record):
-    """Put a belief into every lane."""
-    for place in range(len(_LOADED)):
-        value = record[_LOADED[place, 0]]
-        first = _LOADED[place, 1] * LANES
+def _charge(INPUT, SHOWN, SPREAD, COST, noise, limit, margin, price, goal, goal_weight):
+    """What a sample costs; of the output's variance ``noise`` is the sensor's own."""
+    over = abs(SHOWN) + margin * np.sqrt(SPREAD) - limit
+    over = over if over > 0.0 else 0.0
+    off = SHOWN - goal
+    return COST + _BEYOND / limit * over + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise)
+
+
+def _weigh(KNOWN, COST):
+    """What is known, less the cost; also of a plan whose numbers are none any more."""
+    score = KNOWN - COST
+    return score if score > LOST else LOST
+
+
+@cache
+def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
+    """The imagination of a model; arguments as `estimator.engine.imagination.imagination`."""
+    imagined = imagination(model, degree, lag)
+    place, names = imagined.layout, belief_names(model)
+    size, kept = len(place) * LANES, imagined.kept * LANES
+    k, n_record = model.n_coefficients, model.n_states + model.n_coefficients
+    n_states = model.n_states
+    # A block holds a record's states and covariances, and not the means of the coefficients, which are the same in all.
+    n_loaded = n_states + sum(name.startswith("P_") for name in names)
+    inputs = tuple(place[name] * LANES for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT") if name in place)
+    u, cost, score = inputs[0], place["COST"] * LANES, place["SCORE"] * LANES
+    first = next(iter(model.coefficients))
+    covariance = place[f"P_{first}_{first}"] * LANES
+    noise = names.index("GAMMA_SHAPE") + 2
+    advance_belief, judge = imagined.advance, imagined.judge
+    uniform = "noise limit margin price goal goal_weight"
+    charge = lanewise(place, "COST", uniform=uniform)(_charge)
+    weigh = lanewise(place, "SCORE")(_weigh)
+    inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
+
+    @inner
+    def fill(W, record, lasts):
+        for row in range(n_loaded):
+            value = record[row if row < n_states else row - n_states + n_record]
+            for j in range(LANES):
+                W[row * LANES + j] = value
+        for row in range(len(inputs)):
+            value = lasts[max(0, row - 1)]
+            for j in range(LANES):
+                W[inputs[row] + j] = value
         for j in range(LANES):
-            W[first + j] = value
-    for j in range(LANES):
-        W[_COST + j] = 0.0
+            W[cost + j] = 0.0
 
+    @inner
+    def collect(W, record):
+        for row in range(n_loaded):
+            record[row if row < n_states else row - n_states + n_record] = W[row * LANES]
 
-@jit
-def collect(W, record):
-    """Take the belief of the first lane."""
-    for place in range(len(_LOADED)):
-        record[_LOADED[place, 0]] = W[_LOADED[place, 1] * LANES]
+    @inner
+    def advance(W, record, terms):
+        advance_belief(W, record, terms.walk)
+        r = record[noise + 1] / record[noise]
+        charge(W, r, terms.limit, terms.margin, terms.price, terms.goal, terms.goal_weight)
 
+    @inner
+    def appraise(W, M, scale):
+        judge(W, scale * M)
+        weigh(W)
 
-@jit
-def advance(W, record, terms):
-    """One expected sample in every lane, whose inputs stand in row ``u``; noises and means are those of a record."""
-    t1, t2, t3, e = record[_COEFFICIENTS : _COEFFICIENTS + 4]
-    imagine(
-        W, t1, t2, t3, e, record[_NOISES + 1] / record[_NOISES], record[_NOISES + 3] / record[_NOISES + 2],
-        terms.limit, terms.margin, terms.walk_t1, terms.walk_t2, terms.walk_t3, terms.walk_e,
-        terms.price, terms.goal, terms.goal_weight,
-    )  # fmt: skip
+    @inner
+    def precision(W, inverse):
+        work = np.empty((k, k))
+        place = covariance
+        for j in range(k):
+            for i in range(j, k):
+                work[i, j] = W[place]
+                place += LANES
+        half_log_det(work)
+        invert(work, inverse)
 
-
-@jit
-def appraise(W, M, scale):
-    """The lanes' scores, with (scale M) (scale M)ᵀ (4, 4) still to come."""
-    m = scale * M
-    judge(W, m[0, 0], m[1, 0], m[1, 1], m[2, 0], m[2, 1], m[2, 2], m[3, 0], m[3, 1], m[3, 2], m[3, 3])
-
-
-@jit
-def precision(W, inverse):
-    """Inverse (4, 4) of the coefficients' covariance in the first lane."""
-    work = np.empty((4, 4))
-    place = _FIRST
-    for j in range(4):
-        for k in range(j, 4):
-            work[k, j] = W[place]
-            place += LANES
-    half_log_det(work)
-    invert(work, inverse)
+    return Mind(size, kept, u, score, fill, collect, advance, appraise, precision)

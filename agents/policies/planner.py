@@ -6,22 +6,23 @@ Of a sequence of inputs u over the next H samples the expected free energy is, i
            + Σ_h E[(x_h - goal)²] / (2 goal_std²)                       how far it is from a goal (pragmatic, optional)
            + input_cost Σ_h u_h²                                        what it costs (optional)
 
-with C_0 the covariance of (θ, η) now and C_H the one after the H outputs that are expected, by belief propagation: the
+with C_0 the covariance of the coefficients now and C_H the one after the H outputs that are expected, by belief propagation: the
 joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample teaches is not
 counted again by the next. The teaching part then telescopes: a plan of the whole episode would be Bayesian D-optimal.
 J is the information that the rest of the episode after H will bring anyway, at the rate of the last plans; so a plan
 looks for what will be lacking at the end. Where the coefficients walk (``drift``) J is 0, and the walk is imagined too.
 
-A displacement x_h must stay within the limit by a margin of standard deviations of the output that is then predicted;
+What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then predicted;
 plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian exceeds with
 probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes true.
 
-The search (`agents.policies.planning`) builds a plan sample by sample, by the best ways through the plane of the last
-two displacements, and improves it by small changes. Horizon 1 is myopic.
+The search (`agents.policies.planning`) builds a plan sample by sample, by the best ways through the plane of the model's
+first two states, and improves it by small changes. Horizon 1 is myopic.
 
 Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
 climbs by gradient (`agents.policies.pursuit`): then the question is when to spend, which no short horizon can answer.
-That search knows neither ``max_slew`` nor ``drift``.
+That search knows neither ``max_slew`` nor ``drift``, and Eq. (2) alone; other models need a ``horizon``, and then plan as
+if the energy had no limit but the amplitude's.
 """
 
 from __future__ import annotations
@@ -33,19 +34,26 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from agents.policies.imagination import Terms
-from agents.policies.planning import plan
+from agents.policies.motion import View, places, scales
+from agents.policies.planning import search
 from agents.policies.pursuit import pursue
-from duffing_env.layout import SETTINGS
+from estimator.engine.tasks import belief_names
+from estimator.models.difference import difference
 from estimator.parameters import FloatArray
+from estimator.record import RECORD
 
-#: The last plans (n, horizon) in V, what plans taught per sample (n, 4, 4), and the streams of random numbers (n, 4).
-PlannerState = tuple[FloatArray, FloatArray, npt.NDArray[np.uint64]]
+#: The last plans (n, horizon) in V, what plans taught per sample (n, K, K), the streams of random numbers (n, 4), and
+#: the last input (n,) in V.
+PlannerState = tuple[FloatArray, FloatArray, npt.NDArray[np.uint64], FloatArray]
 
 #: Samples to plan for under an amplitude limit: some periods of the oscillator.
 _HORIZON = 24
 
-# Places in the observation.
-_LAST_INPUT, _TIME_LEFT, _BUDGET_LEFT = 18, 20, 21
+# Where `agents.policies.pursuit` looks for the entries of a record, by their names in Eq. (2).
+_PURSUED = {
+    "x1": "x0", "x2": "x1", "theta1": "t1", "theta2": "t2", "theta3": "t3", "eta": "e", "GAMMA_SHAPE": "g_shape",
+    "GAMMA_RATE": "g_rate", "XI_SHAPE_y": "n_shape", "XI_RATE_y": "n_rate",
+}  # fmt: skip
 
 
 class Planner:
@@ -69,7 +77,8 @@ class Planner:
 
     Raises:
         ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
-            samples, a number is out of range, or a goal or cost is asked of a plan of the whole episode.
+            samples, a number is out of range, or a plan of the whole episode is asked to have a goal or cost, or to be
+            of another model than Eq. (2).
     """
 
     def __init__(
@@ -104,24 +113,31 @@ class Planner:
                 f"env must take an action for every sample, as plans do, but its hold is {experiment.hold}; "
                 "make it with hold=1, or choose a learned policy or a signal"
             )
-        whole = experiment.max_rms is not None and horizon is None
+        setup, self._view = experiment.setup, View.of(experiment)
+        whole = bool(np.isfinite(setup.budget)) and horizon is None
         if whole and (goal_std is not None or input_cost):
             raise ValueError(
                 "goal_std and input_cost must be left out where the energy is limited, but are "
                 f"{goal_std!r} and {input_cost!r}; pass a horizon to plan with them"
             )
+        if whole and self._view != View(difference()):
+            raise ValueError(
+                f"horizon must be given where the energy is limited and the model is {self._view.model.name!r}, not "
+                "Eq. (2): only of that are whole episodes planned"
+            )
         horizon = env.horizon if whole else min(horizon or _HORIZON, env.horizon)
-        self._energy = env.horizon * experiment.max_rms**2 if whole else None
+        self._energy = setup.budget if whole else None
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
-        settings = dict(zip(SETTINGS, experiment.settings.tolist(), strict=True))
+        means = experiment.believed.coefficients_mean
         self._terms = Terms(
-            amplitude=settings["max_input"],
-            slew=settings["max_slew"],
-            limit=settings["max_output"],
+            amplitude=setup.max_input,
+            slew=setup.max_slew,
+            limit=setup.max_output,
             margin=float(-ndtri(risk / env.horizon)),
-            **{name: settings[name] for name in Terms._fields if name.startswith("walk")},
+            walk=setup.walk.copy(),
+            scales=scales(self._view, means, setup.max_input, setup.max_output),
             price=float(input_cost),
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
@@ -155,27 +171,40 @@ class Planner:
                 f"observation must be of the planner's own {len(records)} environments, but has shape {observed.shape}"
             )
         n = len(records)
+        k, terms = self._view.model.n_coefficients, self._terms
         if state is None:
-            plans, rates = np.zeros((n, self.horizon)), np.zeros((n, 4, 4))
+            plans, rates, before = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n)
             words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
         else:
-            plans, rates, words = state[0].copy(), state[1].copy(), state[2].copy()
+            plans, rates, words, before = (part.copy() for part in state)
         if episode_start is not None:
             begun = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)
-            plans[begun], rates[begun] = 0.0, 0.0
-        last, time_left, budget_left = observed.reshape(n, -1)[:, [_LAST_INPUT, _TIME_LEFT, _BUDGET_LEFT]].T
-        left = np.rint(time_left * self._env.horizon).astype(np.int64)
-        terms = self._terms
+            plans[begun], rates[begun], before[begun] = 0.0, 0.0, 0.0
+        at, rows = places(self._view.model), observed.reshape(n, -1)
+        left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
+        last = terms.amplitude * rows[:, at.last_input]
         inputs, scores = np.empty((2, n))
         if self._energy is not None:
-            energies = budget_left * self._energy
+            energies = rows[:, at.budget_left] * self._energy
             limits = terms.amplitude, terms.limit, terms.margin
-            pursue(records, left, energies, *limits, plans, words, inputs, scores)
+            pursue(_pursued(records), left, energies, *limits, plans, words, inputs, scores)
         else:
-            last = terms.amplitude * last
-            plan(records, left, self.horizon, self.rounds, terms, last, plans, rates, words, inputs, scores)
+            lasts = np.stack([last, before], axis=1)
+            search(*self._view).plan(
+                records, left, self.horizon, self.rounds, terms, lasts, plans, rates, words, inputs, scores
+            )
         actions = (inputs / terms.amplitude).astype(np.float32)
-        return actions.reshape(*observed.shape[:-1], 1), (plans, rates, words)
+        return actions.reshape(*observed.shape[:-1], 1), (plans, rates, words, last)
+
+
+def _pursued(records: FloatArray) -> FloatArray:
+    """Beliefs in Eq. (2) as `agents.policies.pursuit` takes them."""
+    found = np.zeros((len(records), len(RECORD)))
+    for column, name in zip(records.T, belief_names(difference()), strict=True):
+        _, *pair = name.split("_") if name.startswith("P_") else ("", name)
+        known = _PURSUED.get(name) or "_".join(["P", *(_PURSUED[part] for part in pair)])
+        found[:, RECORD.index(known)] = column
+    return found
 
 
 def _stream(seed: np.random.SeedSequence) -> npt.NDArray[np.uint64]:
