@@ -15,23 +15,23 @@ import numpy.typing as npt
 
 from agents import metrics
 from agents.policies import make_policy
-from duffing_env.experiment import ContinuousExperiment, Experiment, SimulatedExperiment
-from duffing_env.layout import OBSERVATION, OSCILLATOR
+from duffing_env.experiment import Experiment, SimulatedExperiment
+from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator import Belief, ContinuousBelief, PhysicalParameters, Prior
-from estimator.belief import RecordBelief
 from estimator.identify import identify
 from estimator.maximum_a_posteriori import maximum_a_posteriori
+from estimator.models.difference import difference
+from estimator.physical import coefficients_of
+from estimator.posterior import Belief
+from estimator.rig import Rig
+from estimator.truth import Parameters
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Who else identifies the systems from what a policy left behind, beside the environment's own estimator.
 AUDITOR = "auditor"
 FACTORISATIONS = ("structured", "mean_field")
-
-# Entries of the observation.
-_LAST_INPUT, _LAST_OUTPUT = (list(OBSERVATION).index(name) for name in ("last_input", "last_output"))
 
 
 @dataclass(frozen=True)
@@ -152,20 +152,20 @@ def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str
     if not isinstance(experiment, SimulatedExperiment):
         return evaluation
     found, stays = evaluation.metrics, experiment.jump == 0
-    is_difference = not isinstance(experiment, ContinuousExperiment)
+    is_difference = experiment.plant == difference()
     if stays:
         gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
         found["fisher_gain"] = gains
         evaluation.estimators.update(_audit(evaluation, truth, experiment))
-    if stays and is_difference:
         efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
         if efficiency is not None:  # an oracle is stored, of the systems of seed 0
             found["efficiency"] = efficiency
+    if stays and is_difference:
         found["silverbox_equivalent"] = metrics.silverbox_equivalents(gains, truth, experiment, seed)
     if is_difference:
         means = np.array([belief.coefficients_mean for belief in beliefs])
         found["simulation_rmse"] = metrics.simulation_errors(means, truth)
-    if stays and isinstance(beliefs[0], Belief) and record_available():
+    if stays and is_difference and record_available():
         _, twins, _, _ = roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
         found["arrow_rmse"] = metrics.arrow_errors(np.array([twin.coefficients_mean for twin in twins]))
     return evaluation
@@ -180,18 +180,21 @@ def make(env_id: str, systems: int, options: dict[str, Any] | None = None) -> Du
 
 def roll_out(
     name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]
-) -> tuple[Evaluation, list[RecordBelief], PhysicalParameters, Experiment]:
+) -> tuple[Evaluation, list[Belief], Any, Experiment]:
     """One episode of every system; the beliefs it ended with, the truth and the experiment."""
     envs = make(env_id, systems, options)
     policy = make_policy(name, envs, seed=seed)
     hold = envs.experiment.hold
     if hold > 1:  # applied sample by sample instead, which is the same, so that every sample is seen
         envs = make(env_id, systems, {**options, "hold": 1})
+    entries = list(observation_bounds(envs.experiment.model))
+    last_input, last_output = entries.index("last_input"), entries.index("last_input") + 1
+    first = parameter_names(envs.experiment.truth_model)[0]
     observations, _ = envs.reset(seed=seed)
     prior, horizon = envs.belief(0), envs.horizon
     began, curve = envs.truth, np.zeros((horizon + 1, systems))
     inputs, outputs = np.full((2, horizon, systems), np.nan)
-    beliefs: list[RecordBelief] = [prior] * systems
+    beliefs: list[Belief] = [prior] * systems
     truths = [began] * systems
     ended_early, jumped_at = np.zeros(systems), np.full(systems, horizon)
     running = np.ones(systems, dtype=np.bool_)
@@ -205,9 +208,9 @@ def roll_out(
             episode_start = np.zeros(systems, dtype=np.bool_)
         observations, _, terminated, truncated, infos = envs.step(actions)
         curve[t + 1] = curve[t] + np.where(running, infos["log_posterior_gain"], 0.0)
-        jumped_at[running & (jumped_at == horizon) & (envs.truth.m != began.m)] = t
-        inputs[t, running] = envs.max_input * observations[running, _LAST_INPUT]
-        outputs[t, running] = envs.experiment.max_output * observations[running, _LAST_OUTPUT]
+        jumped_at[running & (jumped_at == horizon) & (getattr(envs.truth, first) != getattr(began, first))] = t
+        inputs[t, running] = envs.max_input * observations[running, last_input]
+        outputs[t, running] = envs.experiment.max_output * observations[running, last_output]
         finished = running & (terminated | truncated)
         for row in np.flatnonzero(finished):
             beliefs[row], truths[row] = infos["belief"][row], infos["truth"][row]
@@ -218,18 +221,22 @@ def roll_out(
             curve[t + 2 :] = curve[t + 1]
             break
     envs.close()
-    truth = PhysicalParameters(*(np.array([getattr(t, p) for t in truths]) for p in OSCILLATOR))
+    names = parameter_names(envs.experiment.truth_model)
+    truth = Parameters({p: np.array([getattr(t, p) for t in truths]) for p in names})
     means = np.array([belief.coefficients_mean for belief in beliefs])
     covs = np.array([belief.coefficients_cov for belief in beliefs])
     # The environment does not count what a jump of the truth takes away: what lacks at the end was lost there.
-    first, last = (type(prior).coefficients_of(oscillators) for oscillators in (began, truth))
-    for row in np.flatnonzero(jumped_at < horizon):
-        gain = beliefs[row].log_prob(last[row]) - prior.log_prob(first[row])
-        curve[jumped_at[row] + 1 :, row] += gain - curve[-1, row]
+    jumped = np.flatnonzero(jumped_at < horizon)
+    if len(jumped):
+        model, step = prior.model, prior.step
+        before, after = (coefficients_of(model, metrics.parameters_of(t, model), step) for t in (began, truth))
+        for row in jumped:
+            gain = beliefs[row].log_prob(after[row]) - prior.log_prob(before[row])
+            curve[jumped_at[row] + 1 :, row] += gain - curve[-1, row]
     values = {
         "information_gain": np.array([prior.entropy() - belief.entropy() for belief in beliefs]),
         "log_posterior_gain": curve[-1],
-        **metrics.estimate_metrics(means, covs, truth, type(prior)),
+        **metrics.estimate_metrics(means, covs, truth, prior.model, prior.step),
         "ended_early": ended_early,
         **metrics.input_metrics(inputs),
         # Processor time. The first call may compile, and counts where there is no other.
@@ -238,35 +245,30 @@ def roll_out(
     return Evaluation(name, values, curve, inputs, outputs), beliefs, truth, envs.experiment
 
 
-def _audit(
-    evaluation: Evaluation, truth: PhysicalParameters, experiment: SimulatedExperiment
-) -> dict[str, dict[str, FloatArray]]:
+def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:
     """What every estimator of the plant, and the auditor, make of the inputs and outputs of a policy.
 
-    The auditor fits the plant's own equation. That of the paper, on the plant of the other, takes as an environment
-    does the input at the sample before.
+    The auditor fits the plant's own equation. That of the paper, on another plant whose input goes linearly from one
+    action to the next, takes as an environment does the input at the sample before.
     """
-    u, y = evaluation.inputs.T, evaluation.outputs.T
-    hands: dict[str, tuple[RecordBelief, FloatArray]] = {}
-    if isinstance(experiment, ContinuousExperiment):
-        earlier = np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
-        hands["ode"] = experiment.physical_prior, u
-        hands |= {f"nlarx_{name}": (_paper_prior(experiment, name), earlier) for name in FACTORISATIONS}
-        auditor: Prior | ContinuousBelief = experiment.physical_prior
+    u, y, plant, step = evaluation.inputs.T, evaluation.outputs.T, experiment.plant, experiment.step
+    interpolation = "linear" if plant.is_continuous and experiment.degree else "zero_order"
+    rig = Rig(step, interpolation=interpolation)
+    hands: dict[str, tuple[Belief, FloatArray]] = {}
+    if plant == difference():
+        hands = {name: (experiment.prior_of(plant, name), u) for name in FACTORISATIONS}
     else:
-        hands |= {name: (_paper_prior(experiment, name), u) for name in FACTORISATIONS}
-        auditor = experiment.believed
+        hands["ode" if plant.is_continuous else "structured"] = experiment.prior_of(plant), u
+        if set(parameter_names(plant)) == set(parameter_names(difference())):
+            earlier = u if not experiment.degree else np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
+            hands |= {f"nlarx_{name}": (experiment.prior_of(difference(), name), earlier) for name in FACTORISATIONS}
     found: dict[str, dict[str, FloatArray]] = {}
     for name, (prior, acting) in hands.items():
-        beliefs = identify(acting, y, prior)
+        beliefs = identify(acting, y, prior, rig if prior.model.is_continuous else None)
         means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
-        found[name] = metrics.estimate_metrics(means, covs, truth, type(prior))
-    fit = maximum_a_posteriori(u, y, auditor, experiment.process_noise, experiment.measurement_noise)
-    kind = ContinuousBelief if isinstance(auditor, ContinuousBelief) else Belief
-    found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, kind)
+        found[name] = metrics.estimate_metrics(means, covs, truth, prior.model, step)
+    fit = maximum_a_posteriori(
+        plant, u, y, experiment.prior_of(plant), experiment.process_noise, experiment.measurement_noise, interpolation
+    )
+    found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, plant, step)
     return found
-
-
-def _paper_prior(experiment: SimulatedExperiment, factorisation: str) -> Belief:
-    """What the estimator of the paper's equation believes first."""
-    return Belief(experiment.believed.to_record(factorisation=factorisation), factorisation)

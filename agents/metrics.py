@@ -8,11 +8,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from duffing_env.experiment import ContinuousExperiment
+from duffing_env.layout import parameter_names
 from duffing_env.silverbox import load_record, regime_input
-from estimator import NLARX, Belief, ContinuousBelief, PhysicalParameters, fisher_information, to_coefficients
-from estimator.belief import RecordBelief
-from estimator.continuous_likelihood import continuous_information
+from estimator.free_run import free_run
+from estimator.information import fisher_information
+from estimator.models.difference import difference
+from estimator.models.model import Model
+from estimator.physical import coefficients_of, to_physical
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -22,32 +24,38 @@ LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}
 _TWIN_ARROW_SAMPLES = 8_192
 
 
+def parameters_of(truth: Any, model: Model) -> dict[str, FloatArray]:
+    """The true parameters by name, each of one plant or of a batch."""
+    return {name: np.asarray(getattr(truth, name), dtype=np.float64) for name in parameter_names(model)}
+
+
 def estimate_metrics(
-    means: FloatArray, covs: FloatArray, truth: PhysicalParameters, kind: type[RecordBelief] = Belief
+    means: FloatArray, covs: FloatArray, truth: Any, model: Model, step: float
 ) -> dict[str, FloatArray]:
     """Posteriors of coefficients beside the truth.
 
     Args:
-        means: (n, 4).
-        covs: (n, 4, 4).
+        means: (n, K).
+        covs: (n, K, K).
         truth: the systems.
-        kind: whose coefficients they are.
+        model: whose coefficients they are.
+        step: sampling step [s].
 
     Returns:
-        Relative errors ``error_m`` to ``error_b``; the share of the coefficients that their intervals hold, at each of
+        Relative errors ``error_<parameter>``; the share of the coefficients that their intervals hold, at each of
         `LEVELS`; ``nees``, the normalised estimation error squared dᵀ C⁻¹ d per coefficient, whose mean is 1 where the
         posterior is calibrated.
     """
-    true_physical = np.stack([truth.m, truth.c, truth.a, truth.b], axis=-1)
-    errors = np.abs(kind.propagate(means, covs)[0] / true_physical - 1)
+    true = parameters_of(truth, model)
+    errors = np.abs(to_physical(model, means, step) / np.stack(list(true.values()), axis=-1) - 1)
     free = np.flatnonzero(np.diagonal(covs, axis1=1, axis2=2).all(axis=0))  # without those that are known, as θ2 = 0
-    deviations, covs = (means - kind.coefficients_of(truth))[:, free], covs[:, free][:, :, free]
+    deviations, covs = (means - coefficients_of(model, true, step))[:, free], covs[:, free][:, :, free]
     stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
     units = covs / (stds[:, :, None] * stds[:, None, :])  # better conditioned than the covariances themselves
     scaled = deviations / stds
     nees = np.einsum("ni,ni->n", scaled, np.linalg.solve(units, scaled[:, :, None])[:, :, 0]) / len(free)
     return {
-        **{f"error_{name}": errors[:, i] for i, name in enumerate("mcab")},
+        **{f"error_{name}": errors[:, i] for i, name in enumerate(true)},
         **{
             name: (np.abs(scaled) <= stats.norm.ppf(0.5 + level / 2)).mean(axis=1) for name, level in LEVELS.items()
         },
@@ -63,23 +71,23 @@ def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
     return {"input_power": power, "input_peak": peak, "crest_factor": crest}
 
 
-def information(
-    inputs: FloatArray, truth: PhysicalParameters, experiment: Any, outputs: FloatArray | None = None
-) -> FloatArray:
+def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatArray | None = None) -> FloatArray:
     """(n,) ½ log det(Λ0 + F) - ½ log det Λ0 [nats] of inputs (T, n): what an efficient estimator gains from them.
 
-    F is the Fisher information at the true coefficients, along the outputs (T, n) that were seen, or along the
-    response without noise; Λ0 is the inverse covariance of the environment's prior. The coefficients are those of the
-    plant's equation; that of the plant ``sde`` needs the outputs.
+    F is the Fisher information at the true coefficients of the plant's equation, along the outputs (T, n) that were
+    seen, or along the response without noise; Λ0 is the inverse covariance of the prior of plants so drawn.
     """
-    noises = experiment.process_noise, experiment.measurement_noise
-    if isinstance(experiment, ContinuousExperiment):
-        assert outputs is not None
-        cov = experiment.physical_prior.coefficients_cov
-        F = continuous_information(ContinuousBelief.coefficients_of(truth), inputs.T, outputs.T, *noises)
-    else:
-        cov = experiment.believed.coefficients_cov
-        F = fisher_information(to_coefficients(truth), inputs.T, *noises, y=None if outputs is None else outputs.T)
+    model, step = experiment.plant, experiment.step
+    cov = experiment.prior_of(model).coefficients_cov
+    F = fisher_information(
+        model,
+        coefficients_of(model, parameters_of(truth, model), step),
+        inputs.T,
+        experiment.process_noise,
+        experiment.measurement_noise,
+        y=None if outputs is None else outputs.T,
+        interpolation="linear" if experiment.degree and model.is_continuous else "zero_order",
+    )
     std = np.sqrt(np.diag(cov))
     prior = np.linalg.inv(cov / np.outer(std, std))
     return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])
@@ -134,21 +142,19 @@ def equal_information(gains: FloatArray, lengths: npt.NDArray[np.int64], told: F
     return equivalents
 
 
-def simulation_errors(means: FloatArray, truth: PhysicalParameters) -> FloatArray:
-    """(n,) RMSE [V] of free runs with estimated coefficients, beside the true system's, over the arrow's input."""
-    u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:]
-    model, rest = NLARX(input_delay=1), np.zeros(2)
-    errors = np.empty(len(means))
-    for i, (mean, true) in enumerate(zip(means, Belief.coefficients_of(truth), strict=True)):
-        errors[i] = _rmse(model.simulate(mean, u, rest), model.simulate(true, u, rest))
-    return errors
+def simulation_errors(means: FloatArray, truth: Any) -> FloatArray:
+    """(n,) RMSE [V] of free runs of Eq. (2) with estimated coefficients, beside the true ones, over the arrow's input."""
+    u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:-1]
+    true = coefficients_of(difference(), parameters_of(truth, difference()))
+    runs = [[free_run(difference(), c, u) for c in pair] for pair in zip(means, true, strict=True)]
+    return np.array([_rmse(np.append(0.0, believed), np.append(0.0, exact)) for believed, exact in runs])
 
 
 def arrow_errors(means: FloatArray) -> FloatArray:
     """(n,) RMSE [V] of free runs over the real arrow record; inf where a run diverges."""
     arrow = load_record().arrow
-    model = NLARX(input_delay=1)
-    return np.array([_rmse(model.simulate(mean, arrow.u, arrow.y[:2])[2:], arrow.y[2:]) for mean in means])
+    start = arrow.y[1::-1]
+    return np.array([_rmse(free_run(difference(), mean, arrow.u[1:-1], start), arrow.y[2:]) for mean in means])
 
 
 def _rmse(simulated: FloatArray, output: FloatArray) -> float:

@@ -235,10 +235,14 @@ class SimulatedExperiment(Experiment):
     @cached_property
     def believed(self) -> Belief:
         """The prior that fits plants so drawn, and the noises."""
-        mean, cov = log_uniform_moments(self.model, self.center, self.spread, self.step)
+        return self.prior_of(self.model, self.factorisation)
+
+    def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
+        """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
+        mean, cov = log_uniform_moments(model, self.center, self.spread, self.step)
         return weak_prior(
-            self.model, mean, cov, self.process_noise, self.measurement_noise, self.noise_shape, step=self.step,
-            factorisation=self.factorisation,
+            model, mean, cov, self.process_noise, self.measurement_noise, self.noise_shape, step=self.step,
+            factorisation=factorisation,
         )  # fmt: skip
 
     @property

@@ -44,15 +44,14 @@ def source(kind: Kind, loop: Any) -> str:
     """``model_move`` and ``twin_move``: the believed and the true plant alone; ``compare`` adds up, ``conclude`` ends."""
     import sympy as sp
 
-    from duffing_env.sources import moved
-    from estimator.engine.derive import calculus, renamed, symbol
+    from estimator.engine.derive import calculus, renamed, state_step, symbol
 
     model = kind.belief
     believed = {x: f"MODEL_{x}" for x in model.states} | {c: c for c in model.coefficients}
     true = {x: f"TWIN_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
     at = ("T",) if model.is_continuous else ()
-    text = loop("model_move", "The believed plant moves.", *moved(model, kind.degree, believed), *at)
-    text += loop("twin_move", "The true plant moves.", *moved(model, kind.degree, true), *at)
+    text = loop("model_move", "The believed plant moves.", *state_step(model, kind.degree, believed), *at)
+    text += loop("twin_move", "The true plant moves.", *state_step(model, kind.degree, true), *at)
     shown = calculus(model).outputs[0].subs(symbol("u"), 0)
     ours, theirs = (renamed([("", shown)], names)[0][1] for names in (believed, true))
     lines = [("E_d", symbol("DEVIATION") + (ours - theirs) ** 2), ("E_p", symbol("POWER") + theirs**2)]

@@ -74,26 +74,6 @@ def _walk(model: Model, loop: Any) -> str:
     return source + f"@jit\ndef walk(W, variances):\n    walk_lanes(W, {told})\n"
 
 
-def moved(model: Model, degree: int, names: Mapping[str, str]) -> tuple[Any, dict[str, str]]:
-    """Assignments of the state alone over a sample, or over a Runge-Kutta step of it, of renamed quantities.
-
-    Returns:
-        The assignments, and what each of the renamed states becomes.
-    """
-    from estimator.engine import derive
-
-    if model.is_continuous:
-        mapping = {**names, **{f"M_{x}": names[x] for x in model.states}}
-        lines = derive.renamed(derive.plain_step(model, degree), mapping)
-        return lines, {names[x]: f"M_{x}_e" for x in model.states}
-    lines, motion = derive.difference_step(model)
-    results = {}
-    for x, value in zip(model.states, motion.state, strict=True):
-        lines.append((f"NEXT_{x}", value))
-        results[names[x]] = f"NEXT_{x}"
-    return derive.renamed(lines, names), results
-
-
 def _plant(model: Model, degree: int, loop: Any) -> str:
     """``plant``: the plant over a sample with its noise, or over a Runge-Kutta step of it; and its sensors.
 
@@ -102,7 +82,7 @@ def _plant(model: Model, degree: int, loop: Any) -> str:
     from estimator.engine import derive
 
     names = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
-    lines, results = moved(model, degree, names)
+    lines, results = derive.state_step(model, degree, names)
     found, symbol = derive.calculus(model), derive.symbol
     strength, w, v = symbol("process_noise"), symbol("NOISE_w"), symbol("NOISE_v")
     white = model.is_continuous and not model.held
