@@ -30,7 +30,7 @@ def source(kind: Kind, loop: Any) -> str:
     if model.is_continuous:
         start = [(f"V_{name}", value) for name, value in derive.carried_at_start(model).items()]
         text += loop("expect_begin", "At the mean.", start, {name: f"V_{name}" for name in derive.carried(model)})
-        moved = {name: f"{name}_e" for name in derive.carried(model)}
+        moved = {name: f"{name}_E" for name in derive.carried(model)}
         text += loop("expect_move", "One Runge-Kutta step.", derive.motion_step(model, kind.degree), moved, "T")
         lines: Any = []
         motion = derive.carried_at_end(model)

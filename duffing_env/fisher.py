@@ -30,7 +30,7 @@ def source(kind: Kind, loop: Any) -> str:
         start = [(f"V_{name}", value) for name, value in derive.carried_at_start(model).items()]
         start = derive.renamed(start, true)
         text += loop("ideal_begin", "At the truth.", start, {name: f"V_{name}" for name in derive.carried(model)})
-        moved = {name: f"{name}_e" for name in derive.carried(model)}
+        moved = {name: f"{name}_E" for name in derive.carried(model)}
         step = derive.renamed(derive.motion_step(model, kind.degree), true)
         text += loop("ideal_move", "One Runge-Kutta step.", step, moved, "T")
         lines: Any = []

@@ -294,7 +294,7 @@ def state_step(model: Model, degree: int, names: Mapping[str, str]) -> tuple[Ass
     if model.is_continuous:
         mapping = {**names, **{f"M_{x}": names[x] for x in model.states}}
         lines = renamed(plain_step(model, degree), mapping)
-        return lines, {names[x]: f"M_{x}_e" for x in model.states}
+        return lines, {names[x]: f"M_{x}_E" for x in model.states}
     lines, motion = difference_step(model)
     results = {}
     for x, value in zip(model.states, motion.state, strict=True):
