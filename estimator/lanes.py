@@ -18,6 +18,8 @@ from typing import Any
 
 import numba
 
+from estimator.compiled import Compiled
+
 #: Systems in a block. A multiple of the vector width (8 doubles in AVX-512); 32 lanes of ~120 rows stay within 32 KiB.
 LANES = 32
 
@@ -126,10 +128,10 @@ def _places(
 
 
 def kernel(function: Callable[..., Any] | None = None, *, kind: str = "", **options: Any) -> Any:
-    """Compile an entry point: a function that Python calls, cached on disk.
+    """Compile an entry point: a function that Python calls, kept on disk (`estimator.compiled`).
 
-    Numba's cache knows when the file of the function changed, but not the files of the functions it calls; a stale
-    kernel would give wrong numbers in silence. So the stamp of the cache is a digest of all our sources.
+    Numba's own cache knows when the file of the function changed, but not the files of the functions it calls; a stale
+    kernel would give wrong numbers in silence. So the stamp of ours is a digest of all our sources.
 
     Args:
         function: to compile.
@@ -138,12 +140,8 @@ def kernel(function: Callable[..., Any] | None = None, *, kind: str = "", **opti
     """
     if function is None:
         return partial(kernel, kind=kind, **options)
-    dispatcher = numba.njit(cache=True, **OPTIONS, **options)(_renamed(function, kind))
-    stored = dispatcher._cache
-    stored._cache_file._source_stamp = source_digest(Path(function.__code__.co_filename).parent)
-    if kind:
-        # Numba would add a pickle of what the function has from around, which is another one in every process.
-        stored._index_key = lambda signature, codegen: (signature, codegen.magic_tuple())
+    dispatcher = numba.njit(**OPTIONS | options)(_renamed(function, kind))
+    dispatcher._cache = Compiled(function, source_digest(Path(function.__code__.co_filename).parent), named=bool(kind))
     return dispatcher
 
 

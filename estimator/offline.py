@@ -16,11 +16,11 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from estimator.checks import series
+from estimator.lanes import kernel
 from estimator.parameters import FloatArray
 
 TOLERANCE = 1e-6
@@ -255,7 +255,7 @@ def _in_volts(parameters: FloatArray, scale: FloatArray, target_mean: float, tar
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(fastmath=False)
 def _free_run(parameters, regressor_mean, u, input_delay, y, start):
     """Continues y in place from sample ``start`` on."""
     units = (len(parameters) - 4) // 5

@@ -158,7 +158,6 @@ def difference_step(model: Model) -> tuple[Assignments, Moved]:
 
 def carried(model: Model) -> list[str]:
     """Names that a differential equation carries over its Runge-Kutta steps: M, S and N, or D where noise is held."""
-    c = calculus(model)
     names = [f"M_{i}" for i in model.states]
     names += [f"S_{i}_{j}" for i in model.states for j in model.movers]
     return names + ([f"D_{i}" for i in model.states] if model.held else pairs("N", list(model.states)))
@@ -174,7 +173,7 @@ def carried_at_start(model: Model) -> dict[str, sp.Expr]:
 
 def carried_at_end(model: Model) -> Moved:
     """What is carried, as a sample leaves it."""
-    c, states = calculus(model), list(model.states)
+    states = list(model.states)
     by = tuple(tuple(symbol(f"S_{i}_{j}") if j in model.movers else sp.S.Zero for j in model.names) for i in states)
     if model.held:
         noise = tuple(tuple(symbol(f"D_{i}") * symbol(f"D_{k}") for k in states) for i in states)

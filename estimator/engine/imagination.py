@@ -118,7 +118,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
         start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
         source += "@jit\n" + emit.lane_loop("begin", [], start, place, LANES, doc="The point that moves, at the mean.")
         step = derive.renamed(derive.motion_step(model, degree), given)
-        moves = {name: f"{name}_e" for name in derive.carried(model)}
+        moves = {name: f"{name}_E" for name in derive.carried(model)}
         source += "@jit\n" + emit.lane_loop("move", step, moves, place, LANES, ("T", *coefficients), doc="One step.")
     source += "@jit\n" + emit.lane_loop("expect", lines, results, place, LANES, uniform, doc="One expected sample.")
     return source + _composed(model) + _judgement(model, place)

@@ -105,9 +105,9 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
         lines, moved = [], derive.carried_at_end(model)
         start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
         source += loop("begin", "The point that moves.", [], start)
-        carried = {name: f"{name}_e" for name in derive.carried(model)}
+        carried = {name: f"{name}_E" for name in derive.carried(model)}
         source += loop("move", "One Runge-Kutta step.", derive.motion_step(model, degree), carried, "T")
-        point = {f"M_{x}": f"M_{x}_e" for x in states}
+        point = {f"M_{x}": f"M_{x}_E" for x in states}
         source += loop("move_plainly", "The same of the state alone.", derive.plain_step(model, degree), point, "T")
     else:
         lines, moved = derive.difference_step(model)

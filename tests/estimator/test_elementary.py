@@ -90,3 +90,60 @@ def test_expected_log_gamma_equals_monte_carlo_and_scipy():
     draws = np.log(np.random.default_rng(0).gamma(shape, 1 / rate, 200_000))
     assert expected_log_gamma(shape, rate) == pytest.approx(draws.mean(), abs=5 * draws.std() / np.sqrt(len(draws)))
     assert expected_log_gamma(shape, rate) == pytest.approx(special.digamma(shape) - np.log(rate), rel=1e-14)
+
+
+@numba.njit
+def _each(kind, x):
+    out = np.empty_like(x)
+    for i in range(len(x)):
+        if kind == 0:
+            out[i] = elementary.sin(x[i])
+        elif kind == 1:
+            out[i] = elementary.cos(x[i])
+        elif kind == 2:
+            out[i] = elementary.exp(x[i])
+        else:
+            out[i] = elementary.tanh(x[i])
+    return out
+
+
+def _wide(limit):
+    """Two hundred thousand numbers over all sizes up to a limit, both signs, and what is special."""
+    rng = np.random.default_rng(0)
+    sizes = np.exp(rng.uniform(np.log(1e-300), np.log(limit), 100_000))
+    numbers = np.concatenate([sizes, rng.uniform(-limit, limit, 100_000), [0.0, limit, 1.0, 0.5]])
+    return np.concatenate([numbers, -numbers])
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["sin", "cos"])
+def test_sine_and_cosine_over_a_hundred_thousand_radians(kind):
+    x = _wide(1e5)
+    quarters = np.arange(-60_000, 60_000) * (np.pi / 2)
+    x = np.concatenate([x, quarters[np.abs(quarters) < 1e5], quarters[:1000] / 2])
+    # Two units in the last place of 1, and half a unit of NumPy's.
+    assert np.abs(_each(kind, x) - (np.sin, np.cos)[kind](x)).max() <= 2.5 * EPS
+
+
+def test_a_small_sine_keeps_its_relative_accuracy():
+    x = _wide(0.7)
+    assert (np.abs(_each(0, x) - np.sin(x)) <= 2.5 * np.spacing(np.abs(np.sin(x)))).all()
+
+
+def test_exponential_over_its_range():
+    x = _wide(700.0)
+    exact = np.exp(x)
+    assert (np.abs(_each(2, x) - exact) <= 2.5 * np.spacing(exact)).all()
+    outside = np.array([-1e300, -701.0, 701.0, 1e300])
+    np.testing.assert_array_equal(_each(2, outside) > np.exp(699.0), [False, False, True, True])
+    assert (_each(2, outside)[:2] < 1e-303).all()
+
+
+def test_hyperbolic_tangent_over_its_range():
+    x = _wide(1e5)
+    assert np.abs(_each(3, x) - np.tanh(x)).max() <= 4.5 * EPS
+    np.testing.assert_array_equal(_each(3, np.array([800.0, -1e300, 0.0])), [1.0, -1.0, 0.0])
+
+
+def test_what_is_no_number_stays_none():
+    for kind in range(4):
+        assert np.isnan(_each(kind, np.array([np.nan]))).all()

@@ -1,0 +1,160 @@
+"""Compiled code on disk: read by whoever needs it next, made anew where it is damaged, left out where none can be kept.
+
+It stands in place of Numba's own cache, whose index and data files are fatal where they are damaged, which refuses to
+work where nothing can be written, and which cannot see a bit that flipped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.caching import _Cache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
+
+
+@cache
+def folder() -> Path | None:
+    """Where generated and compiled code is kept; None, with one RuntimeWarning, where nothing can be written.
+
+    ``NUMBA_CACHE_DIR`` where it is set; else ``__pycache__`` beside this file; else the user's cache folder.
+    """
+    for place in _places():
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            handle, probe = tempfile.mkstemp(dir=place)
+            os.close(handle)
+            os.unlink(probe)
+        except OSError:
+            continue
+        return place
+    warnings.warn(
+        "no folder can be written for compiled code, so it is compiled anew in every process; set NUMBA_CACHE_DIR to a "
+        "folder that can",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return None
+
+
+def _places() -> list[Path]:
+    import platformdirs
+
+    wished = os.environ.get("NUMBA_CACHE_DIR")
+    places = [Path(wished).absolute()] if wished else [Path(__file__).parent / "__pycache__"]
+    try:
+        of_user = Path(platformdirs.user_cache_dir("duffing-env"))
+    except RuntimeError:  # a user without a home
+        return places
+    return [*places, of_user] if of_user.is_absolute() else places
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file in one piece; a full disk only costs the next process the time to make it again."""
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except OSError:
+        pass
+
+
+class Compiled(_Cache):
+    """What Numba asks for compiled code of a function, and gives it to: one file per signature and processor.
+
+    A file begins with the stamp of the sources and the digest of the rest. Another stamp is another version of the
+    sources, whose code is made anew in silence; another digest is damage.
+
+    Args:
+        function: whose code.
+        stamp: of the sources, 64 hexadecimal digits.
+        named: whether its qualified name tells it from others that are defined at the same place. Otherwise what it
+            has from around does, which may differ between two processes; then it is compiled in both.
+    """
+
+    def __init__(self, function: Callable[..., Any], stamp: str, named: bool = False) -> None:
+        code = function.__code__
+        self._name = f"{Path(code.co_filename).stem}.{function.__qualname__}".replace("<", "").replace(">", "")
+        self._where = f"{code.co_filename}:{code.co_firstlineno}:{sys.version_info[:2]}:{numba.__version__}"
+        self._around = () if named else function.__closure__ or ()
+        self._stamp = stamp.encode()
+        self._enabled = True
+
+    @property
+    def cache_path(self) -> str | None:
+        """The folder; None where nothing can be written."""
+        return None if folder() is None else str(folder())
+
+    def enable(self) -> None:
+        """Use files."""
+        self._enabled = True
+
+    def disable(self) -> None:
+        """Use no files."""
+        self._enabled = False
+
+    def flush(self) -> None:
+        """Remove the files of all functions of this name."""
+        place = folder()
+        for path in place.glob(f"{self._name[:100]}-*.compiled") if place is not None else ():
+            path.unlink(missing_ok=True)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled function; None where there is none, or a damaged one."""
+        target_context.refresh()
+        path = self._path(sig, target_context.codegen())
+        try:
+            content = path.read_bytes() if path is not None else b""
+        except OSError:
+            return None
+        stamp, digest, payload = content[:64], content[64:128], content[128:]
+        if path is None or (stamp != self._stamp and len(content) > 128):
+            return None
+        try:
+            if hashlib.sha256(payload).hexdigest().encode() != digest:
+                raise ValueError("the digest is another")
+            return CompileResult._rebuild(target_context, *pickle.loads(payload))
+        except Exception:  # whatever a pickle raises
+            _warn_of_damage(str(path.parent))
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a compiled function, if it can be kept."""
+        path = self._path(sig, data.codegen)
+        if path is None or data.lifted or data.library.has_dynamic_globals:
+            return
+        payload = dumps(data._reduce())
+        write(path, self._stamp + hashlib.sha256(payload).hexdigest().encode() + payload)
+
+    def _path(self, sig: Any, codegen: Any) -> Path | None:
+        place = folder() if self._enabled else None
+        if place is None:
+            return None
+        key = hashlib.sha256(f"{self._where}\n{self._name}\n{sig}\n{codegen.magic_tuple()}".encode())
+        key.update(dumps(tuple(cell.cell_contents for cell in self._around)))
+        return place / f"{self._name[:100]}-{key.hexdigest()[:16]}.compiled"
+
+
+@cache
+def _warn_of_damage(place: str) -> None:
+    """Once per process."""
+    warnings.warn(
+        f"compiled code in {place} is damaged, and is made anew; if this comes again, delete that folder",
+        RuntimeWarning,
+        stacklevel=2,
+    )

@@ -1,0 +1,193 @@
+"""Compiled and generated code on disk: kept, damaged, and where nothing can be kept."""
+
+import importlib
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+
+from estimator import compiled
+from estimator.engine import cache as generated
+
+SOURCE = """
+from estimator.lanes import kernel
+
+@kernel
+def run(x):
+    return 2 * x
+
+def adder(shift):
+    @kernel
+    def add(x):
+        return x + shift
+    return add
+"""
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder of its own for compiled code, and a module `run_of_compiled`."""
+    (tmp_path / "run_of_compiled.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "compiled"))
+    compiled.folder.cache_clear()
+    compiled._warn_of_damage.cache_clear()
+    yield tmp_path / "compiled"
+    sys.modules.pop("run_of_compiled", None)
+    compiled.folder.cache_clear()
+    compiled._warn_of_damage.cache_clear()
+
+
+def fresh():
+    """The module as another process would see it."""
+    sys.modules.pop("run_of_compiled", None)
+    importlib.invalidate_caches()
+    return importlib.import_module("run_of_compiled")
+
+
+def called():
+    """What a fresh kernel gives, and whether its code came from disk."""
+    run = fresh().run
+    return run(21), sum(run.stats.cache_hits.values())
+
+
+def test_compiled_code_is_read_again(place):
+    assert called() == (42, 0)
+    assert called() == (42, 1)
+    assert len(list(place.iterdir())) == 1
+    fresh().run._cache.flush()
+    assert not list(place.iterdir())
+    assert called() == (42, 0)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[:50],
+        lambda content: content[:100],
+        lambda content: content[: len(content) // 2],
+        lambda content: content[:-1],
+        lambda content: content[:1000] + bytes([content[1000] ^ 1]) + content[1001:],
+        lambda content: content[:128] + b"no pickle",
+    ],
+)
+def test_damaged_code_is_made_anew_with_one_warning(place, damage):
+    called()
+    (path,) = place.iterdir()
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    with pytest.warns(RuntimeWarning, match=f"compiled code in {place} is damaged, and is made anew") as caught:
+        results = [called(), called(), (path.write_bytes(damage(whole)), called())[1]]
+    assert results == [(42, 0), (42, 1), (42, 0)]
+    assert len(caught) == 1
+
+
+def test_code_of_other_sources_is_replaced_in_silence(place):
+    called()
+    (path,) = place.iterdir()
+    content = path.read_bytes()
+    path.write_bytes(b"0" * 64 + content[64:])
+    assert called() == (42, 0)
+    assert path.read_bytes()[:64] == content[:64]
+
+
+def test_functions_with_other_surroundings_have_other_code(place):
+    module = fresh()
+    assert [module.adder(shift)(1) for shift in (1, 10, 1)] == [2, 11, 2]
+
+
+def nowhere(monkeypatch, tmp_path):
+    """No folder can be made: all wishes lead below a file."""
+    (tmp_path / "file").write_text("")
+    for name in ("NUMBA_CACHE_DIR", "HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / "file" / "folder"))
+
+
+def test_where_nothing_can_be_written_it_runs_with_one_warning(place, tmp_path, monkeypatch):
+    nowhere(monkeypatch, tmp_path)
+    with pytest.warns(RuntimeWarning, match="no folder can be written .* set NUMBA_CACHE_DIR") as caught:
+        results = called(), called(), loaded()
+    assert results == ((42, 0), (42, 0), (1, 1))
+    assert len(caught) == 1
+    fresh().run._cache.flush()
+    assert fresh().run._cache.cache_path is None
+
+
+def test_a_folder_that_becomes_read_only_costs_nothing_but_time(place, monkeypatch):
+    assert compiled.folder() == place
+
+    def refuse(*args, **kwargs):
+        raise PermissionError("read-only file system")
+
+    monkeypatch.setattr(compiled.tempfile, "mkstemp", refuse)
+    assert called() == (42, 0)
+    assert loaded()[0] == 1
+    assert not list(place.iterdir())
+
+
+def test_a_user_without_a_home_gets_no_folder_called_tilde(tmp_path, monkeypatch):
+    nowhere(monkeypatch, tmp_path)
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    monkeypatch.chdir(tmp_path)
+    compiled.folder.cache_clear()
+    with pytest.warns(RuntimeWarning, match="no folder can be written"):
+        assert compiled.folder() is None
+    compiled.folder.cache_clear()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
+
+
+def test_the_package_starts_without_a_home_and_with_nothing_to_write(tmp_path):
+    (tmp_path / "file").write_text("")
+    environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME")}
+    environment["NUMBA_CACHE_DIR"] = environment["XDG_CACHE_HOME"] = str(tmp_path / "file" / "folder")
+    text = "import warnings; warnings.simplefilter('error'); import estimator.online, estimator.engine.tasks"
+    subprocess.run([sys.executable, "-c", text], env=environment, check=True, cwd=Path(__file__).parents[2])
+
+
+# --- Generated source ----------------------------------------------------------------------------------------------
+
+
+def loaded():
+    """What generated source gives, and how often it was generated."""
+    made = []
+
+    def make():
+        made.append(1)
+        return "def answer():\n    return number\n"
+
+    code = generated.load("toy", "answer", "key", make, {"number": 1})
+    return code.answer(), len(made)
+
+
+def test_generated_source_is_read_again(place):
+    assert loaded() == (1, 1)
+    assert loaded() == (1, 0)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[: len(content) // 2],
+        lambda content: content.replace(b"return", b"retirn"),
+        lambda content: content.replace(b"number", b"numbes"),
+        lambda content: content + b"boom()\n",
+        lambda content: b"\xff" + content,
+    ],
+)
+def test_damaged_source_is_generated_anew_in_silence(place, damage):
+    loaded()
+    (path,) = place.glob("toy-answer-*.py")
+    whole = path.read_bytes()
+    assert damage(whole) != whole
+    path.write_bytes(damage(whole))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert loaded() == (1, 1)
+    assert path.read_bytes() == whole
+    assert loaded() == (1, 0)
