@@ -90,12 +90,12 @@ class Kernel:
     told ``packed``, the `duffing_env.layout.Setup` as one array.
 
     Attributes:
-        step: ``step(first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations,
-            outcomes, final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the calling thread. ``saved``
-            (2 rows * LANES,) is work space, ``actions`` (n,) are inputs in parts of the largest, ``recorded_u`` and
-            ``recorded_y`` (T,) the record that is replayed and one sample elsewhere, ``reset_mode`` says how finished
-            environments are reset; RESET_NOW does nothing but start episodes in those of ``mask`` (n,). It writes
-            ``observations`` (n, entries) float32, and ``outcomes`` (len(OUTCOME), n).
+        step: ``step(first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask,
+            observations, outcomes, final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the
+            calling thread. ``saved`` (2 rows * LANES,) is work space, ``actions`` (n,) are inputs in parts of the
+            largest, ``recorded_u`` and ``recorded_y`` (T,) the record that is replayed and one sample elsewhere,
+            ``reset_mode`` says how finished environments are reset; RESET_NOW does nothing but start episodes in those
+            of ``mask`` (n,). It writes ``observations`` (n, entries) float32, and ``outcomes`` (len(OUTCOME), n).
             Where environments were reset in this very step, it writes ``final_observations``, like ``observations``,
             and ``ended`` (n_blocks, rows * LANES), their rows as the episode left them.
         step_parallel: all blocks on Numba's threads, as many as ``saved`` (threads, 2 rows * LANES) has rows.
@@ -123,6 +123,8 @@ def compiled(kind: Kind) -> Kernel:
     summed = tuple(row[name] for name in SUMMED)
     sensors = [f"Y_{y}" for y in kind.truth.outputs]
     cleared = ["INPUT", "LAST_INPUT", "OLDER_INPUT", "SPENT", "EARNED", "ELAPSED", "WAITING", "WORK"]
+    # Mean field's rows of a θ2 that the model does not have must be 0, also after an episode that ended with NaN.
+    cleared += [name for name in place if name.startswith(("MF_theta2", "MF_P_"))]
     at_rest = tuple(row[name] for name in [*cleared, *sensors, *(f"X_{x}" for x in kind.truth.states)])
 
     draw_noise = lanewise(place, "STREAM_a STREAM_b STREAM_c STREAM_d NOISE_w NOISE_v")(_draw_noise)
@@ -133,7 +135,7 @@ def compiled(kind: Kind) -> Kernel:
     draw_jump = at_lane(place, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon")(_draw_jump)
 
     simulated, normal, drifts = kind.plant is not None, kind.normal, kind.drifts
-    move = _plant_of(kind, code, draw_noise) if simulated else None
+    move: Any = _plant_of(kind, code, draw_noise) if simulated else None
     infer = updater(kind)
     make_hooks = REWARDS[kind.reward].hooks
     hooks = Hooks(nothing_in_lane, nothing, nothing, nothing) if make_hooks is None else make_hooks(kind, code)
@@ -141,7 +143,7 @@ def compiled(kind: Kind) -> Kernel:
     is_worked = make_hooks is not None
     is_structured, jumps, pays = kind.factorisation == "structured", kind.jumps, kind.pays
     settle_truth, appraise, settle, observe = code.settle_truth, code.appraise, code.settle, code.observe
-    walk = code.walk if drifts else None
+    walk: Any = code.walk if drifts else None
     digests = (kind.belief.digest, kind.plant.digest if kind.plant else "replay")
     unpack = unpacker(kind)
     name = "_".join(str(word) for word in (*digests, *kind[2:]))
@@ -276,8 +278,8 @@ def compiled(kind: Kind) -> Kernel:
                     outcomes[k, lane + j] = W[outcome + k * LANES + j]
             for again in range(2):
                 observe(
-                    W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output, 1.0 / setup.max_input,
-                    1.0 / setup.horizon, 1.0 / setup.budget,
+                    W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output,
+                    1.0 / setup.max_input, 1.0 / setup.horizon, 1.0 / setup.budget,
                 )  # fmt: skip
                 for j in range(LANES):
                     for k in range(n_observation):
@@ -315,9 +317,9 @@ def _plant_of(kind: Kind, code: Any, draw_noise: Any) -> Any:
     model, n_outputs = kind.plant, kind.plant.n_outputs
     if n_outputs > 3:
         raise ValueError(f"outputs must be at most 3 in an environment, but {model.name!r} has {n_outputs}")
-    plant, steps, white = code.plant, model.substeps, model.is_continuous and not model.held
+    plant, steps, draws_each_step = code.plant, model.substeps, not model.held
     length, root, root_3 = 1.0 / steps, math.sqrt(1.0 / steps), math.sqrt(3.0)
-    sense_0 = getattr(code, "sense_0", None)
+    sense_0: Any = getattr(code, "sense_0", None)
     sense_1 = getattr(code, "sense_1", sense_0)
     sense_2 = getattr(code, "sense_2", sense_0)
     continuous = model.is_continuous
@@ -326,11 +328,9 @@ def _plant_of(kind: Kind, code: Any, draw_noise: Any) -> Any:
     def move(W, setup):
         if continuous:
             for s in range(steps):
-                if white:
-                    plant(W, s / steps, setup.process_noise, length, root, root_3)
+                plant(W, s / steps, setup.process_noise, length, root, root_3)
+                if draws_each_step:
                     draw_noise(W)
-                else:
-                    plant(W, s / steps, setup.process_noise if s == steps - 1 else 0.0)
             sense_0(W, setup.measurement_noise[0])
         else:
             plant(W, setup.measurement_noise[0], setup.process_noise)

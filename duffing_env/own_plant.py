@@ -11,9 +11,9 @@ import numpy as np
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
 from duffing_env.rewards import REWARDS
-from estimator.parameters import PhysicalParameters
 from estimator.models.difference import difference
 from estimator.models.model import Model
+from estimator.parameters import PhysicalParameters
 from estimator.posterior import Belief
 from estimator.priors import named_prior
 

@@ -41,7 +41,7 @@ TEST_INPUT = _schroeder()
 
 
 def source(kind: Kind, loop: Any) -> str:
-    """``model_move`` and ``twin_move``: the believed and the true plant alone; ``compare`` adds up, ``conclude`` ends."""
+    """``model_move`` and ``twin_move``: the believed and the true plant; ``compare`` adds up, ``conclude`` ends."""
     import sympy as sp
 
     from estimator.engine.derive import calculus, renamed, state_step, symbol

@@ -25,6 +25,9 @@ def capped(ratio):
 
 _NAMES = {**NAMES, "capped": capped}
 
+#: What the plant of a difference equation is told.
+_NOISES = ("measurement_noise", "process_noise")
+
 #: Bounds of a determinant that has a logarithm: below, numbers lose digits.
 _SMALLEST, _LARGEST = 2.0**-1000, 2.0**1000
 
@@ -33,9 +36,8 @@ _SMALLEST, _LARGEST = 2.0**-1000, 2.0**1000
 def parts(kind: Kind) -> Any:
     """The compiled functions of a kind of experiment: see `_source` for their names."""
     reward = REWARDS[kind.reward]
-    key = source_digest(Path(__file__).parent) + repr(
-        (kind._replace(belief=None, plant=None), kind.belief.digest, kind.plant and kind.plant.digest)
-    )
+    digests = (kind.belief.digest, kind.plant and kind.plant.digest)
+    key = source_digest(Path(__file__).parent) + repr((kind[2:], digests))
     names = {**_NAMES, "reward": reward.value}
     return stored.load(kind.belief.name, "environment", key, lambda: _source(kind), names)
 
@@ -85,16 +87,17 @@ def _plant(model: Model, degree: int, loop: Any) -> str:
     lines, results = derive.state_step(model, degree, names)
     found, symbol = derive.calculus(model), derive.symbol
     strength, w, v = symbol("process_noise"), symbol("NOISE_w"), symbol("NOISE_v")
-    white = model.is_continuous and not model.held
     after: dict[str, Any] = {}
     for a, x in enumerate(model.states):
         kick = strength * found.noise[a] * w
-        if white:
+        if model.is_continuous:
             # The increment of the noise over a step of length h, and where it reaches a state only through others, its
-            # integral; the two are drawn jointly.
+            # integral; of white noise the two are drawn jointly.
             h = symbol("length")
             through = sum(found.by[a][k] * strength * found.noise[k] for k in range(model.n_states))
-            direct, integral = symbol("root") * w, h * symbol("root") / 2 * (w + v / symbol("root_3"))
+            direct, integral = h * w, h * h / 2 * w
+            if not model.held:
+                direct, integral = symbol("root") * w, h * symbol("root") / 2 * (w + v / symbol("root_3"))
             kick = strength * found.noise[a] * direct if found.noise[a] != 0 else through * integral
         kick = derive.renamed([("", kick)], names)[0][1]
         lines.append((f"K_{x}", symbol(results[names[x]]) + kick))
@@ -111,9 +114,8 @@ def _plant(model: Model, degree: int, loop: Any) -> str:
         else:
             lines.append(("SHOWN", value))
             results |= {f"Y_{y}": "SHOWN"}
-    arguments = ["T"] if model.is_continuous else ["measurement_noise"]
-    arguments += ["process_noise", *(["length", "root", "root_3"] if white else [])]
-    return source + loop("plant", "The plant moves.", lines, results, *arguments)
+    first = ("T", "process_noise", "length", "root", "root_3") if model.is_continuous else _NOISES
+    return source + loop("plant", "The plant moves.", lines, results, *first)
 
 
 def _truth(kind: Kind, loop: Any) -> str:
@@ -180,7 +182,7 @@ def log_det_and_density(
 
 
 def _standing(kind: Kind) -> tuple[Any, Any]:
-    """Assignments of ``NEW_LOG_DET``, ``NEW_LOG_DENSITY`` and ``NEW_ERROR`` of a belief beside the truth; and soundness."""
+    """Assignments of ``NEW_LOG_DET``, ``NEW_LOG_DENSITY`` and ``NEW_ERROR`` beside the truth; and soundness."""
     import sympy as sp
 
     from estimator.engine import derive
