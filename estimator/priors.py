@@ -55,7 +55,40 @@ def log_uniform_moments(
     for _ in names:
         probabilities = np.outer(probabilities, weights / 2).ravel()  # the weights sum to 2, the length of [-1, 1]
     points = coefficients_of(model, {name: center[name] * row for name, row in zip(names, grid, strict=True)}, step)
-    # Plain sums, because the last digits of a BLAS product depend on its number of threads.
+    return _moments(points, probabilities)
+
+
+def gaussian_moments(
+    model: Model, mean: Mapping[str, float], std: Mapping[str, float], step: float = SAMPLING_STEP
+) -> tuple[FloatArray, FloatArray]:
+    """Moments of the coefficients of a plant whose parameters are independent and Gaussian.
+
+    Exact where the coefficients are linear in the parameters; else integrated by tensor Gauss-Hermite quadrature.
+
+    Args:
+        model: whose coefficients.
+        mean: parameter to its mean.
+        std: parameter to its standard deviation; 0 for one that is known.
+        step: sampling step [s].
+
+    Returns:
+        Mean (K,) and covariance (K, K).
+    """
+    names = list(model.physical or model.coefficients)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(max(2, min(7, int(_POINTS ** (1 / len(names))))))
+    grid = np.stack(np.meshgrid(*[nodes] * len(names), indexing="ij")).reshape(len(names), -1)
+    probabilities = np.ones(1)
+    for _ in names:
+        probabilities = np.outer(probabilities, weights / weights.sum()).ravel()
+    drawn = {name: mean[name] + std.get(name, 0.0) * row for name, row in zip(names, grid, strict=True)}
+    return _moments(coefficients_of(model, drawn, step), probabilities)
+
+
+def _moments(points: FloatArray, probabilities: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of weighed points (N, K).
+
+    Plain sums, because the last digits of a BLAS product depend on its number of threads.
+    """
     mean = np.array([(probabilities * column).sum() for column in points.T])
     deviations = points - mean
     cov = np.array([[(probabilities * (one * other)).sum() for one in deviations.T] for other in deviations.T])
