@@ -14,12 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from agents import metrics
+from agents.plants import plant_of
 from agents.policies import make_policy
 from duffing_env.experiment import ContinuousExperiment, Experiment, SimulatedExperiment
 from duffing_env.layout import OBSERVATION, OSCILLATOR
 from duffing_env.silverbox import record_available
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator import Belief, ContinuousBelief, PhysicalParameters, Prior
+from estimator import Belief, ContinuousBelief, PhysicalParameters
 from estimator.belief import RecordBelief
 from estimator.identify import identify
 from estimator.maximum_a_posteriori import maximum_a_posteriori
@@ -252,17 +253,16 @@ def _audit(
         earlier = np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
         hands["ode"] = experiment.physical_prior, u
         hands |= {f"nlarx_{name}": (_paper_prior(experiment, name), earlier) for name in FACTORISATIONS}
-        auditor: Prior | ContinuousBelief = experiment.physical_prior
     else:
         hands |= {name: (_paper_prior(experiment, name), u) for name in FACTORISATIONS}
-        auditor = experiment.believed
     found: dict[str, dict[str, FloatArray]] = {}
     for name, (prior, acting) in hands.items():
         beliefs = identify(acting, y, prior)
         means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
         found[name] = metrics.estimate_metrics(means, covs, truth, type(prior))
-    fit = maximum_a_posteriori(u, y, auditor, experiment.process_noise, experiment.measurement_noise)
-    kind = ContinuousBelief if isinstance(auditor, ContinuousBelief) else Belief
+    noises, plant = (experiment.process_noise, experiment.measurement_noise), plant_of(experiment)
+    fit = maximum_a_posteriori(plant.model, u, y, plant.prior, *noises, plant.interpolation)
+    kind = ContinuousBelief if isinstance(experiment, ContinuousExperiment) else Belief
     found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, kind)
     return found
 

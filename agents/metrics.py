@@ -8,11 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from duffing_env.experiment import ContinuousExperiment
+from agents.plants import plant_of
 from duffing_env.silverbox import load_record, regime_input
-from estimator import NLARX, Belief, ContinuousBelief, PhysicalParameters, fisher_information, to_coefficients
+from estimator import NLARX, Belief, PhysicalParameters, fisher_information
 from estimator.belief import RecordBelief
-from estimator.continuous_likelihood import continuous_information
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -70,16 +69,15 @@ def information(
 
     F is the Fisher information at the true coefficients, along the outputs (T, n) that were seen, or along the
     response without noise; Λ0 is the inverse covariance of the environment's prior. The coefficients are those of the
-    plant's equation; that of the plant ``sde`` needs the outputs.
+    plant's equation.
     """
     noises = experiment.process_noise, experiment.measurement_noise
-    if isinstance(experiment, ContinuousExperiment):
-        assert outputs is not None
-        cov = experiment.physical_prior.coefficients_cov
-        F = continuous_information(ContinuousBelief.coefficients_of(truth), inputs.T, outputs.T, *noises)
-    else:
-        cov = experiment.believed.coefficients_cov
-        F = fisher_information(to_coefficients(truth), inputs.T, *noises, y=None if outputs is None else outputs.T)
+    plant = plant_of(experiment)
+    F = fisher_information(
+        plant.model, plant.coefficients_of(truth), inputs.T, *noises, interpolation=plant.interpolation,
+        y=None if outputs is None else outputs.T,
+    )  # fmt: skip
+    cov = plant.prior.coefficients_cov
     std = np.sqrt(np.diag(cov))
     prior = np.linalg.inv(cov / np.outer(std, std))
     return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])

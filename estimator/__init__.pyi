@@ -6,13 +6,12 @@ from .continuous import (
     continuous_prior,
 )
 from .ensemble import NoiseRatio
-from .fisher import (
+from .gaussian import JointBelief
+from .information import (
     cramer_rao,
     fisher_information,
-    ode_information,
     relative_covariance,
 )
-from .gaussian import JointBelief
 from .models.nlarx import NLARX
 from .models.ode import DuffingODE
 from .offline import PEMNARX
@@ -50,7 +49,6 @@ __all__ = [
     "cramer_rao",
     "fisher_information",
     "load_estimator",
-    "ode_information",
     "relative_covariance",
     "save_estimator",
     "to_coefficients",

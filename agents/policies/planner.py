@@ -32,10 +32,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
+from agents.plants import believed_of
 from agents.policies.imagination import Terms
 from agents.policies.planning import plan
-from agents.policies.pursuit import pursue
+from agents.policies.pursuit import Rule, pursuit, record_places
 from duffing_env.layout import SETTINGS
+from estimator.engine.feeding import input_degree
 from estimator.parameters import FloatArray
 
 #: The last plans (n, horizon) in V, what plans taught per sample (n, 4, 4), and the streams of random numbers (n, 4).
@@ -112,6 +114,9 @@ class Planner:
             )
         horizon = env.horizon if whole else min(horizon or _HORIZON, env.horizon)
         self._energy = env.horizon * experiment.max_rms**2 if whole else None
+        if whole:
+            model, interpolation = believed_of(experiment)
+            self._pursue = pursuit(model, input_degree(model, interpolation)).pursue
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
@@ -168,9 +173,9 @@ class Planner:
         terms = self._terms
         inputs, scores = np.empty((2, n))
         if self._energy is not None:
-            energies = budget_left * self._energy
-            limits = terms.amplitude, terms.limit, terms.margin
-            pursue(records, left, energies, *limits, plans, words, inputs, scores)
+            energies, rule = budget_left * self._energy, Rule(terms.amplitude, terms.limit, terms.margin)
+            last = terms.amplitude * last
+            self._pursue(records, record_places(), left, energies, rule, last, plans, words, inputs, scores)
         else:
             last = terms.amplitude * last
             plan(records, left, self.horizon, self.rounds, terms, last, plans, rates, words, inputs, scores)
