@@ -10,8 +10,8 @@ The gradient is the reverse derivative of this arithmetic, which the engine gene
 every step begins with, one backward.
 
 A *start* is what a step begins with: the rows of a path, that is the states, the filter's covariance V of them (upper
-triangle) and their sensitivities Z to the coefficients (row by row), then the older inputs that the first sample depends
-on, the newest first. All zeros is at rest.
+triangle) and their sensitivities Z to the coefficients (row by row), then the older inputs that the first sample
+depends on, the newest first. All zeros is at rest.
 """
 
 from __future__ import annotations

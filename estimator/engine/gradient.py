@@ -60,12 +60,12 @@ def _source(model: Model, degree: int) -> str:
     noises = ["Q", *(f"R_{y}" for y in model.outputs)]
     shown = f"SHOWN_{next(iter(model.outputs))}"
     if model.is_continuous:
-        lines, moved = [], derive.carried_at_end(model)
+        before, moved = derive.Assignments(), derive.carried_at_end(model)
     else:
-        lines, moved = derive.difference_step(model)
+        before, moved = derive.difference_step(model)
     live = {derive.symbol("LIVE"): derive.sp.S.One}
     more, results = algebra.path_sample(model, moved, degree, observed=False)
-    lines = [(name, e.xreplace(live)) for name, e in [*lines, *more]]
+    lines = [(name, e.xreplace(live)) for name, e in [*before, *more]]
     path_after = [results.get(row, row) for row in path_rows]
     held: dict[str, Sequence[str]] = {"P": path_rows, "F": information, **({"M": carried} if carried else {})}
     held |= {"C": coefficients, "U": inputs, "N": noises}
