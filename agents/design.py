@@ -1,65 +1,166 @@
-"""The worth of a sequence of inputs, and its exact gradient, compiled: what oracle and planner climb.
+"""The worth of a sequence of inputs, and its exact gradient, compiled for any model: what oracle and planner climb.
 
-The worth is ½ log det(Λ + F(u)) in nats, with F the Fisher information of (θ1, θ2, θ3, η) along the response without
-noise (`estimator.fisher`) and Λ what is known before, less a penalty for displacements beyond a limit L:
+The worth is ½ log det(Λ + F(u)) in nats, with F the Fisher information of the model's coefficients along the response
+without noise (`estimator.information`) and Λ what is known before, less a penalty where the first sensor's signal x
+goes beyond a limit L:
 
     J(u) = ½ log det(Λ + F(u)) - ρ Σ_t max(0, |x_t| / L - 1)²
 
-The gradient is the reverse derivative of this arithmetic: one pass forward that keeps every step's start, one backward.
+The gradient is the reverse derivative of this arithmetic, which the engine generates: one pass forward that keeps what
+every step begins with, one backward.
 
-A *start* (13,) is what a step begins with: displacement x and the one before, the filter's covariance of the two
-(3 entries), and the sensitivities (4 and 4) of the two to the coefficients. All zeros is at rest.
+A *start* is what a step begins with: the rows of a path, that is the states, the filter's covariance V of them (upper
+triangle) and their sensitivities Z to the coefficients (row by row), then the older inputs that the first sample
+depends on, the newest first. All zeros is at rest.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimator.fisher import regress, spread
-from estimator.lanes import jit
+from estimator.engine.feeding import older_inputs
+from estimator.engine.gradient import pieces
+from estimator.lanes import jit, kernel, part
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
 
-START_SIZE = 13
-
-#: A trajectory is followed no further than to this many times the limit: the difference equation blows up.
-_LOST = 1.2
+#: A trajectory is followed no further than to this many times the limit: a difference equation blows up.
+LOST = 1.2
 
 
-@jit
-def roll(theta, q, r, limit, start, u, tape, F):
-    """Follow the inputs (T,); F (4, 4) is overwritten by their information, and tape[t] by step t's start.
+class Known(NamedTuple):
+    """What a worth is taken at.
 
-    Returns:
-        The steps that were followed, the peak of |x| in them [V], and Σ max(0, |x| / L - 1)².
+    Attributes:
+        coefficients: (K,) the model's.
+        precision: (K, K) Λ.
+        noises: variances of the process noise and of each sensor's (`estimator.information.variances`).
     """
-    t1, t2, t3, e = theta[0], theta[1], theta[2], theta[3]
-    F[:, :] = 0.0
-    tape[0] = start
-    peak, excess = 0.0, 0.0
-    moved = np.empty(4)
-    for t in range(len(u)):
-        now, after = tape[t], tape[t + 1]
-        x, last_x = now[0], now[1]
-        a = t1 + 3.0 * t2 * x * x
-        c0, _, variance = spread(a, t3, now[2], now[3], now[4], q)
-        weight = 1.0 / (variance + r)
-        regress(a, t3, now[5:9], now[9:13], x, last_x, u[t], moved)
-        for j in range(4):
-            for k in range(j + 1):
-                F[j, k] += weight * moved[j] * moved[k]
-            after[5 + j] = r * weight * moved[j]
-            after[9 + j] = now[5 + j] - c0 * weight * moved[j]
-        after[0] = t1 * x + t2 * x * x * x + t3 * last_x + e * u[t]
-        after[1] = x
-        after[2], after[3], after[4] = r * weight * variance, r * weight * c0, now[2] - c0 * c0 * weight
-        size = abs(after[0])
-        peak = max(peak, size)
-        over = max(0.0, size / limit - 1.0)
-        excess += over * over
-        if not size < _LOST * limit:
-            return t + 1, peak, excess
-    return len(u), peak, excess
+
+    coefficients: FloatArray
+    precision: FloatArray
+    noises: tuple[float, ...]
+
+
+class Memory(NamedTuple):
+    """What climbing writes on.
+
+    Attributes:
+        tape: (T, size) what every sample began with.
+        shown: (T,) the first sensor's signal.
+        F: (K, K) Λ + F, whose lower triangle becomes its factor.
+        G: (K, K) its inverse.
+        gradient: (T,) ∂J/∂u.
+    """
+
+    tape: FloatArray
+    shown: FloatArray
+    F: FloatArray
+    G: FloatArray
+    gradient: FloatArray
+
+
+class Designer(NamedTuple):
+    """Compiled functions of one model and interpolation of the input.
+
+    Attributes:
+        start_size: numbers in a start.
+        n_path: of these, the rows of a path.
+        memory: ``memory(T)``, a `Memory` for up to T samples.
+        worth: ``worth(known, limit, penalty, start, u, memory)``: J(u) [nats] of inputs (T,), and the peak of |x|. A
+            trajectory that is lost (`LOST`) counts what it told until then.
+        climb: as ``worth``, and fills in ``memory.gradient``.
+        earlier: ``earlier(start, u, t)``: the input at sample t, which may lie before the first.
+        code: `estimator.engine.gradient.pieces`, for those who follow a path themselves.
+    """
+
+    start_size: int
+    n_path: int
+    memory: Any
+    worth: Any
+    climb: Any
+    earlier: Any
+    code: Any
+
+
+@cache
+def designer(model: Model, degree: int = 0) -> Designer:
+    """The worth of inputs to a model, and its gradient.
+
+    Args:
+        model: the equation.
+        degree: of the input's polynomial over a sample: 0 held, 1 linear.
+    """
+    code = pieces(model, degree)
+    begin, coefficients_of, lay, step, back = code.begin, code.coefficients, code.lay, code.step, code.back
+    gather, seed, n_path, n_tape = code.gather, code.seed, code.n_path, code.n_tape
+    k, older = model.n_coefficients, older_inputs(model, degree)
+    kind = f"{model.name}_{model.digest}_{degree}"
+
+    @part(kind)
+    def memory(samples):
+        return Memory(
+            np.empty((samples, n_tape)), np.empty(samples), np.empty((k, k)), np.empty((k, k)), np.empty(samples)
+        )
+
+    @part(kind)
+    def earlier(start, u, t):
+        if t >= 0:
+            return u[t]
+        return start[n_path - 1 - t] if older >= -t else 0.0
+
+    @part(kind)
+    def roll(known, limit, start, u, memory):
+        """Follow the inputs; gives the steps that were followed, the peak of |x|, and Σ max(0, |x| / L - 1)²."""
+        tape, shown, noises = memory.tape, memory.shown, known.noises
+        C = coefficients_of(known.coefficients)
+        P, F = begin(start)
+        peak, excess, steps = 0.0, 0.0, 0
+        for t in range(len(u)):
+            U = lay(u[t], earlier(start, u, t - 1), earlier(start, u, t - 2))
+            P, F, x, _ = step(P, F, C, U, noises, tape, t)
+            shown[t] = x
+            size = abs(x)
+            steps = t + 1
+            peak = max(peak, size)
+            over = max(0.0, size / limit - 1.0)
+            excess += over * over
+            if not size < LOST * limit:
+                break
+        gather(F, known.precision, memory.F)
+        return steps, peak, excess
+
+    @kernel(kind=kind)
+    def worth(known, limit, penalty, start, u, memory):
+        _, peak, excess = roll(known, limit, start, u, memory)
+        return half_log_det(memory.F) - penalty * excess, peak
+
+    @kernel(kind=kind)
+    def climb(known, limit, penalty, start, u, memory):
+        steps, peak, excess = roll(known, limit, start, u, memory)
+        value = half_log_det(memory.F)
+        invert(memory.F, memory.G)
+        tape, shown, gradient, noises = memory.tape, memory.shown, memory.gradient, known.noises
+        C = coefficients_of(known.coefficients)
+        gradient[: len(u)] = 0.0
+        G, H = seed(memory.G)
+        for t in range(steps - 1, -1, -1):
+            over = max(0.0, abs(shown[t]) / limit - 1.0)
+            pushed = -2.0 * penalty * over * (1.0 if shown[t] > 0.0 else -1.0) / limit
+            U = lay(u[t], earlier(start, u, t - 1), earlier(start, u, t - 2))
+            G, by_now, by_last, by_older = back(G, H, C, U, noises, pushed, tape, t)
+            gradient[t] += by_now
+            if older > 0 and t > 0:
+                gradient[t - 1] += by_last
+            if older > 1 and t > 1:
+                gradient[t - 2] += by_older
+        return value - penalty * excess, peak
+
+    return Designer(n_path + older, n_path, memory, worth, climb, earlier, code)
 
 
 @jit
@@ -103,66 +204,3 @@ def invert(L, inverse):
             column[i] = total / L[i, i]
         for i in range(size):
             inverse[i, j] = column[i]
-
-
-@jit
-def worth(theta, precision, q, r, limit, penalty, start, u, tape, F):
-    """The worth J(u) in nats, and the peak of |x| [V]. A trajectory that is lost counts what it told until then."""
-    _, peak, excess = roll(theta, q, r, limit, start, u, tape, F)
-    for j in range(4):
-        for k in range(j + 1):
-            F[j, k] += precision[j, k]
-    return half_log_det(F) - penalty * excess, peak
-
-
-@jit
-def climb(theta, precision, q, r, limit, penalty, start, u, tape, F, gradient):
-    """As `worth`, and ∂J/∂u (T,) [nats/V] into ``gradient``."""
-    t2, t3, e = theta[1], theta[2], theta[3]
-    steps, peak, excess = roll(theta, q, r, limit, start, u, tape, F)
-    for j in range(4):
-        for k in range(j + 1):
-            F[j, k] += precision[j, k]
-    value = half_log_det(F)
-    G = np.empty((4, 4))
-    invert(F, G)
-    gradient[:] = 0.0
-    # Names as in `roll`; a letter b at the end is the derivative of J by that quantity.
-    moved, movedb, Gm = np.empty(4), np.empty(4), np.empty(4)
-    sb, last_sb = np.zeros(4), np.zeros(4)
-    xb, last_xb, p00b, p01b, p11b = 0.0, 0.0, 0.0, 0.0, 0.0
-    for t in range(steps - 1, -1, -1):
-        now = tape[t]
-        x, last_x, p00, p01, p11 = now[0], now[1], now[2], now[3], now[4]
-        reached = tape[t + 1, 0]
-        over = max(0.0, abs(reached) / limit - 1.0)
-        xb -= 2.0 * penalty * over * (1.0 if reached > 0.0 else -1.0) / limit
-        a = theta[0] + 3.0 * t2 * x * x
-        c0, _, variance = spread(a, t3, p00, p01, p11, q)
-        w = 1.0 / (variance + r)
-        regress(a, t3, now[5:9], now[9:13], x, last_x, u[t], moved)
-        told, toward, back = 0.0, 0.0, 0.0
-        for j in range(4):
-            # J is ½ log det, so that ∂J/∂F is half the inverse, and ∂J/∂s_t the inverse times w s_t.
-            Gm[j] = G[j, 0] * moved[0] + G[j, 1] * moved[1] + G[j, 2] * moved[2] + G[j, 3] * moved[3]
-            told += 0.5 * Gm[j] * moved[j]
-            toward += sb[j] * moved[j]
-            back += last_sb[j] * moved[j]
-            movedb[j] = w * (r * sb[j] - c0 * last_sb[j] + Gm[j])
-        wb = r * toward - c0 * back + told + r * variance * p00b + c0 * r * p01b - c0 * c0 * p11b
-        varianceb = r * w * p00b - w * w * wb
-        c0b = w * (r * p01b - back - 2.0 * c0 * p11b) + a * varianceb
-        c1b = t3 * varianceb
-        ab = c0 * varianceb + p00 * c0b + p01 * c1b
-        for j in range(4):
-            ab += movedb[j] * now[5 + j]
-            # s becomes the earlier one in the next step, so both of its derivatives add up.
-            sb[j] = a * movedb[j] + last_sb[j]
-            last_sb[j] = t3 * movedb[j]
-        p00b, p01b, p11b = a * c0b + p11b, t3 * c0b + a * c1b, t3 * c1b
-        gradient[t] = movedb[3] + e * xb
-        xb, last_xb = (
-            a * xb + last_xb + movedb[0] + 3.0 * x * x * movedb[1] + 6.0 * t2 * x * ab,
-            t3 * xb + movedb[2],
-        )  # fmt: skip
-    return value - penalty * excess, peak

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
+from agents.plants import plant_of
 from duffing_env.layout import parameter_names
 from duffing_env.silverbox import load_record, regime_input
 from estimator.free_run import free_run
@@ -77,17 +78,13 @@ def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatA
     F is the Fisher information at the true coefficients of the plant's equation, along the outputs (T, n) that were
     seen, or along the response without noise; Λ0 is the inverse covariance of the prior of plants so drawn.
     """
-    model, step = experiment.plant, experiment.step
-    cov = experiment.prior_of(model).coefficients_cov
+    noises = experiment.process_noise, experiment.measurement_noise
+    plant = plant_of(experiment)
     F = fisher_information(
-        model,
-        coefficients_of(model, parameters_of(truth, model), step),
-        inputs.T,
-        experiment.process_noise,
-        experiment.measurement_noise,
+        plant.model, plant.coefficients_of(truth), inputs.T, *noises, interpolation=plant.interpolation,
         y=None if outputs is None else outputs.T,
-        interpolation="linear" if experiment.degree and model.is_continuous else "zero_order",
-    )
+    )  # fmt: skip
+    cov = plant.prior.coefficients_cov
     std = np.sqrt(np.diag(cov))
     prior = np.linalg.inv(cov / np.outer(std, std))
     return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])

@@ -14,123 +14,31 @@ depend on the number of systems.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from agents.ascent import appraise, improve
+from agents.ascent import Limits, climber
 from agents.cli import JsonOptions, run_script
-from agents.evaluation import evaluate, make
+from agents.evaluation import evaluate
+from agents.oracle_task import Systems, Task
 from agents.policies.imagination import Terms
 from agents.policies.planning import play
-from agents.policies.pursuit import swings
-from duffing_env.vector_env import DuffingVectorEnv
+from agents.policies.pursuit import pursuit
 from estimator.files import write_atomically
-from estimator.fisher import as_rows, fisher_information
-from estimator.parameters import Coefficients, FloatArray, to_coefficients
+from estimator.information import fisher_information
+from estimator.models.difference import difference
+from estimator.parameters import FloatArray
 from estimator.record import COEFFICIENTS, RECORD
-
-FOLDER = Path(__file__).parent / "oracles"
 
 #: Steps of the gradient, random starts, and changed copies in a round.
 _ITERATIONS, _STARTS, _COPIES = 100, 24, 16
-
-
-@dataclass(frozen=True)
-class Task:
-    """What an oracle is for: everything that the worth of an input, and which inputs are allowed, depend on.
-
-    Attributes:
-        max_input: amplitude limit [V].
-        max_output: limit of the displacement without noise [V].
-        samples: of an episode.
-        process_noise: standard deviation [V].
-        measurement_noise: standard deviation [V].
-        spread: of the prior.
-        plant_spread: of the systems.
-        max_rms: limit of the root mean square of the input over an episode [V]; None where there is none.
-    """
-
-    max_input: float
-    max_output: float
-    samples: int
-    process_noise: float
-    measurement_noise: float
-    spread: float
-    plant_spread: float
-    max_rms: float | None = None
-
-    @classmethod
-    def of(cls, envs: DuffingVectorEnv) -> Task:
-        """The task of an environment; ValueError where its plant is not a difference equation that stays as it is."""
-        e: Any = envs.experiment
-        if e.plant_kind != "difference" or e.jump or e.max_slew is not None:
-            raise ValueError(
-                f"env must simulate the difference equation without jump and slew limit, but is {e}; "
-                "choose another track"
-            )
-        spread = e.spread if e.plant_spread is None else e.plant_spread
-        return cls(
-            e.max_input, e.max_output, e.samples, e.process_noise, e.measurement_noise, e.spread, spread, e.max_rms
-        )  # fmt: skip
-
-    @property
-    def energy(self) -> float:
-        """Limit of Σ u² [V²]."""
-        return np.inf if self.max_rms is None else self.max_rms**2 * self.samples
-
-    @property
-    def path(self) -> Path:
-        """The file in the package that holds this task's oracle."""
-        digest = hashlib.sha256(json.dumps(asdict(self)).encode()).hexdigest()[:12]
-        return FOLDER / f"{self.samples}-samples-{digest}.npz"
-
-
-@dataclass(frozen=True)
-class Systems:
-    """The systems of a task, by row.
-
-    Attributes:
-        task: what is asked of them.
-        theta: (n, 4) their coefficients.
-        precision: (4, 4) Λ0.
-    """
-
-    task: Task
-    theta: FloatArray
-    precision: FloatArray
-
-    @classmethod
-    def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None) -> Systems:
-        """The first systems of a track, as they are evaluated with seed 0."""
-        envs = make(env_id, count, options)
-        envs.reset(seed=0)
-        theta = as_rows(to_coefficients(envs.truth))
-        precision = np.linalg.inv(envs.belief(0).coefficients_cov).astype(np.float64)
-        return cls(Task.of(envs), theta, precision)
-
-    def worth(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Worth ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
-
-        Each (n,). Inputs that are not finite, as after the end of an episode, tell nothing from there on.
-        """
-        u = np.array(inputs, dtype=np.float64)
-        if u.ndim != 2 or len(u) > len(self.theta):
-            raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.theta)}, but have {u.shape}")
-        values, peaks = np.empty((2, len(u)))
-        t = self.task
-        appraise(
-            self.theta, self.precision, t.process_noise**2, t.measurement_noise**2, t.max_output, u, values, peaks
-        )  # fmt: skip
-        return values, peaks
 
 
 @dataclass(frozen=True)
@@ -175,13 +83,13 @@ class Oracle:
             inputs=as_stored(self.inputs / self.systems.task.max_input),
             theta=self.systems.theta,
             values=self.values,
-            task=np.array(json.dumps(asdict(self.systems.task))),
+            task=np.array(json.dumps(self.systems.task.description)),
         )
         write_atomically(self.systems.task.path, content.getvalue())
         return self.systems.task.path
 
     def efficiency(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike) -> FloatArray:
-        """D-efficiency (n,) of an episode: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / 4].
+        """D-efficiency (n,) of an episode: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / K] for K coefficients.
 
         F is taken at the true coefficients along the outputs that were seen, because feedback keeps these within
         their limit, and not the response without noise to the same inputs, which drifts away from them. 0.5 means that
@@ -199,10 +107,12 @@ class Oracle:
         if u.ndim != 2 or len(u) > len(self.values):
             raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
         task = self.systems.task
-        system = Coefficients(*self.systems.theta[: len(u)].T)
-        information = fisher_information(system, u, task.process_noise, task.measurement_noise, y=outputs)
+        information = fisher_information(
+            task.model, self.systems.theta[: len(u)], u, task.process_noise, task.measurement_noise, y=outputs,
+            interpolation=task.interpolation,
+        )  # fmt: skip
         values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]
-        efficiency: FloatArray = np.exp((values - self.values[: len(u)]) / 2)
+        efficiency: FloatArray = np.exp(2 * (values - self.values[: len(u)]) / task.model.n_coefficients)
         return efficiency
 
 
@@ -220,7 +130,8 @@ def search(
     """Search the best input of one system.
 
     Gradient ascent from many starts, then in rounds from changed copies of the best one (iterated local search). Where
-    only amplitudes are limited, copies are planned anew from a random sample on, which finds more than the gradient.
+    only amplitudes are limited and the plant is the paper's equation, copies are planned anew from a random sample on,
+    which finds more than the gradient.
 
     Args:
         systems: of a task.
@@ -234,16 +145,18 @@ def search(
     """
     task = systems.task
     one = Systems(task, np.repeat(systems.theta[row : row + 1], len(given) + _STARTS, axis=0), systems.precision)
+    is_planned = task.max_rms is None and task.model == difference()
     best, best_value = np.zeros(task.samples), -np.inf
     words = rng.integers(0, 2**64, 4, dtype=np.uint64)
     pool = np.empty((_STARTS, task.samples))
     if task.max_rms is None:
         pool[:] = _signals(task, _STARTS, rng)
     else:
-        swings(systems.theta[row], task.energy, pool, words)
+        swings = pursuit(task.model, task.degree).swings
+        swings(one.known(0), task.max_output, task.energy, pool, words)
     pool = np.concatenate([given, pool])
     for k in range(rounds + 1):
-        if k == 0 or task.max_rms is not None:
+        if k == 0 or not is_planned:
             _climb(one, pool, 0.3 if k == 0 else 0.1)
         # What is stored is rounded; only what keeps the limits as stored counts.
         pool = task.max_input * as_stored(pool / task.max_input).astype(np.float64)
@@ -251,7 +164,7 @@ def search(
         values[~(peaks <= task.max_output)] = -np.inf
         if values.max() > best_value:
             best, best_value = pool[values.argmax()].copy(), float(values.max())
-        if task.max_rms is None:
+        if is_planned:
             pool = np.stack([_planned(best, one, rng, words) for _ in range(_COPIES)])
         else:
             pool = np.stack([_changed(best, task, rng) for _ in range(_COPIES)])
@@ -261,9 +174,9 @@ def search(
 def _climb(one: Systems, pool: FloatArray, rate: float) -> None:
     """Gradient ascent from every input of a pool (k, samples), in place."""
     task = one.task
-    q, r = task.process_noise**2, task.measurement_noise**2
-    limits = (task.max_output, task.max_input, task.energy)
-    improve(one.theta[0], one.precision, q, r, *limits, rate, _ITERATIONS, pool, np.empty(len(pool)))
+    limits = Limits(task.max_output, task.max_output, task.max_input, task.energy)
+    improve = climber(task.model, task.degree).improve
+    improve(one.known(0), limits, rate, _ITERATIONS, pool, np.empty(len(pool)))
 
 
 def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.NDArray[np.uint64]) -> FloatArray:

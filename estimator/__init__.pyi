@@ -6,10 +6,9 @@ from .continuous import (
     continuous_prior,
 )
 from .ensemble import NoiseRatio
-from .fisher import (
+from .information import (
     cramer_rao,
     fisher_information,
-    ode_information,
     relative_covariance,
 )
 from .gaussian import JointBelief
@@ -65,7 +64,6 @@ __all__ = [
     "duffing",
     "fisher_information",
     "load_estimator",
-    "ode_information",
     "paper_text_prior",
     "published_run_prior",
     "recorded_prior",

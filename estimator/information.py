@@ -1,7 +1,7 @@
 """What an experiment can tell at best: Fisher information and Cramér-Rao bounds, of any model.
 
-The state is latent, so an output tells about the coefficients only what the past outputs did not. With the Kalman filter
-of the model linearised along its trajectory, ν_t the innovation, S_t its variance, s_t = -∂ν_t/∂(coefficients),
+The state is latent, so an output tells about the coefficients only what the past outputs did not. With the Kalman
+filter of the model linearised along its trajectory, ν_t the innovation, S_t its variance, s_t = -∂ν_t/∂(coefficients),
 
     F = Σ_t s_t s_tᵀ / S_t,
 
@@ -114,7 +114,7 @@ def variances(model: Model, process_noise: float, measurement_noise: npt.ArrayLi
         )
     if not (np.all(stds > 0) and np.isfinite(stds).all()):
         raise ValueError(
-            f"measurement_noise must be positive and finite, but is {measurement_noise}; pass a standard deviation"
+            f"measurement_noise must be positive and finite, but is {stds.tolist()}; pass a standard deviation"
         )
     sensors = np.broadcast_to(stds, model.n_outputs)
     return (float(process_noise) ** 2, *(float(std) ** 2 for std in sensors))

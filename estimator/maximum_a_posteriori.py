@@ -1,7 +1,7 @@
 """Maximum a posteriori: what a whole record says of the coefficients, to one who knows the noises and has time.
 
 An auditor for the online estimators, and for whoever chooses their inputs: it shares neither their updates nor their
-beliefs. With the Kalman filter's innovations ν_t and their variances S_t at the coefficients ψ of any model it minimises
+beliefs. With the Kalman filter's innovations ν_t and their variances S_t at the coefficients ψ of a model it minimises
 
     L(ψ) = ½ Σ_t (ν_t² / S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0)
 

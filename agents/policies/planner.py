@@ -33,14 +33,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
+from agents.plants import believed_of
 from agents.policies.imagination import Terms
 from agents.policies.motion import View, places, scales
 from agents.policies.planning import search
-from agents.policies.pursuit import pursue
-from estimator.engine.tasks import belief_names
-from estimator.models.difference import difference
+from agents.policies.pursuit import Rule, pursuit, record_places
+from estimator.engine.feeding import input_degree
 from estimator.parameters import FloatArray
-from estimator.record import RECORD
 
 #: The last plans (n, horizon) in V, what plans taught per sample (n, K, K), the streams of random numbers (n, 4), and
 #: the last input (n,) in V.
@@ -48,13 +47,6 @@ PlannerState = tuple[FloatArray, FloatArray, npt.NDArray[np.uint64], FloatArray]
 
 #: Samples to plan for under an amplitude limit: some periods of the oscillator.
 _HORIZON = 24
-
-# Where `agents.policies.pursuit` looks for the entries of a record, by their names in Eq. (2).
-_PURSUED = {
-    "x1": "x0", "x2": "x1", "theta1": "t1", "theta2": "t2", "theta3": "t3", "eta": "e", "GAMMA_SHAPE": "g_shape",
-    "GAMMA_RATE": "g_rate", "XI_SHAPE_y": "n_shape", "XI_RATE_y": "n_rate",
-}  # fmt: skip
-
 
 class Planner:
     """Expected free energy planning on the beliefs of an environment.
@@ -120,13 +112,11 @@ class Planner:
                 "goal_std and input_cost must be left out where the energy is limited, but are "
                 f"{goal_std!r} and {input_cost!r}; pass a horizon to plan with them"
             )
-        if whole and self._view != View(difference()):
-            raise ValueError(
-                f"horizon must be given where the energy is limited and the model is {self._view.model.name!r}, not "
-                "Eq. (2): only of that are whole episodes planned"
-            )
         horizon = env.horizon if whole else min(horizon or _HORIZON, env.horizon)
         self._energy = setup.budget if whole else None
+        if whole:
+            model, interpolation = believed_of(experiment)
+            self._pursue = pursuit(model, input_degree(model, interpolation)).pursue
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
@@ -185,9 +175,9 @@ class Planner:
         last = terms.amplitude * rows[:, at.last_input]
         inputs, scores = np.empty((2, n))
         if self._energy is not None:
-            energies = rows[:, at.budget_left] * self._energy
-            limits = terms.amplitude, terms.limit, terms.margin
-            pursue(_pursued(records), left, energies, *limits, plans, words, inputs, scores)
+            energies, rule = rows[:, at.budget_left] * self._energy, Rule(terms.amplitude, terms.limit, terms.margin)
+            known = record_places(self._view.model)
+            self._pursue(records, known, left, energies, rule, last, plans, words, inputs, scores)
         else:
             lasts = np.stack([last, before], axis=1)
             search(*self._view).plan(
@@ -195,16 +185,6 @@ class Planner:
             )
         actions = (inputs / terms.amplitude).astype(np.float32)
         return actions.reshape(*observed.shape[:-1], 1), (plans, rates, words, last)
-
-
-def _pursued(records: FloatArray) -> FloatArray:
-    """Beliefs in Eq. (2) as `agents.policies.pursuit` takes them."""
-    found = np.zeros((len(records), len(RECORD)))
-    for column, name in zip(records.T, belief_names(difference()), strict=True):
-        _, *pair = name.split("_") if name.startswith("P_") else ("", name)
-        known = _PURSUED.get(name) or "_".join(["P", *(_PURSUED[part] for part in pair)])
-        found[:, RECORD.index(known)] = column
-    return found
 
 
 def _stream(seed: np.random.SeedSequence) -> npt.NDArray[np.uint64]:

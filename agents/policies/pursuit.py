@@ -1,4 +1,4 @@
-"""The planner's search under a limit of energy, compiled: the whole rest of the episode, by gradient.
+"""The planner's search under a limit of energy, compiled for any model: the whole rest of the episode, by gradient.
 
 When energy is short, what matters is when to spend it: the best input rests, and then drives the oscillator up at its
 own frequency in one burst. No short horizon sees that. So the plan is for all samples that are left, and climbs the
@@ -9,23 +9,19 @@ and parameters this is the same belief propagation as that of `agents.policies.p
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any, NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 
-from agents.ascent import ascend, project
-from agents.design import START_SIZE, half_log_det, invert
+from agents.ascent import Limits, climber, project
+from agents.design import Known, designer, half_log_det, invert
 from agents.policies.planning import uniform
-from estimator.lanes import jit, kernel
-from estimator.record import COEFFICIENTS, RECORD
-
-_X0, _X1, _T1, _NOISES = (RECORD.index(name) for name in ("x0", "x1", "t1", "g_shape"))
-_STATES = np.array([RECORD.index(f"P_{pair}") for pair in ("x0_x0", "x0_x1", "x1_x1")])
-_CROSS = np.array([[RECORD.index(f"P_{x}_{c}") for c in COEFFICIENTS] for x in ("x0", "x1")])
-_COVARIANCE = np.array(
-    [
-        [RECORD.index(f"P_{'_'.join(sorted((a, b), key=COEFFICIENTS.index))}") for a in COEFFICIENTS]
-        for b in COEFFICIENTS
-    ]
-)
+from estimator.engine.tasks import belief_names
+from estimator.lanes import kernel, part
+from estimator.models.model import Model
+from estimator.posterior import covariance_places
 
 #: Input before and after a burst, in parts of that within.
 _WEAK = 0.2
@@ -36,94 +32,187 @@ _STEPS, _TRIAL = 8, 3
 #: Length of these steps in parts of what the energy allows.
 _RATE = 0.2
 
+#: A burst that drives the signal further than so many times its limit goes on from rest.
+_FAR = 2.0
 
-@kernel
-def pursue(records, left, energies, amplitude, limit, margin, plans, words, actions, scores):
-    """Improve the plans of n environments by some gradient steps.
 
-    Args:
-        records: (n, RECORD_SIZE) their beliefs.
-        left: (n,) samples left in their episodes.
-        energies: (n,) energy left [V²].
-        amplitude: largest input [V].
-        limit: of the displacement [V].
-        margin: predictive standard deviations of a settled filter that a plan keeps from it.
-        plans: (n, T) the last plans, begun one sample ago [V]; all zeros where there is none. Overwritten.
-        words: (n, 4) streams of random numbers; overwritten.
-        actions: (n,) receives the first input of the plan [V].
-        scores: (n,) receives the plan's worth [nats].
+class BeliefPlaces(NamedTuple):
+    """Where a flat record keeps what a plan begins with.
+
+    Attributes:
+        mean: (n + K,) means of states, then coefficients.
+        cov: (n + K, n + K) their covariance.
+        noises: (1 + sensors, 2) shape and rate of γ, then of each sensor's ξ.
     """
-    T = plans.shape[1]
-    start, theta = np.empty(START_SIZE), np.empty(4)
-    precision, F = np.empty((4, 4)), np.empty((4, 4))
-    tape = np.empty((T + 1, START_SIZE))
-    challenger = np.empty(T)
-    for i in range(len(records)):
-        steps = max(1, min(T, left[i]))
-        q = records[i, _NOISES + 1] / records[i, _NOISES]
-        r = records[i, _NOISES + 3] / records[i, _NOISES + 2]
-        begin(records[i], theta, precision, start, F)
-        aim = limit - margin * np.sqrt(start[2] + q + r)
-        u, other = plans[i, :steps], challenger[:steps]
-        fresh = not np.any(plans[i])
-        plans[i, :-1] = plans[i, 1:].copy()
-        plans[i, -1] = 0.0
-        project(u, amplitude, energies[i])
-        swing(theta, start, energies[i], fresh, other, words[i])
-        project(other, amplitude, energies[i])
-        told = (theta, precision, q, r, aim, np.inf, amplitude, energies[i], _RATE)
-        scores[i] = ascend(*told, _STEPS, start, u, tape, F)
-        if fresh or ascend(*told, _TRIAL, start, other, tape, F) > scores[i]:
-            u[:] = other
-            scores[i] = ascend(*told, _STEPS, start, u, tape, F)
-        actions[i] = u[0]
+
+    mean: npt.NDArray[np.intp]
+    cov: npt.NDArray[np.intp]
+    noises: npt.NDArray[np.intp]
 
 
-@jit
-def begin(record, theta, precision, start, work):
-    """From a belief: means, precision of the coefficients, and what a trajectory starts with (`agents.design`)."""
-    for j in range(4):
-        theta[j] = record[_T1 + j]
-        for k in range(4):
-            work[j, k] = record[_COVARIANCE[j, k]]
-    half_log_det(work)
-    invert(work, precision)
-    start[0], start[1] = record[_X0], record[_X1]
-    # State = S (coefficients' error) + what is left of it, with S = P_xc Λ.
-    for s in range(2):
-        for j in range(4):
-            total = 0.0
-            for k in range(4):
-                total += record[_CROSS[s, k]] * precision[k, j]
-            start[5 + 4 * s + j] = total
-    for p in range(3):
-        first, second = p // 2, 1 if p > 0 else 0
-        value = record[_STATES[p]]
-        for k in range(4):
-            value -= start[5 + 4 * first + k] * record[_CROSS[second, k]]
-        start[2 + p] = max(0.0, value) if p != 1 else value
+def record_places(model: Model) -> BeliefPlaces:
+    """Those of a model's records (`estimator.posterior.Belief`)."""
+    names = belief_names(model)
+    first = names.index("GAMMA_SHAPE")
+    noises = np.arange(first, len(names)).reshape(-1, 2)
+    return BeliefPlaces(np.arange(len(model.names)), covariance_places(model), noises)
 
 
-@jit
-def swing(theta, start, energy, late, u, words):
-    """A burst (T,) that pushes as the believed oscillator moves, from a random sample on; weak before and after it.
+class Pursuit(NamedTuple):
+    """Compiled functions of one model and interpolation of the input.
 
-    ``late`` is the first plan of an episode: not random, and late enough that the burst finds a better belief.
+    Attributes:
+        pursue: ``pursue(records, places, left, energies, rule, last, plans, words, actions, scores)``: improve the
+            plans of n environments by some gradient steps.
+
+            - ``records`` (n, size): their beliefs, which keep their numbers at ``places``.
+            - ``left`` (n,) samples, and ``energies`` (n,) energy, left in their episodes.
+            - ``rule``: a `Rule`.
+            - ``last`` (n,): the inputs applied last.
+            - ``plans`` (n, T): the last plans, begun one sample ago; all zeros where there is none. Overwritten.
+            - ``words`` (n, 4): streams of random numbers; overwritten.
+            - ``actions`` (n,) receives the first input of each plan, ``scores`` (n,) its worth [nats].
+        begin: ``begin(mean, cov, precision, start)``: from the moments of states and coefficients the inverse (K, K) of
+            the coefficients' covariance, and what a path starts with (`agents.design`).
+        swings: ``swings(known, limit, energy, inputs, words)``: fill inputs (k, T) with bursts from rest, which push as
+            the system moves.
     """
-    T = len(u)
-    begun = int(T * (0.35 if late else 0.6 * uniform(words)))
-    length = 1 + int(T * (0.4 if late else 0.2 + 0.6 * uniform(words)))
-    strength = np.sqrt(energy / length)
-    x, last_x = start[0], start[1]
-    for t in range(T):
-        strong = begun <= t < begun + length
-        u[t] = (strength if strong else _WEAK * strength) * (1.0 if x >= last_x else -1.0)
-        moved = theta[0] * x + theta[1] * x * x * x + theta[2] * last_x + theta[3] * u[t]
-        x, last_x = moved if abs(moved) < 1.0 else 0.0, x
+
+    pursue: Any
+    begin: Any
+    swings: Any
 
 
-@kernel
-def swings(theta, energy, inputs, words):
-    """Fill inputs (n, T) with such bursts of a system (4,) at rest."""
-    for i in range(len(inputs)):
-        swing(theta, np.zeros(START_SIZE), energy, False, inputs[i], words)
+class Rule(NamedTuple):
+    """What plans must keep.
+
+    Attributes:
+        amplitude: largest input.
+        limit: of the first sensor's signal.
+        margin: its predictive standard deviations, those of the first sample, that a plan keeps from the limit.
+    """
+
+    amplitude: float
+    limit: float
+    margin: float
+
+
+@cache
+def pursuit(model: Model, degree: int = 0) -> Pursuit:
+    """Planning the whole rest of an episode of a model; arguments as `agents.design.designer`."""
+    found, ascend = designer(model, degree), climber(model, degree).ascend
+    memory_for, start_size, n_path = found.memory, found.start_size, found.n_path
+    begin_path, coefficients_of, lay, step = found.code.begin, found.code.coefficients, found.code.lay, found.code.step
+    n, k, sensors = model.n_states, model.n_coefficients, model.n_outputs
+    kind = f"{model.name}_{model.digest}_{degree}"
+    begin = part(kind)(_beginning(n, k))
+    as_noises = found.code.noises
+
+    @part(kind)
+    def rest(known, start, last, tape):
+        """The signals of two samples without input, and the first one's predictive variance."""
+        C = coefficients_of(known.coefficients)
+        P, F = begin_path(start)
+        P, F, x, spread = step(P, F, C, lay(0.0, last, 0.0), known.noises, tape, 0)
+        _, _, then, _ = step(P, F, C, lay(0.0, 0.0, last), known.noises, tape, 0)
+        return x, then, spread
+
+    @part(kind)
+    def swing(known, start, limit, energy, late, u, words, tape):
+        """A burst (T,) that pushes as the signal moves, from a random sample on; weak before and after it.
+
+        ``late`` is the first plan of an episode: not random, and late enough that the burst finds a better belief.
+        """
+        T = len(u)
+        begun = int(T * (0.35 if late else 0.6 * uniform(words)))
+        length = 1 + int(T * (0.4 if late else 0.2 + 0.6 * uniform(words)))
+        strength = np.sqrt(energy / length)
+        last = start[n_path] if start_size > n_path else 0.0
+        before, x, _ = rest(known, start, last, tape)
+        older = 0.0
+        C = coefficients_of(known.coefficients)
+        P, F = begin_path(start)
+        for t in range(T):
+            strong = begun <= t < begun + length
+            u[t] = (strength if strong else _WEAK * strength) * (1.0 if x >= before else -1.0)
+            before = x
+            P, F, x, _ = step(P, F, C, lay(u[t], last, older), known.noises, tape, 0)
+            last, older = u[t], last
+            if not abs(x) < _FAR * limit:
+                P, F = begin_path(np.zeros(start_size))
+                x = 0.0
+
+    @kernel(kind=kind)
+    def pursue(records, places, left, energies, rule, last, plans, words, actions, scores):
+        T = plans.shape[1]
+        start, precision, coefficients = np.zeros(start_size), np.empty((k, k)), np.empty(k)
+        mean, cov, variances = np.empty(n + k), np.empty((n + k, n + k)), np.empty(sensors + 1)
+        memory, challenger, best = memory_for(T), np.empty(T), np.empty(T)
+        for i in range(len(records)):
+            steps = max(1, min(T, left[i]))
+            for a in range(n + k):
+                mean[a] = records[i, places.mean[a]]
+                for b in range(n + k):
+                    cov[a, b] = records[i, places.cov[a, b]]
+            begin(mean, cov, precision, start)
+            if start_size > n_path:
+                start[n_path] = last[i]
+            coefficients[:] = mean[n:]
+            for a in range(sensors + 1):
+                variances[a] = records[i, places.noises[a, 1]] / records[i, places.noises[a, 0]]
+            known = Known(coefficients, precision, as_noises(variances))
+            _, _, spread = rest(known, start, last[i], memory.tape)
+            aim = rule.limit - rule.margin * np.sqrt(spread)
+            u, other = plans[i, :steps], challenger[:steps]
+            fresh = not np.any(plans[i])
+            plans[i, :-1] = plans[i, 1:].copy()
+            plans[i, -1] = 0.0
+            limits = Limits(np.inf, aim, rule.amplitude, energies[i])
+            project(u, rule.amplitude, energies[i])
+            swing(known, start, rule.limit, energies[i], fresh, other, words[i], memory.tape)
+            project(other, rule.amplitude, energies[i])
+            scores[i] = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
+            if fresh or ascend(known, limits, _RATE, _TRIAL, start, other, best[:steps], memory) > scores[i]:
+                u[:] = other
+                scores[i] = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
+            actions[i] = u[0]
+
+    @kernel(kind=kind)
+    def swings(known, limit, energy, inputs, words):
+        tape, start = memory_for(1).tape, np.zeros(start_size)
+        for i in range(len(inputs)):
+            swing(known, start, limit, energy, False, inputs[i], words, tape)
+
+    return Pursuit(pursue, begin, swings)
+
+
+def _beginning(n: int, k: int) -> Any:
+    """See `Pursuit.begin`, for n states and k coefficients."""
+    spreads = n * (n + 1) // 2
+
+    def begin(mean, cov, precision, start):
+        work = np.empty((k, k))
+        for a in range(k):
+            for b in range(k):
+                work[a, b] = cov[n + a, n + b]
+        half_log_det(work)
+        invert(work, precision)
+        start[:n] = mean[:n]
+        # State = Z (coefficients' error) + what is left of it, with Z = P_xc Λ.
+        first = n + spreads
+        for a in range(n):
+            for b in range(k):
+                total = 0.0
+                for c in range(k):
+                    total += cov[a, n + c] * precision[c, b]
+                start[first + k * a + b] = total
+        place = n
+        for a in range(n):
+            for b in range(a, n):
+                value = cov[a, b]
+                for c in range(k):
+                    value -= start[first + k * a + c] * cov[b, n + c]
+                start[place] = max(0.0, value) if a == b else value
+                place += 1
+
+    return begin

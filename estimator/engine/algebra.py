@@ -333,14 +333,15 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
             for b, name in enumerate(coefficients)
         }
         counted = put(f"I{tag}", symbol("LIVE") * weight)
+        weighed = {name: put(f"U{tag}_{name}", counted * told[name]) for name in coefficients}
         for b, name in enumerate(coefficients):
             for other in coefficients[b:]:
-                totals[f"F_{name}_{other}"] += counted * told[name] * told[other]
+                totals[f"F_{name}_{other}"] += weighed[name] * told[other]
         error = put(f"E{tag}", symbol(f"Y_{sensor}") - shown) if observed else ZERO
         if observed:
             totals["LOSS"] += HALF * (counted * error**2 - symbol("LIVE") * sp.log(weight))
             for name in coefficients:
-                totals[f"SLOPE_{name}"] -= counted * told[name] * error
+                totals[f"SLOPE_{name}"] -= weighed[name] * error
         else:
             results[f"SHOWN_{sensor}"] = text_of(shown)
             if k == 0:

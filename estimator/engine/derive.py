@@ -328,8 +328,10 @@ def reverse(assignments: Assignments, wanted: Sequence[str], seeds: Mapping[str,
             continue
         own = symbol(f"G_{name}")
         lines.append((str(own), sum(parts, sp.S.Zero)))
+        inverted = expression.base if expression.is_Pow and expression.exp == -1 else None
         for used in sorted(expression.free_symbols, key=str):
-            slope = sp.diff(expression, used)
+            # The slope of 1/x needs no further division.
+            slope = sp.diff(expression, used) if inverted is None else -(symbol(name) ** 2) * sp.diff(inverted, used)
             adjoints.setdefault(str(used), []).append(slope * own)
     lines += [(f"G_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in wanted]
     return lines

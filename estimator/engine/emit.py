@@ -148,3 +148,38 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def scalar_function(
+    name: str,
+    lines: Assignments,
+    results: Sequence[Sequence[str]],
+    arguments: Mapping[str, Sequence[str]],
+    uniform: Sequence[str] = (),
+    doc: str = "",
+) -> str:
+    """Source of ``name(*arguments, *uniform)`` of tuples of scalars, which stay in registers from call to call.
+
+    Args:
+        name: of the function.
+        lines: in the order of execution; those that no result needs are left out.
+        results: the names (or numbers) that each tuple returned holds; one tuple is returned by itself.
+        arguments: name of a tuple to the names that it holds.
+        uniform: further arguments, each a scalar.
+        doc: a line for the reader.
+
+    Raises:
+        ValueError: for a name that is neither assigned nor an argument.
+    """
+    wanted = {str(value) for group in results for value in group}
+    kept = _needed(lines, wanted)
+    used = {str(s) for _, e in kept for s in e.free_symbols} | {v for v in wanted if not is_number(v)}
+    given = {held for group in arguments.values() for held in group} | set(uniform)
+    unknown = sorted(used - given - {target for target, _ in kept})
+    if unknown:
+        raise ValueError(f"{name} uses {unknown}, which no line assigns and no argument brings")
+    body = [f"({', '.join(held)},) = {group}" for group, held in arguments.items() if used & set(held)]
+    body += [f"{target} = {text_of(e)}" for target, e in kept]
+    gathered = [f"({', '.join(group)},)" for group in results]
+    source = [f"def {name}({', '.join([*arguments, *uniform])}):", f'    """{doc}"""']
+    return "\n".join([*source, *(f"    {line}" for line in body), f"    return {', '.join(gathered)}"]) + "\n"

@@ -358,16 +358,14 @@ def test_rewards_that_count_no_information_stay_as_they_are():
 
 def test_the_example_brings_about_as_much_as_the_oracle():
     """In the volume of what a sample tells, within a factor of two."""
-    from agents.oracle import Oracle, Systems
     from estimator.fisher import fisher_information
-    from estimator.parameters import to_coefficients
+
+    from agents.oracle import Oracle, Systems
 
     systems = Systems.of(AMPLITUDE, 32)
-    envs = make(AMPLITUDE, 32)
-    envs.reset(seed=0)
     task = systems.task
     told = fisher_information(
-        to_coefficients(envs.truth), Oracle.of(systems).inputs[:32], task.process_noise, task.measurement_noise
+        task.model, systems.theta, Oracle.of(systems).inputs[:32], task.process_noise, task.measurement_noise
     )
     best = told.mean(axis=0) / task.samples
     example = example_rate(AMPLITUDE, {}, seed=0)

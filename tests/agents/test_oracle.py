@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 
 from agents import oracle as module
+from agents import oracle_task
 from agents.evaluation import evaluate
 from agents.oracle import Config, Oracle, Systems, as_stored, design, main, search
 
-SHORT, POWER = "duffing_env/Short-v0", "duffing_env/Power-v0"
+SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Continuous-v0"
 STORED = [SHORT, POWER, "duffing_env/Amplitude-v0", "duffing_env/Output-v0"]
 
 
 @pytest.fixture
 def empty_folder(monkeypatch, tmp_path):
-    monkeypatch.setattr(module, "FOLDER", tmp_path)
+    monkeypatch.setattr(oracle_task, "FOLDER", tmp_path)
     return tmp_path
 
 
@@ -59,6 +60,23 @@ def test_under_a_budget_the_search_spends_it_in_a_burst():
     # Spread evenly over the episode, the same energy tells 3 nats less.
     square = 0.0222 * np.sign(np.sin(2 * np.pi * 68 / 610.35 * np.arange(256) + 0.1))
     assert value > systems.worth(square[None])[0][0] + 3.0
+
+
+@pytest.mark.parametrize("options", [{}, {"horizon": 96, "max_rms": 0.03}])
+def test_the_search_serves_the_differential_equation_too(options, empty_folder):
+    systems = Systems.of(CONTINUOUS, 1, {"horizon": 48, **options})
+    rng = np.random.default_rng(0)
+    given = 0.03 * rng.choice([-1.0, 1.0], (1, systems.task.samples))
+    u, value = search(systems, 0, given, rng, rounds=1)
+    values, peaks = systems.worth(u[None])
+    assert np.abs(u).max() <= 0.15
+    assert (u**2).sum() <= systems.task.energy
+    assert peaks[0] <= 0.6
+    assert value == values[0]
+    assert value > systems.worth(given)[0][0] + 2.0
+    oracle = Oracle(systems, as_stored(u[None] / 0.15) * 0.15, values)
+    oracle.save()
+    np.testing.assert_allclose(Oracle.of(systems).inputs[0], u, atol=1e-12)
 
 
 def test_what_is_better_takes_its_place_and_nothing_else(empty_folder):
@@ -146,8 +164,9 @@ def test_stored_oracles_keep_the_limits_of_their_tracks(track):
 
 
 def test_tracks_without_an_oracle_say_so():
-    for track in ("Drift-v0", "Continuous-v0"):
-        with pytest.raises(ValueError, match="difference equation without jump"):
-            Systems.of(f"duffing_env/{track}", 1)
+    with pytest.raises(ValueError, match="plant without jump and slew limit"):
+        Systems.of("duffing_env/Drift-v0", 1)
+    with pytest.raises(FileNotFoundError, match="no oracle is stored"):
+        Oracle.of(Systems.of(CONTINUOUS, 1, {"horizon": 31}))
     with pytest.raises(ValueError, match="inputs must have shape"):
         Systems.of(SHORT, 1).worth(np.zeros((2, 48)))

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import duffing_env
-from agents.design import START_SIZE, worth
+from agents.design import Known, designer
 from agents.policies import make_policy
 from agents.policies.imagination import LAYOUT, imagine, judge
 from agents.policies.planner import Planner
-from agents.policies.pursuit import begin
+from agents.policies.pursuit import pursuit, record_places
 from estimator.lanes import LANES
+from estimator.models.difference import difference
 
 sys.path.append(str(Path(__file__).parents[1] / "estimator"))
 from twins import Moments, random_prior, structured_step
@@ -111,10 +112,11 @@ def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
     rng = np.random.default_rng(2)
     q, r = 0.01**2, 0.02**2
     belief = known_noises(random_prior(rng), q, r)
-    theta, precision, start, F = np.empty(4), np.empty((4, 4)), np.empty(START_SIZE), np.empty((4, 4))
-    begin(belief.to_record(), theta, precision, start, F)
+    found, record, places = designer(difference()), belief.to_record(), record_places()
+    mean, start, precision = record[places.mean], np.zeros(found.start_size), np.empty((4, 4))
+    pursuit(difference()).begin(mean, record[places.cov], precision, start)
     u = rng.normal(0.0, 0.05, 8)
-    value, _ = worth(theta, precision, q, r, 1e3, 0.0, start, u, np.empty((9, START_SIZE)), F)
+    value, _ = found.worth(Known(mean[2:].copy(), precision, (q, r)), 1e3, 0.0, start, u, found.memory(8))
     assert value == pytest.approx(-expected_log_det(belief, u, q, r)[1], abs=1e-6)
 
 
@@ -153,6 +155,18 @@ def test_the_budget_is_spent_and_not_exceeded():
     energy = (inputs**2).sum(axis=0) / (256 * 0.0222**2)
     assert np.all(energy <= 1 + 1e-4)
     assert np.all(energy > 0.98)
+
+
+def test_under_a_budget_plans_follow_the_differential_equation_too():
+    options = {"max_rms": 0.0222, "horizon": 128}
+    inputs, _, early = roll_out("duffing_env/Continuous-v0", 4, options=options)
+    assert early == 0
+    energy = (inputs**2).sum(axis=0) / (128 * 0.0222**2)
+    assert np.all(energy <= 1 + 1e-4)
+    assert np.all(energy > 0.95)
+    # A burst: half of the energy within a third of the time.
+    windows = [(inputs[t : t + 43] ** 2).sum(axis=0) for t in range(86)]
+    assert np.all(np.max(windows, axis=0) > 0.5 * (inputs**2).sum(axis=0))
 
 
 def test_looking_ahead_teaches_more_than_myopia_and_a_goal_keeps_still():

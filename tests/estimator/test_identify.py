@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from estimator import NLARX, Belief, ContinuousBelief, OnlineEstimator, Prior, continuous_prior
-from estimator.continuous_likelihood import accumulate, continuous_information
 from estimator.identify import identify
+from estimator.information import fisher_information, follow
 from estimator.maximum_a_posteriori import maximum_a_posteriori
+from estimator.models.duffing import duffing
 
 NOISES = (5e-4, 5e-4)
 LENGTHS = [40, 7, 40] + 31 * [25]  # more than a block of lanes
@@ -113,8 +114,7 @@ def test_the_likelihood_and_its_slope_are_those_of_a_filter_with_matrices():
     u, y, envs = records("duffing_env/Continuous-v0", samples=25, systems=2)
     psi = ContinuousBelief.coefficients_of(envs.truth) * [1.02, 0.97, 1.1, 0.99]
     q, r, start = NOISES[0] ** 2, NOISES[1] ** 2, 1e-6
-    loss, slope, information = np.zeros(2), np.zeros((2, 4)), np.zeros((2, 4, 4))
-    accumulate(psi, u, y, q, r, start, loss, slope, information)
+    loss, slope, information = follow(duffing(), psi, u, y[:, :, None], (q, r), start * np.eye(2), 1)
     for row in range(2):
         assert loss[row] == pytest.approx(likelihood_by_differences(psi[row], u[row], y[row], q, r, start), rel=2e-2)
         for k in range(4):
@@ -128,7 +128,7 @@ def test_the_likelihood_and_its_slope_are_those_of_a_filter_with_matrices():
 def test_the_auditor_of_the_physical_equation_is_calibrated():
     u, y, envs = records("duffing_env/Continuous-v0", samples=256, systems=200, seed=1)
     truth = ContinuousBelief.coefficients_of(envs.truth)
-    fit = maximum_a_posteriori(u, y, continuous_prior(), *NOISES)
+    fit = maximum_a_posteriori(duffing(), u, y, continuous_prior(), *NOISES, "linear")
     assert fit.converged.mean() > 0.98
     error, std = fit.mean - truth, np.sqrt(np.diagonal(fit.cov, axis1=1, axis2=2))
     assert 0.86 < np.mean(np.abs(error) < 1.645 * std) < 0.94
@@ -138,6 +138,6 @@ def test_the_auditor_of_the_physical_equation_is_calibrated():
     # It ends where the environment's own estimator does, but for what that one has to learn of the noises.
     own = np.array([envs.belief(row).coefficients_mean for row in range(200)])
     assert np.median(np.abs(own - fit.mean) / std) < 0.5
-    information = continuous_information(truth, u, y, *NOISES)
+    information = fisher_information(duffing(), truth, u, *NOISES, y=y, interpolation="linear")
     gained = np.linalg.slogdet(np.linalg.inv(continuous_prior().coefficients_cov) + information)[1] / 2
     assert gained.mean() == pytest.approx(-np.linalg.slogdet(fit.cov)[1].mean() / 2, abs=0.3)

@@ -1,28 +1,28 @@
 """Fisher information: against a plain twin, the curvature of the likelihood, the estimator's posterior, and bounds."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from estimator import (
-    SAMPLING_STEP,
-    SILVERBOX_TWIN,
-    Coefficients,
-    OnlineEstimator,
-    PhysicalParameters,
-    Prior,
-    to_coefficients,
-)
-from estimator.fisher import as_rows, cramer_rao, fisher_information, ode_information, relative_covariance
-from estimator.models.ode import N_MOTION, DuffingODE, flow
+from estimator import SILVERBOX_TWIN, Belief, OnlineEstimator, PhysicalParameters, Prior
+from estimator.information import cramer_rao, fisher_information, follow, relative_covariance
+from estimator.models.difference import difference
+
+sys.path.append(str(Path(__file__).parent))
+import filtering
+from filtering import CASES
 
 Q, R = 5e-4, 3e-4
-TWIN = to_coefficients(SILVERBOX_TWIN)
+PAPER = difference()
+TWIN = Belief.coefficients_of(SILVERBOX_TWIN)
 
 
 def draw_systems(rng, n, spread=0.3):
     factors = np.exp(rng.uniform(np.log(1 - spread), np.log(1 + spread), (4, n)))
     centre = np.array([getattr(SILVERBOX_TWIN, name) for name in "mcab"])
-    return to_coefficients(PhysicalParameters(*(centre[:, None] * factors)))
+    return Belief.coefficients_of(PhysicalParameters(*(centre[:, None] * factors)))
 
 
 def simulate(theta, u, rng=None):
@@ -74,8 +74,8 @@ def test_without_noise_it_is_what_differences_of_the_filters_innovations_give(st
     rng = np.random.default_rng(0)
     systems = draw_systems(rng, 5)
     u = rng.choice([-0.12, 0.12], (5, 60))
-    information = fisher_information(systems, u, Q, R, state_std=state_std)
-    for theta, inputs, F in zip(as_rows(systems), u, information, strict=True):
+    information = fisher_information(PAPER, systems, u, Q, R, state_std=state_std)
+    for theta, inputs, F in zip(systems, u, information, strict=True):
         slopes, variances = differentiated(theta, inputs, simulate(theta, inputs), state_std)
         expected = slopes.T @ (slopes / variances[:, None])
         scale = np.sqrt(np.diag(expected))
@@ -84,20 +84,20 @@ def test_without_noise_it_is_what_differences_of_the_filters_innovations_give(st
 
 def test_along_outputs_it_is_that_of_the_filter_on_them():
     rng = np.random.default_rng(1)
-    theta, u = as_rows(TWIN), rng.choice([-0.12, 0.12], 100)
+    theta, u = TWIN, rng.choice([-0.12, 0.12], 100)
     y = simulate(theta, u, rng)
     slopes, variances = differentiated(theta, u, y)
     expected = slopes.T @ (slopes / variances[:, None])
     scale = np.sqrt(np.diag(expected))
-    F = fisher_information(TWIN, u, Q, R, y=y)
+    F = fisher_information(PAPER, TWIN, u, Q, R, y=y)
     # The gain's sensitivity is left out: it is of the order of the innovation beside the displacement.
     np.testing.assert_allclose(F / np.outer(scale, scale), expected / np.outer(scale, scale), rtol=0, atol=0.01)
 
 
 def test_it_is_the_mean_curvature_of_the_log_likelihood():
     rng = np.random.default_rng(2)
-    theta, u, runs = as_rows(TWIN), rng.choice([-0.12, 0.12], 60), 100
-    F = fisher_information(TWIN, u, Q, R)
+    theta, u, runs = TWIN, rng.choice([-0.12, 0.12], 60), 100
+    F = fisher_information(PAPER, TWIN, u, Q, R)
     scale = 1 / np.sqrt(np.diag(F))
     steps = 0.1 * scale
     curvatures = np.empty((runs, 4))
@@ -118,13 +118,13 @@ def test_the_structured_posterior_has_the_information_of_prior_and_data():
     # With known noises it is an extended Kalman filter of state and coefficients, so its precision is near Λ0 + F.
     rng = np.random.default_rng(3)
     u = rng.choice([-0.12, 0.12], 250)
-    y = simulate(as_rows(TWIN), u, rng)
+    y = simulate(TWIN, u, rng)
     prior = Prior.silverbox_twin(0.1, Q, R, noise_shape=1e9)
     estimator = OnlineEstimator(prior=prior)
     acting = np.concatenate([u, [0.0]])
     estimator.run(acting, np.concatenate([[0.0], y]))
     precision = np.linalg.inv(prior.coefficients_cov)
-    F = fisher_information(TWIN, u, Q, R, y=y, state_std=1e-3)
+    F = fisher_information(PAPER, TWIN, u, Q, R, y=y, state_std=1e-3)
     gained = 0.5 * np.linalg.slogdet((precision + F) @ prior.coefficients_cov)[1]
     posterior = estimator.belief.coefficients_cov
     believed = -0.5 * np.linalg.slogdet(posterior @ precision)[1]
@@ -136,21 +136,21 @@ def test_a_series_ends_before_its_first_nan():
     u = rng.choice([-0.1, 0.1], (2, 50))
     short = u.copy()
     short[0, 30:] = np.nan
-    information = fisher_information(TWIN, short, Q, R)
-    np.testing.assert_array_equal(information[0], fisher_information(TWIN, u[0, :30], Q, R))
-    np.testing.assert_array_equal(information[1], fisher_information(TWIN, u[1], Q, R))
+    information = fisher_information(PAPER, TWIN, short, Q, R)
+    np.testing.assert_array_equal(information[0], fisher_information(PAPER, TWIN, u[0, :30], Q, R))
+    np.testing.assert_array_equal(information[1], fisher_information(PAPER, TWIN, u[1], Q, R))
 
 
 def test_bounds():
     rng = np.random.default_rng(5)
-    F = fisher_information(TWIN, rng.choice([-0.12, 0.12], 200), Q, R)
+    F = fisher_information(PAPER, TWIN, rng.choice([-0.12, 0.12], 200), Q, R)
     precision = np.linalg.inv(Prior.silverbox_twin().coefficients_cov)
     for bound, total in ((cramer_rao(F), F), (cramer_rao(F, precision), F + precision)):
         np.testing.assert_allclose(bound @ total, np.eye(4), atol=1e-8)
     # Relative errors are those of a simulated change of m, c, a and b.
     bound = cramer_rao(F)
-    relative = relative_covariance(TWIN, bound)
-    draws = rng.multivariate_normal(as_rows(TWIN), bound, size=20_000)
+    relative = relative_covariance(PAPER, TWIN, bound)
+    draws = rng.multivariate_normal(TWIN, bound, size=20_000)
     eta = draws[:, 3]
     a = (1 - draws[:, 0] - draws[:, 2]) / eta / SILVERBOX_TWIN.a - 1
     b = -draws[:, 1] / eta / SILVERBOX_TWIN.b - 1
@@ -160,69 +160,70 @@ def test_bounds():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"process_noise": 0.0}, "process_noise must be positive"),
+        ({"process_noise": -1.0}, "process_noise must be 0 or more"),
         ({"measurement_noise": -1.0}, "measurement_noise must be positive"),
         ({"state_std": -1.0}, "state_std must be 0 or more"),
+        ({"measurement_noise": [1.0, 2.0]}, "measurement_noise must be one number, or one for each"),
         ({"y": np.zeros(3)}, "u and y must have one shape"),
+        ({"interpolation": "linear"}, "interpolation must be 'zero_order' for the difference equation"),
+        ({"interpolation": "spline"}, "interpolation must be one of"),
     ],
 )
 def test_errors_name_the_argument(arguments, words):
     with pytest.raises(ValueError, match=words):
-        fisher_information(TWIN, np.zeros(5), **arguments)
+        fisher_information(PAPER, TWIN, np.zeros(5), **{"process_noise": Q, "measurement_noise": R, **arguments})
 
 
 def test_errors_of_batches_and_of_nothing_learned():
-    batch = Coefficients(*(np.ones(3) for _ in range(4)))
     with pytest.raises(ValueError, match="batches of one size"):
-        fisher_information(batch, np.zeros((2, 5)))
+        fisher_information(PAPER, np.ones((3, 4)), np.zeros((2, 5)), Q, R)
+    with pytest.raises(ValueError, match="coefficients must be of"):
+        fisher_information(PAPER, np.ones(3), np.zeros(5), Q, R)
     with pytest.raises(ValueError, match="positive definite"):
-        cramer_rao(fisher_information(TWIN, np.zeros(5)))
+        cramer_rao(fisher_information(PAPER, TWIN, np.zeros(5), Q, R))
 
 
-def ode_innovations(parameters, u, y, q, r):
-    """Innovations and their variances of the extended Kalman filter of Eq. (1) from rest, with matrices."""
-    model, step = DuffingODE(), SAMPLING_STEP
-    p = np.concatenate([parameters * [step**2, step, step**2, step**2], np.zeros(3)])
-    J, work = np.empty((2, N_MOTION)), np.empty((3, 2, N_MOTION))
-    m, P, d = np.zeros(2), np.zeros((2, 2)), np.array([1.0, 2.0])
-    innovations, variances = np.empty(len(u) - 1), np.empty(len(u) - 1)
-    for t, piece in enumerate(model.pieces(u)):
-        m = np.array(flow(m[0], m[1], p, piece, model.substeps, J, work))
-        A = J[:, :2]
-        P = A @ P @ A.T + q**2 * np.outer(d, d)
-        variances[t] = P[0, 0] + r**2
-        K = P[:, 0] / variances[t]
-        innovations[t] = y[t] - m[0]
-        m, P = m + K * innovations[t], P - np.outer(K, P[0])
-    return innovations, variances
-
-
-def test_the_equation_of_motion_has_an_information_too():
-    rng = np.random.default_rng(6)
-    twin = SILVERBOX_TWIN
-    parameters = np.array([twin.a, twin.c, 1.0, twin.b]) / twin.m
-    u, q, r = 0.1 * rng.uniform(-1, 1, 80), 2e-4, 1e-3
-    silent = -ode_innovations(parameters, u, np.zeros(79), 0.0, 1e6)[0]  # no output is believed: a free run
-    slopes = np.empty((79, 4))
-    for j in range(4):
-        h = 1e-5 * parameters * (np.arange(4) == j)
-        sides = [ode_innovations(parameters + s * h, u, silent, q, r)[0] for s in (1, -1)]
-        slopes[:, j] = (sides[0] - sides[1]) / (2 * h[j])
-    variances = ode_innovations(parameters, u, silent, q, r)[1]
-    expected = slopes.T @ (slopes / variances[:, None])
+@pytest.mark.parametrize("case", CASES)
+def test_of_any_model_it_is_that_of_a_filter_with_matrices(case):
+    model, interpolation, c, size = CASES[case]
+    u = size * np.random.default_rng(6).uniform(-1, 1, 30)
+    q, r = 2e-3, 1e-3
+    expected = filtering.information(model, interpolation, c, u, q**2, r**2, 1e-6)
+    F = fisher_information(model, c, u, q, r, interpolation=interpolation, state_std=1e-3)
     scale = np.sqrt(np.diag(expected))
-    F = ode_information(parameters, u, q, r)
     np.testing.assert_allclose(F / np.outer(scale, scale), expected / np.outer(scale, scale), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("parameters", "arguments", "words"),
-    [
-        (np.ones(3), {}, r"parameters must have shape \(4,\)"),
-        (np.ones(4), {"process_noise": -1.0}, "process_noise must be 0 or more"),
-        (np.ones(4), {"measurement_noise": 0.0}, "measurement_noise must be positive"),
-    ],
-)
-def test_its_errors_name_the_argument(parameters, arguments, words):
-    with pytest.raises(ValueError, match=words):
-        ode_information(parameters, np.zeros(5), **arguments)
+@pytest.mark.parametrize("case", CASES)
+def test_the_likelihood_of_any_model_is_that_of_a_filter_with_matrices(case):
+    model, interpolation, c, size = CASES[case]
+    rng = np.random.default_rng(7)
+    u, q, r = size * rng.uniform(-1, 1, (2, 20)), 2e-5, 1e-5
+    y = np.array([filtering.filtered(model, interpolation, c, row, None, q**2, r**2)[2] for row in u])
+    y += r * rng.standard_normal(y.shape)
+    degree = int(interpolation == "linear")
+    points, rest = np.array([c, c], dtype=np.float64), np.zeros((model.n_states, model.n_states))
+    found = follow(model, points, u, y, (q**2, *[r**2] * model.n_outputs), rest, degree)
+    for row in range(2):
+        value = filtering.log_likelihood(model, interpolation, c, u[row], y[row], q**2, r**2)
+        assert -found.loss[row] == pytest.approx(value, rel=1e-6)
+        std = 1 / np.sqrt(np.diag(found.information[row]))
+        for j in range(len(c)):
+            h = 1e-3 * std * (np.arange(len(c)) == j)
+            up, down = (
+                filtering.log_likelihood(model, interpolation, c + s * h, u[row], y[row], q**2, r**2) for s in (1, -1)
+            )
+            # In standard deviations. Left out is what S and the gain tell, which is as small as the noise beside u.
+            assert -found.slope[row, j] * std[j] == pytest.approx((up - down) / 2e-3, abs=0.02)
+    np.testing.assert_array_equal(found.information, np.swapaxes(found.information, 1, 2))
+
+
+def test_spare_lanes_and_other_series_change_nothing():
+    rng = np.random.default_rng(8)
+    systems, u = draw_systems(rng, 40), rng.choice([-0.1, 0.1], (40, 30))
+    u[7] = np.nan
+    u[11, 4:] = np.nan
+    many = fisher_information(PAPER, systems, u, Q, R)
+    for row in (0, 7, 11, 39):
+        np.testing.assert_array_equal(many[row], fisher_information(PAPER, systems[row], u[row], Q, R))
+    np.testing.assert_array_equal(many[7], np.zeros((4, 4)))
