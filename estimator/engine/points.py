@@ -1,4 +1,6 @@
-"""Sigma points, as assignments: a belief's motion by the cubature rule of `estimator.inference.sigma_points`.
+"""Sigma points, as assignments: a belief's motion by the cubature rule of degree 3.
+
+(Arasaratnam and Haykin 2009, doi:10.1109/TAC.2009.2019800; an unscented transform whose centre has no weight.)
 
 The points lie along the columns of √pairs L, L Lᵀ = P over the *movers*, the quantities on which the motion depends;
 the other rows of L say how the rest goes along. A mover of variance 0, or one that depends on those before it, leaves a
@@ -29,8 +31,10 @@ from estimator.engine.derive import (
     renamed,
     symbol,
 )  # fmt: skip
-from estimator.inference.sigma_points import ROUNDING
 from estimator.models.model import Model
+
+#: What rounding leaves of the variance of a dimension that depends on those before it, as a part of that variance.
+ROUNDING = 1e-14
 
 #: The second of three where the first is positive, else the third; and 1 for what is negative or no number, else 0.
 select, below = sp.Function("select"), sp.Function("below")
