@@ -11,12 +11,9 @@ from .information import (
     fisher_information,
     relative_covariance,
 )
-from .gaussian import JointBelief
 from .models.difference import difference
 from .models.duffing import duffing
 from .models.model import Model
-from .models.nlarx import NLARX
-from .models.ode import DuffingODE
 from .offline import PEMNARX
 from .online import OnlineEstimator
 from .parameters import (
@@ -43,15 +40,12 @@ from .saving import (
 
 __all__ = [
     "CONTINUOUS_TWIN",
-    "NLARX",
     "PEMNARX",
     "SAMPLING_STEP",
     "SILVERBOX_TWIN",
     "Belief",
     "Coefficients",
     "ContinuousBelief",
-    "DuffingODE",
-    "JointBelief",
     "Model",
     "NoiseRatio",
     "OnlineEstimator",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,31 +16,13 @@ from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.posterior import Belief, covariance_places
 from estimator.rig import Rig
+from estimator.settings import Settings
 
 #: Shape of a Gamma belief that further samples do not move.
 _CERTAIN = 1e15
 
 #: What rounding may leave below zero of the eigenvalues of a covariance, in units of its standard deviations.
 _ROUNDING = 1e-5
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a filter learns.
-
-    Attributes:
-        factorisation: ``structured`` or ``mean_field``.
-        iterations: per sample.
-        as_published: with the departures of the published run.
-        drift: standard deviation of a coefficient's step per sample, in parts of that of its prior.
-        noise_hypotheses: ratios of the noises.
-    """
-
-    factorisation: str = "structured"
-    iterations: int = 3
-    as_published: bool = False
-    drift: float = 0.0
-    noise_hypotheses: int = 1
 
 
 class Filter:
@@ -79,7 +61,9 @@ class Filter:
         settings = self.settings
         if settings.factorisation == "mean_field":
             return samples.published(settings.iterations, settings.as_published)
-        return samples.structured(self.model, degree(self.model, self.rig), settings.iterations, members)
+        return samples.structured(
+            self.model, degree(self.model, self.rig), settings.iterations, settings.expectations, members
+        )
 
     def __getstate__(self) -> dict[str, object]:
         return {name: value for name, value in self.__dict__.items() if name != "_loop"}
@@ -240,8 +224,10 @@ class Filter:
         noises = record[-2 - 2 * self.model.n_outputs :]
         noises *= np.repeat(_CERTAIN / noises[::2], 2)
         # As many iterations as the filter itself takes, though one were enough: that loop is compiled.
-        iterations = self.settings.iterations if self.settings.factorisation == "structured" else 3
-        known = Filter(self.prior.with_records(record[None])[0], self.rig, Settings(iterations=iterations))
+        settings = replace(self.settings, drift=0.0, noise_hypotheses=1)
+        if settings.factorisation == "mean_field":
+            settings = Settings()
+        known = Filter(self.prior.with_records(record[None])[0], self.rig, settings)
         return known
 
     def follow(self, u: FloatArray, y: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from estimator.checks import scalar, series
 from estimator.ensemble import NoiseRatio
-from estimator.filter import Filter, Settings
+from estimator.filter import Filter
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -19,14 +19,9 @@ from estimator.parameters import FloatArray
 from estimator.posterior import Belief, covariance_places
 from estimator.priors import recorded_prior, silverbox_prior
 from estimator.rig import Rig
+from estimator.settings import Settings, settled
 
 _SAMPLES_BETWEEN_REPORTS = 5_000
-
-#: More iterations per sample change nothing that shows.
-_MOST_ITERATIONS = 100
-
-#: More ratios of the noises than data could tell apart.
-_MOST_HYPOTHESES = 1000
 
 
 class OnlineEstimator:
@@ -47,6 +42,8 @@ class OnlineEstimator:
         as_published: mean field with the two departures of the published run, to reproduce its numbers.
         drift: lets the coefficients walk at random, to follow a system that changes: standard deviation of a
             coefficient's step per sample, in parts of that of its prior. 0.01 forgets in some hundred samples.
+        expectations: what a step does to the Gaussian belief: ``first_order``, by the derivative at its mean; or
+            ``sigma_points``, by points that spread as the belief does, for beliefs that are wide.
         noise_hypotheses: number of ratios σ_w/σ_v to weigh by their evidence (`estimator.ensemble`), structured only.
             With 1 the ratio stays nearly what the priors of γ and ξ say. 9 resolve it; an odd number has the priors'
             own ratio among them. Each is there at three levels, so that a sample costs three updates a hypothesis.
@@ -82,12 +79,17 @@ class OnlineEstimator:
         iterations: int | None = None,
         as_published: bool = False,
         drift: float = 0.0,
+        expectations: str = "first_order",
         noise_hypotheses: int = 1,
     ) -> None:
         if not isinstance(model, Model | None):
             raise ValueError(f"model must be a Model, but is {model!r:.60}; use difference() or duffing()")
         self.model = difference() if model is None else model
-        self.settings = _settled(self.model, factorisation, iterations, as_published, drift, noise_hypotheses)
+        if iterations is None:
+            iterations = DEFAULT_ITERATIONS["mean_field" if factorisation == "mean_field" else "structured"]
+        self.settings = settled(
+            self.model, Settings(factorisation, iterations, as_published, expectations, drift, noise_hypotheses)
+        )
         self._free_energies = np.full((1, self.settings.iterations), np.nan)
         self._forecasts = np.empty((0, self.model.n_outputs, 2))
         self._spare = np.empty_like(self._free_energies), np.empty((1, self.model.n_outputs, 2))
@@ -294,44 +296,6 @@ def _overflowed(place: int, u: float, y: object) -> str:
         f"u and y must keep the belief finite, but near sample {place} (u = {u}, y = {y}) it overflowed; the estimator "
         f"is unchanged: check the sample's scale, or use a prior nearer to the system"
     )
-
-
-def _settled(
-    model: Model, factorisation: str, iterations: int | None, as_published: bool, drift: float, noise_hypotheses: int
-) -> Settings:
-    """Checked settings."""
-    if factorisation not in tuple(DEFAULT_ITERATIONS):
-        raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {factorisation!r}")
-    published = factorisation == "mean_field"
-    if published and model != difference():
-        raise ValueError(
-            f"factorisation must be 'structured' for {model.name}, but is 'mean_field'; that is for the paper's model"
-        )
-    if iterations is None:
-        iterations = DEFAULT_ITERATIONS[factorisation]
-    _whole("iterations", iterations, _MOST_ITERATIONS)
-    _whole("noise_hypotheses", noise_hypotheses, _MOST_HYPOTHESES)
-    if as_published and not published:
-        raise ValueError(
-            f"as_published goes with factorisation='mean_field', but factorisation is {factorisation!r}; the published "
-            f"run was mean field"
-        )
-    if not isinstance(drift, int | float | np.floating) or not 0 <= drift < np.inf:
-        raise ValueError(f"drift must be at least 0 and finite, but is {drift!r}; 0 is a system that stays")
-    if drift and published:
-        raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {drift!r}; use structured")
-    if noise_hypotheses > 1 and (published or model.n_outputs > 1):
-        what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"
-        raise ValueError(
-            f"noise_hypotheses must be 1 for {what}, but is {noise_hypotheses}; use factorisation='structured' and one "
-            f"sensor"
-        )
-    return Settings(factorisation, int(iterations), bool(as_published), float(drift), int(noise_hypotheses))
-
-
-def _whole(name: str, value: object, most: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= most:
-        raise ValueError(f"{name} must be a whole number from 1 to {most}, but is {value!r}")
 
 
 def _settled_prior(model: Model, prior: Belief | None, settings: Settings) -> Belief:

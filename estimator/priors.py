@@ -195,19 +195,22 @@ def published_run_prior(nonlinear: bool = True) -> Belief:
 
     Without ``nonlinear`` θ2 is known to be 0: the paper's FEM-LARX.
     """
-    return _paper_prior(2.0, 1e-2, (1e8, 1e3), (1e8, 1e1), nonlinear)
+    return _paper_prior("published_run", nonlinear)
 
 
 def paper_text_prior(nonlinear: bool = True) -> Belief:
     """The prior as the paper's section 4 states it; the state's, not given there, is that of the published run."""
-    return _paper_prior(1.0, 10.0, (1e3, 1e1), (1e8, 1e3), nonlinear)
+    return _paper_prior("paper_text", nonlinear)
 
 
-def _paper_prior(
-    eta: float, variance: float, gamma: tuple[float, float], xi: tuple[float, float], nonlinear: bool
-) -> Belief:
-    mean = np.array([0.0, 0.0, 1.0, float(nonlinear), 1.0, eta])
-    return Belief.of(difference(), mean, np.diag([10.0, 10.0, 10.0, 10.0 * nonlinear, 10.0, variance]), gamma, xi)
+def _paper_prior(name: str, nonlinear: bool) -> Belief:
+    prior = named_prior(name, difference())
+    if nonlinear:
+        return prior
+    mean, cov, place = prior.mean, prior.cov, prior.model.names.index("theta2")
+    mean[place], cov[place], cov[:, place] = 0.0, 0.0, 0.0
+    gamma_shape, gamma_rate, xi_shape, xi_rate = prior.noises
+    return Belief.of(prior.model, mean, cov, (gamma_shape, gamma_rate), (xi_shape, xi_rate))
 
 
 def recorded_prior(

@@ -83,7 +83,9 @@ def _built(arrays: dict[str, Any]) -> OnlineEstimator:
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         found = description.get("format") if isinstance(description, dict) else None
         raise ValueError(f"it is of format {found!r}, not {FORMAT}")
-    declared = {name: tuple(v) if isinstance(v, list) else v for name, v in description["model"].items()}
+    declared: dict[str, Any] = {
+        name: tuple(v) if isinstance(v, list) else v for name, v in description["model"].items()
+    }
     model, settings = Model(**declared), description["settings"]
     rig = Rig(**description["rig"])
     first = arrays.get("first")

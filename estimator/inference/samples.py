@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
 from estimator.engine import tasks
+from estimator.engine.free_energy import free_energies
 from estimator.inference import mean_field
-from estimator.inference.noise import sample_free_energy
 from estimator.lanes import LANES, alone, at_lane, jit, kernel, part, relaid, rows
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -60,54 +59,40 @@ class Loop:
 
 
 @cache
-def structured(model: Model, degree: int, iterations: int, members: int = 1) -> Loop:
+def structured(model: Model, degree: int, iterations: int, expectations: str = "first_order", members: int = 1) -> Loop:
     """The structured factorisation, with a lane for each member where there are several."""
     lanes = 1 if members == 1 else LANES
-    task = tasks.structured(model, degree, iterations=iterations, lanes=lanes, trace=True, missing=True)
+    task = tasks.structured(
+        model, degree, iterations=iterations, lanes=lanes, trace=True, missing=True, expectations=expectations
+    )
     place, update = task.layout, task.update
+    energies_of = free_energies(model, iterations, lanes, place)
     sensors = model.n_outputs
-    kind = f"{model.name}_{_digest(model.digest, degree, iterations, lanes)}"
-    g_shape, g_rate = place["GAMMA_SHAPE"] * lanes, place["GAMMA_RATE"] * lanes
-    n_shape = tuple(place[f"XI_SHAPE_{y}"] * lanes for y in model.outputs)
-    n_rate = tuple(place[f"XI_RATE_{y}"] * lanes for y in model.outputs)
-    y_rows = tuple(place[f"Y_{y}"] * lanes for y in model.outputs)
-    traced = tuple(place[f"TRACE_{k}_mean"] * lanes for k in range(sensors))
+    kind = f"{model.name}_{_digest(model.digest, degree, iterations, lanes, expectations)}"
+    means = tuple(place[f"TRACE_{k}_mean"] * lanes for k in range(sensors))
+    parts = tuple(
+        tuple(place[f"TRACE_{k}_{what}"] * lanes for what in ("variance", f"q_{iterations - 1}", f"r_{iterations - 1}"))
+        for k in range(sensors)
+    )
+    unsound = place.get("UNSOUND", -1) * lanes
 
     @part(kind)
     def take(W, before):
-        for j in range(lanes):
-            before[j] = W[g_rate + j]
-            for k in range(sensors):
-                before[(k + 1) * lanes + j] = W[n_rate[k] + j]
+        if unsound >= 0:
+            for j in range(lanes):
+                W[unsound + j] = 0.0
         update(W)
 
     @part(kind)
     def judge(W, j, before, values, forecasts):
-        values[:] = 0.0
-        learned = False
+        energies_of(W, j, values)
+        if unsound >= 0 and W[unsound + j] > 0.0:
+            values[:] = np.nan
         for k in range(sensors):
-            at = traced[k] + j
-            innovation, variance, shown = W[at + lanes], W[at + 2 * lanes], W[at + 3 * lanes]
-            seen = not np.isnan(W[y_rows[k] + j])
-            learns = shown > 0.0 and not learned
-            q, r = 0.0, 0.0
-            for i in range(iterations):
-                q, r = W[at + (4 + 2 * i) * lanes], W[at + (5 + 2 * i) * lanes]
-                if seen and learns:
-                    values[i] += sample_free_energy(
-                        innovation, variance, q, r, W[g_shape + j], shown * before[j],
-                        W[n_shape[k] + j], before[(k + 1) * lanes + j],
-                    )  # fmt: skip
-                elif seen:
-                    values[i] += _sensor_free_energy(
-                        innovation, variance, r, W[n_shape[k] + j], before[(k + 1) * lanes + j]
-                    )
-            learned = learned or learns
-            forecasts[k, 0] = W[at]
-            forecasts[k, 1] = variance + q + r
+            forecasts[k, 0] = W[means[k] + j]
+            forecasts[k, 1] = W[parts[k][0] + j] + W[parts[k][1] + j] + W[parts[k][2] + j]
 
-    size = max((1 + sensors) * lanes, iterations)
-    return Loop(_loop(kind, model, place, lanes, size, take, judge), place, lanes)
+    return Loop(_loop(kind, model, place, lanes, iterations, take, judge), place, lanes)
 
 
 def mean_field_layout(lanes: int) -> tuple[dict[str, int], dict[str, int]]:
@@ -167,18 +152,6 @@ def published(iterations: int, as_published: bool) -> Loop:
 
 def _digest(*parts: Any) -> str:
     return hashlib.sha256(repr((tasks.stored.engine_digest(), parts)).encode()).hexdigest()[:12]
-
-
-@jit
-def _sensor_free_energy(innovation, variance, r, shape, prior_rate):
-    """Free energy of a further sensor [nats], to which no process noise of its own came."""
-    total = variance + r
-    step = r * innovation / total
-    half = 0.5 * (step * step + r * variance / total)
-    rate = prior_rate + half
-    gaussian = 0.5 * (LOG_2PI + np.log(total) + innovation * innovation / total)
-    sensor = half * (shape / rate - 1 / r) - 0.5 * (np.log(r) + expected_log_gamma(shape, rate))
-    return gaussian + sensor + gamma_step_divergence(shape - 0.5, prior_rate, half)
 
 
 @jit

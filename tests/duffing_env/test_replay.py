@@ -14,7 +14,8 @@ from agents.policies import make_policy
 from duffing_env.env import SilverboxReplayEnv
 from duffing_env.silverbox import RecordNotFound
 from duffing_env.vector_env import SilverboxReplayVectorEnv
-from estimator import NLARX, SILVERBOX_TWIN, OnlineEstimator, Prior
+from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, difference
+from estimator.priors import named_prior
 
 TRACK = "duffing_env/SilverboxReplay-v0"
 SAMPLES = 2000
@@ -77,8 +78,9 @@ class TestWithTheRecord:
         steps = [env.step(action) for action in recorded_actions(env, SAMPLES)]
 
         settings = {name: options[name] for name in ("factorisation", "iterations", "as_published") if name in options}
-        model = NLARX(nonlinear=options.get("nonlinear", True), input_delay=0)
-        estimator = OnlineEstimator(model, getattr(Prior, options.get("prior", "silverbox_twin"))(), **settings)
+        model = difference("paper" if options.get("nonlinear", True) else "linear")
+        prior = named_prior(options.get("prior", "silverbox_twin"), model)
+        estimator = OnlineEstimator(model, prior, Rig(), **settings)
         u, y = record.multisine.u[:SAMPLES], record.multisine.y[delay : SAMPLES + delay]
         free_energy = estimator.run(u, y)
         np.testing.assert_allclose([step[1] for step in steps], -free_energy[:, -1], rtol=1e-7, atol=1e-7)

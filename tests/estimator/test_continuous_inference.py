@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from twins import Moments, assert_same_moments, block_of, continuous_step, records_of, runge_kutta
 
-from estimator import CONTINUOUS_TWIN, ContinuousBelief, DuffingODE, continuous_prior
+from estimator import CONTINUOUS_TWIN, ContinuousBelief, OnlineEstimator, continuous_prior, duffing
 from estimator.inference import continuous, free_energy
 from estimator.lanes import LANES
-from estimator.models import ode
+from estimator.posterior import Belief
 from estimator.record import LAYOUT, N_ROWS
 
 TWIN = ContinuousBelief.coefficients_of(CONTINUOUS_TWIN)
@@ -57,36 +57,26 @@ def test_update_equals_its_twin(iterations, substeps):
         priors = posteriors
 
 
-def test_without_process_noise_it_is_the_model_for_records():
-    # `DuffingODE` with offsets, feedthrough and cubic damping known to be 0. It holds the process noise over a sample.
+def test_it_is_the_update_that_the_engine_generates():
     rng = np.random.default_rng(1)
-    prior = continuous_prior(process_noise=1e-12, state_std=0.05)
-    samples, iterations = 50, 3
-    u = rng.uniform(-0.15, 0.15, samples)
-    y = 0.1 * rng.standard_normal(samples)
-    theirs = [0, 1, 2, 5, 3, 4]  # x, x', stiffness, cubic, damping, gain
+    prior = continuous_prior(state_std=0.05)
     moments, known = Moments.of_record(prior.record), [0, 1, 3, 4, 5, 6]
-    mean, cov = np.zeros(ode.N_JOINT), np.zeros((ode.N_JOINT, ode.N_JOINT))
-    mean[theirs], cov[np.ix_(theirs, theirs)] = moments.mean[known], moments.cov[np.ix_(known, known)]
-    noises = np.array([*moments.gamma, *moments.xi])
-    pieces = DuffingODE().pieces(np.concatenate([[0.0], u]))
-    energies, forecasts = np.empty((samples, iterations)), np.empty((samples, 2))
-    walk = np.zeros(len(ode.PARAMETERS))
-    ode.run_samples(mean, cov, noises, walk, pieces, u, y, True, continuous.SUBSTEPS, energies, forecasts, None)
-
+    belief = Belief.of(duffing(), moments.mean[known], moments.cov[np.ix_(known, known)], moments.gamma, moments.xi)
+    estimator = OnlineEstimator(duffing(), belief)
     rows = block_of([prior.record] * LANES, 0.0, 0.0).reshape(N_ROWS, LANES)
     last_u = 0.0
-    for t in range(samples):
-        for name, value in (("last_u", last_u), ("u", u[t]), ("y", y[t])):
+    for u, y in zip(rng.uniform(-0.15, 0.15, 50).tolist(), (0.1 * rng.standard_normal(50)).tolist(), strict=True):
+        for name, value in (("last_u", last_u), ("u", u), ("y", y)):
             rows[LAYOUT[name]] = value
-        continuous.update(rows.reshape(-1), iterations, continuous.SUBSTEPS)
-        last_u = u[t]
-        assert rows[LAYOUT["predicted"], 0] == pytest.approx(forecasts[t, 0], abs=1e-12)
-        assert free_energy(rows.reshape(-1), 0, True) == pytest.approx(energies[t, -1], rel=1e-9, abs=1e-8)
-    expected_mean, expected_cov = np.zeros(7), np.zeros((7, 7))
-    expected_mean[known], expected_cov[np.ix_(known, known)] = mean[theirs], cov[np.ix_(theirs, theirs)]
-    expected = Moments(expected_mean, expected_cov, tuple(noises[:2]), tuple(noises[2:]))
-    assert_same(Moments.of_record(records_of(rows.reshape(-1))[0]), expected, rtol=1e-8)
+        continuous.update(rows.reshape(-1), 3, continuous.SUBSTEPS)
+        last_u = u
+        estimator.update(u, y)
+        assert rows[LAYOUT["predicted"], 0] == pytest.approx(estimator.forecasts[0, 0], abs=1e-12)
+        assert free_energy(rows.reshape(-1), 0, True) == pytest.approx(estimator.free_energy, rel=1e-9, abs=1e-8)
+    found, after = estimator.belief, Moments.of_record(records_of(rows.reshape(-1))[0])
+    std = np.sqrt(np.diag(found.cov))
+    np.testing.assert_allclose((after.mean[known] - found.mean) / std, 0, atol=1e-8)
+    np.testing.assert_allclose(after.cov[np.ix_(known, known)], found.cov, rtol=1e-7, atol=1e-15)
 
 
 def test_lanes_are_independent():

@@ -10,7 +10,7 @@ from test_structured_generated import LANES, some_samples, updated
 
 from estimator.engine import tasks
 from estimator.engine.free_energy import free_energies
-from estimator.inference.sigma_points import ROUNDING
+from estimator.engine.points import ROUNDING
 from estimator.models.model import Model
 
 NAMES = ["duffing", "duffing, all terms", "cubic", "pendulum", "wiener-hammerstein", "van der pol"]

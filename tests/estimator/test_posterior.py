@@ -1,4 +1,4 @@
-"""`JointBelief`: what it refuses, what it answers, and that nobody can write into it."""
+"""`Belief`: what it refuses, what it answers, and that nobody can write into it."""
 
 import dataclasses
 import re
@@ -7,16 +7,22 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from estimator import JointBelief
+from estimator.models.model import Model
+from estimator.posterior import Belief
 
+#: A model whose coefficients have no other face.
+MODEL = Model(
+    "oscillator",
+    {"x": "V", "v": "V"},
+    {"stiffness": "s⁻²", "damping": "s⁻¹", "cubic": "V⁻² s⁻²"},
+    noise=("0", "1"),
+    outputs={"y": "x"},
+    rates=("v", "u - damping*v - stiffness*x - cubic*x**3"),
+)
 FIELDS = {
-    "names": ("stiffness", "damping", "cubic"),
-    "units": ("s⁻²", "s⁻¹", "V⁻² s⁻²"),
     "mean": np.array([0.1, -2.0, 1.8e5, 42.0, 7e5]),
-    "gamma_shape": 2.0,
-    "gamma_rate": 2e-6,
-    "xi_shape": 3.0,
-    "xi_rate": 12e-8,
+    "gamma": (2.0, 2e-6),
+    "xi": (3.0, 12e-8),
 }
 
 
@@ -28,7 +34,7 @@ def covariance(seed=0):
 
 
 def belief(**changes):
-    return JointBelief(**{**FIELDS, "cov": covariance(), **changes})
+    return Belief.of(MODEL, **{**FIELDS, "cov": covariance(), **changes})
 
 
 def fixed(index):
@@ -79,12 +85,6 @@ def test_entropy_and_density_equal_scipy(known, rest):
     assert one.log_prob(points.reshape(7, 1, 3)).shape == (7, 1)
 
 
-def test_entropy_of_what_is_no_density_is_nan():
-    cov = covariance()
-    cov[2, 2] = -1.0
-    assert np.isnan(belief(cov=cov).entropy())
-
-
 def test_nothing_can_be_written_into_it():
     mean, cov = FIELDS["mean"].copy(), covariance()
     one = belief(mean=mean, cov=cov)
@@ -92,25 +92,31 @@ def test_nothing_can_be_written_into_it():
     assert np.isfinite(one.mean).all()
     assert np.isfinite(one.cov).all()
     for array in (one.mean, one.cov, one.state_mean, one.state_cov, one.coefficients_mean, one.coefficients_cov):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1.0
+        array[:] = 0.0
+    np.testing.assert_array_equal(one.mean, FIELDS["mean"])
+    np.testing.assert_array_equal(one.cov, covariance())
+    with pytest.raises(ValueError, match="read-only"):
+        one.record[0] = 1.0
     with pytest.raises(dataclasses.FrozenInstanceError):
-        one.gamma_rate = 1.0
+        one.step = 1.0
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mean": np.zeros(2)}, "mean must hold the state and 3 parameters, but has shape (2,)"),
-        ({"mean": np.zeros((5, 1))}, "mean must hold the state and 3 parameters, but has shape (5, 1)"),
-        ({"cov": np.eye(3)}, "cov must have shape (5, 5), but has (3, 3); it goes with mean"),
-        ({"cov": np.ones(5)}, "cov must have shape (5, 5), but has (5,)"),
-        ({"mean": np.array([0, 0, np.nan, 0, 0])}, "mean and cov must be finite"),
-        ({"cov": np.full((5, 5), np.inf)}, "mean and cov must be finite"),
-        ({"gamma_shape": 0.0}, "gamma_shape must be positive and finite, but is 0.0; pass a value above 0"),
-        ({"gamma_rate": -1.0}, "gamma_rate must be positive and finite, but is -1.0"),
-        ({"xi_shape": np.nan}, "xi_shape must be positive and finite, but is nan"),
-        ({"xi_rate": np.inf}, "xi_rate must be positive and finite, but is inf"),
+        (
+            {"mean": np.zeros(2)},
+            "mean and cov must have shapes (5,) and (5, 5) for the model 'oscillator', but have (2,)",
+        ),
+        ({"cov": np.eye(3)}, "mean and cov must have shapes (5,) and (5, 5)"),
+        ({"cov": np.triu(np.ones((5, 5)))}, "cov must be symmetric; pass (C + C.T) / 2"),
+        ({"cov": np.diag([1.0, 1.0, -1.0, 1.0, 1.0])}, "covariance must be positive semi-definite"),
+        ({"cov": 2 * np.ones((5, 5)) - np.eye(5)}, "covariance must be positive semi-definite"),
+        ({"mean": np.array([0, 0, np.nan, 0, 0])}, "record must be finite, but stiffness is not; replace it"),
+        ({"gamma": (0.0, 1.0)}, "shapes and rates of the noises must be positive, but are [0.0, 1.0"),
+        ({"xi": (1.0, -1.0)}, "shapes and rates of the noises must be positive"),
+        ({"xi": [(1.0, 1.0), (1.0, 1.0)]}, "xi must have a pair for each of ['y']"),
+        ({"step": 0.0}, "step must be positive and finite, but is 0.0"),
     ],
 )
 def test_errors_name_the_field(changes, message):
