@@ -25,7 +25,7 @@ class OnTheRecord(SilverboxReplayEnv):
 
     def step(self, action):
         assert action in self.action_space
-        played = int(self._batch.quantity("elapsed")[0])
+        played = int(self._batch.quantity("ELAPSED")[0])
         return super().step(self.recorded_input[played] / self.max_input)
 
 
