@@ -84,7 +84,7 @@ def test_settings_are_the_options():
     kind, setup = experiment.kind, experiment.setup
     assert (kind.belief, kind.plant, kind.factorisation) == (difference(), difference(), "mean_field")
     assert (kind.iterations, kind.reward) == (4, "free_energy")
-    assert not (kind.drifts or kind.normal or kind.jumps or kind.pays)
+    assert [kind.drifts, kind.normal, kind.jumps, kind.pays] == [False] * 4
     expected = {
         "max_input": 0.1, "max_output": 0.5, "horizon": 9.0, "process_noise": 1e-3, "spread": 0.1, "hold": 1,
         "delay": 0, "as_published": False, "step": SAMPLING_STEP, "budget": np.inf, "max_slew": np.inf,

@@ -205,6 +205,20 @@ def test_a_prior_of_ones_own_is_where_episodes_start():
     assert env.belief.entropy() < PlantEnv(Difference(), prior=prior).belief.entropy()
 
 
+def test_a_model_without_the_cubic_term_recovers_from_a_plant_that_fails():
+    # Mean field keeps rows of a θ2 that the model does not have: they must not stay NaN.
+    prior = named_prior("silverbox_twin", difference("linear"), "mean_field")
+    env = PlantEnv(Scripted([0.01, 1e200]), prior=prior, factorisation="mean_field", max_output=1e300)
+    told = []
+    for _ in range(2):
+        env.reset()
+        told.append([env.step([0.5])[0], env.step([0.5])[4]["diverged"]])
+    np.testing.assert_array_equal(told[0][0], told[1][0])
+    assert told[0][1]
+    assert told[1][1]
+    assert not np.array_equal(told[1][0], env.reset()[0])
+
+
 def test_several_plants_are_several_environments():
     plants = [Difference(), Difference()]
     with pytest.raises(ValueError, match="SyncVectorEnv"):
