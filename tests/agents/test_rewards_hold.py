@@ -61,8 +61,7 @@ def played():
 
 def test_rewards_rank_inputs_as_an_auditor_s_errors_do(played):
     truth, u, y, returns, _ = played
-    prior = (PRIOR.coefficients_mean, PRIOR.coefficients_cov)
-    fit = maximum_a_posteriori(MODEL, u, y, prior, *NOISES)
+    fit = maximum_a_posteriori(MODEL, u, y, PRIOR, *NOISES)
     estimates = to_physical(MODEL, fit.mean)
     true = np.stack([truth.m, truth.c, truth.a, truth.b], axis=-1)
     errors = np.log(np.abs(estimates / true - 1) + 1e-9).reshape(-1, SYSTEMS, 4).mean(axis=(1, 2))
