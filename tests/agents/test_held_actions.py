@@ -8,7 +8,6 @@ import pytest
 
 from agents.evaluation import evaluate, make
 from agents.policies import make_policy
-from duffing_env.layout import OBSERVATION
 from estimator import SAMPLING_STEP
 
 TRACK = "duffing_env/Amplitude-v0"
@@ -25,7 +24,7 @@ def play(policy, rows, steps):
     """Actions (steps, rows)."""
     state, told = None, []
     for _ in range(steps):
-        actions, state = policy.predict(np.zeros((rows, len(OBSERVATION))), state)
+        actions, state = policy.predict(np.zeros((rows, 22)), state)
         told.append(actions[:, 0])
     return np.array(told)
 

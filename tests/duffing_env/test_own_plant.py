@@ -16,7 +16,8 @@ from duffing_env import own_plant
 from duffing_env.env import DuffingEnv
 from duffing_env.own_plant import PlantEnv
 from duffing_env.rewards import REWARDS
-from estimator import Prior
+from estimator.models.difference import difference
+from estimator.priors import named_prior, weak_prior
 
 TRACK = "duffing_env/Plant-v0"
 
@@ -71,7 +72,7 @@ def test_a_plant_that_gives_the_simulated_outputs_gives_the_same_episode_to_the_
     told, outputs, played = [simulated.reset(seed=3)], [], actions(256)
     for action in played:
         told.append(simulated.step(action))
-        outputs.append(simulated._batch.quantity("y")[0])
+        outputs.append(simulated._batch.quantity("Y_y")[0])
         if told[-1][2]:
             break
     assert told[-1][2]
@@ -184,7 +185,7 @@ def test_nobody_knows_the_truth():
     [
         (None, {}, r"methods reset\(\) and step\(u\), but None has no reset"),
         (type("Half", (), {"reset": print}), {}, r"has no step\(\)"),
-        (Difference(), {"prior": "flat"}, r"prior must be an estimator.Prior or None, but is 'flat'"),
+        (Difference(), {"prior": "flat"}, r"prior must be an estimator.Belief or None, but is 'flat'"),
         (Difference(), {"horizon": 0}, "horizon must be a whole number"),
         (Difference(), {"spread": 0.1}, "spread=0.1 is no option of this environment"),
     ],
@@ -195,12 +196,27 @@ def test_bad_arguments_are_refused_with_a_remedy(plant, options, message):
 
 
 def test_a_prior_of_ones_own_is_where_episodes_start():
-    prior = Prior.silverbox_twin(spread=0.1, state_std=0.2)
+    twin = named_prior("silverbox_twin", difference())
+    prior = weak_prior(twin.model, twin.coefficients_mean, twin.coefficients_cov / 9, state_std=0.2)
     env = PlantEnv(Difference(), prior=prior)
     env.reset()
     np.testing.assert_array_equal(env.belief.coefficients_cov, prior.coefficients_cov)
     env.step([1.0])
     assert env.belief.entropy() < PlantEnv(Difference(), prior=prior).belief.entropy()
+
+
+def test_a_model_without_the_cubic_term_recovers_from_a_plant_that_fails():
+    # Mean field keeps rows of a θ2 that the model does not have: they must not stay NaN.
+    prior = named_prior("silverbox_twin", difference("linear"), "mean_field")
+    env = PlantEnv(Scripted([0.01, 1e200]), prior=prior, factorisation="mean_field", max_output=1e300)
+    told = []
+    for _ in range(2):
+        env.reset()
+        told.append([env.step([0.5])[0], env.step([0.5])[4]["diverged"]])
+    np.testing.assert_array_equal(told[0][0], told[1][0])
+    assert told[0][1]
+    assert told[1][1]
+    assert not np.array_equal(told[1][0], env.reset()[0])
 
 
 def test_several_plants_are_several_environments():

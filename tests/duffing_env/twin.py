@@ -138,22 +138,24 @@ def structured_update(prior, step, y, iterations):
         The posterior, and the sample's free energy [nats].
     """
     moved, jacobian, noise = step
-    T = np.hstack([jacobian, np.eye(6)[:, :2]])  # from (states and coefficients before, w, w') to those after
+    d = len(prior.mean)
+    T = np.hstack([jacobian, np.eye(d)[:, :2]])  # from (states and coefficients before, w, w') to those after
     gamma, xi = prior.gamma, prior.xi
     for _ in range(iterations):
         q, r = gamma[1] / gamma[0], xi[1] / xi[0]
-        P = np.zeros((8, 8))
-        P[:6, :6], P[6:, 6:] = prior.cov, q * noise
+        P = np.zeros((d + 2, d + 2))
+        P[:d, :d], P[d:, d:] = prior.cov, q * noise
         S = T[0] @ P @ T[0] + r
         gain = P @ T[0] / S
         deviation = gain * (y - moved[0])
         posterior = P - np.outer(gain, T[0] @ P)
-        w_power = (deviation[6] ** 2 + posterior[6, 6]) / noise[0, 0]
+        w_power = (deviation[d] ** 2 + posterior[d, d]) / noise[0, 0]
         v_power = (y - moved[0] - T[0] @ deviation) ** 2 + T[0] @ posterior @ T[0]
         gamma = prior.gamma[0] + 0.5, prior.gamma[1] + w_power / 2
         xi = prior.xi[0] + 0.5, prior.xi[1] + v_power / 2
     # w' given w is as before the sample, and falls out.
-    told = -entropy(posterior[:7, :7]) - expected_log_gaussian((deviation[:6], posterior[:6, :6]), P[:6, :6])
+    told = -entropy(posterior[: d + 1, : d + 1])
+    told -= expected_log_gaussian((deviation[:d], posterior[:d, :d]), P[:d, :d])
     told += 0.5 * np.log(noise[0, 0]) - expected_log_normal(w_power, gamma) - expected_log_normal(v_power, xi)
     told += gamma_divergence(gamma, prior.gamma) + gamma_divergence(xi, prior.xi)
     mean = np.concatenate([moved, prior.mean[2:]]) + T @ deviation
@@ -161,8 +163,11 @@ def structured_update(prior, step, y, iterations):
     return Moments(mean, (cov + cov.T) / 2, gamma, xi), told
 
 
-def mean_field_update(prior, u, y, iterations):
-    """The six updates of the paper, ``iterations`` times: the posterior, and the sample's free energy [nats]."""
+def mean_field_update(prior, u, y, iterations, as_published=False):
+    """The six updates of the paper, ``iterations`` times: the posterior, and the sample's free energy [nats].
+
+    ``as_published``: without the offset of the linearisation, and with E[x_{t-1}]²/2 more in the rate of γ.
+    """
     S, s = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0])
     z, theta, eta = slice(0, 2), slice(2, 5), 5
     prior_z, P_z, prior_theta, P_theta = prior.mean[z], prior.cov[z, z], prior.mean[theta], prior.cov[theta, theta]
@@ -185,14 +190,15 @@ def mean_field_update(prior, u, y, iterations):
         V_z = np.diag([1 / (E_gamma + E_xi), 1 / TIE])
         m_z = np.array([V_z[0, 0] * (E_gamma * (m_theta @ J_theta + m_eta * u) + E_xi * y), m_last[0]])
         J_x = np.array([m_theta[0] + 3 * m_theta[1] * m_last[0] ** 2, m_theta[2]])
-        A, offset = S + np.outer(s, J_x), m_theta @ features(m_last) - J_x @ m_last
+        A = S + np.outer(s, J_x)
+        offset = 0.0 if as_published else m_theta @ features(m_last) - J_x @ m_last
         V_last = np.linalg.inv(W_z + A.T @ W @ A)
         m_last = V_last @ (W_z @ prior_z + A.T @ W @ (m_z - s * (m_eta * u + offset)))
         J_theta, J_x = features(m_last), np.array([m_theta[0] + 3 * m_theta[1] * m_last[0] ** 2, m_theta[2]])
         w_power = (m_z[0] - m_theta @ J_theta - m_eta * u) ** 2 + V_z[0, 0]
         w_power += J_x @ V_last @ J_x + J_theta @ V_theta @ J_theta + u**2 * V_eta
         v_power = (y - m_z[0]) ** 2 + V_z[0, 0]
-        gamma = prior.gamma[0] + 0.5, prior.gamma[1] + w_power / 2
+        gamma = prior.gamma[0] + 0.5, prior.gamma[1] + (w_power + as_published * m_last[0] ** 2) / 2
         xi = prior.xi[0] + 0.5, prior.xi[1] + v_power / 2
     told = -entropy(V_theta) - expected_log_gaussian((m_theta - prior_theta, V_theta), P_theta)
     told += 0.5 * (np.log(P_eta / V_eta) + V_eta / P_eta - 1 + (m_eta - prior_eta) ** 2 / P_eta)
