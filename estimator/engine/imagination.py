@@ -181,6 +181,8 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
 def determinant(entries: Mapping[tuple[int, int], Any], size: int, tag: str) -> tuple[Any, Any]:
     """Assignments of an L D Lᵀ factorisation of a symmetric matrix, and its determinant.
 
+    A pivot of 0, of what is known, counts as 1.
+
     Args:
         entries: (i, j) with j <= i to the entry.
         size: of the matrix.
@@ -201,6 +203,8 @@ def determinant(entries: Mapping[tuple[int, int], Any], size: int, tag: str) -> 
             lines.append((f"{tag}U_{i}_{j}", value))
             scaled[i, j] = symbol(f"{tag}L_{i}_{j}")
             lines.append((f"{tag}L_{i}_{j}", unscaled[j] / pivots[j]))
+        left = symbol(f"{tag}R_{i}")
+        lines.append((f"{tag}R_{i}", entries[i, i] - sum(scaled[i, m] * unscaled[m] for m in range(i))))
+        lines.append((f"{tag}D_{i}", sp.Function("select")(left**2, left, sp.S.One)))
         pivots.append(symbol(f"{tag}D_{i}"))
-        lines.append((f"{tag}D_{i}", entries[i, i] - sum(scaled[i, m] * unscaled[m] for m in range(i))))
     return lines, sp.Mul(*pivots)
