@@ -20,7 +20,8 @@ from estimator.models.model import Model
 
 #: Runge-Kutta steps per sample of what is only imagined. A filter needs an integration error far below the posterior's
 #: standard deviation, because it adds up over a record. A plan does not: it compares inputs, all imagined alike, by what
-#: they teach. With two steps the nats of a plan of Eq. (1) differ from those with eight by less than 1e-3.
+#: they teach. With two steps the 22 nats of 24 random pushes of Eq. (1) are 0.01 less than with sixteen, 0.005 more or
+#: less from plan to plan.
 SUBSTEPS = 2
 
 #: What a belief knows that is none any more: less than any that is one, and still a number to compare with.
@@ -103,7 +104,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
 
     symbol, coefficients = derive.symbol, list(model.coefficients)
     given = fed(model, degree, lag)
-    lines, moved = ([], derive.carried_at_end(model)) if model.is_continuous else derive.difference_step(model)
+    lines, moved = derive.moved(model)
     more, results = algebra.expected_sample(model, moved, degree)
     # The coefficients walk before the sample, so that what it does begins with the wider covariance.
     walked = {f"P_{c}_{c}": f"WALKED_{c}" for c in coefficients}
@@ -180,6 +181,8 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
 def determinant(entries: Mapping[tuple[int, int], Any], size: int, tag: str) -> tuple[Any, Any]:
     """Assignments of an L D Lᵀ factorisation of a symmetric matrix, and its determinant.
 
+    A pivot of 0, of what is known, counts as 1.
+
     Args:
         entries: (i, j) with j <= i to the entry.
         size: of the matrix.
@@ -200,6 +203,8 @@ def determinant(entries: Mapping[tuple[int, int], Any], size: int, tag: str) -> 
             lines.append((f"{tag}U_{i}_{j}", value))
             scaled[i, j] = symbol(f"{tag}L_{i}_{j}")
             lines.append((f"{tag}L_{i}_{j}", unscaled[j] / pivots[j]))
+        left = symbol(f"{tag}R_{i}")
+        lines.append((f"{tag}R_{i}", entries[i, i] - sum(scaled[i, m] * unscaled[m] for m in range(i))))
+        lines.append((f"{tag}D_{i}", sp.Function("select")(left**2, left, sp.S.One)))
         pivots.append(symbol(f"{tag}D_{i}"))
-        lines.append((f"{tag}D_{i}", entries[i, i] - sum(scaled[i, m] * unscaled[m] for m in range(i))))
     return lines, sp.Mul(*pivots)
