@@ -28,14 +28,15 @@ from agents.ascent import Limits, climber
 from agents.cli import JsonOptions, run_script
 from agents.evaluation import evaluate
 from agents.oracle_task import Systems, Task
+from agents.policies import planning
 from agents.policies.imagination import Terms
-from agents.policies.planning import play
+from agents.policies.motion import View, scales
 from agents.policies.pursuit import pursuit
 from estimator.files import write_atomically
 from estimator.information import fisher_information
 from estimator.models.difference import difference
 from estimator.parameters import FloatArray
-from estimator.record import COEFFICIENTS, RECORD
+from estimator.posterior import Belief
 
 #: Steps of the gradient, random starts, and changed copies in a round.
 _ITERATIONS, _STARTS, _COPIES = 100, 24, 16
@@ -183,16 +184,18 @@ def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.N
     """A copy that the planner, who knows the system, plans anew from a random sample on."""
     task = one.task
     planned = u.copy()
-    value = dict.fromkeys(RECORD, 0.0) | dict(zip(COEFFICIENTS, one.theta[0], strict=True))
-    covariance = np.linalg.inv(one.precision)
-    for i, one_name in enumerate(COEFFICIENTS):
-        value |= {f"P_{one_name}_{other}": covariance[i, j] for j, other in enumerate(COEFFICIENTS) if j >= i}
-    value |= {"g_shape": 1.0, "g_rate": task.process_noise**2, "n_shape": 1.0, "n_rate": task.measurement_noise**2}
-    record = np.array([value[name] for name in RECORD])
+    model, n = task.model, task.model.n_states
+    mean, cov = np.zeros(len(model.names)), np.zeros((len(model.names), len(model.names)))
+    mean[n:], cov[n:, n:] = one.theta[0], np.linalg.inv(one.precision)
+    noises = [(1.0, variance) for variance in task.noises]
+    record = Belief.of(model, mean, cov, noises[0], noises[1:]).record.copy()
     first = int(rng.integers(-task.samples // 8, task.samples - 1))
     horizon, rounds = int(rng.integers(8, 25)), int(rng.integers(1, 9))
     limit = 0.9999 * task.max_output  # leaves room for the rounding of what is stored
-    play(record, first, horizon, rounds, Terms(task.max_input, np.inf, limit, 0.0), planned, words)
+    view = View(model, task.degree)
+    sizes = scales(view, one.theta[0], task.max_input, limit)
+    terms = Terms(task.max_input, np.inf, limit, 0.0, np.zeros(model.n_coefficients), sizes)
+    planning.search(*view).play(record, first, horizon, rounds, terms, planned, words)
     return planned
 
 

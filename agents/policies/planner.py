@@ -48,6 +48,7 @@ PlannerState = tuple[FloatArray, FloatArray, npt.NDArray[np.uint64], FloatArray]
 #: Samples to plan for under an amplitude limit: some periods of the oscillator.
 _HORIZON = 24
 
+
 class Planner:
     """Expected free energy planning on the beliefs of an environment.
 

@@ -13,7 +13,6 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from estimator.engine.derive import Assignments
 
-
 #: Functions that are written out: a call is compiled on its own, and costs more than what it does. Arguments that stand
 #: there twice must be names.
 _INLINE = {

@@ -124,7 +124,9 @@ def moments(model: Model) -> tuple[Assignments, Moved]:
     weight = [symbol(f"WEIGHT_{c}") for c in range(m)]
     image = lambda p, i: symbol(f"I_{p}_{i}")  # noqa: E731
     for i in states:
-        lines.append((f"MIDDLE_{i}", sum((weight[c] * (image(2 * c, i) + image(2 * c + 1, i)) for c in range(m)), ZERO)))
+        lines.append(
+            (f"MIDDLE_{i}", sum((weight[c] * (image(2 * c, i) + image(2 * c + 1, i)) for c in range(m)), ZERO))
+        )
         lines += [(f"OFF_{p}_{i}", image(p, i) - symbol(f"MIDDLE_{i}")) for p in range(2 * m)]
         lines += [(f"LEAN_{c}_{i}", weight[c] * (image(2 * c, i) - image(2 * c + 1, i))) for c in range(m)]
     off = lambda p, i: symbol(f"OFF_{p}_{i}")  # noqa: E731
