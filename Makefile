@@ -2,23 +2,28 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+# Processes that run the tests. A file's tests stay together, so that few kernels are compiled twice.
+WORKERS ?= 2
 
-.PHONY: demo test docs lint format bench evidence lock clean
+.PHONY: demo test docs lint format bench evidence portability lock clean
 
 demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
 	rm -rf runs/demo
 	$(BIN)/python train.py --steps 1500000 --output runs/demo
 
-test: $(READY)  ## all tests but the slow evidence
-	$(BIN)/python -m pytest -m "not slow"
+test: $(READY)  ## all tests but the slow evidence, in WORKERS processes
+	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 docs: $(READY)  ## the manual, into build/manual; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file docs/manual/mkdocs.yml
 	@echo "The manual is in build/manual: open index.html, or see it with its search at localhost:8000 after"
 	@echo "  $(BIN)/python -m http.server --directory build/manual"
 
-evidence: $(READY)  ## the slow evidence: coverage tables, reproduction
+evidence: $(READY)  ## the slow evidence: coverage tables, trainings, times
 	$(BIN)/python -m pytest -m slow -s
+
+portability: $(READY)  ## the tests that compute, under several instruction sets; about half an hour
+	$(BIN)/python -m benchmarks.portability --workers $(WORKERS)
 
 bench: $(READY)  ## timed comparisons, with peers in .venv-peers; about 15 minutes
 	$(BIN)/python -m benchmarks --json runs/benchmarks/results.json
@@ -32,15 +37,41 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-$(READY): requirements.lock pyproject.toml
-	$(PYTHON) -m venv .venv
+# The Python versions are those of the classifiers in pyproject.toml.
+VERSIONS := $(shell sed -n 's/.*"Programming Language :: Python :: \(3\.[0-9]*\)".*/\1/p' pyproject.toml)
+WORKS := duffing-env works with Python $(firstword $(VERSIONS)) to $(lastword $(VERSIONS))
+VERSION = $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+$(info $(WORKS).)
+
+LOCKED := .venv/.locked
+# Where PYTHON is named, and .venv has another version, .venv is built anew.
+ifneq ($(origin PYTHON),file)
+ifneq ($(VERSION),$(shell cat $(LOCKED) 2>/dev/null))
+.PHONY: $(LOCKED)
+endif
+endif
+
+# From nothing, so that what has left the lock leaves .venv too.
+$(LOCKED): requirements.lock
+	$(if $(filter $(VERSION),$(VERSIONS)),,$(error $(WORKS); $(PYTHON) is $(or \
+		$(addprefix Python ,$(VERSION)),not to be found). Name another: make PYTHON=python$(lastword $(VERSIONS))))
+	$(PYTHON) -m venv --clear .venv
 	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	echo $(VERSION) > $(LOCKED)
+
+$(READY): $(LOCKED) pyproject.toml
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $(READY)
 
-lock: $(READY)  ## write the versions that are installed now into the lock, keeping its head
-	{ grep '^#' requirements.lock; $(BIN)/pip freeze --exclude-editable | sed 's/+cpu$$//'; } > requirements.lock.tmp
-	mv requirements.lock.tmp requirements.lock
+lock: $(LOCKED)  ## write the versions that are installed now into the lock, keeping its head
+	grep '^#' requirements.lock > requirements.lock.tmp
+	$(BIN)/pip freeze --all --exclude pip --exclude-editable >> requirements.lock.tmp
+	sed -E '/^(cuda|nvidia|triton)/d; s/\+cpu$$//' requirements.lock.tmp > requirements.lock
+	rm requirements.lock.tmp
+
+.PHONY: lock-check
+lock-check: $(READY)  ## every line of the lock has a binary file for every Python version
+	$(BIN)/python .ci/check_lock.py $(VERSIONS)
 
 clean:
 	rm -rf .venv build dist

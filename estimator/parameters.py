@@ -13,6 +13,7 @@ the parameters as (m, c, a, b) and the coefficients as (θ1, θ2, θ3, η).
 """
 
 import dataclasses
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -281,13 +282,21 @@ def log_uniform_moments(
         value = getattr(center, name)
         if value <= 0:
             raise ValueError(f"center.{name} must be positive, but is {value}; a log-uniform interval lies above zero")
+    mean, cov = _integrated(*(float(getattr(center, name)) for name in ("m", "c", "a", "b")), float(spread), step)
+    return mean.copy(), cov.copy()
 
+
+@lru_cache(maxsize=64)  # every environment asks for them, and the quadrature is most of what it costs to make one
+def _integrated(
+    center_m: float, center_c: float, center_a: float, center_b: float, spread: float, step: float
+) -> tuple[FloatArray, FloatArray]:
+    """The moments that `log_uniform_moments` gives."""
     nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
     # log(1 ± spread) = log(1 - spread²) / 2 ± artanh(spread)
     factors = np.sqrt(1 - spread**2) * np.exp(np.arctanh(spread) * nodes)
     m, c, a, b = np.stack(np.meshgrid(*[factors] * 4, indexing="ij")).reshape(4, -1)
     psi = to_coefficients(
-        PhysicalParameters(m=center.m * m, c=center.c * c, a=center.a * a, b=center.b * b),
+        PhysicalParameters(m=center_m * m, c=center_c * c, a=center_a * a, b=center_b * b),
         step,
     )
     points = np.stack([psi.theta1, psi.theta2, psi.theta3, psi.eta], axis=-1)

@@ -49,7 +49,7 @@ def command(script, *arguments, folder=ROOT):
     return subprocess.run(
         [sys.executable, ROOT / script, *map(str, arguments)],
         env=os.environ | {"COLUMNS": "400", "OMP_NUM_THREADS": "1"},
-        capture_output=True, text=True, timeout=120, cwd=folder,
+        capture_output=True, text=True, timeout=600, cwd=folder,
     )  # fmt: skip
 
 

@@ -80,7 +80,7 @@ def test_a_browser_shows_it_without_overflow(page, tmp_path, width):
             "--disable-background-networking", "--disable-component-update", "--disable-quic",
             f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900", "--dump-dom", probed.as_uri(),
         ],
-        capture_output=True, text=True, timeout=120,
+        capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     content, window, figures = map(int, re.search(r"<title>(\d+) (\d+) (\d+)</title>", done.stdout).groups())
     assert figures == 4

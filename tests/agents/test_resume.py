@@ -96,7 +96,7 @@ def test_a_kill_loses_at_most_one_checkpoint_interval(tmp_path, algo):
     finished = subprocess.run(
         [sys.executable, "-c", KILLED, algo, folder],
         cwd=Path(agents.__file__).parents[1], env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True, text=True, timeout=200,
+        capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert finished.returncode == -signal.SIGKILL, finished.stderr
     assert list(folder.glob(".checkpoint-*"))

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from rounding import U32
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -74,7 +75,7 @@ def test_only_a_time_limit_is_truncated():
             beyond_limit = abs(last[19]) > 1.0  # the last output in parts of max_output
             assert time_is_up is not bool(beyond_limit)
             lengths[time_is_up].append(infos[row]["episode"]["l"])
-            assert last[TIME_LEFT] == pytest.approx(1 - lengths[time_is_up][-1] / HORIZON, abs=1e-6)
+            assert last[TIME_LEFT] == pytest.approx(1 - lengths[time_is_up][-1] / HORIZON, abs=U32)
     assert set(lengths[True]) == {HORIZON}
     assert min(lengths[False]) < HORIZON
 
@@ -88,7 +89,8 @@ def test_an_episode_sums_its_own_rewards_only():
         for row in range(8):
             earned[row].append(float(rewards[row]))
             if dones[row]:
-                assert infos[row]["episode"]["r"] == pytest.approx(sum(earned[row]), rel=1e-5)
+                slack = U32 * np.abs(earned[row]).sum()  # every reward has been rounded to float32, but not in the sum
+                assert infos[row]["episode"]["r"] == pytest.approx(sum(earned[row]), rel=0, abs=1.01 * slack)
                 assert infos[row]["episode"]["l"] == len(earned[row])
                 assert infos[row]["episode"]["t"] >= 0.0
                 earned[row], episodes = [], episodes + 1
@@ -207,7 +209,7 @@ def test_sac_learns_on_it_from_the_right_transitions():
     buffer, filled = model.replay_buffer, slice(model.replay_buffer.pos)
     time_left = buffer.next_observations[filled, :, TIME_LEFT]
     steps_on = buffer.observations[filled, :, TIME_LEFT] - time_left
-    np.testing.assert_allclose(steps_on, 1 / HORIZON, atol=1e-6)  # never into the next episode
+    np.testing.assert_allclose(steps_on, 1 / HORIZON, rtol=0, atol=3 * U32)  # never into the next episode
     np.testing.assert_array_equal(buffer.timeouts[filled], time_left == 0.0)
     dones, timeouts = buffer.dones[filled].sum(), buffer.timeouts[filled].sum()
     assert dones > timeouts > 0
@@ -239,12 +241,13 @@ def test_evaluate_policy_evaluates_a_model():
     envs.seed(9)
     returns, lengths = evaluate_policy(model, envs, n_eval_episodes=3, return_episode_rewards=True)
     assert lengths == [HORIZON] * 3
-    for row, seed in enumerate(spawn_seeds(9, 3)):
-        env = gym.make(TRACK, **options)
-        observation, _ = env.reset(seed=seed)
-        total = 0.0
-        for _ in range(HORIZON):
-            action, _ = model.predict(observation, deterministic=True)
-            observation, reward, _, _, _ = env.step(action)
-            total += reward
-        assert returns[row] == pytest.approx(total, rel=1e-4)
+    singles = [gym.make(TRACK, **options) for _ in range(3)]
+    observations = [env.reset(seed=seed)[0] for env, seed in zip(singles, spawn_seeds(9, 3), strict=True)]
+    earned = []
+    for _ in range(HORIZON):
+        # All rows at once, as there: a product of matrices rounds by its size.
+        actions, _ = model.predict(np.array(observations), deterministic=True)
+        steps = [env.step(action) for env, action in zip(singles, actions, strict=True)]
+        observations = [step[0] for step in steps]
+        earned.append([step[1] for step in steps])
+    np.testing.assert_allclose(returns, np.sum(earned, axis=0), rtol=1e-12)

@@ -1,12 +1,11 @@
-import platform
-
 import pytest
+from targets import has_fused_multiply_add
 
 from benchmarks.assembly import NotCounted, Operations, count, count_text
 from benchmarks.roofline import divide, move, multiply_add, take_root
 from estimator.lanes import lanewise, rows
 
-on_x86 = pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="counts x86-64 assembly")
+on_x86 = pytest.mark.skipif(not has_fused_multiply_add(), reason="counts x86-64 assembly with AVX and FMA")
 
 UNROLLED_TWICE = """
         vmovupd (%rdi,%rax,8), %zmm0

@@ -1,8 +1,9 @@
 import math
-import time
+from types import SimpleNamespace
 
 import pytest
 
+from benchmarks import timing
 from benchmarks.timing import Result, Row, measure, timed
 
 
@@ -74,14 +75,15 @@ def test_bad_requests_are_refused() -> None:
         measure([row, row], 1)
 
 
-def test_timed_measures_the_work_only() -> None:
+def test_timed_measures_the_work_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now=100.0, perf_counter=lambda: clock.now)
+    monkeypatch.setattr(timing, "time", clock)
+
     def action(count: int) -> float:
-        time.sleep(0.02)
+        clock.now += 0.5
         return 7.0 * count
 
-    seconds, work = timed(action)(3)
-    assert 0.02 <= seconds < 0.2
-    assert work == 21.0
+    assert timed(action)(3) == (0.5, 21.0)
 
 
 def test_results_say_their_median_minimum_and_maximum() -> None:

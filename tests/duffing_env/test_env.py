@@ -12,10 +12,10 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env as gymnasium_check
-from twin import to_coefficients
+from rounding import U32
+from twin import PAIRS, to_coefficients
 
 from duffing_env.env import DuffingEnv
-from duffing_env.rewards import REWARDS
 from estimator import PhysicalParameters
 from estimator.posterior import Belief
 
@@ -75,8 +75,7 @@ def test_examples_of_the_docstrings(module):
     assert results.failed == 0
 
 
-@pytest.mark.parametrize("reward", REWARDS)
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+@pytest.mark.parametrize(("factorisation", "reward"), PAIRS)
 def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(factorisation, reward):
     from stable_baselines3.common.env_checker import check_env as sb3_check
 
@@ -257,11 +256,10 @@ def test_no_time_limit_but_the_horizon():
     episode = play(env, random_actions(0), seed=0)
     assert len(episode) - 1 == 300
     assert "belief" in episode[-1][-1]
-    np.testing.assert_allclose([step[0][20] for step in episode], 1 - np.arange(301) / 300, atol=1e-7)
+    np.testing.assert_allclose([step[0][20] for step in episode], 1 - np.arange(301) / 300, rtol=2 * U32)
 
 
-@pytest.mark.parametrize("reward", REWARDS)
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+@pytest.mark.parametrize(("factorisation", "reward"), PAIRS)
 @pytest.mark.parametrize(
     ("name", "value"),
     [*(("X_x1", value) for value in (np.nan, np.inf, -np.inf, 1e200, 1e70)), ("X_x2", np.inf), ("theta1", 1e300)],
@@ -307,18 +305,17 @@ EXTREMES = [
 
 
 @pytest.mark.parametrize("options", [{}, *EXTREMES], ids=str)
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
-def test_observations_stay_in_their_space_and_rewards_finite(factorisation, options):
-    for reward in REWARDS:
-        env = DuffingEnv(factorisation=factorisation, reward=reward, **options)
-        for seed in range(6):
-            rng = np.random.default_rng(seed)
-            actions = rng.uniform(-1, 1, (256, 1)) if seed % 2 else rng.choice([-1.0, 1.0], (256, 1))
-            for step in play(env, actions, seed=seed):
-                assert step[0] in env.observation_space
-                if len(step) == 5:
-                    numbers = step[1], step[4]["information_gain"], step[4]["log_posterior_gain"]
-                    assert np.isfinite(numbers).all(), numbers
+@pytest.mark.parametrize(("factorisation", "reward"), PAIRS)
+def test_observations_stay_in_their_space_and_rewards_finite(factorisation, reward, options):
+    env = DuffingEnv(factorisation=factorisation, reward=reward, **options)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        actions = rng.uniform(-1, 1, (256, 1)) if seed % 2 else rng.choice([-1.0, 1.0], (256, 1))
+        for step in play(env, actions, seed=seed):
+            assert step[0] in env.observation_space
+            if len(step) == 5:
+                numbers = step[1], step[4]["information_gain"], step[4]["log_posterior_gain"]
+                assert np.isfinite(numbers).all(), numbers
 
 
 @pytest.mark.parametrize("factorisation", FACTORISATIONS)

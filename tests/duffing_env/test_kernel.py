@@ -4,15 +4,15 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from rounding import U64
 from scipy import stats
-from twin import PARAMETERS, TwinEnv, assert_env_follows_twin, to_coefficients
+from twin import PAIRS, PARAMETERS, TwinEnv, assert_env_follows_twin, to_coefficients
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.env import DuffingEnv, observation_space
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import observation_bounds
-from duffing_env.rewards import REWARDS
 from estimator import SILVERBOX_TWIN, PhysicalParameters
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
@@ -22,10 +22,11 @@ COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
 
 
-@pytest.mark.parametrize("reward", REWARDS)
-@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+@pytest.mark.parametrize(("factorisation", "reward"), PAIRS)
 def test_env_follows_its_twin(factorisation, reward):
-    for seed in (0, 1, 2**40):
+    # The rewards meet the same episodes: one of them shows that seeds differ in nothing but their numbers.
+    seeds = (0, 1, 2**40) if reward == "information_gain" else (0,)
+    for seed in seeds:
         env = DuffingEnv(factorisation=factorisation, reward=reward)
         endings = assert_env_follows_twin(env, TwinEnv(seed, factorisation=factorisation), reward, seed)
         assert endings == [(False, True)] * 2
@@ -50,7 +51,7 @@ def test_env_follows_its_twin_with_other_options(factorisation, options):
             DuffingEnv(factorisation=factorisation, **options)
         return
     options = {"factorisation": factorisation, **options}
-    for seed in range(3):
+    for seed in range(2):
         endings = assert_env_follows_twin(DuffingEnv(**options), TwinEnv(seed, **options), "information_gain", seed, 4)
         if "max_output" in options:
             assert (True, False) in endings
@@ -89,8 +90,11 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
     assert np.abs(np.corrcoef(quantiles)[np.triu_indices(4, 1)]).max() < 4 / np.sqrt(size)
 
     expected = to_coefficients(PhysicalParameters(*drawn))
-    for name, values in zip(COEFFICIENTS, expected, strict=True):
-        np.testing.assert_allclose(batch.quantity(f"TRUE_{name}"), values, rtol=1e-13)
+    # θ₁ = 1 + m / (m + c h) - a η cancels; the others are products. None takes more than eight operations on a side.
+    sizes = np.abs(np.stack(list(expected)))
+    sizes[0] = 1 - expected[2] + drawn[2] * expected[3]
+    told = np.stack([batch.quantity(f"TRUE_{name}") for name in COEFFICIENTS])
+    assert (np.abs(told - np.stack(list(expected))) <= 16 * U64 * sizes).all()
 
 
 def test_prior_has_the_moments_of_the_oscillators():

@@ -473,6 +473,7 @@ def test_free_energy_over_the_record(record, factorisation, prior):
         assert np.mean(rises > 1e-9) <= 1e-4
 
 
+@pytest.mark.slow  # a time, which a busy machine makes longer
 def test_the_record_takes_less_than_a_second(record):
     # 0.2 s where this was written; the published run took 239 to 289 s.
     u, y = record.multisine.u, record.multisine.y

@@ -1,0 +1,99 @@
+"""Whether requirements.lock can be installed from binary files alone, asked for each Python version given.
+
+``python .ci/check_lock.py 3.11 3.12``. It prints a line per version and exits with 1 if one of them fails. Nothing is
+downloaded but what the index says of the files. The files are those of this machine's system and processor.
+
+pip evaluates the conditions of dependencies for the Python that runs it. So it is asked without dependencies, and
+these are compared with the lock here: every package that another one needs must stand in it, with a fitting version.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+from packaging.markers import Environment, default_environment
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+
+# What torch's own files ask for on machines with an accelerator. torch names the versions.
+LEFT_TO_TORCH = ("cuda-", "nvidia-", "triton")
+
+
+def environment(version: str) -> Environment:
+    """What conditions see in the first release of a Python version, which is the one that pip is asked for, too."""
+    here = default_environment()
+    here["python_version"] = version
+    here["python_full_version"] = here["implementation_version"] = f"{version}.0"
+    return here
+
+
+def resolve(version: str) -> list[dict]:
+    """Return pip's metadata of every line of the lock.
+
+    Raises:
+        RuntimeError: if a line has no binary file for this version, with pip's words.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.json"
+        command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--no-deps", "--quiet"]
+        command += ["--only-binary=:all:", "--python-version", version, "--target", folder, "--report", str(report)]
+        command += ["--requirement", str(ROOT / "requirements.lock")]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(done.stderr.strip().splitlines()[-1])
+        return [entry["metadata"] for entry in json.loads(report.read_text())["install"]]
+
+
+def missing(packages: list[dict], version: str) -> list[str]:
+    """Return what the project and the packages need in this version of Python and the lock does not have."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    locked = {canonicalize_name(package["name"]): package for package in packages}
+    wanted = [("pyproject.toml", Requirement(line), "") for line in project["dependencies"]]
+    for extra, lines in project["optional-dependencies"].items():
+        wanted += [("pyproject.toml", Requirement(line), extra) for line in lines]
+    for package in packages:
+        wanted += [(package["name"], Requirement(line), "") for line in package.get("requires_dist", [])]
+
+    faults, seen = [], set()
+    while wanted:
+        needs, requirement, extra = wanted.pop()
+        if (needs, str(requirement), extra) in seen:
+            continue
+        seen.add((needs, str(requirement), extra))
+        name = canonicalize_name(requirement.name)
+        if name.startswith(LEFT_TO_TORCH):
+            continue
+        if requirement.marker and not requirement.marker.evaluate({**environment(version), "extra": extra}):
+            continue
+        if name not in locked:
+            faults.append(f"{needs} needs {requirement}")
+        elif not requirement.specifier.contains(locked[name]["version"], prereleases=True):
+            faults.append(f"{needs} needs {requirement}, not {locked[name]['version']}")
+        else:
+            lines = locked[name].get("requires_dist", [])
+            wanted += [(locked[name]["name"], Requirement(line), more) for more in requirement.extras for line in lines]
+    return faults
+
+
+def main(versions: list[str]) -> int:
+    """Print a line per version, and return 1 if the lock fails for one."""
+    failed = 0
+    for version in versions:
+        try:
+            packages = resolve(version)
+            faults = missing(packages, version)
+        except RuntimeError as error:
+            faults = [str(error)]
+        failed |= bool(faults)
+        told = "; ".join(faults) or f"{len(packages)} binary files, all that is needed"
+        print(f"Python {version}: {told}", flush=True)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

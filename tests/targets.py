@@ -1,0 +1,15 @@
+"""What Numba compiles for, which a setting may make another processor than that of the machine."""
+
+import platform
+from functools import cache
+
+import numba
+
+
+@cache
+def has_fused_multiply_add() -> bool:
+    """Whether it is an x86-64 with AVX2 and fused multiply-adds, whose assembly some tests read."""
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return False
+    probe = numba.njit("float64(float64, float64, float64)", fastmath={"contract"})(lambda a, b, c: a * b + c)
+    return "vfmadd" in next(iter(probe.inspect_asm().values()))
