@@ -26,6 +26,12 @@ PAIRS = [
         factorisation,
         reward,
         marks=[pytest.mark.slow]
+        * (factorisation == "mean_field" and reward in ("fisher", "expected_free_energy", "simulation_error")),
+    )
+    for factorisation in ("structured", "mean_field")
+    for reward in REWARDS
+]
+
 PARAMETERS = ("m", "c", "a", "b")
 ITERATIONS = {"structured": 3, "mean_field": 10}
 TIE = 1e12  # precision of the identity between the second component of z_t and the first of z_{t-1}
