@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from itertools import combinations, combinations_with_replacement
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -128,10 +128,10 @@ def unpacker(kind: Kind) -> Any:
     sizes |= dict.fromkeys(("walk", "inverse_std"), kind.belief.n_coefficients)
     sizes |= {"prior": len(belief_names(kind.belief)), "log_precisions": 1 + kind.belief.n_outputs}
     told, at = [], 0
-    for name, annotation in Setup.__annotations__.items():
+    for name, kind_of_value in get_type_hints(Setup).items():
         size = sizes.get(name)
         place = f"packed[{at}]" if size is None else f"packed[{at}:{at + size}]"
-        told.append({"int": f"int({place})", "bool": f"{place} != 0.0"}.get(str(annotation), place))
+        told.append({int: f"int({place})", bool: f"{place} != 0.0"}.get(kind_of_value, place))
         at += 1 if size is None else size
     namespace: dict[str, Any] = {"Setup": Setup}
     exec(f"def unpack(packed):\n    return Setup({', '.join(told)})\n", namespace)

@@ -51,6 +51,11 @@ class PlantExperiment(Experiment):
             )
         if self.prior is not None and not isinstance(self.prior, Belief):
             raise ValueError(f"prior must be an estimator.Belief or None, but is {self.prior!r:.60}")
+        if self.model.n_outputs != 1:
+            raise ValueError(
+                f"prior must be of a model with one sensor, but {self.model.name!r} has {self.model.n_outputs}; "
+                "a plant gives one number"
+            )
 
     @property
     def samples(self) -> int:

@@ -103,6 +103,7 @@ def test_what_the_kernel_gets_is_the_setup():
     assert again._fields == setup._fields
     for name, value in setup._asdict().items():
         np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
+        assert isinstance(getattr(again, name), type(value) if isinstance(value, int) else float | np.ndarray), name
 
 
 def test_defaults_are_those_of_the_documentation():

@@ -17,6 +17,7 @@ from duffing_env.env import DuffingEnv
 from duffing_env.own_plant import PlantEnv
 from duffing_env.rewards import REWARDS
 from estimator.models.difference import difference
+from estimator.models.pendulum import PENDULUM
 from estimator.priors import named_prior, weak_prior
 
 TRACK = "duffing_env/Plant-v0"
@@ -186,6 +187,7 @@ def test_nobody_knows_the_truth():
         (None, {}, r"methods reset\(\) and step\(u\), but None has no reset"),
         (type("Half", (), {"reset": print}), {}, r"has no step\(\)"),
         (Difference(), {"prior": "flat"}, r"prior must be an estimator.Belief or None, but is 'flat'"),
+        (Difference(), {"prior": weak_prior(PENDULUM, np.ones(3), np.eye(3))}, "of a model with one sensor"),
         (Difference(), {"horizon": 0}, "horizon must be a whole number"),
         (Difference(), {"spread": 0.1}, "spread=0.1 is no option of this environment"),
     ],
