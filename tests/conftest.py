@@ -1,10 +1,9 @@
-"""Fixtures for all tests, where they find the Silverbox record, and what they share when several processes run them.
+"""Fixtures for all tests, where they find the Silverbox record.
 
 The record is never in the repository. The tests look for it where `load_record` does, and in
 `shared/data/silverbox` beside the checkout when `SILVERBOX_DATA` is unset.
 """
 
-import fcntl
 import os
 from pathlib import Path
 
@@ -14,7 +13,6 @@ for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 import pytest  # noqa: E402
-from numba.core.caching import IndexDataCacheFile  # noqa: E402
 
 from duffing_env.silverbox import SilverboxRecord, load_record, record_available  # noqa: E402
 
@@ -22,20 +20,6 @@ BESIDE_THE_CHECKOUT = Path(__file__).parents[2] / "shared" / "data" / "silverbox
 
 if not os.environ.get("SILVERBOX_DATA") and BESIDE_THE_CHECKOUT.is_dir():
     os.environ["SILVERBOX_DATA"] = str(BESIDE_THE_CHECKOUT)
-
-
-def _save_alone(self, key, data, save=IndexDataCacheFile.save):
-    """Store a compiled kernel while no other process of the tests does.
-
-    Numba numbers the files of a function's signatures. Two processes that store different signatures at once could
-    take the same number, and the kernel of one would then be found under the signature of the other.
-    """
-    with open(Path(self._cache_path) / ".lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        save(self, key, data)
-
-
-IndexDataCacheFile.save = _save_alone
 
 
 @pytest.fixture(scope="session")

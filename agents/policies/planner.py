@@ -14,15 +14,16 @@ looks for what will be lacking at the end. Where the coefficients walk (``drift`
 
 What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then predicted;
 plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian exceeds with
-probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes true.
+probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes true. Where an
+input comes to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the
+sample between moves the next output about as much again, and no input makes up for it: the margin is then twice as wide.
 
 The search (`agents.policies.planning`) builds a plan sample by sample, by the best ways through the plane of the model's
 first two states, and improves it by small changes. Horizon 1 is myopic.
 
 Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
 climbs by gradient (`agents.policies.pursuit`): then the question is when to spend, which no short horizon can answer.
-That search knows neither ``max_slew`` nor ``drift``, and Eq. (2) alone; other models need a ``horizon``, and then plan as
-if the energy had no limit but the amplitude's.
+That search knows neither ``max_slew`` nor ``drift``.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ class Planner:
             amplitude=setup.max_input,
             slew=setup.max_slew,
             limit=setup.max_output,
-            margin=float(-ndtri(risk / env.horizon)),
+            margin=float(-ndtri(risk / env.horizon)) * (1 + max(self._view.degree, self._view.lag)),
             walk=setup.walk.copy(),
             scales=scales(self._view, means, setup.max_input, setup.max_output),
             price=float(input_cost),

@@ -16,8 +16,10 @@ from agents.policies.export import draw_signal, export_signal
 from agents.policies.feedback import FEEDBACK, TURN
 from agents.policies.signals import Limits, SignalPolicy
 from duffing_env.experiment import SimulatedExperiment
+from duffing_env.layout import observation_bounds
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters, to_coefficients
-from estimator.prior import Prior
+from estimator.models.difference import difference
+from estimator.priors import silverbox_prior
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 RECORDED = ("silverbox-multisine", "silverbox-arrow")
@@ -188,19 +190,17 @@ def test_feedback_ends_no_episode_and_uses_the_room(name, options):
 
 
 def observation(**entries):
-    from duffing_env.layout import OBSERVATION
-
-    return np.array([entries.get(name, 0.0) for name in OBSERVATION], dtype=np.float32)
+    return np.array([entries.get(name, 0.0) for name in observation_bounds(difference())], dtype=np.float32)
 
 
 def test_velocity_sign_pumps_with_the_velocity_and_brakes_beyond_the_amplitude():
     policy = make_policy("velocity-sign")
     assert policy.predict(observation())[0] == 1.0
-    assert policy.predict(observation(state_x0=0.1, state_x1=0.05))[0] == 1.0
-    assert policy.predict(observation(state_x0=0.1, state_x1=0.15))[0] == -1.0
-    turning = observation(state_x0=TURN + 0.05, state_x1=TURN)
+    assert policy.predict(observation(state_x1=0.1, state_x2=0.05))[0] == 1.0
+    assert policy.predict(observation(state_x1=0.1, state_x2=0.15))[0] == -1.0
+    turning = observation(state_x1=TURN + 0.05, state_x2=TURN)
     assert policy.predict(turning)[0] == -1.0
-    swinging = observation(state_x0=0.0, state_x1=-0.6)  # through the middle, too fast
+    swinging = observation(state_x1=0.0, state_x2=-0.6)  # through the middle, too fast
     assert policy.predict(swinging)[0] == -1.0
 
 
@@ -209,7 +209,7 @@ def test_amplitude_is_that_of_a_sampled_sine():
     frequency = policy.frequency(observation()[np.newaxis])
     for phase in np.linspace(0, 6, 7):
         x0, x1 = 0.3 * np.sin(phase - 2 * np.pi * frequency[0] * SAMPLING_STEP * np.arange(2))
-        row = observation(state_x0=x0, state_x1=x1)[np.newaxis].astype(np.float64)
+        row = observation(state_x1=x0, state_x2=x1)[np.newaxis].astype(np.float64)
         assert policy.amplitude(row) == pytest.approx(0.3, rel=1e-4)
 
 
@@ -217,13 +217,13 @@ def test_amplitude_is_that_of_a_sampled_sine():
 def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
     env = SimpleNamespace(unwrapped=SimpleNamespace(max_input=0.15, experiment=SimulatedExperiment(spread=spread)))
     policy = make_policy("square-believed", env)
-    prior = Prior.silverbox_twin(spread)
+    prior = silverbox_prior(spread=spread)
     stds = np.sqrt(np.diag(prior.coefficients_cov))
     twin = SILVERBOX_TWIN
     believed = to_coefficients(PhysicalParameters(0.95 * twin.m, twin.c, 1.05 * twin.a, twin.b))
-    mean_t1 = (believed.theta1 - prior.theta_mean[0]) / stds[0]
-    mean_t3 = (believed.theta3 - prior.theta_mean[2]) / stds[2]
-    row = observation(mean_t1=mean_t1, mean_t3=mean_t3)
+    mean_t1 = (believed.theta1 - prior.coefficients_mean[0]) / stds[0]
+    mean_t3 = (believed.theta3 - prior.coefficients_mean[2]) / stds[2]
+    row = observation(mean_theta1=mean_t1, mean_theta3=mean_t3)
     natural = np.sqrt(1.05 * twin.a / (0.95 * twin.m)) / (2 * np.pi)
     state, wave = None, []
     for _ in range(400):
@@ -233,6 +233,29 @@ def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
     rises = np.flatnonzero(np.diff(wave) > 0)
     measured = (rises.size - 1) / (SAMPLING_STEP * (rises[-1] - rises[0]))
     assert measured == pytest.approx(natural, rel=0.01)
+
+
+@pytest.mark.parametrize("name", FEEDBACK)
+def test_feedback_pumps_equation_1_too(name):
+    asked, seen, ended = roll_out(name, "duffing_env/Continuous-v0", 16, horizon=128)
+    assert ended == 0
+    assert set(np.unique(np.abs(asked))) == {1.0}
+    # The first state of its observation is the displacement too.
+    assert np.median(np.abs(seen[:, :, 16]).max(axis=0)) > 0.5
+
+
+def test_resonance_and_amplitude_are_read_off_equation_1():
+    env = gym.make("duffing_env/Continuous-v0").unwrapped
+    policy, model = make_policy("square-believed", env), env.experiment.model
+    prior = env.experiment.believed.coefficients_mean
+    row = np.zeros((1, len(observation_bounds(model))))
+    expected = np.sqrt(prior[0] - prior[2] ** 2 / 4) / (2 * np.pi * SAMPLING_STEP)  # of m, c and a
+    assert policy.frequency(row)[0] == pytest.approx(expected, rel=1e-9)
+    omega = 2 * np.pi * SAMPLING_STEP * expected
+    for phase in np.linspace(0, 6, 7):
+        row[0, list(observation_bounds(model)).index("state_x")] = 0.3 * np.sin(phase)
+        row[0, list(observation_bounds(model)).index("state_v")] = 0.3 * omega * np.cos(phase)
+        assert policy.amplitude(row)[0] == pytest.approx(0.3, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", FEEDBACK)

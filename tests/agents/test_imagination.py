@@ -5,7 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agents.design import START_SIZE, worth
 from agents.policies.imagination import Terms, mind
+from agents.policies.planner import _pursued
+from agents.policies.pursuit import begin
 from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment
 from estimator.engine.imagination import LOST, imagination
 from estimator.lanes import LANES
@@ -172,6 +175,19 @@ def test_the_cost_is_price_goal_and_what_is_beyond_the_limit(case):
     assert beyond > 0
     cost = 1e4 * beyond / 0.05 + 3.0 * 0.1**2 + 4.0 * ((shown - 0.1) ** 2 + variance - 0.02**2)
     np.testing.assert_allclose(W[place["COST"]], cost, rtol=1e-9)
+
+
+def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
+    # Kalman's separation of state and parameters: -½ log det C_H of the joint recursion is ½ log det(Λ + F).
+    model = difference()
+    belief = random_belief(model, np.random.default_rng(2))
+    theta, precision, start, F = np.empty(4), np.empty((4, 4)), np.empty(START_SIZE), np.empty((4, 4))
+    begin(_pursued(belief.record[None])[0], theta, precision, start, F)
+    u = np.random.default_rng(3).normal(0.0, 0.05, 8)
+    value, _ = worth(theta, precision, 0.01**2, 0.02**2, 1e3, 0.0, start, u, np.empty((9, START_SIZE)), F)
+    W, found = block_after(model, 0, belief, np.repeat(u[:, None], LANES, axis=1), terms(model, limit=1e3))
+    found.appraise(W.reshape(-1), np.zeros((4, 4)), 1.0)
+    assert value == pytest.approx(W[imagination(model).layout["SCORE"], 0], abs=1e-6)
 
 
 def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
