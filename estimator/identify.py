@@ -21,7 +21,7 @@ from estimator.posterior import Belief
 from estimator.rig import Rig
 
 
-def identify(u: npt.ArrayLike, y: npt.ArrayLike, prior: Any, rig: Rig | None = None) -> list[Any]:
+def identify(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | None = None) -> list[Belief]:
     """Identify a system from each of n records, sample by sample.
 
     Args:
@@ -38,11 +38,6 @@ def identify(u: npt.ArrayLike, y: npt.ArrayLike, prior: Any, rig: Rig | None = N
     Raises:
         ValueError: for shapes that do not fit, a prior of another kind, or another rig.
     """
-    from estimator.belief import RecordBelief
-    from estimator.record_identify import identify_records
-
-    if isinstance(prior, RecordBelief):
-        return identify_records(u, y, prior)
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be a Belief, but is {prior!r:.60}; see estimator.priors")
     inputs, outputs = np.array(u, dtype=np.float64), np.array(y, dtype=np.float64)
