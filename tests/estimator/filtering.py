@@ -14,7 +14,7 @@ TANKS = Model(
     name="tanks",
     states={"upper": "m", "lower": "m"},
     coefficients={"flow": "1", "leak": "1", "valve": "1", "bias": "m"},
-    next_state=("upper - flow*tanh(upper) + valve*(u + 0.5*u1)", "lower + flow*tanh(upper) - leak*lower**2"),
+    next_state=("upper - flow*tanh(upper) + valve*(u + 0.5*u1)", "lower + flow*tanh(upper) - leak*tanh(lower)"),
     noise=("1", "0.5"),
     outputs={"level": "lower + bias", "top": "upper + 0.1*u"},
 )
