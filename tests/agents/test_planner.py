@@ -215,7 +215,7 @@ def test_the_map_measures_every_state_by_its_size_at_the_limit():
 
 def test_under_a_budget_plans_follow_the_differential_equation_too():
     options = {"max_rms": 0.0222, "horizon": 128}
-    inputs, _, early = roll_out("duffing_env/Continuous-v0", 4, options=options)
+    inputs, _, early, _ = roll_out("Continuous", 4, options=options)
     assert early == 0
     energy = (inputs**2).sum(axis=0) / (128 * 0.0222**2)
     assert np.all(energy <= 1 + 1e-4)
