@@ -205,7 +205,9 @@ def test_the_map_measures_every_state_by_its_size_at_the_limit():
     found = scales(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 0.6)
     np.testing.assert_allclose(found, [0.6, 0.6 * omega], rtol=0.15)
     # Also where no input comes near the limit.
-    np.testing.assert_allclose(scales(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 1e3)[1], 1e3 * omega, rtol=0.15)
+    np.testing.assert_allclose(
+        scales(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 1e3)[1], 1e3 * omega, rtol=0.15
+    )
     seen = scales(View(WIENER_HAMMERSTEIN), [0.4, 0.1, 0.0, 0.5], 0.15, 0.6)
     assert seen[2] == 0.6
     assert np.all(seen[:2] > 0.1)
