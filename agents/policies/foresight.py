@@ -5,8 +5,8 @@ network learns such a function poorly from means, deviations and displacements. 
 oscillator does with a push up, none or a push down, and what that would teach (`agents.policies.prospects`). Three
 things are done for it:
 
-- **Features.** Where the model is odd, observations are turned upright, so that the first sensor shows nothing negative,
-  and the action is turned back.
+- **Features.** Where the model is odd, observations are turned upright, so that the first sensor shows nothing
+  negative, and the action is turned back.
 - **A shield.** An action in whose direction no way is left to stay within the displacement limit is replaced by none,
   or by a push the other way, whichever is safe. So also a policy that still tries its actions out seldom ends an
   episode, and learns to go close to the limit.

@@ -58,8 +58,8 @@ class Mind(NamedTuple):
         score: where the row of the scores begins.
         fill: ``fill(W, record, lasts)``: put a belief into every lane, and the last inputs, newest first (2,).
         collect: ``collect(W, record)``: take the belief of the first lane.
-        advance: ``advance(W, record, terms)``: one expected sample in every lane, and its cost; the coefficients and the
-            noises are those of a record.
+        advance: ``advance(W, record, terms)``: one expected sample in every lane, and its cost; coefficients and noises
+            are those of a record.
         appraise: ``appraise(W, M, scale)``: the scores, minus the expected free energy up to a constant, with (scale M)
             (scale M)ᵀ (K, K) of information still to come.
         precision: ``precision(W, inverse)``: inverse (K, K) of the coefficients' covariance in the first lane.

@@ -145,7 +145,7 @@ def _swinger(view: View) -> Any:
         W = np.zeros(size)
         W[n : n + k] = means
         peaks[:] = 0.0
-        for t in range(_SAMPLES):
+        for _ in range(_SAMPLES):
             sense(W)
             W[u] = max_input if W[velocity] >= 0.0 else -max_input
             glance(W)

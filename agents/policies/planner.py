@@ -6,20 +6,21 @@ Of a sequence of inputs u over the next H samples the expected free energy is, i
            + Σ_h E[(x_h - goal)²] / (2 goal_std²)                       how far it is from a goal (pragmatic, optional)
            + input_cost Σ_h u_h²                                        what it costs (optional)
 
-with C_0 the covariance of the coefficients now and C_H the one after the H outputs that are expected, by belief propagation: the
-joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample teaches is not
-counted again by the next. The teaching part then telescopes: a plan of the whole episode would be Bayesian D-optimal.
-J is the information that the rest of the episode after H will bring anyway, at the rate of the last plans; so a plan
+with C_0 the covariance of the coefficients now and C_H the one after the H outputs that are expected, by belief
+propagation: the joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample
+teaches is not counted again by the next. The teaching part then telescopes: a plan of the whole episode would be
+Bayesian D-optimal. J is the information that the rest of the episode after H will bring anyway, at the rate of the last plans; so a plan
 looks for what will be lacking at the end. Where the coefficients walk (``drift``) J is 0, and the walk is imagined too.
 
-What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then predicted;
-plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian exceeds with
-probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes true. Where an
-input comes to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the
-sample between moves the next output about as much again, and no input makes up for it: the margin is then twice as wide.
+What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then
+predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
+exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes
+true. Where an input comes to act in full only a sample later, because it goes linearly from the last one to the new,
+the noise of the sample between moves the next output about as much again, and no input makes up for it: the margin is
+then twice as wide.
 
-The search (`agents.policies.planning`) builds a plan sample by sample, by the best ways through the plane of the model's
-first two states, and improves it by small changes. Horizon 1 is myopic.
+The search (`agents.policies.planning`) builds a plan sample by sample, by the best ways through the plane of the
+model's first two states, and improves it by small changes. Horizon 1 is myopic.
 
 Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
 climbs by gradient (`agents.policies.pursuit`): then the question is when to spend, which no short horizon can answer.

@@ -65,8 +65,8 @@ class Search(NamedTuple):
             - ``words`` (n, 4): streams of random numbers; overwritten;
             - ``actions`` (n,): receives the first input of the best plan;
             - ``scores`` (n,): receives the best plan's score [nats].
-        play: ``play(record, first, horizon, rounds, terms, u, words)`` plans the inputs u (T,) from sample ``first`` on,
-            where the means of the belief are the truth. The inputs before it are followed as they are. Arguments as
+        play: ``play(record, first, horizon, rounds, terms, u, words)`` plans the inputs u (T,) from sample ``first``
+            on, where the means of the belief are the truth. The inputs before it are followed as they are. Arguments as
             of ``plan``; ``words`` is (4,), and the record is overwritten.
     """
 

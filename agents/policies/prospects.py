@@ -8,11 +8,11 @@ push up, none, or a push down; then follows one of `CONTINUATIONS`:
 - ``brake``: pushes against the motion,
 - ``rest``: none.
 
-What a sequence of inputs *brings* is Σ_t φ_tᵀ W φ_t / (2 σ²) with φ the derivative by the coefficients of what the first
-sensor shows after a sample from a known state, (x_t, x_t³, x_{t-1}, u_t) for Eq. (2), and the variance σ² of an output:
-to first order the growth of ½ log det(C⁻¹ + J), with C the coefficients' covariance, J what the rest of the episode will
-tell anyway, and W = (C⁻¹ + J)⁻¹. So it counts what will be lacking at the end. An output whose margin of `MARGIN`
-standard deviations reaches beyond the limit takes away more than anything brings.
+What a sequence of inputs *brings* is Σ_t φ_tᵀ W φ_t / (2 σ²) with φ the derivative by the coefficients of what the
+first sensor shows after a sample from a known state, (x_t, x_t³, x_{t-1}, u_t) for Eq. (2), and the variance σ² of an
+output: to first order the growth of ½ log det(C⁻¹ + J), with C the coefficients' covariance, J what the rest of the
+episode will tell anyway, and W = (C⁻¹ + J)⁻¹. So it counts what will be lacking at the end. An output whose margin of
+`MARGIN` standard deviations reaches beyond the limit takes away more than anything brings.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def lookout(view: View) -> Any:
 
     @inner
     def play(prospect, W, first, continuation, code, brought):
-        """Play one sequence: fills what it has brought by each horizon, and gives the highest output with its margin."""
+        """Play a sequence: fills what it has brought by each horizon, and gives the highest output with its margin."""
         push, limit = prospect.push, prospect.limit
         W[:] = prospect.start
         total, peak, h = 0.0, 0.0, 0

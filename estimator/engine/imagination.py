@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, pairwise
 from typing import Any
 
 from estimator.engine import cache as stored
@@ -19,9 +19,9 @@ from estimator.lanes import LANES, rows
 from estimator.models.model import Model
 
 #: Runge-Kutta steps per sample of what is only imagined. A filter needs an integration error far below the posterior's
-#: standard deviation, because it adds up over a record. A plan does not: it compares inputs, all imagined alike, by what
-#: they teach. With two steps the 22 nats of 24 random pushes of Eq. (1) are 0.01 less than with sixteen, 0.005 more or
-#: less from plan to plan.
+#: standard deviation, because it adds up over a record. A plan does not: it compares inputs, all imagined alike, by
+#: what they teach. With two steps the 22 nats of 24 random pushes of Eq. (1) are 0.01 less than with sixteen, 0.005
+#: more or less from plan to plan.
 SUBSTEPS = 2
 
 #: What a belief knows that is none any more: less than any that is one, and still a number to compare with.
@@ -37,8 +37,8 @@ class Imagination:
 
     Attributes:
         advance: ``advance(W, record, walk)``: one expected sample in every lane. Means of the coefficients and of the
-            noises' precisions are those of a belief's record; ``walk`` (K,) are variances by which the coefficients walk
-            before the sample. Leaves in ``SHOWN`` what the first sensor is expected to show, and in ``SPREAD`` the
+            noises' precisions are those of a belief's record; ``walk`` (K,) are variances by which the coefficients
+            walk before the sample. Leaves in ``SHOWN`` what the first sensor is expected to show, and in ``SPREAD`` the
             variance of that output.
         judge: ``judge(W, M)``: leaves ½ log det(C⁻¹ + M Mᵀ) in ``KNOWN``, with C the coefficients' covariance and M
             (K, K), lower triangular, the factor of the information that is still to come; `LOST` where C is no
@@ -111,7 +111,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
     wider = [(walked[f"P_{c}_{c}"], symbol(f"P_{c}_{c}") + symbol(f"WALK_{c}")) for c in coefficients]
     lines = wider + derive.renamed([*lines, *more], {**walked, **given})
     results = {row: walked.get(value, value) for row, value in results.items()}
-    results = {**walked, **results, **{older: newer for newer, older in zip(inputs, inputs[1:], strict=False)}}
+    results = {**walked, **results, **{older: newer for newer, older in pairwise(inputs)}}
     noises = ["Q", *(f"R_{y}" for y in model.outputs)]
     uniform = [*coefficients, *noises, *(f"WALK_{c}" for c in coefficients)]
     source = ""

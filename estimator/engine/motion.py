@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 from estimator.engine import cache as stored
@@ -123,7 +124,7 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     more += [(f"END_{x}", value) for x, value in zip(states, moved.state, strict=True)]
     results = {row: f"{row}_e" for row in ("SHOWN", *(f"PHI_{c}" for c in model.coefficients))}
     results |= {x: f"END_{x}" for x in states}
-    results |= {older: newer for newer, older in zip(inputs, inputs[1:], strict=False)}
+    results |= {older: newer for newer, older in pairwise(inputs)}
     source += loop("finish", "What the sensor shows, by the coefficients too.", [*lines, *more], results)
     for name, move, end in (("glance", "move_plainly", "see"), ("step", "move", "finish")):
         steps = model.substeps

@@ -17,8 +17,8 @@ from agents.policies.feedback import FEEDBACK, TURN
 from agents.policies.signals import Limits, SignalPolicy
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.layout import observation_bounds
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters, to_coefficients
 from estimator.models.difference import difference
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters, to_coefficients
 from estimator.priors import silverbox_prior
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"

@@ -146,7 +146,7 @@ def test_features_are_those_of_the_twin(env_id):
 
 @pytest.mark.parametrize("name", ["Amplitude", "Power"])
 def test_features_are_those_that_the_shipped_policies_were_trained_with(name):
-    """The numbers are those of the code before features were of any model; they differ by float32's rounding at most."""
+    """The numbers of the code that they were trained with, within the rounding of float32."""
     stored = json.loads((Path(__file__).parent / "data" / "foresight-eq2.json").read_text())[name]
     view = Foresight.of(make(f"duffing_env/{name}-v0", 1), RATE).look(stored["observations"])
     np.testing.assert_allclose(view.features, stored["features"], rtol=4e-7, atol=1e-9)
