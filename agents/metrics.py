@@ -102,7 +102,7 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatAr
     return oracle.efficiency(evaluation.inputs.T[:n], evaluation.outputs.T[:n])
 
 
-def silverbox_equivalents(gains: FloatArray, truth: PhysicalParameters, experiment: Any, seed: int) -> FloatArray:
+def silverbox_equivalents(gains: FloatArray, truth: Any, experiment: Any, seed: int) -> FloatArray:
     """(n,) samples of the Silverbox multisine regime that tell as much as ``gains`` (n,) of `information`.
 
     Each system is given a stretch of the regime as recorded, at its own power (`regime_information`). Interpolated
@@ -112,7 +112,7 @@ def silverbox_equivalents(gains: FloatArray, truth: PhysicalParameters, experime
 
 
 def regime_information(
-    truth: PhysicalParameters, experiment: Any, seed: int, scale: float = 1.0, longest: float = 15.5
+    truth: Any, experiment: Any, seed: int, scale: float = 1.0, longest: float = 15.5
 ) -> tuple[npt.NDArray[np.int64], FloatArray]:
     """What stretches of the Silverbox multisine regime, times ``scale``, tell of each system.
 
