@@ -9,8 +9,9 @@ Of a sequence of inputs u over the next H samples the expected free energy is, i
 with C_0 the covariance of the coefficients now and C_H the one after the H outputs that are expected, by belief
 propagation: the joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample
 teaches is not counted again by the next. The teaching part then telescopes: a plan of the whole episode would be
-Bayesian D-optimal. J is the information that the rest of the episode after H will bring anyway, at the rate of the last plans; so a plan
-looks for what will be lacking at the end. Where the coefficients walk (``drift``) J is 0, and the walk is imagined too.
+Bayesian D-optimal. J is the information that the rest of the episode after H will bring anyway, at the rate of the last
+plans; so a plan looks for what will be lacking at the end. Where the coefficients walk (``drift``) J is 0, and the walk
+is imagined too.
 
 What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then
 predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
@@ -169,7 +170,7 @@ class Planner:
             plans, rates, before = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n)
             words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
         else:
-            plans, rates, words, before = (part.copy() for part in state)
+            plans, rates, words, before = state[0].copy(), state[1].copy(), state[2].copy(), state[3].copy()
         if episode_start is not None:
             begun = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)
             plans[begun], rates[begun], before[begun] = 0.0, 0.0, 0.0

@@ -101,17 +101,14 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
 
     found, symbol, states = derive.calculus(model), derive.symbol, list(model.states)
     inputs = inputs_of(model, degree, lag)
-    source = ""
+    source, (lines, moved) = "", derive.moved(model)
     if model.is_continuous:
-        lines, moved = [], derive.carried_at_end(model)
         start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
         source += loop("begin", "The point that moves.", [], start)
         carried = {name: f"{name}_E" for name in derive.carried(model)}
         source += loop("move", "One Runge-Kutta step.", derive.motion_step(model, degree), carried, "T")
         point = {f"M_{x}": f"M_{x}_E" for x in states}
         source += loop("move_plainly", "The same of the state alone.", derive.plain_step(model, degree), point, "T")
-    else:
-        lines, moved = derive.difference_step(model)
     at = dict(zip(map(symbol, states), moved.state, strict=True)) | {symbol("u"): derive.input_at_end(model, degree)}
     shown = found.outputs[0].xreplace(at)
     readout = [slope.xreplace(at) for slope in found.readouts[0]]
