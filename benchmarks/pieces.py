@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from duffing_env.plant import draw_noise, move_plant
 
 from duffing_env.layout import LAYOUT, N_ROWS
 from duffing_env.noise import stream_words
-from duffing_env.plant import draw_noise, move_plant
 from estimator import SILVERBOX_TWIN, Prior, to_coefficients
 from estimator.inference import update
 from estimator.lanes import LANES, jit, kernel

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from duffing_env.plant import draw_noise, move_plant
 
 from benchmarks.assembly import NotCounted, Operations, count
 from benchmarks.pieces import plants
@@ -19,7 +20,6 @@ from benchmarks.timing import Result, Row, measure, timed
 from duffing_env.batch import Batch
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_NEXT_STEP, observe
-from duffing_env.plant import draw_noise, move_plant
 from duffing_env.rewards import settle
 from estimator.inference import DEFAULT_ITERATIONS, mean_field, structured
 from estimator.lanes import LANES, inlined, jit, kernel, lanewise, rows
