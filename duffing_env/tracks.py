@@ -37,7 +37,7 @@ TRACKS: dict[str, dict[str, Any]] = {
         "vector_entry_point": "duffing_env.vector_env:ContinuousVectorEnv",
         "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
     },
-    # The pendulum of IO-SMC²: both angle and velocity are seen without noise (1 nrad), p ~ N([14.7, 0, 3], ...), 0.05 s.
+    # The pendulum of IO-SMC²: angle and velocity are seen without noise (here 1 µrad), every 0.05 s.
     "duffing_env/Pendulum-v0": {
         "entry_point": "duffing_env.model_env:ModelEnv",
         "vector_entry_point": "duffing_env.model_env:ModelVectorEnv",

@@ -18,7 +18,7 @@ from agents.policies.learned import WEIGHTS, load_policy, save_policy
 from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
 from duffing_env.silverbox import Regime, regime_input
-from estimator import NLARX, SAMPLING_STEP, OnlineEstimator, Prior
+from estimator import SAMPLING_STEP, OnlineEstimator, Rig, difference, silverbox_prior
 
 TRACK = "duffing_env/Amplitude-v0"
 CONTINUOUS = "duffing_env/Continuous-v0"
@@ -191,7 +191,7 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
         assert measured.pop("input_peak") == pytest.approx(peak, rel=slack)
         assert measured.pop("crest_factor") == pytest.approx(peak / np.sqrt(power), rel=slack)
         assert measured.pop("decision_time") > 0
-        full_prior = Prior.silverbox_twin(options.get("spread", 0.3))  # mean field leaves out its cross-covariances
+        full_prior = silverbox_prior(spread=options.get("spread", 0.3))  # mean field leaves out its cross-covariances
         gain = fisher_gain(coefficients, single.inputs, single.outputs, full_prior)
         assert measured.pop("fisher_gain") == pytest.approx(gain, abs=1e-3)
         assert measured.pop("silverbox_equivalent") > 0
@@ -336,7 +336,7 @@ def test_the_replay_environment_is_evaluated(record):
     u, y = record.arrow.u, record.arrow.y
     samples = int(np.argmax(np.abs(y[1:]) > limit)) + 1  # the episode ends when y, one sample later, is beyond
     assert samples > 1000
-    estimator = OnlineEstimator(NLARX(input_delay=0), Prior.silverbox_twin())
+    estimator = OnlineEstimator(difference(), silverbox_prior(), Rig(interpolation="zero_order", delay=0))
     before = entropy(estimator.belief)
     estimator.run(u[:samples], y[1 : samples + 1])
     np.testing.assert_allclose(on_record.metrics["information_gain"], before - entropy(estimator.belief), rtol=1e-9)
