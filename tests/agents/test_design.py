@@ -8,18 +8,19 @@ import pytest
 
 from agents.ascent import Limits, climber
 from agents.design import Known, designer, half_log_det, invert
-from estimator import SILVERBOX_TWIN, Belief, Prior
+from estimator import SILVERBOX_TWIN, silverbox_prior
 from estimator.engine.gradient import pieces
 from estimator.information import fisher_information
 from estimator.models.difference import difference
+from estimator.physical import coefficients_of
 
 sys.path.append(str(Path(__file__).parents[1] / "estimator"))
 from filtering import CASES
 
 Q, R, LIMIT, AMPLITUDE = 5e-4, 3e-4, 0.3, 0.1
 PAPER = difference()
-THETA = Belief.coefficients_of(SILVERBOX_TWIN)
-PRECISION = np.linalg.inv(Prior.silverbox_twin().coefficients_cov)
+THETA = coefficients_of(PAPER, {name: getattr(SILVERBOX_TWIN, name) for name in "mcab"})
+PRECISION = np.linalg.inv(silverbox_prior(PAPER).coefficients_cov)
 TWIN = Known(THETA, PRECISION, (Q**2, R**2))
 
 

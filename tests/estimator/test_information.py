@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator import SILVERBOX_TWIN, Belief, OnlineEstimator, PhysicalParameters, Prior
+from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior
 from estimator.information import cramer_rao, fisher_information, follow, relative_covariance
-from estimator.models.difference import difference
+from estimator.physical import coefficients_of
 
 sys.path.append(str(Path(__file__).parent))
 import filtering
@@ -16,13 +16,13 @@ from filtering import CASES
 
 Q, R = 5e-4, 3e-4
 PAPER = difference()
-TWIN = Belief.coefficients_of(SILVERBOX_TWIN)
+CIRCUIT = {name: getattr(SILVERBOX_TWIN, name) for name in "mcab"}
+TWIN = coefficients_of(PAPER, CIRCUIT)
 
 
 def draw_systems(rng, n, spread=0.3):
     factors = np.exp(rng.uniform(np.log(1 - spread), np.log(1 + spread), (4, n)))
-    centre = np.array([getattr(SILVERBOX_TWIN, name) for name in "mcab"])
-    return Belief.coefficients_of(PhysicalParameters(*(centre[:, None] * factors)))
+    return coefficients_of(PAPER, {name: CIRCUIT[name] * row for name, row in zip("mcab", factors, strict=True)})
 
 
 def simulate(theta, u, rng=None):
@@ -119,7 +119,7 @@ def test_the_structured_posterior_has_the_information_of_prior_and_data():
     rng = np.random.default_rng(3)
     u = rng.choice([-0.12, 0.12], 250)
     y = simulate(TWIN, u, rng)
-    prior = Prior.silverbox_twin(0.1, Q, R, noise_shape=1e9)
+    prior = silverbox_prior(PAPER, 0.1, Q, R, noise_shape=1e9)
     estimator = OnlineEstimator(prior=prior)
     acting = np.concatenate([u, [0.0]])
     estimator.run(acting, np.concatenate([[0.0], y]))
@@ -144,7 +144,7 @@ def test_a_series_ends_before_its_first_nan():
 def test_bounds():
     rng = np.random.default_rng(5)
     F = fisher_information(PAPER, TWIN, rng.choice([-0.12, 0.12], 200), Q, R)
-    precision = np.linalg.inv(Prior.silverbox_twin().coefficients_cov)
+    precision = np.linalg.inv(silverbox_prior(PAPER).coefficients_cov)
     for bound, total in ((cramer_rao(F), F), (cramer_rao(F, precision), F + precision)):
         np.testing.assert_allclose(bound @ total, np.eye(4), atol=1e-8)
     # Relative errors are those of a simulated change of m, c, a and b.

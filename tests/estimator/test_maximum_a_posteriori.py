@@ -4,23 +4,21 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from estimator import SILVERBOX_TWIN, PhysicalParameters, Prior, to_coefficients
+from estimator import SILVERBOX_TWIN, difference, silverbox_prior, weak_prior
 from estimator.maximum_a_posteriori import maximum_a_posteriori
-from estimator.models.difference import difference
 from estimator.models.pendulum import PENDULUM
-from estimator.priors import weak_prior
+from estimator.physical import coefficients_of
 
 PAPER = difference()
 NOISES = (5e-4, 5e-4)
-PRIOR = Prior.silverbox_twin(0.3, *NOISES)
+PRIOR = silverbox_prior(PAPER, 0.3, *NOISES)
 
 
 def simulate(systems, samples, rng):
     """Systems from rest under uniform inputs: true coefficients (n, 4), u and y (n, T)."""
     center = np.array([SILVERBOX_TWIN.m, SILVERBOX_TWIN.c, SILVERBOX_TWIN.a, SILVERBOX_TWIN.b])
     drawn = center * np.exp(rng.uniform(np.log(0.7), np.log(1.3), (systems, 4)))
-    c = to_coefficients(PhysicalParameters(*drawn.T))
-    psi = np.stack([c.theta1, c.theta2, c.theta3, c.eta], axis=-1)
+    psi = coefficients_of(PAPER, dict(zip("mcab", drawn.T, strict=True)))
     u, y = rng.uniform(-0.15, 0.15, (systems, samples)), np.empty((systems, samples))
     x = last = np.zeros(systems)
     for t in range(samples):
@@ -42,7 +40,7 @@ def objective(psi, u, y):
         loss += 0.5 * (innovation**2 / variance + np.log(variance))
         gain = cov[:, 0] / variance
         mean, cov = mean + gain * innovation, cov - np.outer(gain, cov[0])
-    pull = psi - np.append(PRIOR.theta_mean, PRIOR.eta_mean)
+    pull = psi - PRIOR.coefficients_mean
     return loss + 0.5 * pull @ np.linalg.solve(PRIOR.coefficients_cov, pull)
 
 
@@ -79,7 +77,7 @@ def test_episodes_of_different_lengths_fit_into_one_array():
 
 def test_without_samples_it_is_the_prior():
     fit = maximum_a_posteriori(PAPER, np.full((1, 3), np.nan), np.full((1, 3), np.nan), PRIOR, *NOISES)
-    np.testing.assert_allclose(fit.mean[0], np.append(PRIOR.theta_mean, PRIOR.eta_mean), rtol=1e-14)
+    np.testing.assert_allclose(fit.mean[0], PRIOR.coefficients_mean, rtol=1e-14)
     np.testing.assert_allclose(fit.cov[0], PRIOR.coefficients_cov, rtol=1e-9)
 
 
