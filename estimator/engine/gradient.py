@@ -87,7 +87,7 @@ def _motion(model: Model, degree: int, carried: list[str], path_rows: list[str])
 
     held = {"M": carried, "C": list(model.coefficients), "U": input_rows(model, degree)}
     start = [emit.text_of(value) for value in derive.carried_at_start(model).values()]
-    step, moves = derive.motion_step(model, degree), {name: f"{name}_e" for name in carried}
+    step, moves = derive.motion_step(model, degree), {name: f"{name}_E" for name in carried}
     source = "@jit\n" + emit.scalar_function("start", [], [start], {"P": path_rows}, doc="The point that moves.")
     source += "@jit\n" + emit.scalar_function("move", step, [list(moves.values())], held, ("T",), "A Runge-Kutta step.")
     adjoints = {"GM": [f"G_{name}" for name in carried], "GU": [f"G_{name}" for name in held["U"]]}
