@@ -16,14 +16,15 @@ import numpy as np
 
 from benchmarks.coverage import LENGTHS, NOISES, QUANTILE, wilson
 from duffing_env.vector_env import ContinuousVectorEnv
-from estimator.continuous import COEFFICIENTS
 from estimator.files import write_atomically
+from estimator.models.duffing import duffing
 from estimator.parameters import FloatArray
 
 TRACK = "duffing_env/Continuous-v0"
 NO_LIMIT = 1e3  # V
 ESTIMATORS = ("ode", "nlarx")
-PHYSICAL = ("m", "c", "a", "b")
+COEFFICIENTS = tuple(duffing().coefficients)
+PHYSICAL = tuple(duffing().physical)
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def evaluate(
     if estimator == "ode":
         means = np.array([belief.coefficients_mean for belief in beliefs])
         covs = np.array([belief.coefficients_cov for belief in beliefs])
-        hits = _hits(tuple(COEFFICIENTS), means, covs, beliefs[0].coefficients_of(truth)) | hits
+        hits = _hits(COEFFICIENTS, means, covs, beliefs[0].coefficients_of(truth)) | hits
     # Relative to the truth, because the scales of m, c, a and b are ten orders apart.
     error = estimates / physical - 1
     relative = covariances / (physical[:, :, None] * physical[:, None, :])

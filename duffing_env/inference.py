@@ -35,7 +35,7 @@ def free_energy_of(kind: Kind) -> Any:
     place = layout_of(kind)
     if kind.factorisation == "mean_field":
         function, _, outputs, uniform = mean_field.free_energy.declaration
-        return at_lane(_paper_layout(kind), outputs, uniform)(function)
+        return at_lane(paper_layout(kind), outputs, uniform)(function)
     traced, last = free_energies(kind.belief, kind.iterations, LANES, place), kind.iterations - 1
 
     @jit
@@ -47,7 +47,7 @@ def free_energy_of(kind: Kind) -> Any:
     return free_energy
 
 
-def _paper_layout(kind: Kind) -> dict[str, int]:
+def paper_layout(kind: Kind) -> dict[str, int]:
     """The rows of mean field's own names; those of a θ2 that the model does not have hold zeros."""
     place = layout_of(kind)
     layout = {old: place[new] if new in place else place["MF_theta2"] for old, new in _PAPER.items()}
@@ -61,7 +61,7 @@ def _paper_layout(kind: Kind) -> dict[str, int]:
 
 
 def _mean_field(kind: Kind) -> Any:
-    layout, iterations = _paper_layout(kind), kind.iterations
+    layout, iterations = paper_layout(kind), kind.iterations
     begin, iterate, end = (relaid(f, layout) for f in (mean_field.begin, mean_field.iterate, mean_field.end))
 
     @jit

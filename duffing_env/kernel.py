@@ -7,6 +7,7 @@ batch with one live lane, so both faces give bit-identical trajectories.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -39,6 +40,11 @@ def _draw_noise(STREAM_a, STREAM_b, STREAM_c, STREAM_d, WAITING):
         as_bits(a) if live else STREAM_a, as_bits(b) if live else STREAM_b,
         as_bits(c) if live else STREAM_c, as_bits(d) if live else STREAM_d, w, v,
     )  # fmt: skip
+
+
+def noise_drawer(place: Mapping[str, int]) -> Any:
+    """``draw_noise(W)``: two standard normal numbers in every lane, into rows ``NOISE_w`` and ``NOISE_v``."""
+    return lanewise(place, "STREAM_a STREAM_b STREAM_c STREAM_d NOISE_w NOISE_v")(_draw_noise)
 
 
 def _limit_input(ASKED, INPUT, LAST_INPUT, SPENT, budget, max_slew):
@@ -127,7 +133,7 @@ def compiled(kind: Kind) -> Kernel:
     cleared += [name for name in place if name.startswith(("MF_theta2", "MF_P_"))]
     at_rest = tuple(row[name] for name in [*cleared, *sensors, *(f"X_{x}" for x in kind.truth.states)])
 
-    draw_noise = lanewise(place, "STREAM_a STREAM_b STREAM_c STREAM_d NOISE_w NOISE_v")(_draw_noise)
+    draw_noise = noise_drawer(place)
     limit_input = lanewise(place, "INPUT LAST_INPUT OLDER_INPUT RISE SPENT", uniform="budget max_slew")(_limit_input)
     play_record = lanewise(place, f"INPUT {sensors[0]} OFF_RECORD", uniform="max_input")(_play_record)
     pay = lanewise(place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(_pay)
