@@ -140,7 +140,7 @@ def equal_information(gains: FloatArray, lengths: npt.NDArray[np.int64], told: F
 
 
 def simulation_errors(means: FloatArray, truth: Any) -> FloatArray:
-    """(n,) RMSE [V] of free runs of Eq. (2) with estimated coefficients beside the true ones, over the arrow's input."""
+    """(n,) RMSE [V] of free runs of Eq. (2) with estimated coefficients beside the true ones, for the arrow input."""
     u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:-1]
     true = coefficients_of(difference(), parameters_of(truth, difference()))
     runs = [[free_run(difference(), c, u) for c in pair] for pair in zip(means, true, strict=True)]

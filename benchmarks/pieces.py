@@ -11,20 +11,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from duffing_env.plant import draw_noise, move_plant
 
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import noise_drawer
 from duffing_env.layout import layout_of
 from duffing_env.noise import stream_words
-<<<<<<< HEAD
-from estimator import SILVERBOX_TWIN, Prior, to_coefficients
-from estimator.inference import update
-=======
 from duffing_env.sources import parts
 from estimator.engine.tasks import structured
 from estimator.inference.samples import mean_field_update
->>>>>>> bench
 from estimator.lanes import LANES, jit, kernel
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from duffing_env.plant import draw_noise, move_plant
 
 from benchmarks.assembly import NotCounted, Operations, count
 from benchmarks.pieces import experiment_of, plants
@@ -19,19 +18,12 @@ from benchmarks.report import Claim, Section
 from benchmarks.timing import Result, Row, measure, timed
 from duffing_env.batch import Batch
 from duffing_env.experiment import SimulatedExperiment
-<<<<<<< HEAD
-from duffing_env.kernel import RESET_NEXT_STEP, observe
-from duffing_env.rewards import settle
-from estimator.inference import DEFAULT_ITERATIONS, mean_field, structured
-from estimator.lanes import LANES, inlined, jit, kernel, lanewise, rows
-=======
 from duffing_env.inference import paper_layout, updater
 from duffing_env.kernel import RESET_NEXT_STEP, noise_drawer
 from duffing_env.layout import layout_of
 from duffing_env.sources import parts
 from estimator.inference import mean_field
 from estimator.lanes import LANES, inlined, jit, kernel, lanewise, relaid, rows
->>>>>>> bench
 
 SIZE = 1024
 STEPS = 256
