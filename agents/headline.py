@@ -25,8 +25,9 @@ from agents.evaluation import roll_out
 from agents.leaderboard import MEDIAN, METRICS, Metric, cell_of, center_and_interval, finite
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.silverbox import record_available, regime_input
-from estimator import SILVERBOX_TWIN, Belief
+from estimator import SILVERBOX_TWIN, difference
 from estimator.files import write_atomically
+from estimator.physical import coefficients_of
 
 REGIME = "silverbox-multisine"
 
@@ -98,7 +99,11 @@ def main(config: Config) -> None:
         }
     floor = None
     if record_available():
-        floor = float(metrics.arrow_errors(Belief.coefficients_of(SILVERBOX_TWIN)[None])[0])
+        floor = float(
+            metrics.arrow_errors(
+                coefficients_of(difference(), metrics.parameters_of(SILVERBOX_TWIN, difference()))[None]
+            )[0]
+        )
     show(results, floor)
     written = {"systems": config.systems, "seed": config.seed, "twin_on_the_arrow": floor, "comparisons": results}
     write_atomically(config.json, json.dumps(finite(written), indent=2, allow_nan=False) + "\n")

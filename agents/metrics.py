@@ -141,10 +141,11 @@ def equal_information(gains: FloatArray, lengths: npt.NDArray[np.int64], told: F
 
 def simulation_errors(means: FloatArray, truth: Any) -> FloatArray:
     """(n,) RMSE [V] of free runs of Eq. (2) with estimated coefficients beside the true ones, for the arrow input."""
-    u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:-1]
+    u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:][1:-1]
     true = coefficients_of(difference(), parameters_of(truth, difference()))
     runs = [[free_run(difference(), c, u) for c in pair] for pair in zip(means, true, strict=True)]
-    return np.array([_rmse(np.append(0.0, believed), np.append(0.0, exact)) for believed, exact in runs])
+    at_rest = np.zeros(2)  # as a record's first two outputs, which are given
+    return np.array([_rmse(np.append(at_rest, believed), np.append(at_rest, exact)) for believed, exact in runs])
 
 
 def arrow_errors(means: FloatArray) -> FloatArray:

@@ -73,7 +73,9 @@ class ModelExperiment(SimulatedExperiment):
             if given not in MODELS:
                 raise ValueError(f"system must be one of {list(MODELS)} or a Model, but is {given!r}")
             return MODELS[given]()
-        fields = {key: tuple(value) if isinstance(value, list) else value for key, value in given.items()}
+        fields: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in given.items()
+        }
         return Model(**fields)
 
     @property

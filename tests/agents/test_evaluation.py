@@ -132,7 +132,7 @@ def run_single(name, options):
             observation, _, terminated, truncated, _ = env.step(action)
             beliefs.append(env.unwrapped.belief)
             inputs.append(options.get("max_input", 0.15) * float(np.clip(action[0], -1, 1)))
-            outputs.append(env.unwrapped._batch.quantity("y")[0])
+            outputs.append(env.unwrapped._batch.quantity("Y_y")[0])
             done = terminated or truncated
         yield SimpleNamespace(truth=truth, beliefs=beliefs, inputs=inputs, outputs=outputs, terminated=terminated)
 
