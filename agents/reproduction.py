@@ -251,7 +251,7 @@ def train_through_environment(setting: Setting, nonlinear: bool, data: Path | No
     if terminated:
         raise RuntimeError(f"the episode must reach the end of the record, but was terminated before: {info}")
     means: FloatArray = info["belief"].coefficients_mean
-    return means
+    return means if nonlinear else np.insert(means, 1, 0.0)  # without the cubic term θ2 is no coefficient: it is 0
 
 
 def make_environment(setting: Setting, nonlinear: bool, data: Path | None) -> gym.Env:

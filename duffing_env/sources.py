@@ -231,7 +231,7 @@ def _judgement(kind: Kind, loop: Any) -> str:
     told = [symbol(name) for name in ("GAIN", "POSTERIOR", "ERROR", "E_ERROR", "E_WORK")]
     paid = sp.Function("reward")(*told) - symbol("input_cost") * symbol("INPUT") ** 2
     first = next(iter(model.outputs))
-    beyond = check(symbol("VOID")) + check(symbol(f"Y_{first}") ** 2 - symbol("max_output") ** 2)
+    beyond = check(symbol("VOID")) + check(sp.Abs(symbol(f"Y_{first}")) - symbol("max_output"))
     ended = sp.Function("reaches")(symbol("LATER"), symbol("horizon"))
     lines += [("PAID", paid), ("STOPPED", check(beyond)), ("LATER", symbol("ELAPSED") + 1)]
     lines.append(("OVER", (1 - symbol("STOPPED")) * ended))
