@@ -118,7 +118,8 @@ class Batch:
     def records(self) -> FloatArray:
         """(n, RECORD_SIZE) the beliefs now, as flat records (`estimator.record`); a copy."""
         records = self._blocks[:, :RECORD_SIZE].swapaxes(1, 2).reshape(-1, RECORD_SIZE)
-        return records[: self.size]
+        # Of a single block that is a view, in another order, for which a kernel would be compiled once more.
+        return np.array(records[: self.size], order="C")
 
     def belief(self, index: int) -> RecordBelief:
         """The belief of environment ``index``."""
