@@ -223,6 +223,7 @@ def test_senseless_hyperparameters_are_refused(settings, message):
         PPOSettings(**{**asdict(TINY), **settings})
 
 
+@pytest.mark.slow  # a training that has to be long enough to learn something
 def test_training_beats_signals_that_do_not_look(tmp_path):
     """Clearly: on the same systems, 95 % intervals apart, after 600,000 samples."""
     ppo = PPOSettings(num_envs=256, n_steps=32, batch_size=2048, learning_rate=3e-3, hidden=(32,))

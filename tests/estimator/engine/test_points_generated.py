@@ -114,7 +114,7 @@ def test_on_a_linear_model_it_is_first_order(monkeypatch):
         assert_agrees(get_belief(W, task.layout, LANES, lane, case), expected, 4 * case.operations * lost)
 
 
-@pytest.mark.parametrize("name", ["paper", "van der pol"])
+@pytest.mark.parametrize("name", ["paper", pytest.param("van der pol", marks=pytest.mark.slow)])
 def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
     """Beliefs, inputs and outputs over sixteen decades, sixty samples on end."""
     case = CASES[name]

@@ -62,7 +62,10 @@ def test_an_update_equals_its_equations(name, iterations, monkeypatch):
     assert_equals_reference(case, task, some_samples(case, 1), iterations)
 
 
-@pytest.mark.parametrize("name", ["duffing, all terms", "pendulum", "cubic"])
+# Compiling a model takes seconds; the same source is tested without the compiler above, so one is enough here.
+@pytest.mark.parametrize(
+    "name", ["pendulum", *(pytest.param(name, marks=pytest.mark.slow) for name in ("duffing, all terms", "cubic"))]
+)
 def test_a_compiled_update_equals_its_equations_with_missing_outputs(name):
     """Of two sensors none, the first, the second or both are missing."""
     case = CASES[name]
