@@ -40,6 +40,7 @@ def test_rows_do_not_depend_on_their_number():
     assert few.task.path == many.task.path
 
 
+@pytest.mark.slow  # twenty seconds of searching
 def test_the_search_keeps_the_limits_and_beats_a_random_signal():
     systems = Systems.of(SHORT, 1)
     rng = np.random.default_rng(0)
