@@ -116,7 +116,8 @@ class Batch:
         """(n, size) the beliefs now, as flat records (`estimator.Belief`); a copy."""
         size = record_size(self.experiment.model)
         records = self._blocks[:, :size].swapaxes(1, 2).reshape(-1, size)
-        return records[: self.size]
+        # Of a single block that is a view, in another order, for which a kernel would be compiled once more.
+        return np.array(records[: self.size], order="C")
 
     def belief(self, index: int) -> Belief:
         """The belief of environment ``index``."""

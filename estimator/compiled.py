@@ -6,11 +6,14 @@ work where nothing can be written, and which cannot see a bit that flipped.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import pickle
 import sys
 import tempfile
+import threading
+import time
 import warnings
 from collections.abc import Callable
 from functools import cache
@@ -18,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core import event
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
@@ -74,6 +78,66 @@ def write(path: Path, content: bytes) -> None:
         pass
 
 
+class Compilation(event.Listener):
+    """Watches over compilation: Numba tells when it begins and ends to compile a function.
+
+    What takes longer than `PATIENCE` says on stderr that it compiles, once in a process. Python's garbage collector
+    rests meanwhile: it finds nothing in what Numba builds, and takes a fifth of the time.
+    """
+
+    #: Seconds that the process may spend compiling before it says so.
+    PATIENCE = 2.0
+
+    def __init__(self) -> None:
+        self._depth = 0  # a function that others call is compiled while they are
+        self._spent = 0.0
+        self._began = 0.0
+        self._timer: threading.Timer | None = None
+        self._collects = False
+
+    def on_start(self, event: Any) -> None:
+        """A function begins to be compiled."""
+        dispatcher = event.data["dispatcher"]
+        if self._depth == 0 and not isinstance(dispatcher._cache, Compiled):
+            return  # somebody else's
+        self._depth += 1
+        if self._depth > 1:
+            return
+        self._collects = gc.isenabled()
+        gc.disable()
+        self._began = time.perf_counter()
+        if self._spent < self.PATIENCE:
+            self._timer = threading.Timer(self.PATIENCE - self._spent, self._say, [dispatcher.py_func])
+            self._timer.daemon = True
+            self._timer.start()
+
+    def on_end(self, event: Any) -> None:
+        """A function is compiled, or cannot be."""
+        self._depth = max(0, self._depth - 1)
+        if self._depth > 0 or self._began == 0.0:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._spent += time.perf_counter() - self._began
+        self._began = 0.0
+        if self._collects:
+            gc.enable()
+
+    def _say(self, function: Callable[..., Any]) -> None:
+        self._spent = self.PATIENCE
+        place = folder()
+        kept = "again in every process, because no folder can be written" if place is None else f"once, into {place}"
+        what = f"{function.__module__}.{function.__name__}"
+        print(f"duffing-env is compiling {what}, which takes some seconds ({kept})", file=sys.stderr, flush=True)
+
+
+@cache
+def watch_compilation() -> None:
+    """Let a `Compilation` watch from now on."""
+    event.register("numba:compile", Compilation())
+
+
 class Compiled(_Cache):
     """What Numba asks for compiled code of a function, and gives it to: one file per signature and processor.
 
@@ -94,6 +158,7 @@ class Compiled(_Cache):
         self._around = () if named else function.__closure__ or ()
         self._stamp = stamp.encode()
         self._enabled = True
+        watch_compilation()
 
     @property
     def cache_path(self) -> str | None:

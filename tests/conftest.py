@@ -11,6 +11,8 @@ from pathlib import Path
 # number of cores, nor do the processes that run the tests fight for these. Numba's threads are the tests' own subject.
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+# The manual's tools bring colorama, with which Numba colours the messages of every signature that does not fit.
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 import pytest  # noqa: E402
 
@@ -28,3 +30,8 @@ def record() -> SilverboxRecord:
     if not record_available():
         pytest.skip("the Silverbox record is not on this machine; set SILVERBOX_DATA")
     return load_record()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with a folder whose first files share no kernel, so that two processes do not compile the same at once."""
+    items.sort(key=lambda item: item.path.parent.name != "duffing_env")

@@ -429,7 +429,10 @@ def test_the_example_brings_about_as_much_as_the_oracle():
     assert 0.5 < ratio < 1.1
 
 
-@pytest.mark.parametrize("settings", [PPOSettings(levels=3), PPOSettings(), SACSettings(learning_starts=64)])
+@pytest.mark.parametrize(
+    "settings",
+    [PPOSettings(levels=3), PPOSettings(), pytest.param(SACSettings(learning_starts=64), marks=pytest.mark.slow)],
+)
 def test_a_policy_that_was_trained_with_it_acts_the_same_from_its_file(tmp_path, settings):
     settings = replace(settings, foresight=True, num_envs=8, batch_size=32, hidden=(4,))
     algo = "sac" if isinstance(settings, SACSettings) else "ppo"

@@ -89,7 +89,7 @@ train(config(sys.argv[1], Path(sys.argv[2])))
 """
 
 
-@pytest.mark.parametrize("algo", ["ppo", "sac"])
+@pytest.mark.parametrize("algo", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_a_kill_loses_at_most_one_checkpoint_interval(tmp_path, algo):
     """Killed by SIGKILL while the third of four checkpoints is half-written, it goes on from the second."""
     folder = tmp_path / "run"

@@ -39,6 +39,7 @@ def test_a_setting_reaches_the_tests(tmp_path):
     assert "A_SETTING" not in os.environ
 
 
+@pytest.mark.slow  # another pytest
 def test_what_cannot_run_is_no_pass(tmp_path):
     with pytest.raises(OSError, match=r"the tests did not (run|end) under 'mine'"):
         run(Setting("mine", (str(tmp_path / "nothing"),)), 1, tmp_path)

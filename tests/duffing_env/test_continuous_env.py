@@ -36,16 +36,13 @@ def test_the_fisher_information_is_refused_to_an_equation_that_the_plant_does_no
         ContinuousEnv(reward="fisher", estimator="nlarx")
 
 
-#: Left to the evidence, because a kernel is seconds of compilation, and these add nothing but a combination: what the
-#: rewards read of a belief of the difference equation is tested there. Only the promise depends on the input's time.
-EVIDENCE = {
-    "structured": ("free_energy", "simulation_error"),
-    "mean_field": ("free_energy", "expected_free_energy", "simulation_error"),
-}
+#: Left to the evidence, because a kernel is seconds of compilation: what a free energy and a free run are is tested on
+#: the difference equation, and so is what rewards read of its beliefs.
+EVIDENCE = {"ode": ("free_energy", "simulation_error")}
+EVIDENCE["nlarx"] = (*EVIDENCE["ode"], "expected_free_energy")
 PAIRS = [
-    pytest.param(options, reward, marks=[pytest.mark.slow] * (options["estimator"] == "nlarx" and reward in left_out))
+    pytest.param(options, reward, marks=[pytest.mark.slow] * (reward in EVIDENCE[options["estimator"]]))
     for options in ESTIMATORS
-    for left_out in [EVIDENCE[options.get("factorisation", "structured")]]
     for reward in REWARDS
     if not (reward == "fisher" and options["estimator"] == "nlarx")  # refused, as tested above
 ]

@@ -30,7 +30,8 @@ KNOWN = {"noise_shape": 1e9, "horizon": 60}  # noises that are known, so that no
     [
         ("duffing_env/Amplitude-v0", {}),
         ("duffing_env/Continuous-v0", {}),
-        ("duffing_env/Continuous-v0", {"estimator": "nlarx"}),
+        # seconds of compilation for another combination
+        pytest.param("duffing_env/Continuous-v0", {"estimator": "nlarx"}, marks=pytest.mark.slow),
         ("duffing_env/Continuous-v0", {"max_slew": 0.02}),
     ],
 )

@@ -65,8 +65,15 @@ def test_example_of_the_docstring():
     assert results.failed == 0
 
 
-@pytest.mark.parametrize("reward", ["information_gain", "free_energy"])
-@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+@pytest.mark.parametrize(
+    ("factorisation", "reward"),
+    [
+        ("structured", "information_gain"),
+        ("structured", "free_energy"),
+        ("mean_field", "information_gain"),
+        pytest.param("mean_field", "free_energy", marks=pytest.mark.slow),  # seconds of compilation
+    ],
+)
 def test_a_plant_that_gives_the_simulated_outputs_gives_the_same_episode_to_the_bit(factorisation, reward):
     options = {"factorisation": factorisation, "reward": reward, "max_output": 0.25}
     simulated = DuffingEnv(**options)

@@ -1,5 +1,6 @@
 """Compiled and generated code on disk: kept, damaged, and where nothing can be kept."""
 
+import gc
 import importlib
 import os
 import subprocess
@@ -8,6 +9,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+from numba.core import event
 
 from estimator import compiled
 from estimator.engine import cache as generated
@@ -191,3 +193,29 @@ def test_damaged_source_is_generated_anew_in_silence(place, damage):
         assert loaded() == (1, 1)
     assert path.read_bytes() == whole
     assert loaded() == (1, 0)
+
+
+def test_what_takes_long_says_so_once(place, monkeypatch, capsys):
+    """A small patience stands for a compilation that takes long."""
+    watching = compiled.Compilation()
+    monkeypatch.setattr(watching, "PATIENCE", 1e-3)
+    event.register("numba:compile", watching)
+    try:
+        assert called() == (42, 0)
+        assert fresh().adder(2)(1) == 3
+    finally:
+        event.unregister("numba:compile", watching)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("duffing-env is compiling run_of_compiled.")
+    assert str(place) in line
+
+
+def test_garbage_is_collected_again_after_compilation(place):
+    called()
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        fresh().adder(2)(1)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()

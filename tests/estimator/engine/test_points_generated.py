@@ -50,6 +50,7 @@ def test_an_update_equals_its_equations(name, monkeypatch):
     assert_equals_reference(case, generated(case), samples)
 
 
+@pytest.mark.slow  # as below; without compilation the tests above ask the same
 def test_a_compiled_update_equals_its_equations():
     case = CASES["van der pol"]
     task = tasks.structured(
@@ -114,7 +115,8 @@ def test_on_a_linear_model_it_is_first_order(monkeypatch):
         assert_agrees(get_belief(W, task.layout, LANES, lane, case), expected, 4 * case.operations * lost)
 
 
-@pytest.mark.parametrize("name", ["paper", pytest.param("van der pol", marks=pytest.mark.slow)])
+@pytest.mark.slow  # eighteen seconds of compilation
+@pytest.mark.parametrize("name", ["paper", "van der pol"])
 def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
     """Beliefs, inputs and outputs over sixteen decades, sixty samples on end."""
     case = CASES[name]
