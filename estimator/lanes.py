@@ -30,8 +30,8 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "no
 #: Compile a function that other compiled functions call.
 jit = numba.njit(**OPTIONS)
 
-#: Compile a scalar function that is always inlined into its callers, as vectorisation needs. Python cannot call it.
-inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, **OPTIONS)
+#: Compile a scalar function that is always inlined into its callers, as vectorisation needs.
+inlined = numba.njit(forceinline=True, **OPTIONS)
 
 
 def rows(*groups: str, start: int = 0) -> dict[str, int]:
