@@ -112,12 +112,13 @@ def _move_often(W, repeats):
 
 def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
     """The pieces of a step: lane functions, and how often a step calls them."""
-    kind = experiment_of(factorisation).kind
+    experiment = experiment_of(factorisation)
+    kind = experiment.kind
     code = parts(kind)
     if factorisation == "structured":
         inference = {updater(kind): 1}
     else:
-        times = {mean_field.begin: 1, mean_field.iterate: kind.iterations, mean_field.end: 1}
+        times = {mean_field.begin: 1, mean_field.iterate: experiment.setup.iterations, mean_field.end: 1}
         inference = {relaid(function, paper_layout(kind)): count for function, count in times.items()}
     return {
         "noise": {noise_drawer(layout_of(kind)): 1},

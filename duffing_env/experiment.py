@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from duffing_env.layout import Kind, Setup, parameter_names
-from duffing_env.rewards import check_reward
+from duffing_env.rewards import REWARDS, check_reward
 from estimator.continuous import CONTINUOUS_TWIN
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
@@ -127,12 +127,16 @@ class Experiment:
         return {}
 
     @property
+    def _iterations(self) -> int:
+        return int(self.iterations or DEFAULT_ITERATIONS[self.factorisation])
+
+    @property
     def kind(self) -> Kind:
         """What the kernel is compiled for."""
         return Kind(
             self.model, self.plant, self.degree, self.factorisation,
-            int(self.iterations or DEFAULT_ITERATIONS[self.factorisation]), self.reward,
-            pays=self.terminal or self.terminated_return is not None,
+            self._iterations if self.factorisation == "structured" else 0,
+            self.reward if REWARDS[self.reward].hooks is not None else "",
         )  # fmt: skip
 
     @property
@@ -145,6 +149,7 @@ class Experiment:
             "max_output": float(self.max_output),
             "horizon": float(self.samples),
             "hold": 1,
+            "iterations": self._iterations,
             "process_noise": 0.0,
             "measurement_noise": np.zeros(self.truth_model.n_outputs),
             "step": self.step,
@@ -153,9 +158,11 @@ class Experiment:
             "spread": 0.0,
             "budget": np.inf,
             "max_slew": np.inf,
-            "input_cost": 0.0,
+            "input_price": 0.0,
             "jump": 0.0,
+            "drifts": False,
             "walk": np.zeros(model.n_coefficients),
+            "weights": np.array(REWARDS[self.reward].weights),
             "terminal": self.terminal,
             "forfeits": self.terminated_return is not None,
             "terminated_return": float(self.terminated_return or 0.0),
@@ -254,15 +261,11 @@ class SimulatedExperiment(Experiment):
             "spread": float(self.spread if self.plant_spread is None else self.plant_spread),
             "budget": np.inf if self.max_rms is None else self.horizon * self.max_rms * self.max_rms,
             "max_slew": np.inf if self.max_slew is None else float(self.max_slew),
-            "input_cost": self.input_cost / self.max_input / self.max_input,
+            "input_price": float(np.sqrt(self.input_cost)) / self.max_input,
             "jump": float(self.jump),
+            "drifts": self.drift > 0,
             "walk": self.drift**2 * np.diag(self.believed.coefficients_cov),
         }
-
-    @property
-    def kind(self) -> Kind:
-        """What the kernel is compiled for."""
-        return super().kind._replace(drifts=self.drift > 0, jumps=self.jump > 0)
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,12 @@ _PAPER = {"x0": "x1", "x1": "x2", "t1": "theta1", "t2": "theta2", "t3": "theta3"
 def updater(kind: Kind) -> Any:
     """Update every lane's belief, with its input and outputs in their rows.
 
-    ``update(W)``, or of mean field ``update(W, as_published)``.
+    ``update(W)``, or of mean field ``update(W, iterations, as_published)``.
     """
     if kind.factorisation == "mean_field":
         return _mean_field(kind)
     return structured(
-        kind.belief, kind.degree, iterations=kind.iterations, within=layout_of(kind), trace=kind.reward == "free_energy"
+        kind.belief, kind.degree, iterations=kind.iterations, within=layout_of(kind), trace=kind.work == "free_energy"
     ).update
 
 
@@ -61,11 +61,11 @@ def paper_layout(kind: Kind) -> dict[str, int]:
 
 
 def _mean_field(kind: Kind) -> Any:
-    layout, iterations = paper_layout(kind), kind.iterations
+    layout = paper_layout(kind)
     begin, iterate, end = (relaid(f, layout) for f in (mean_field.begin, mean_field.iterate, mean_field.end))
 
     @jit
-    def update(W, as_published):
+    def update(W, iterations, as_published):
         begin(W)
         for _ in range(iterations):
             iterate(W, as_published)

@@ -140,16 +140,16 @@ def compiled(kind: Kind) -> Kernel:
     streams = "STREAM_a STREAM_b STREAM_c STREAM_d"
     draw_jump = at_lane(place, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon")(_draw_jump)
 
-    simulated, normal, drifts = kind.plant is not None, kind.normal, kind.drifts
+    simulated = kind.plant is not None
     move: Any = _plant_of(kind, code, draw_noise) if simulated else None
     infer = updater(kind)
-    make_hooks = REWARDS[kind.reward].hooks
+    make_hooks = REWARDS[kind.work].hooks if kind.work else None
     hooks = Hooks(nothing_in_lane, nothing, nothing, nothing) if make_hooks is None else make_hooks(kind, code)
     begin_work, before, expect, after = hooks
     is_worked = make_hooks is not None
-    is_structured, jumps, pays = kind.factorisation == "structured", kind.jumps, kind.pays
+    is_structured = kind.factorisation == "structured"
     settle_truth, appraise, settle, observe = code.settle_truth, code.appraise, code.settle, code.observe
-    walk: Any = code.walk if drifts else None
+    walk: Any = code.walk
     digests = (kind.belief.digest, kind.plant.digest if kind.plant else "replay")
     unpack = unpacker(kind)
     name = "_".join(str(word) for word in (*digests, *kind[2:]))
@@ -164,7 +164,7 @@ def compiled(kind: Kind) -> Kernel:
         width = math.log(1.0 + setup.spread) - low
         for p in range(n_parameters):
             first, a, b, c, d = draw(a, b, c, d)
-            if normal:
+            if setup.width[p] > 0.0:
                 second, a, b, c, d = draw(a, b, c, d)
                 deviation, _ = normal_pair(to_unit(first), to_unit(second))
                 W[drawn + p * LANES + j] = setup.center[p] + setup.width[p] * deviation
@@ -184,7 +184,7 @@ def compiled(kind: Kind) -> Kernel:
                 W[i * LANES + j] = setup.prior[i]
             draw_plant(W, j, setup)
             W[jump_at + j] = -1.0
-            if jumps:
+            if setup.jump > 0.0:
                 draw_jump(W, j, setup.jump, setup.horizon)
             for r in at_rest:
                 W[r + j] = 0.0
@@ -216,7 +216,7 @@ def compiled(kind: Kind) -> Kernel:
                 for j in range(LANES):
                     W[asked + j] = setup.max_input * max(-1.0, min(1.0, actions[lane + j]))
                 limit_input(W, setup.budget, setup.max_slew)
-                if jumps:
+                if setup.jump > 0.0:
                     for j in range(LANES):
                         if W[elapsed + j] == W[jump_at + j]:
                             W[drawn + j] *= W[jump_factor + j]
@@ -236,18 +236,21 @@ def compiled(kind: Kind) -> Kernel:
                 # What to return to if the update breaks the belief.
                 for i in range(n_saved):
                     saved[i] = W[i]
-                if drifts:
+                if setup.drifts:
                     walk(W, setup.walk)
                 if is_worked:
                     expect(W, setup)
                 if is_structured:
                     infer(W)
                 else:
-                    infer(W, setup.as_published)
+                    infer(W, setup.iterations, setup.as_published)
                 if is_worked:
                     after(W, setup)
-                settle(W, setup.step, setup.max_output, setup.horizon, setup.input_cost)
-                if pays:
+                settle(
+                    W, setup.step, setup.max_output, setup.horizon, setup.input_price, setup.weights[0],
+                    setup.weights[1], setup.weights[2], setup.weights[3],
+                )  # fmt: skip
+                if setup.terminal or setup.forfeits:
                     pay(W, setup.terminal, setup.forfeits, setup.terminated_return)
                 void = 0
                 for j in range(LANES):
@@ -285,7 +288,7 @@ def compiled(kind: Kind) -> Kernel:
             for again in range(2):
                 observe(
                     W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output,
-                    1.0 / setup.max_input, 1.0 / setup.horizon, 1.0 / setup.budget,
+                    1.0 / setup.max_input, setup.horizon, 1.0 / setup.budget,
                 )  # fmt: skip
                 for j in range(LANES):
                     for k in range(n_observation):

@@ -36,12 +36,9 @@ class Kind(NamedTuple):
         plant: the model that is simulated; None where a record is replayed.
         degree: of the input over a sample of a differential equation: 0 held, 1 linear from the last input to this one.
         factorisation: ``structured``, or the paper's ``mean_field``.
-        iterations: variational iterations per sample.
-        reward: its name.
-        drifts: whether the coefficients are believed to walk.
-        normal: whether plants are drawn from a Gaussian, instead of log-uniformly about a centre.
-        jumps: whether the first parameter jumps within an episode.
-        pays: whether rewards are paid at the end, or an episode that is terminated forfeits them.
+        iterations: variational iterations per sample of the structured belief, whose update is generated with them; 0
+            for mean field, which is told.
+        work: name of the reward, if it has hooks (`duffing_env.rewards`); the others are weights that a kernel is told.
     """
 
     belief: Model
@@ -49,11 +46,7 @@ class Kind(NamedTuple):
     degree: int = 0
     factorisation: str = "structured"
     iterations: int = 3
-    reward: str = "information_gain"
-    drifts: bool = False
-    normal: bool = False
-    jumps: bool = False
-    pays: bool = False
+    work: str = ""
 
     @property
     def truth(self) -> Model:
@@ -69,17 +62,20 @@ class Setup(NamedTuple):
         max_output: limit of the first sensor.
         horizon: samples of an episode.
         hold: samples of an action.
+        iterations: variational iterations per sample.
         process_noise: standard deviation of what a sample's process noise does to the first sensor.
         measurement_noise: (sensors,) standard deviations.
         step: sampling step [s].
         center: (p,) parameters in the middle of the range, or their means.
-        width: (p,) their standard deviations, for plants from a Gaussian.
+        width: (p,) standard deviations of those that are drawn from a Gaussian; 0 for the others.
         spread: relative half width of the range.
         budget: of the energy Σ u²; inf for none.
         max_slew: largest change of the input; inf for none.
-        input_cost: per u².
+        input_price: square root of what an input of 1 costs.
         jump: of the first parameter, in parts of it; 0 for none.
-        walk: (K,) variances of the coefficients' walk in a sample.
+        drifts: whether the coefficients are believed to walk.
+        walk: (K,) variances of their walk in a sample.
+        weights: (4,) of the reward (`duffing_env.rewards.Reward`).
         terminal: whether a reward is paid at the end.
         forfeits: whether an episode that is terminated returns ``terminated_return``.
         terminated_return: see there.
@@ -94,6 +90,7 @@ class Setup(NamedTuple):
     max_output: float
     horizon: float
     hold: int
+    iterations: int
     process_noise: float
     measurement_noise: npt.NDArray[np.float64]
     step: float
@@ -102,9 +99,11 @@ class Setup(NamedTuple):
     spread: float
     budget: float
     max_slew: float
-    input_cost: float
+    input_price: float
     jump: float
+    drifts: bool
     walk: npt.NDArray[np.float64]
+    weights: npt.NDArray[np.float64]
     terminal: bool
     forfeits: bool
     terminated_return: float
@@ -124,7 +123,7 @@ def pack(setup: Setup) -> npt.NDArray[np.float64]:
 def unpacker(kind: Kind) -> Any:
     """``unpack(packed)``: the setup again, compiled."""
     sensors, parameters = kind.truth.n_outputs, len(parameter_names(kind.truth))
-    sizes = {"measurement_noise": sensors, "center": parameters, "width": parameters}
+    sizes = {"measurement_noise": sensors, "center": parameters, "width": parameters, "weights": 4}
     sizes |= dict.fromkeys(("walk", "inverse_std"), kind.belief.n_coefficients)
     sizes |= {"prior": len(belief_names(kind.belief)), "log_precisions": 1 + kind.belief.n_outputs}
     told, at = [], 0
@@ -178,9 +177,9 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
     wanted += ["ELAPSED", "WAITING", "RECORDED_u", "RECORDED_y", "LOG_DET", "LOG_DENSITY", "ERROR", "WORK", "EARNED"]
     wanted += OUTCOME
     wanted += [f"OBS_{name}" for name in observation_bounds(belief)]
-    if kind.reward == "fisher":
+    if kind.work == "fisher":
         wanted += [f"I_{name}" for name in belief_names(belief) if name.startswith("P_")]
-    if kind.reward == "simulation_error":
+    if kind.work == "simulation_error":
         wanted += [f"{who}_{x}" for who in ("MODEL", "TWIN") for x in belief.states]
         wanted += ["DEVIATION", "POWER", "MISFIT"]
     if kind.factorisation == "mean_field":
@@ -192,7 +191,7 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
             both = [f"MF_P_{i}_{j}" for i, j in combinations_with_replacement(paper, 2) if "theta2" in (i, j)]
             wanted += ["MF_theta2", *both]
     wanted += [name for name in carried_names(belief) if name not in place]
-    if kind.reward == "free_energy" and kind.factorisation == "structured":
+    if kind.work == "free_energy" and kind.factorisation == "structured":
         wanted += trace_names(belief, kind.iterations)
     missing = [name for name in dict.fromkeys(wanted) if name not in place]
     place |= rows(" ".join(missing), start=len(place))

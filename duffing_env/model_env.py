@@ -11,7 +11,7 @@ import numpy as np
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import Experiment, SimulatedExperiment
-from duffing_env.layout import Kind, parameter_names
+from duffing_env.layout import parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.models import MODELS
 from estimator.models.model import Model
@@ -120,11 +120,6 @@ class ModelExperiment(SimulatedExperiment):
             scale = 0.0 if self.plant_spread == 0 else 1.0
             told["width"] = scale * np.array([self.std[name] for name in parameter_names(self.plant)])
         return told
-
-    @property
-    def kind(self) -> Kind:
-        """What the kernel is compiled for."""
-        return super().kind._replace(normal=self.std is not None)
 
 
 class ModelEnv(DuffingEnv):

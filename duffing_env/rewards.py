@@ -60,7 +60,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from duffing_env.layout import Kind
-from estimator.lanes import inlined, jit
+from estimator.lanes import jit
 
 
 class Hooks(NamedTuple):
@@ -94,37 +94,20 @@ class Reward:
     """A reward.
 
     Attributes:
-        value: compiled function of the decrease of entropy and the increase of the log posterior at the truth in the
-            sample [nats], the error of the parameters before and after it, and the ``WORK`` of its hooks.
+        weights: of what a sample gave: the decrease of entropy, the increase of the log posterior at the truth [nats],
+            the decrease of the parameters' error, and the ``WORK`` of its hooks.
         needs_truth: whether it compares with the true plant.
         source: generates the functions that its hooks use, from a kind and `duffing_env.sources`' loop.
         hooks: makes the hooks, from a kind and the compiled functions.
     """
 
-    value: Any
+    weights: tuple[float, float, float, float]
     needs_truth: bool = False
     source: Callable[[Kind, Any], str] | None = None
     hooks: Callable[[Kind, Any], Hooks] | None = None
 
 
-@inlined
-def _gain(gain, posterior, error, new_error, work):
-    return gain
-
-
-@inlined
-def _posterior(gain, posterior, error, new_error, work):
-    return posterior
-
-
-@inlined
-def _error(gain, posterior, error, new_error, work):
-    return error - new_error
-
-
-@inlined
-def _work(gain, posterior, error, new_error, work):
-    return work
+_WORK = (0.0, 0.0, 0.0, 1.0)
 
 
 def _lazily(module: str) -> tuple[Callable[[Kind, Any], str], Callable[[Kind, Any], Hooks]]:
@@ -139,13 +122,13 @@ def _lazily(module: str) -> tuple[Callable[[Kind, Any], str], Callable[[Kind, An
 
 #: The rewards by name.
 REWARDS = {
-    "information_gain": Reward(_gain),
-    "log_posterior": Reward(_posterior, needs_truth=True),
-    "parameter_error": Reward(_error, needs_truth=True),
-    "free_energy": Reward(_work, False, *_lazily("duffing_env.free_energy")),
-    "fisher": Reward(_work, True, *_lazily("duffing_env.fisher")),
-    "expected_free_energy": Reward(_work, False, *_lazily("duffing_env.expectation")),
-    "simulation_error": Reward(_work, True, *_lazily("duffing_env.simulation")),
+    "information_gain": Reward((1.0, 0.0, 0.0, 0.0)),
+    "log_posterior": Reward((0.0, 1.0, 0.0, 0.0), needs_truth=True),
+    "parameter_error": Reward((0.0, 0.0, 1.0, 0.0), needs_truth=True),
+    "free_energy": Reward(_WORK, False, *_lazily("duffing_env.free_energy")),
+    "fisher": Reward(_WORK, True, *_lazily("duffing_env.fisher")),
+    "expected_free_energy": Reward(_WORK, False, *_lazily("duffing_env.expectation")),
+    "simulation_error": Reward(_WORK, True, *_lazily("duffing_env.simulation")),
 }
 
 

@@ -35,11 +35,9 @@ _SMALLEST, _LARGEST = 2.0**-1000, 2.0**1000
 @cache
 def parts(kind: Kind) -> Any:
     """The compiled functions of a kind of experiment: see `_source` for their names."""
-    reward = REWARDS[kind.reward]
     digests = (kind.belief.digest, kind.plant and kind.plant.digest)
     key = source_digest(Path(__file__).parent) + repr((kind[2:], digests))
-    names = {**_NAMES, "reward": reward.value}
-    return stored.load(kind.belief.name, "environment", key, lambda: _source(kind), names)
+    return stored.load(kind.belief.name, "environment", key, lambda: _source(kind), _NAMES)
 
 
 def _source(kind: Kind) -> str:
@@ -58,9 +56,8 @@ def _source(kind: Kind) -> str:
     source = _truth(kind, loop) + _judgement(kind, loop) + _observation(kind, loop)
     if kind.plant is not None:
         source += _plant(kind.plant, kind.degree, plant_loop)
-    if kind.drifts:
-        source += _walk(kind.belief, loop)
-    own = REWARDS[kind.reward].source
+    source += _walk(kind.belief, loop)
+    own = REWARDS[kind.work].source if kind.work else None
     return source + ("" if own is None else own(kind, loop))
 
 
@@ -124,13 +121,15 @@ def _truth(kind: Kind, loop: Any) -> str:
 
     known = {p: derive.symbol(p) for p in parameter_names(kind.truth)}
     lines, results = [], {}
-    for model in {kind.truth: None, kind.belief: None}:
+    # Each equation on its own: a plant's coefficients must not depend on what else is believed, to the last bit.
+    for tag, model in zip("WX", {kind.truth: None, kind.belief: None}, strict=False):
+        own = {}
         for c in model.coefficients:
             text = model.inverse[c] if model.inverse else c
             value = derive.parse(text, {**known, "step": derive.symbol("step")}, model.name)
-            lines.append((f"V_{c}", derive.renamed([("", value)], {p: f"PARAM_{p}" for p in known})[0][1]))
+            own[f"V_{c}"] = derive.renamed([("", value)], {p: f"PARAM_{p}" for p in known})[0][1]
             results[f"TRUE_{c}"] = f"V_{c}"
-    lines = derive.shared(dict(lines), "W")
+        lines += derive.shared(own, tag)
     return loop("settle_truth", "The true coefficients, of the parameters.", lines, results, "step", one=True)
 
 
@@ -228,8 +227,10 @@ def _judgement(kind: Kind, loop: Any) -> str:
     lines.append(("E_WORK", select(symbol("VOID"), sp.S.Zero, symbol("WORK"))))
     lines.append(("GAIN", (symbol("LOG_DET") - symbol("E_LOG_DET")) / 2))
     lines.append(("POSTERIOR", symbol("E_LOG_DENSITY") - symbol("LOG_DENSITY")))
-    told = [symbol(name) for name in ("GAIN", "POSTERIOR", "ERROR", "E_ERROR", "E_WORK")]
-    paid = sp.Function("reward")(*told) - symbol("input_cost") * symbol("INPUT") ** 2
+    weighed = ("w_gain", "w_posterior", "w_error", "w_work")
+    given = (symbol("GAIN"), symbol("POSTERIOR"), symbol("ERROR") - symbol("E_ERROR"), symbol("E_WORK"))
+    paid = sum(symbol(weight) * value for weight, value in zip(weighed, given, strict=True))
+    paid -= (symbol("input_price") * symbol("INPUT")) ** 2  # the square alone may overflow
     first = next(iter(model.outputs))
     beyond = check(symbol("VOID")) + check(sp.Abs(symbol(f"Y_{first}")) - symbol("max_output"))
     ended = sp.Function("reaches")(symbol("LATER"), symbol("horizon"))
@@ -238,7 +239,7 @@ def _judgement(kind: Kind, loop: Any) -> str:
     results = {"LOG_DET": "E_LOG_DET", "LOG_DENSITY": "E_LOG_DENSITY", "ERROR": "E_ERROR", "REWARD": "PAID"}
     results |= {"INFORMATION_GAIN": "GAIN", "LOG_POSTERIOR_GAIN": "POSTERIOR", "TERMINATED": "STOPPED"}
     results |= {"TRUNCATED": "OVER", "DIVERGED": "BROKEN", "ELAPSED": "LATER"}
-    uniform = ("step", "max_output", "horizon", "input_cost")
+    uniform = ("step", "max_output", "horizon", "input_price", *weighed)
     doc = "What a sample gave, and whether it ends the episode; a belief that is broken gives nothing and ends it."
     return source + loop("settle", doc, lines, results, *uniform)
 
@@ -272,7 +273,7 @@ def _observation(kind: Kind, loop: Any) -> str:
     values["last_input"] = symbol("INPUT") * symbol("per_input")
     for y in model.outputs:
         values[f"last_{y}"] = symbol(f"Y_{y}") * symbol("per_output")
-    values["time_left"] = 1 - symbol("ELAPSED") * symbol("per_horizon")
+    values["time_left"] = 1 - symbol("ELAPSED") / symbol("horizon")
     values["budget_left"] = 1 - symbol("SPENT") * symbol("per_budget")
     clip = sp.Function("clip")
     bounds = observation_bounds(model)
@@ -281,7 +282,7 @@ def _observation(kind: Kind, loop: Any) -> str:
         lines += [(f"B_{name}", value), (f"V_{name}", clip(symbol(f"B_{name}"), low, high))]
     uniform = [f"{letter}_{c}" for letter in ("PRIOR", "SCALE") for c in coefficients]
     uniform += ["LOG_gamma", *(f"LOG_xi_{y}" for y in model.outputs)]
-    scales = ["per_output", "per_input", "per_horizon", "per_budget"]
+    scales = ["per_output", "per_input", "horizon", "per_budget"]
     source = loop(
         "observe_lanes", "The observation, in rows.", lines, {f"OBS_{n}": f"V_{n}" for n in values}, *uniform, *scales
     )

@@ -177,7 +177,10 @@ def test_beliefs_are_calibrated_and_those_of_the_difference_equation_are_not():
     assert distances["nlarx"] > 100
 
 
-@pytest.mark.parametrize("reward", REWARDS)
+# Every reward that has a kernel of its own is seconds of compilation, and the judgement is the same.
+@pytest.mark.parametrize(
+    "reward", [pytest.param(name, marks=[pytest.mark.slow] * (name in EVIDENCE["ode"])) for name in REWARDS]
+)
 @pytest.mark.parametrize(
     ("name", "value"),
     [("X_x", np.nan), ("X_x", np.inf), ("X_v", np.inf), ("X_x", 1e70), ("stiffness", 1e300), ("stiffness", -1e5)],

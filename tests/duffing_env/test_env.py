@@ -296,16 +296,21 @@ EXTREMES = [
     {"measurement_noise": 10.0},
     {"noise_shape": 1e-3},
     {"noise_shape": 1e9},
-    {"iterations": 1},
-    {"iterations": 50},
     {"horizon": 1},
     # A mean-field covariance of the state loses its determinant to rounding, and the free energy becomes NaN.
     {"max_output": 4000.0, "max_input": 300.0, "process_noise": 3e-9, "measurement_noise": 3e-9, "spread": 0.999},
 ]
 
 
-@pytest.mark.parametrize("options", [{}, *EXTREMES], ids=str)
-@pytest.mark.parametrize(("factorisation", "reward"), PAIRS)
+#: The iterations of a structured update are generated: another kernel for another number.
+MANY = [("structured", "information_gain", {"iterations": n}) for n in (1, 50)]
+
+
+@pytest.mark.parametrize(
+    ("factorisation", "reward", "options"),
+    [pytest.param(*pair.values, options, marks=pair.marks) for pair in PAIRS for options in [{}, *EXTREMES]] + MANY,
+    ids=str,
+)
 def test_observations_stay_in_their_space_and_rewards_finite(factorisation, reward, options):
     env = DuffingEnv(factorisation=factorisation, reward=reward, **options)
     for seed in range(4):

@@ -83,14 +83,16 @@ def test_settings_are_the_options():
     )  # fmt: skip
     kind, setup = experiment.kind, experiment.setup
     assert (kind.belief, kind.plant, kind.factorisation) == (difference(), difference(), "mean_field")
-    assert (kind.iterations, kind.reward) == (4, "free_energy")
-    assert [kind.drifts, kind.normal, kind.jumps, kind.pays] == [False] * 4
+    assert (kind.iterations, kind.work) == (0, "free_energy")
     expected = {
+        "iterations": 4, "drifts": False, "jump": 0.0, "terminal": False, "forfeits": False,
         "max_input": 0.1, "max_output": 0.5, "horizon": 9.0, "process_noise": 1e-3, "spread": 0.1, "hold": 1,
         "delay": 0, "as_published": False, "step": SAMPLING_STEP, "budget": np.inf, "max_slew": np.inf,
     }  # fmt: skip
     assert {name: getattr(setup, name) for name in expected} == expected
     assert setup.measurement_noise.tolist() == [2e-3]
+    assert setup.width.tolist() == [0.0] * 4
+    assert setup.weights.tolist() == [0.0, 0.0, 0.0, 1.0]
     assert setup.center.tolist() == [getattr(SILVERBOX_TWIN, name) for name in "mcab"]
     np.testing.assert_allclose(setup.log_precisions, [-2 * np.log(1e-3), -2 * np.log(2e-3)], rtol=1e-14)
 
@@ -110,8 +112,9 @@ def test_what_the_kernel_gets_is_the_setup():
 def test_defaults_are_those_of_the_documentation():
     experiment = SimulatedExperiment()
     kind, setup = experiment.kind, experiment.setup
-    assert (kind.factorisation, kind.iterations, kind.reward) == ("structured", 3, "information_gain")
-    assert SimulatedExperiment(factorisation="mean_field").kind.iterations == 10
+    assert (kind.factorisation, kind.iterations, kind.work) == ("structured", 3, "")
+    assert setup.weights.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert SimulatedExperiment(factorisation="mean_field").setup.iterations == 10
     assert (setup.max_input, setup.max_output, setup.horizon) == (0.15, 0.6, 256)
     assert (setup.process_noise, setup.measurement_noise.tolist(), setup.spread) == (5e-4, [5e-4], 0.3)
 

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from rounding import U64
 from scipy import stats
-from twin import PAIRS, PARAMETERS, TwinEnv, assert_env_follows_twin, to_coefficients
+from twin import PAIRS, PARAMETERS, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.env import DuffingEnv, observation_space
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import observation_bounds
-from estimator import SILVERBOX_TWIN, PhysicalParameters
+from estimator import SILVERBOX_TWIN
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.pendulum import PENDULUM
+from estimator.physical import coefficients_of
 
 COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
@@ -89,7 +90,7 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
         assert stats.kstest(row, "uniform").pvalue > 0.01
     assert np.abs(np.corrcoef(quantiles)[np.triu_indices(4, 1)]).max() < 4 / np.sqrt(size)
 
-    expected = to_coefficients(PhysicalParameters(*drawn))
+    expected = coefficients_of(difference(), dict(zip(PARAMETERS, drawn, strict=True)))
     # θ₁ = 1 + m / (m + c h) - a η cancels; the others are products. None takes more than eight operations on a side.
     sizes = np.abs(np.stack(list(expected)))
     sizes[0] = 1 - expected[2] + drawn[2] * expected[3]

@@ -34,6 +34,7 @@ class Lanes:
         self.kind = SimulatedExperiment(reward=reward).kind._replace(belief=self.model)
         if not nonlinear:
             self.kind = self.kind._replace(plant=None)
+        self.reward = reward
         self.active, self.nonlinear = ACTIVE[nonlinear], nonlinear
         self.place, self.code = layout_of(self.kind), parts(self.kind)
         self.rows = np.zeros((max(self.place.values()) + 1, LANES))
@@ -64,7 +65,9 @@ class Lanes:
             self.code.appraise(self.rows.reshape(-1), lane, SAMPLING_STEP)
 
     def settle(self, input_cost=0.0, terminal=False, terminated_return=None):
-        self.code.settle(self.rows.reshape(-1), SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), input_cost)
+        weights = REWARDS[self.reward].weights
+        price = np.sqrt(input_cost)
+        self.code.settle(self.rows.reshape(-1), SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
         forfeits = terminated_return is not None
         if terminal or forfeits:
             pay = lanewise(self.place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(_pay)
