@@ -230,7 +230,9 @@ def _judgement(kind: Kind, loop: Any) -> str:
     weighed = ("w_gain", "w_posterior", "w_error", "w_work")
     given = (symbol("GAIN"), symbol("POSTERIOR"), symbol("ERROR") - symbol("E_ERROR"), symbol("E_WORK"))
     paid = sum(symbol(weight) * value for weight, value in zip(weighed, given, strict=True))
-    paid -= (symbol("input_price") * symbol("INPUT")) ** 2  # the square alone may overflow
+    # In two lines, because SymPy squares the factors, and the input's square alone may overflow.
+    lines.append(("EFFORT", symbol("input_price") * symbol("INPUT")))
+    paid -= symbol("EFFORT") ** 2
     first = next(iter(model.outputs))
     beyond = check(symbol("VOID")) + check(sp.Abs(symbol(f"Y_{first}")) - symbol("max_output"))
     ended = sp.Function("reaches")(symbol("LATER"), symbol("horizon"))

@@ -90,12 +90,12 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
         assert stats.kstest(row, "uniform").pvalue > 0.01
     assert np.abs(np.corrcoef(quantiles)[np.triu_indices(4, 1)]).max() < 4 / np.sqrt(size)
 
-    expected = coefficients_of(difference(), dict(zip(PARAMETERS, drawn, strict=True)))
+    expected = coefficients_of(difference(), dict(zip(PARAMETERS, drawn, strict=True))).T
     # θ₁ = 1 + m / (m + c h) - a η cancels; the others are products. None takes more than eight operations on a side.
-    sizes = np.abs(np.stack(list(expected)))
+    sizes = np.abs(expected)
     sizes[0] = 1 - expected[2] + drawn[2] * expected[3]
     told = np.stack([batch.quantity(f"TRUE_{name}") for name in COEFFICIENTS])
-    assert (np.abs(told - np.stack(list(expected))) <= 16 * U64 * sizes).all()
+    assert (np.abs(told - expected) <= 16 * U64 * sizes).all()
 
 
 def test_prior_has_the_moments_of_the_oscillators():
