@@ -89,8 +89,8 @@ def extended_kalman_filter(model: silverbox_peers.Model, u: np.ndarray, y: np.nd
     return mean
 
 
-# Theirs takes a held force to move (z, z') by (1/2, 1), ours counts spring and damper in: a tenth of it. Without process
-# noise, and for a regression, they are the same but for the rounding of the differences: 1e-16 / 1e-6 a sample.
+# Theirs takes a held force to move (z, z') by (1/2, 1), ours counts spring and damper in: a tenth of it. Without
+# process noise, and for a regression, they are the same but for the rounding of the differences: 1e-16 / 1e-6 a sample.
 @pytest.mark.parametrize(
     ("name", "process_noise", "tolerance"), [("ode", 0.0, 1e-5), ("ode", 5e-6, 0.1), ("three-tap", 5e-6, 1e-5)]
 )
