@@ -115,7 +115,7 @@ class ContinuousEnv(DuffingEnv):
     >>> truncated = False
     >>> while not truncated:
     ...     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-    >>> list(info["belief"].parameters())
+    >>> list(info["belief"].coefficients())
     ['stiffness', 'cubic', 'damping', 'gain']
     >>> m, c, a, b = info["belief"].physical()[0]
     >>> bool(abs(m / info["truth"].m - 1) < 0.05)

@@ -275,8 +275,8 @@ def _observation(kind: Kind, loop: Any) -> str:
     values["last_input"] = symbol("INPUT") * symbol("per_input")
     for y in model.outputs:
         values[f"last_{y}"] = symbol(f"Y_{y}") * symbol("per_output")
-    values["time_left"] = 1 - symbol("ELAPSED") / symbol("horizon")
-    values["budget_left"] = 1 - symbol("SPENT") * symbol("per_budget")
+    values["time_left"] = 1 - symbol("ELAPSED") / symbol("horizon")  # no product: exactly 0 at the end
+    values["budget_left"] = 1 - symbol("SPENT") / symbol("budget")
     clip = sp.Function("clip")
     bounds = observation_bounds(model)
     for name, value in values.items():
@@ -284,7 +284,7 @@ def _observation(kind: Kind, loop: Any) -> str:
         lines += [(f"B_{name}", value), (f"V_{name}", clip(symbol(f"B_{name}"), low, high))]
     uniform = [f"{letter}_{c}" for letter in ("PRIOR", "SCALE") for c in coefficients]
     uniform += ["LOG_gamma", *(f"LOG_xi_{y}" for y in model.outputs)]
-    scales = ["per_output", "per_input", "horizon", "per_budget"]
+    scales = ["per_output", "per_input", "horizon", "budget"]
     source = loop(
         "observe_lanes", "The observation, in rows.", lines, {f"OBS_{n}": f"V_{n}" for n in values}, *uniform, *scales
     )
