@@ -19,11 +19,11 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
 from duffing_env.vector_env import DuffingVectorEnv
+from estimator.belief import Belief
 from estimator.identify import identify
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
 from estimator.physical import coefficients_of
-from estimator.posterior import Belief
 from estimator.rig import Rig
 from estimator.truth import Parameters
 

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from duffing_env.layout import parameter_names
+from estimator.belief import Belief
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
-from estimator.posterior import Belief
 
 
 class Plant(NamedTuple):

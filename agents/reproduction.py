@@ -27,9 +27,9 @@ from rich.table import Table
 from agents.policies import make_policy
 from duffing_env.silverbox import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
+from estimator.belief import Belief
 from estimator.offline import PEMNARX
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -29,8 +29,8 @@ from estimator import (
     published_run_prior,
     silverbox_prior,
 )
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 
 MULTISINE = slice(40_650, 127_400)
 TRAINING_SAMPLES = 65_062

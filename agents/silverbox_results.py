@@ -29,8 +29,8 @@ from agents.silverbox_protocol import (
     progress_bar,
 )
 from duffing_env.silverbox import load_record
+from estimator.belief import Belief
 from estimator.files import write_atomically
-from estimator.posterior import Belief
 
 TARGETS = {
     "ODE linear": (0.36, 0.45, 0.36),

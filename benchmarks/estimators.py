@@ -13,8 +13,8 @@ from benchmarks.report import Claim, Section, ratio
 from benchmarks.timing import Row, measure, timed
 from duffing_env.silverbox import load_record, record_available, synthesise_multisine
 from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior, to_coefficients
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 
 SAMPLES = 4096
 UNIT = "µs/sample"

@@ -22,9 +22,9 @@ from estimator import (
     silverbox_prior,
     to_coefficients,
 )
+from estimator.belief import Belief
 from estimator.models.difference import PRESETS, Term
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 from estimator.priors import log_uniform_moments
 
 MODELS = ("paper", "offset", "three-tap", "cubic", "ode")

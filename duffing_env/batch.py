@@ -11,9 +11,9 @@ from duffing_env.experiment import Experiment
 from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
+from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, PhysicalParameters
-from estimator.posterior import Belief, record_size
 from estimator.truth import Parameters
 
 

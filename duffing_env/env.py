@@ -15,9 +15,9 @@ from duffing_env.experiment import Experiment, SimulatedExperiment, make_experim
 from duffing_env.kernel import RESET_BY_HAND
 from duffing_env.layout import SUMMED, observation_bounds
 from duffing_env.replay import ReplayExperiment
+from estimator.belief import Belief
 from estimator.models.model import Model
 from estimator.parameters import FloatArray, PhysicalParameters
-from estimator.posterior import Belief
 from estimator.truth import Parameters
 
 if TYPE_CHECKING:

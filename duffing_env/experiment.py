@@ -14,13 +14,12 @@ import numpy as np
 
 from duffing_env.layout import Kind, Setup, parameter_names
 from duffing_env.rewards import check_reward
-from estimator.continuous import CONTINUOUS_TWIN
+from estimator.belief import Belief
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
-from estimator.posterior import Belief
+from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
 from duffing_env.rewards import REWARDS
+from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import PhysicalParameters
-from estimator.posterior import Belief
 from estimator.priors import named_prior
 
 

@@ -16,10 +16,10 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief
 from estimator.files import write_atomically
 from estimator.parameters import SAMPLING_STEP, FloatArray, PhysicalParameters
 from estimator.physical import propagate
-from estimator.posterior import Belief
 from estimator.truth import Parameters
 
 Frame = npt.NDArray[np.uint8]

@@ -10,10 +10,10 @@ import numpy as np
 
 from duffing_env.experiment import Experiment
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
+from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 from estimator.priors import named_prior
 
 _PRIORS = ("silverbox_twin", "published_run", "paper_text")

@@ -1,7 +1,7 @@
 """The twin: the oscillator nearest to the Silverbox circuit, identified from its record.
 
 Run ``python -m duffing_env.twin`` with the record at hand to print the constants of
-`estimator.parameters.SILVERBOX_TWIN` and of `estimator.continuous.CONTINUOUS_TWIN`.
+`estimator.parameters.SILVERBOX_TWIN` and of `estimator.parameters.CONTINUOUS_TWIN`.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ from duffing_env.env import DuffingEnv, SilverboxReplayEnv, action_space, observ
 from duffing_env.experiment import Experiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import OUTCOME
+from estimator.belief import Belief
 from estimator.parameters import FloatArray, PhysicalParameters
-from estimator.posterior import Belief
 from estimator.truth import Parameters
 
 _RESET_MODES = {

@@ -1,10 +1,5 @@
 # The names of `estimator`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
 from .belief import Belief
-from .continuous import (
-    CONTINUOUS_TWIN,
-    ContinuousBelief,
-    continuous_prior,
-)
 from .ensemble import NoiseRatio
 from .information import (
     cramer_rao,
@@ -17,6 +12,7 @@ from .models.model import Model
 from .offline import PEMNARX
 from .online import OnlineEstimator
 from .parameters import (
+    CONTINUOUS_TWIN,
     SAMPLING_STEP,
     SILVERBOX_TWIN,
     Coefficients,
@@ -24,7 +20,6 @@ from .parameters import (
     to_coefficients,
     to_physical,
 )
-from .prior import Prior
 from .priors import (
     paper_text_prior,
     published_run_prior,
@@ -45,14 +40,11 @@ __all__ = [
     "SILVERBOX_TWIN",
     "Belief",
     "Coefficients",
-    "ContinuousBelief",
     "Model",
     "NoiseRatio",
     "OnlineEstimator",
     "PhysicalParameters",
-    "Prior",
     "Rig",
-    "continuous_prior",
     "cramer_rao",
     "difference",
     "duffing",

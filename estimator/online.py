@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief, covariance_places
 from estimator.checks import scalar, series
 from estimator.ensemble import NoiseRatio
 from estimator.filter import Filter
@@ -16,7 +17,6 @@ from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief, covariance_places
 from estimator.priors import recorded_prior, silverbox_prior
 from estimator.rig import Rig
 from estimator.settings import Settings, settled

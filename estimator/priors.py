@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.physical import coefficients_of
-from estimator.posterior import Belief
 
 #: Points of the quadrature over all parameters together, at most; with 20 along each of four, moments converge to 1e-10
 #: for every spread up to 0.999.

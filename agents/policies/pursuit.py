@@ -18,10 +18,10 @@ import numpy.typing as npt
 from agents.ascent import Limits, climber, project
 from agents.design import Known, designer, half_log_det, invert
 from agents.policies.planning import uniform
+from estimator.belief import covariance_places
 from estimator.engine.tasks import belief_names
 from estimator.lanes import kernel, part
 from estimator.models.model import Model
-from estimator.posterior import covariance_places
 
 #: Input before and after a burst, in parts of that within.
 _WEAK = 0.2
@@ -51,7 +51,7 @@ class BeliefPlaces(NamedTuple):
 
 
 def record_places(model: Model) -> BeliefPlaces:
-    """Those of a model's records (`estimator.posterior.Belief`)."""
+    """Those of a model's records (`estimator.belief.Belief`)."""
     names = belief_names(model)
     first = names.index("GAMMA_SHAPE")
     noises = np.arange(first, len(names)).reshape(-1, 2)

@@ -17,7 +17,7 @@ from twin import PAIRS, to_coefficients
 
 from duffing_env.env import DuffingEnv
 from estimator import PhysicalParameters
-from estimator.posterior import Belief
+from estimator.belief import Belief
 
 TRACK = "duffing_env/Amplitude-v0"
 FACTORISATIONS = ("structured", "mean_field")

@@ -11,10 +11,10 @@ from duffing_env.layout import layout_of
 from duffing_env.rewards import REWARDS, check_reward
 from duffing_env.sources import parts
 from estimator import SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters
+from estimator.belief import Belief
 from estimator.engine.tasks import belief_names
 from estimator.lanes import LANES, lanewise
 from estimator.models.difference import difference
-from estimator.posterior import Belief
 from estimator.priors import named_prior
 
 PARAMETERS = ("m", "c", "a", "b")

@@ -119,7 +119,7 @@ def test_the_prior_has_the_moments_of_the_draw(model):
 def test_the_physical_equation_moves_as_its_filter_expects():
     """Without noises, a filter that knows the coefficients forecasts every output."""
     from estimator import OnlineEstimator, Rig
-    from estimator.posterior import Belief
+    from estimator.belief import Belief
 
     truth = recorded_prior(ODE).coefficients_mean[None].copy()
     truth[0, 4:] = 2e-3, -0.03, 0.05  # force, y0, d

@@ -7,10 +7,10 @@ matrix and inverts it; where a kernel has a closed form for a divergence, a twin
 from dataclasses import dataclass
 
 import numpy as np
+from estimator.record import LAYOUT, N_ROWS, QUANTITIES, RECORD
 from scipy.special import digamma, gammaln
 
 from estimator.lanes import LANES
-from estimator.record import LAYOUT, N_ROWS, QUANTITIES, RECORD
 
 TIE = 1e12  # precision of the identity between the second component of z_t and the first of z_{t-1}
 LOG_2PI = np.log(2 * np.pi)

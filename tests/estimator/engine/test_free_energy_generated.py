@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from engine_cases import CASES, random_belief
 from engine_reference import EPS, update
+from estimator.inference.noise import sample_free_energy
 from test_structured_generated import LANES, some_samples, updated
 
 from estimator.engine import tasks
 from estimator.engine.free_energy import free_energies
-from estimator.inference.noise import sample_free_energy
 
 ITERATIONS = 3
 
