@@ -239,10 +239,8 @@ class SimulatedExperiment(Experiment):
     def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
         """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
         mean, cov = log_uniform_moments(model, self.center, self.spread, self.step)
-        return weak_prior(
-            model, mean, cov, self.process_noise, self.measurement_noise, self.noise_shape, step=self.step,
-            factorisation=factorisation,
-        )  # fmt: skip
+        noises = self.process_noise, self.measurement_noise, self.noise_shape
+        return weak_prior(model, mean, cov, *noises, step=self.step).factorised(factorisation)
 
     @property
     def plant_setup(self) -> dict[str, Any]:
@@ -311,8 +309,7 @@ class ContinuousExperiment(SimulatedExperiment):
 def twin_of(model: Model) -> dict[str, float]:
     """The Silverbox circuit as a model of it sees it; of other models the parameters are not known here: all 1."""
     twin = CONTINUOUS_TWIN if model.is_continuous else SILVERBOX_TWIN
-    known = {name: float(getattr(twin, name)) for name in ("m", "c", "a", "b")}
-    return {name: known.get(name, 1.0) for name in parameter_names(model)}
+    return {name: twin.get(name, 1.0) for name in parameter_names(model)}
 
 
 def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:

@@ -162,7 +162,7 @@ class ModelEnv(DuffingEnv):
 
     ## Information
 
-    As `DuffingEnv`; ``truth`` is a `estimator.truth.Parameters`.
+    As `DuffingEnv`; ``truth`` is a `estimator.Parameters`.
 
     ## Arguments
 

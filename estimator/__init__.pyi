@@ -15,11 +15,9 @@ from .parameters import (
     CONTINUOUS_TWIN,
     SAMPLING_STEP,
     SILVERBOX_TWIN,
-    Coefficients,
-    PhysicalParameters,
-    to_coefficients,
-    to_physical,
+    Parameters,
 )
+from .physical import coefficients_of, to_physical
 from .priors import (
     paper_text_prior,
     published_run_prior,
@@ -39,12 +37,12 @@ __all__ = [
     "SAMPLING_STEP",
     "SILVERBOX_TWIN",
     "Belief",
-    "Coefficients",
     "Model",
     "NoiseRatio",
     "OnlineEstimator",
-    "PhysicalParameters",
+    "Parameters",
     "Rig",
+    "coefficients_of",
     "cramer_rao",
     "difference",
     "duffing",
@@ -56,7 +54,6 @@ __all__ = [
     "relative_covariance",
     "save_estimator",
     "silverbox_prior",
-    "to_coefficients",
     "to_physical",
     "weak_prior",
 ]

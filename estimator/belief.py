@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, TypeVar
 
@@ -144,6 +144,17 @@ class Belief:
             belief.__dict__.update(self.__dict__, record=record)
             beliefs.append(belief)
         return beliefs
+
+    def factorised(self: Self, factorisation: str) -> Self:
+        """This belief as an inference of another factorisation begins with it.
+
+        In ``mean_field``, the paper's, states, θ and η are independent: their cross-covariances are left out.
+        """
+        record, places, n = self.record.copy(), covariance_places(self.model), self.model.n_states
+        if factorisation == "mean_field":
+            record[places[:n, n:]] = 0.0
+            record[places[n:-1, -1]] = 0.0
+        return replace(self, record=record, factorisation=factorisation)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from duffing_env.env import DuffingEnv, observation_space
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import observation_bounds
-from estimator import SILVERBOX_TWIN, PhysicalParameters
+from estimator import SILVERBOX_TWIN, Parameters
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.pendulum import PENDULUM
@@ -89,7 +89,7 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
         assert stats.kstest(row, "uniform").pvalue > 0.01
     assert np.abs(np.corrcoef(quantiles)[np.triu_indices(4, 1)]).max() < 4 / np.sqrt(size)
 
-    expected = to_coefficients(PhysicalParameters(*drawn))
+    expected = to_coefficients(Parameters(zip(PARAMETERS, drawn, strict=True)))
     # θ₁ = 1 + m / (m + c h) - a η cancels; the others are products. None takes more than eight operations on a side.
     sizes = np.abs(np.stack(list(expected)))
     sizes[0] = 1 - expected[2] + drawn[2] * expected[3]
