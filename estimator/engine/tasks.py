@@ -264,22 +264,28 @@ class Path:
     lanes: int
 
 
+def path_names(model: Model) -> list[str]:
+    """Where a path is: the filter's state, its covariance V, and its sensitivities Z to the coefficients."""
+    covariances = [f"V_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2)]
+    return [*model.states, *covariances, *(f"Z_{i}_{c}" for i in model.states for c in model.coefficients)]
+
+
+def path_results(model: Model) -> list[str]:
+    """What a path adds up: minus the log likelihood, its slope, and the information (upper triangle)."""
+    information = [f"F_{c}_{d}" for c, d in combinations_with_replacement(model.coefficients, 2)]
+    return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *information]
+
+
 def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
     """Rows of a path's block."""
     shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
-    states, coefficients = list(model.states), list(model.coefficients)
-    upper = combinations_with_replacement
-    return rows(
-        " ".join([*states, *(f"V_{i}_{k}" for i, k in upper(states, 2))]),
-        " ".join(f"Z_{i}_{c}" for i in states for c in coefficients),
-        " ".join(["LOSS", *(f"SLOPE_{c}" for c in coefficients), *(f"F_{c}_{d}" for c, d in upper(coefficients, 2))]),
-        " ".join([*coefficients, *input_rows(model, degree), *shown, "LIVE", *carried_names(model)]),
-    )
+    given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE"]
+    return rows(" ".join([*path_names(model), *path_results(model), *given, *carried_names(model)]))
 
 
 @cache
 def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -> Path:
-    """The path of a model (`estimator.engine.algebra.path_sample`).
+    """The path of a model (`estimator.engine.path.path_sample`).
 
     Args:
         model: whose equation.
@@ -291,10 +297,11 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -
     noises = ("Q", *(f"R_{y}" for y in model.outputs))
 
     def make() -> str:
-        from estimator.engine import algebra, derive, emit
+        from estimator.engine import derive, emit
+        from estimator.engine.path import path_sample
 
         lines, moved = derive.moved(model)
-        more, results = algebra.path_sample(model, moved, degree, observed)
+        more, results = path_sample(model, moved, degree, observed)
         lines += more
         source = _motion_source(model, degree, place, lanes)
         source += "@jit\n" + emit.lane_loop("finish", lines, results, place, lanes, noises, doc="Predict and see.")
