@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.engine.feeding import feeder, input_degree
-from estimator.engine.tasks import path, path_results
+from estimator.engine.tasks import input_rows, path, path_results
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
 from estimator.parameters import SAMPLING_STEP, FloatArray
@@ -242,7 +242,7 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
     """The compiled loop of `follow`, with totals (n, 1 + K + K (K + 1)/2) packed."""
     task = path(model, degree, observed=observed)
     sample, at, size = task.sample, task.layout, len(task.layout)
-    feed = feeder(model, degree, at["U_0"], LANES)
+    feed = feeder(model, degree, [at[row] for row in input_rows(model, degree)], LANES)
     n, k, p = model.n_states, model.n_coefficients, model.n_outputs
     first_total, first_coefficient, live = at["LOSS"], at[next(iter(model.coefficients))], at["LIVE"]
     shown, n_totals = at[f"Y_{next(iter(model.outputs))}"] if observed else -1, len(path_results(model))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-from estimator.engine.tasks import input_rows
 from estimator.lanes import part
 from estimator.models.model import Model
 
@@ -33,13 +33,13 @@ def older_inputs(model: Model, degree: int) -> int:
     return degree if model.is_continuous else model.taps - 1
 
 
-def feeder(model: Model, degree: int, first: int, lanes: int) -> Any:
-    """Compiled: ``feed(W, j, now, last, older)`` lays the inputs of a sample, newest first, into lane j of a path.
+def feeder(model: Model, degree: int, places: Sequence[int], lanes: int) -> Any:
+    """Compiled: ``feed(W, j, now, last, older)`` lays the inputs of a sample, newest first, into lane j of a block.
 
     Args:
         model: that takes them.
         degree: of the input's polynomial over a sample, 0 or 1.
-        first: row of ``U_0``; the others follow.
+        places: rows of ``U_0``, ``U_1``, ...
         lanes: systems in the block.
 
     Raises:
@@ -47,19 +47,20 @@ def feeder(model: Model, degree: int, first: int, lanes: int) -> Any:
     """
     if degree > 1:
         raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline's input is not known sample by sample")
-    rows = len(input_rows(model, degree))
-    is_line = model.is_continuous and degree == 1
+    rows = [place * lanes for place in places]
+    first, second, third = [*rows, 0, 0][:3]
+    count, is_line = len(rows), model.is_continuous and degree == 1
 
-    @part(f"{first}_{rows}_{is_line}_{lanes}")
+    @part("_".join(map(str, (*rows, is_line, lanes))))
     def feed(W, j, now, last, older):
         if is_line:
-            W[first * lanes + j] = last
-            W[(first + 1) * lanes + j] = now - last
+            W[first + j] = last
+            W[second + j] = now - last
         else:
-            W[first * lanes + j] = now
-            if rows > 1:
-                W[(first + 1) * lanes + j] = last
-            if rows > 2:
-                W[(first + 2) * lanes + j] = older
+            W[first + j] = now
+            if count > 1:
+                W[second + j] = last
+            if count > 2:
+                W[third + j] = older
 
     return feed
