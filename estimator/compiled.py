@@ -13,6 +13,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ import numba
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
+
+from estimator.files import write_atomically
 
 
 @cache
@@ -61,17 +64,8 @@ def _places() -> list[Path]:
 
 def write(path: Path, content: bytes) -> None:
     """Write a file in one piece; a full disk only costs the next process the time to make it again."""
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-    except OSError:
-        pass
+    with suppress(OSError):
+        write_atomically(path, content)
 
 
 class Compiled(_Cache):
