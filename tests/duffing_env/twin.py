@@ -357,7 +357,7 @@ class TwinEnv:
         self.u = float(np.clip(self.u, -left, left))
         self.spent += self.u**2
         if self.jump and self.elapsed == self.jump_at:
-            self.truth = replace(self.truth, m=self.truth.m * self.jump_factor)
+            self.truth = Parameters({**self.truth, "m": self.truth.m * self.jump_factor})
             self._worth = self._appraise()
         fisher = self._fisher_gain()
         self._move()
