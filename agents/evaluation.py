@@ -19,13 +19,13 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
 from duffing_env.vector_env import DuffingVectorEnv
+from estimator.belief import Belief
 from estimator.identify import identify
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
+from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
-from estimator.posterior import Belief
 from estimator.rig import Rig
-from estimator.truth import Parameters
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -229,7 +229,7 @@ def roll_out(
     jumped = np.flatnonzero(jumped_at < horizon)
     if len(jumped):
         model, step = prior.model, prior.step
-        before, after = (coefficients_of(model, metrics.parameters_of(t, model), step) for t in (began, truth))
+        before, after = (coefficients_of(model, t, step) for t in (began, truth))
         for row in jumped:
             gain = beliefs[row].log_prob(after[row]) - prior.log_prob(before[row])
             curve[jumped_at[row] + 1 :, row] += gain - curve[-1, row]

@@ -99,11 +99,7 @@ def main(config: Config) -> None:
         }
     floor = None
     if record_available():
-        floor = float(
-            metrics.arrow_errors(
-                coefficients_of(difference(), metrics.parameters_of(SILVERBOX_TWIN, difference()))[None]
-            )[0]
-        )
+        floor = float(metrics.arrow_errors(coefficients_of(difference(), SILVERBOX_TWIN)[None])[0])
     show(results, floor)
     written = {"systems": config.systems, "seed": config.seed, "twin_on_the_arrow": floor, "comparisons": results}
     write_atomically(config.json, json.dumps(finite(written), indent=2, allow_nan=False) + "\n")

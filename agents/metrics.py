@@ -25,11 +25,6 @@ LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}
 _TWIN_ARROW_SAMPLES = 8_192
 
 
-def parameters_of(truth: Any, model: Model) -> dict[str, FloatArray]:
-    """The true parameters by name, each of one plant or of a batch."""
-    return {name: np.asarray(getattr(truth, name), dtype=np.float64) for name in parameter_names(model)}
-
-
 def estimate_metrics(
     means: FloatArray, covs: FloatArray, truth: Any, model: Model, step: float
 ) -> dict[str, FloatArray]:
@@ -47,7 +42,7 @@ def estimate_metrics(
         `LEVELS`; ``nees``, the normalised estimation error squared dᵀ C⁻¹ d per coefficient, whose mean is 1 where the
         posterior is calibrated.
     """
-    true = parameters_of(truth, model)
+    true = {name: truth[name] for name in parameter_names(model)}
     errors = np.abs(to_physical(model, means, step) / np.stack(list(true.values()), axis=-1) - 1)
     free = np.flatnonzero(np.diagonal(covs, axis1=1, axis2=2).all(axis=0))  # without those that are known, as θ2 = 0
     deviations, covs = (means - coefficients_of(model, true, step))[:, free], covs[:, free][:, :, free]
@@ -142,7 +137,7 @@ def equal_information(gains: FloatArray, lengths: npt.NDArray[np.int64], told: F
 def simulation_errors(means: FloatArray, truth: Any) -> FloatArray:
     """(n,) RMSE [V] of free runs of Eq. (2) with estimated coefficients beside the true ones, for the arrow input."""
     u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:][1:-1]
-    true = coefficients_of(difference(), parameters_of(truth, difference()))
+    true = coefficients_of(difference(), truth)
     runs = [[free_run(difference(), c, u) for c in pair] for pair in zip(means, true, strict=True)]
     at_rest = np.zeros(2)  # as a record's first two outputs, which are given
     return np.array([_rmse(np.append(at_rest, believed), np.append(at_rest, exact)) for believed, exact in runs])

@@ -32,11 +32,11 @@ from agents.policies import planning
 from agents.policies.imagination import Terms
 from agents.policies.motion import View, scales
 from agents.policies.pursuit import pursuit
+from estimator.belief import Belief
 from estimator.files import write_atomically
 from estimator.information import fisher_information
 from estimator.models.difference import difference
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 
 #: Steps of the gradient, random starts, and changed copies in a round.
 _ITERATIONS, _STARTS, _COPIES = 100, 24, 16

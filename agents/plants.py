@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from duffing_env.layout import parameter_names
+from estimator.belief import Belief
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.parameters import FloatArray, Parameters
 from estimator.physical import coefficients_of
-from estimator.posterior import Belief
 
 
 class Plant(NamedTuple):
@@ -26,10 +23,9 @@ class Plant(NamedTuple):
     interpolation: str
     prior: Belief
 
-    def coefficients_of(self, truth: Any) -> FloatArray:
+    def coefficients_of(self, truth: Parameters) -> FloatArray:
         """(..., K) the coefficients of one plant or a batch."""
-        named = {name: np.asarray(getattr(truth, name)) for name in parameter_names(self.model)}
-        return coefficients_of(self.model, named, self.prior.step)
+        return coefficients_of(self.model, truth, self.prior.step)
 
 
 def plant_of(experiment: Any) -> Plant:

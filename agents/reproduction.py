@@ -8,7 +8,6 @@ from the first two of them. `reproduce` does it all; ``docs/reproduction.md`` di
 from __future__ import annotations
 
 import io
-import os
 import platform
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -21,15 +20,16 @@ import gymnasium as gym
 import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from agents.cli import progress_bar
 from agents.policies import make_policy
 from duffing_env.silverbox import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
+from estimator.belief import Belief
+from estimator.files import write_atomically
 from estimator.offline import PEMNARX
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -151,11 +151,11 @@ def reproduce(
     runs = run_all(record, data)
     results = summarise(runs, record)
     if json is not None:
-        _write(json, (dumps(results, indent=2) + "\n").encode())
+        write_atomically(json, dumps(results, indent=2) + "\n")
     for measure in MEASURES:
         png = io.BytesIO()
         draw(runs["as_published"], record.arrow, measure).savefig(png, format="png")
-        _write(figures / f"{measure}_error.png", png.getvalue())
+        write_atomically(figures / f"{measure}_error.png", png.getvalue())
 
     report(results)
     return results
@@ -164,8 +164,7 @@ def reproduce(
 def run_all(record: SilverboxRecord, data: Path | None) -> dict[str, dict[str, Run]]:
     """Trains and validates each model of each setting, behind a progress bar on stderr."""
     runs: dict[str, dict[str, Run]] = {}
-    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("compiling", total=sum(len(setting.models) for setting in SETTINGS.values()))
         compile_kernels(record, data)
         for name, setting in SETTINGS.items():
@@ -376,13 +375,3 @@ def draw(runs: dict[str, Run], validation: Regime, measure: str) -> Figure:
     axes[1, 0].set_ylabel("squared error [V²]")
     axes[0, 0].legend(loc="lower left", fontsize=9)
     return figure
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Writes a file whole or not at all."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(content)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

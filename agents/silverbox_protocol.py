@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from duffing_env.silverbox import Regime, SilverboxRecord
 from estimator import (
@@ -29,8 +27,8 @@ from estimator import (
     published_run_prior,
     silverbox_prior,
 )
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 
 MULTISINE = slice(40_650, 127_400)
 TRAINING_SAMPLES = 65_062
@@ -242,9 +240,3 @@ def coverage_of(forecasts: FloatArray, y: FloatArray) -> float:
     if np.isnan(variance).any():
         return float("nan")
     return float(np.mean(np.abs(y - mean) <= NINETY * np.sqrt(variance)))
-
-
-def progress_bar() -> Progress:
-    """A bar on stderr that names what is being done."""
-    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    return Progress(*columns, console=Console(stderr=True))

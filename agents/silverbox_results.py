@@ -14,6 +14,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from agents.cli import progress_bar
 from agents.silverbox_figures import draw
 from agents.silverbox_protocol import (
     CLOSE,
@@ -26,11 +27,10 @@ from agents.silverbox_protocol import (
     Sections,
     cut,
     evaluate,
-    progress_bar,
 )
 from duffing_env.silverbox import load_record
+from estimator.belief import Belief
 from estimator.files import write_atomically
-from estimator.posterior import Belief
 
 TARGETS = {
     "ODE linear": (0.36, 0.45, 0.36),

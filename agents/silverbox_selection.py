@@ -10,6 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from agents.cli import progress_bar
 from agents.silverbox_protocol import (
     SETTINGS,
     TRAINING_SAMPLES,
@@ -17,7 +18,6 @@ from agents.silverbox_protocol import (
     coverage,
     cut,
     identify,
-    progress_bar,
     rmse,
     simulation_error,
 )

@@ -17,8 +17,8 @@ from scipy.stats import binomtest, norm
 
 from benchmarks.systems import draw, make_model, make_prior, make_rig
 from estimator import OnlineEstimator
+from estimator.belief import Belief
 from estimator.files import write_atomically
-from estimator.posterior import Belief
 
 LEVEL = 0.90
 NOISE_SHAPE = 2.0  # of both Gamma priors: weak

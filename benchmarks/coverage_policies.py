@@ -18,7 +18,6 @@ from scipy import stats
 from agents.cli import run_script
 from agents.evaluation import roll_out
 from agents.leaderboard import METRICS, center_and_interval
-from agents.metrics import parameters_of
 from agents.policies import POLICIES, trained_policies
 from estimator.files import write_atomically
 from estimator.physical import coefficients_of
@@ -75,7 +74,7 @@ def measure(policy: str, track: str, systems: int, seed: int) -> Coverage:
     means = np.array([belief.coefficients_mean for belief in beliefs])
     stds = np.sqrt([np.diag(belief.coefficients_cov) for belief in beliefs])
     model = beliefs[0].model
-    known = coefficients_of(model, parameters_of(truth, model), beliefs[0].step)
+    known = coefficients_of(model, truth, beliefs[0].step)
     inside = np.abs(means - known) <= stats.norm.ppf(0.5 + LEVEL / 2) * stds
     entry = center_and_interval(evaluation.metrics["coverage"][None], METRICS["coverage"])
     passed = LOWEST <= entry["mean"] <= HIGHEST

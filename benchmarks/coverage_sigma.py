@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.coverage import LENGTHS, QUANTILE
 from duffing_env.silverbox import synthesise_multisine
 from estimator import SAMPLING_STEP, OnlineEstimator, Rig, duffing, recorded_prior
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
-from estimator.posterior import Belief
 from estimator.settings import EXPECTATIONS
 
 LEAST = 0.1  # of their means: stiffness, damping, gain and cubic stiffness are drawn again where one is below

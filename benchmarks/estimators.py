@@ -12,9 +12,9 @@ from benchmarks.peer_process import Peers
 from benchmarks.report import Claim, Section, ratio
 from benchmarks.timing import Row, measure, timed
 from duffing_env.silverbox import load_record, record_available, synthesise_multisine
-from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior, to_coefficients
+from estimator import SILVERBOX_TWIN, OnlineEstimator, coefficients_of, difference, silverbox_prior
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 
 SAMPLES = 4096
 UNIT = "µs/sample"
@@ -29,10 +29,10 @@ def samples() -> tuple[FloatArray, FloatArray, str]:
         return regime.u[:SAMPLES], regime.y[:SAMPLES], f"first {SAMPLES:,} samples of the record's multisine"
     rng = np.random.default_rng(0)
     u = synthesise_multisine(rng, realisations=1)[:SAMPLES]
-    truth, acting = to_coefficients(SILVERBOX_TWIN), _delayed(u)
+    (theta1, theta2, theta3, eta), acting = coefficients_of(difference(), SILVERBOX_TWIN), _delayed(u)
     x = np.zeros(SAMPLES)
     for t in range(2, SAMPLES):
-        x[t] = truth.theta1 * x[t - 1] + truth.theta2 * x[t - 1] ** 3 + truth.theta3 * x[t - 2] + truth.eta * acting[t]
+        x[t] = theta1 * x[t - 1] + theta2 * x[t - 1] ** 3 + theta3 * x[t - 2] + eta * acting[t]
         x[t] += 5e-4 * rng.standard_normal()
     y = x + 5e-4 * rng.standard_normal(SAMPLES)
     return u, y, f"{SAMPLES:,} samples of the twin under a synthesised multisine (the record is not on this machine)"

@@ -18,7 +18,7 @@ from duffing_env.layout import layout_of
 from duffing_env.noise import stream_words
 from duffing_env.sources import parts
 from estimator.engine.tasks import structured
-from estimator.inference.samples import mean_field_update
+from estimator.inference import mean_field
 from estimator.lanes import LANES, jit, kernel
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
@@ -64,7 +64,8 @@ def updater(factorisation: str, iterations: int) -> Any:
         task = structured(model, iterations=iterations)
         update, place = task.update, task.layout
     else:
-        update, place = mean_field_update()
+        place = mean_field.layout()
+        update = mean_field.updater(place)
     u, y = place["U_0"] * LANES, place["Y_y"] * LANES
 
     @kernel(kind=f"{model.digest}_{factorisation}_{iterations}")
@@ -77,7 +78,7 @@ def updater(factorisation: str, iterations: int) -> Any:
             if is_structured:
                 update(W)
             else:
-                update(W, iterations)
+                update(W, iterations, False)
 
     return infer_all, place
 

@@ -18,12 +18,12 @@ from benchmarks.report import Claim, Section
 from benchmarks.timing import Result, Row, measure, timed
 from duffing_env.batch import Batch
 from duffing_env.experiment import SimulatedExperiment
-from duffing_env.inference import paper_layout, updater
+from duffing_env.inference import updater
 from duffing_env.kernel import RESET_NEXT_STEP, noise_drawer
 from duffing_env.layout import layout_of
 from duffing_env.sources import parts
 from estimator.inference import mean_field
-from estimator.lanes import LANES, inlined, jit, kernel, lanewise, relaid, rows
+from estimator.lanes import LANES, inlined, jit, kernel, lanewise, rows
 
 SIZE = 1024
 STEPS = 256
@@ -118,8 +118,8 @@ def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
     if factorisation == "structured":
         inference = {updater(kind): 1}
     else:
-        times = {mean_field.begin: 1, mean_field.iterate: experiment.setup.iterations, mean_field.end: 1}
-        inference = {relaid(function, paper_layout(kind)): count for function, count in times.items()}
+        begin, iterate, end, _ = mean_field.pieces(layout_of(kind))
+        inference = {begin: 1, iterate: experiment.setup.iterations, end: 1}
     return {
         "noise": {noise_drawer(layout_of(kind)): 1},
         "plant": {code.plant: 1},

@@ -37,9 +37,9 @@ from benchmarks.report import ratio
 from benchmarks.timing import Result, Row, measure, timed
 from duffing_env.silverbox import Regime
 from estimator import OnlineEstimator
+from estimator.belief import Belief
 from estimator.models.difference import PRESETS
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 
 TIMED = 4096
 """First samples of the training section, which all online rows are timed on."""

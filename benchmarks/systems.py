@@ -14,17 +14,17 @@ import numpy as np
 from estimator import (
     SILVERBOX_TWIN,
     Model,
-    PhysicalParameters,
+    Parameters,
     Rig,
+    coefficients_of,
     difference,
     duffing,
     recorded_prior,
     silverbox_prior,
-    to_coefficients,
 )
+from estimator.belief import Belief
 from estimator.models.difference import PRESETS, Term
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
 from estimator.priors import log_uniform_moments
 
 MODELS = ("paper", "offset", "three-tap", "cubic", "ode")
@@ -96,9 +96,7 @@ def make_prior(name: str, process_noise: float, measurement_noise: float, noise_
         cov = np.diag([STATE_STD**2] * 2 + [_std(term) ** 2 for term in terms])
         mean[2:] = 0.0
         places = [2 + terms.index(term) for term in four]
-        mean[places], cov[np.ix_(places, places)] = log_uniform_moments(
-            difference(), {key: float(getattr(SILVERBOX_TWIN, key)) for key in "mcab"}, SPREAD
-        )
+        mean[places], cov[np.ix_(places, places)] = log_uniform_moments(difference(), SILVERBOX_TWIN, SPREAD)
     noises = weak.noises
     return Belief.of(model, mean, cov, (noises[0], noises[1]), (noises[2], noises[3]))
 
@@ -148,10 +146,9 @@ def draw(
         coefficients = np.column_stack([truth[coefficient] for coefficient in ODE.coefficients])
         records = simulate_ode(coefficients, process_noise, measurement_noise, samples, rng)
         return Systems(tuple(ODE.coefficients), coefficients, *records)
-    twin = np.array([SILVERBOX_TWIN.m, SILVERBOX_TWIN.c, SILVERBOX_TWIN.a, SILVERBOX_TWIN.b])
-    physical = twin * factors
-    psi = to_coefficients(PhysicalParameters(*physical.T))
-    four = dict(zip(_paper_terms(name), (psi.theta1, psi.theta2, psi.theta3, psi.eta), strict=True))
+    physical = np.array(list(SILVERBOX_TWIN.values())) * factors
+    known = coefficients_of(difference(), Parameters(zip("mcab", physical.T, strict=True)))
+    four = dict(zip(_paper_terms(name), known.T, strict=True))
     terms = PRESETS[name]
     coefficients = np.column_stack(
         [four[term] if term in four else _std(term) * rng.standard_normal(systems) for term in terms]

@@ -11,10 +11,9 @@ from duffing_env.experiment import Experiment
 from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
+from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
-from estimator.parameters import FloatArray, PhysicalParameters
-from estimator.posterior import Belief, record_size
-from estimator.truth import Parameters
+from estimator.parameters import FloatArray, Parameters
 
 
 class Batch:
@@ -129,30 +128,20 @@ class Batch:
         records.flags.writeable = False
         return self._prior.with_records(records)
 
-    def truth(self) -> PhysicalParameters | Parameters:
+    def truth(self) -> Parameters:
         """The true plants, a batch of n; where a record is replayed, the twin of its circuit."""
         values = {name: self.quantity(f"PARAM_{name}") for name in self._parameters}
-        return PhysicalParameters(**values) if set(values) == set("mcab") else Parameters(values)
+        return Parameters(values)
 
-    def true_of(self, index: int) -> PhysicalParameters | Parameters:
+    def true_of(self, index: int) -> Parameters:
         """The true plant of environment ``index``."""
         return self.truths(np.array([index]))[0]
 
-    def truths(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[PhysicalParameters | Parameters]:
+    def truths(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[Parameters]:
         """The true plants of some environments; ``final``: those of their last episodes, if reset since."""
         first = self._place[f"PARAM_{self._parameters[0]}"]
-        found: list[PhysicalParameters | Parameters] = []
-        is_oscillator = set(self._parameters) == set("mcab")
-        for values in self._adjacent(indices, first, len(self._parameters), final=final).tolist():
-            named = dict(zip(self._parameters, values, strict=True))
-            if is_oscillator:
-                # Past its checks, which take as long as 200 steps of one of a thousand environments.
-                oscillator = object.__new__(PhysicalParameters)
-                oscillator.__dict__.update(named, tau=np.inf, xi=np.inf)
-                found.append(oscillator)
-            else:
-                found.append(Parameters(named))
-        return found
+        rows = self._adjacent(indices, first, len(self._parameters), final=final).tolist()
+        return [Parameters(zip(self._parameters, values, strict=True)) for values in rows]
 
     def _adjacent(self, indices: npt.NDArray[np.intp], first: int, count: int, *, final: bool) -> FloatArray:
         """(k, count) adjacent rows of some environments, now or at the end of their last episodes; a copy."""

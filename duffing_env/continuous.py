@@ -86,8 +86,8 @@ class ContinuousEnv(DuffingEnv):
     ## Information
 
     Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], ``diverged``. At the end of an
-    episode also ``belief`` (`estimator.ContinuousBelief`; with ``estimator="nlarx"`` `estimator.Belief`) and ``truth``
-    (`estimator.PhysicalParameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+    episode also ``belief`` (`estimator.Belief`) and ``truth`` (`estimator.Parameters`). At any time:
+    ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
 
     ## Arguments
 

@@ -15,10 +15,9 @@ from duffing_env.experiment import Experiment, SimulatedExperiment, make_experim
 from duffing_env.kernel import RESET_BY_HAND
 from duffing_env.layout import SUMMED, observation_bounds
 from duffing_env.replay import ReplayExperiment
+from estimator.belief import Belief
 from estimator.models.model import Model
-from estimator.parameters import FloatArray, PhysicalParameters
-from estimator.posterior import Belief
-from estimator.truth import Parameters
+from estimator.parameters import FloatArray, Parameters
 
 if TYPE_CHECKING:
     from duffing_env.rendering import Screen
@@ -108,7 +107,7 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], summed over the samples that an
     action is held for; ``diverged``. At the end of an episode also ``belief`` (`estimator.Belief`) and ``truth``
-    (`estimator.PhysicalParameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+    (`estimator.Parameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
 
     ## Arguments
 
@@ -194,7 +193,7 @@ class DuffingEnv(gym.Env[Any, Any]):
         return self._batch.records()
 
     @property
-    def truth(self) -> PhysicalParameters | Parameters:
+    def truth(self) -> Parameters:
         """The oscillator that is to be identified."""
         return self._batch.true_of(0)
 

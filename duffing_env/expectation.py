@@ -11,6 +11,7 @@ prediction is the structured one for every belief; of a mean-field one the covar
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from duffing_env.layout import Kind
@@ -19,54 +20,63 @@ from estimator.lanes import jit
 
 
 def source(kind: Kind, loop: Any) -> str:
-    """``expect_begin``, ``expect_move`` and ``expect_finish``: an imagined sample at the belief."""
+    """``expect(W)``: an imagined sample at the belief."""
+    from estimator.engine.derive import symbol
+
+    # γ counts the noise as the first sensor shows that of one sample; N is of unit strength.
+    noises = {"Q": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
+    noises |= {f"R_{y}": symbol(f"XI_RATE_{y}") / symbol(f"XI_SHAPE_{y}") for y in kind.belief.outputs}
+    return imagined_sample("expect", kind, loop, noises)
+
+
+def imagined_sample(
+    name: str, kind: Kind, loop: Any, at: Mapping[str, Any], told: Sequence[str] = (), keeps: bool = False
+) -> str:
+    """Source of ``name(W, *told)``: outputs as expected; leaves ½ log det C - ½ log det C' in ``WORK`` [nats].
+
+    Args:
+        name: of the function.
+        kind: whose model is believed.
+        loop: as `duffing_env.sources` makes it.
+        at: quantity of the model to what stands in its place: another row, or an expression.
+        told: further arguments.
+        keeps: whether the covariance afterwards is kept, in the rows of ``at``.
+    """
     import sympy as sp
 
     from duffing_env.sources import log_det_and_density
     from estimator.engine import algebra, derive
 
-    model, symbol = kind.belief, derive.symbol
-    text = ""
+    model, text, body = kind.belief, "", ""
+    lines, motion = derive.moved(model)
     if model.is_continuous:
-        start = [(f"V_{name}", value) for name, value in derive.carried_at_start(model).items()]
-        text += loop("expect_begin", "At the mean.", start, {name: f"V_{name}" for name in derive.carried(model)})
-        moved = {name: f"{name}_E" for name in derive.carried(model)}
-        text += loop("expect_move", "One Runge-Kutta step.", derive.motion_step(model, kind.degree), moved, "T")
-        lines: Any = []
-        motion = derive.carried_at_end(model)
-    else:
-        lines, motion = derive.difference_step(model)
+        carried = derive.carried(model)
+        start = [(f"V_{row}", value) for row, value in derive.carried_at_start(model).items()]
+        text += loop(
+            f"{name}_begin", "The point that moves.", derive.renamed(start, at), {row: f"V_{row}" for row in carried}
+        )
+        step = derive.renamed(derive.motion_step(model, kind.degree), at)
+        text += loop(f"{name}_move", "One Runge-Kutta step.", step, {row: f"{row}_E" for row in carried}, "T")
+        steps = model.substeps
+        body = f"    {name}_begin(W)\n    for s in range({steps}):\n        {name}_move(W, s / {steps})\n"
     more, results = algebra.expected_sample(model, motion, kind.degree)
-    noises = {"Q": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
-    noises |= {f"R_{y}": symbol(f"XI_RATE_{y}") / symbol(f"XI_SHAPE_{y}") for y in model.outputs}
-    # γ counts the noise as the first sensor shows that of one sample; N is of unit strength.
-    lines = derive.renamed([*lines, *more], noises)
-    log = sp.Function("log")
+    log, covariances = sp.Function("log"), [row for row in results if row.startswith("P_")]
     before, now, _, _ = log_det_and_density(model, tag="B")
-    covariances = {name: symbol(value) for name, value in results.items() if name.startswith("P_")}
-    after, then, _, _ = log_det_and_density(model, entries=covariances, tag="A")
-    lines += [*before, *after, ("GAINED", (log(now) - log(then)) / 2)]
-    return text + loop("expect_finish", "What is expected to be learned.", lines, {"WORK": "GAINED"})
+    entries = {row: derive.symbol(results[row]) for row in covariances}
+    after, then, _, _ = log_det_and_density(model, entries=entries, tag="A")
+    lines = derive.renamed([*lines, *more, *before, *after, ("GAINED", (log(now) - log(then)) / 2)], at)
+    kept = {at[row]: str(derive.renamed([("", entries[row])], at)[0][1]) for row in covariances} if keeps else {}
+    text += loop(f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept, "WORK": "GAINED"}, *told)
+    arguments = ", ".join(["W", *told])
+    return text + f"@jit\ndef {name}({arguments}):\n{body}    {name}_finish({arguments})\n"
 
 
 def hooks(kind: Kind, code: Any) -> Hooks:
     """It expects before the belief is updated."""
-    finish = code.expect_finish
-    if not kind.belief.is_continuous:
-
-        @jit
-        def expect(W, setup):
-            finish(W)
-
-        return Hooks(nothing_in_lane, nothing, expect, nothing)
-
-    begin, move, steps = code.expect_begin, code.expect_move, kind.belief.substeps
+    expect = code.expect
 
     @jit
-    def expect_continuous(W, setup):
-        begin(W)
-        for s in range(steps):
-            move(W, s / steps)
-        finish(W)
+    def before_the_update(W, setup):
+        expect(W)
 
-    return Hooks(nothing_in_lane, nothing, expect_continuous, nothing)
+    return Hooks(nothing_in_lane, nothing, before_the_update, nothing)

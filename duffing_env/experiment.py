@@ -14,13 +14,12 @@ import numpy as np
 
 from duffing_env.layout import Kind, Setup, parameter_names
 from duffing_env.rewards import REWARDS, check_reward
-from estimator.continuous import CONTINUOUS_TWIN
+from estimator.belief import Belief
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
-from estimator.posterior import Belief
+from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
 
 
@@ -247,10 +246,8 @@ class SimulatedExperiment(Experiment):
     def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
         """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
         mean, cov = log_uniform_moments(model, self.center, self.spread, self.step)
-        return weak_prior(
-            model, mean, cov, self.process_noise, self.measurement_noise, self.noise_shape, step=self.step,
-            factorisation=factorisation,
-        )  # fmt: skip
+        noises = self.process_noise, self.measurement_noise, self.noise_shape
+        return weak_prior(model, mean, cov, *noises, step=self.step).factorised(factorisation)
 
     @property
     def plant_setup(self) -> dict[str, Any]:
@@ -315,8 +312,7 @@ class ContinuousExperiment(SimulatedExperiment):
 def twin_of(model: Model) -> dict[str, float]:
     """The Silverbox circuit as a model of it sees it; of other models the parameters are not known here: all 1."""
     twin = CONTINUOUS_TWIN if model.is_continuous else SILVERBOX_TWIN
-    known = {name: float(getattr(twin, name)) for name in ("m", "c", "a", "b")}
-    return {name: known.get(name, 1.0) for name in parameter_names(model)}
+    return {name: twin.get(name, 1.0) for name in parameter_names(model)}
 
 
 def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:

@@ -17,7 +17,7 @@ from numba import prange
 
 from duffing_env import sources
 from duffing_env.inference import updater
-from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, observation_bounds, parameter_names, unpacker
+from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, observation_bounds, parameter_names, unpacker
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
 from estimator.engine.tasks import belief_names
@@ -130,7 +130,7 @@ def compiled(kind: Kind) -> Kernel:
     sensors = [f"Y_{y}" for y in kind.truth.outputs]
     cleared = ["INPUT", "LAST_INPUT", "OLDER_INPUT", "SPENT", "EARNED", "ELAPSED", "WAITING", "WORK"]
     # Mean field's rows of a θ2 that the model does not have must be 0, also after an episode that ended with NaN.
-    cleared += [name for name in place if name.startswith(("MF_theta2", "MF_P_"))]
+    cleared += left_out(kind)
     at_rest = tuple(row[name] for name in [*cleared, *sensors, *(f"X_{x}" for x in kind.truth.states)])
 
     draw_noise = noise_drawer(place)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations
 from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from estimator.engine.tasks import belief_names, carried_names, layout, trace_names
 from estimator.lanes import inlined, rows
+from estimator.models.difference import difference
 from estimator.models.model import Model
 
 #: What a step leaves for an environment's face, in adjacent rows of its block.
@@ -183,19 +184,23 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
         wanted += [f"{who}_{x}" for who in ("MODEL", "TWIN") for x in belief.states]
         wanted += ["DEVIATION", "POWER", "MISFIT"]
     if kind.factorisation == "mean_field":
-        from estimator.record import MEAN_FIELD_SCRATCH
+        from estimator.inference import mean_field
 
-        wanted += [f"MF_{name}" for name in (*MEAN_FIELD_SCRATCH, "prior_g_rate", "prior_n_rate", "x2")]
-        if "theta2" not in belief.coefficients:
-            paper = ("x1", "x2", "theta1", "theta2", "theta3", "eta")
-            both = [f"MF_P_{i}_{j}" for i, j in combinations_with_replacement(paper, 2) if "theta2" in (i, j)]
-            wanted += ["MF_theta2", *both]
+        wanted += [*mean_field.SCRATCH, *left_out(kind)]
     wanted += [name for name in carried_names(belief) if name not in place]
     if kind.work == "free_energy" and kind.factorisation == "structured":
         wanted += trace_names(belief, kind.iterations)
     missing = [name for name in dict.fromkeys(wanted) if name not in place]
     place |= rows(" ".join(missing), start=len(place))
     return place | inputs_of(kind, belief, place)
+
+
+def left_out(kind: Kind) -> list[str]:
+    """Rows of what the paper's model has and the believed one has not, which mean field needs: they hold zeros."""
+    if kind.factorisation != "mean_field":
+        return []
+    known = belief_names(kind.belief)
+    return [name for name in belief_names(difference()) if name not in known]
 
 
 def inputs_of(kind: Kind, model: Model, place: Mapping[str, int]) -> dict[str, int]:

@@ -13,9 +13,9 @@ from duffing_env.env import DuffingEnv
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
+from estimator.belief import Belief
 from estimator.models import MODELS
 from estimator.models.model import Model
-from estimator.posterior import Belief
 from estimator.priors import gaussian_moments, weak_prior
 
 
@@ -157,7 +157,7 @@ class ModelEnv(DuffingEnv):
 
     ## Information
 
-    As `DuffingEnv`; ``truth`` is a `estimator.truth.Parameters`.
+    As `DuffingEnv`; ``truth`` is a `estimator.Parameters`.
 
     ## Arguments
 

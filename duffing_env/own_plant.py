@@ -11,11 +11,11 @@ import numpy as np
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
 from duffing_env.rewards import REWARDS
+from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.model import Model
-from estimator.parameters import PhysicalParameters
-from estimator.posterior import Belief
-from estimator.priors import named_prior
+from estimator.parameters import Parameters
+from estimator.priors import silverbox_prior
 
 
 class Plant(Protocol):
@@ -75,7 +75,7 @@ class PlantExperiment(Experiment):
     @cached_property
     def believed(self) -> Belief:
         """The prior as given, or that of Amplitude-v0."""
-        return self.prior or named_prior("silverbox_twin", difference(), self.factorisation)
+        return self.prior or silverbox_prior().factorised(self.factorisation)
 
 
 class PlantEnv(DuffingEnv):
@@ -180,7 +180,7 @@ class PlantEnv(DuffingEnv):
         self._batch.step(0.0)
 
     @property
-    def truth(self) -> PhysicalParameters:
+    def truth(self) -> Parameters:
         """The plant's true parameters are not known.
 
         Raises:

@@ -16,11 +16,10 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief
 from estimator.files import write_atomically
-from estimator.parameters import SAMPLING_STEP, FloatArray, PhysicalParameters
+from estimator.parameters import SAMPLING_STEP, FloatArray, Parameters
 from estimator.physical import propagate
-from estimator.posterior import Belief
-from estimator.truth import Parameters
 
 Frame = npt.NDArray[np.uint8]
 
@@ -71,7 +70,7 @@ class Screen:
         self._picture: _Picture | None = None
         self._window = _Window(fps) if render_mode == "human" else None
 
-    def start(self, truth: PhysicalParameters | Parameters, belief: Belief, horizon: int) -> None:
+    def start(self, truth: Parameters, belief: Belief, horizon: int) -> None:
         """Begin an episode of at most ``horizon`` samples; ``belief`` is the prior."""
         self._truth = np.array([getattr(truth, name, np.nan) for name in NAMES])
         self._horizon = horizon

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from duffing_env.experiment import Experiment
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
+from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief
-from estimator.priors import named_prior
+from estimator.priors import paper_text_prior, published_run_prior, silverbox_prior
 
-_PRIORS = ("silverbox_twin", "published_run", "paper_text")
+#: Name of a prior to what makes it of a model.
+_PRIORS: dict[str, Callable[[Model], Belief]] = {
+    "silverbox_twin": silverbox_prior,
+    "published_run": partial(published_run_prior, True),
+    "paper_text": partial(paper_text_prior, True),
+}
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,7 @@ class ReplayExperiment(Experiment):
     @cached_property
     def believed(self) -> Belief:
         """The prior of that name."""
-        return named_prior(self.prior, self.model, self.factorisation)
+        return _PRIORS[self.prior](self.model).factorised(self.factorisation)
 
     @property
     def recorded(self) -> tuple[FloatArray, FloatArray]:

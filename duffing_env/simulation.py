@@ -19,6 +19,8 @@ import numpy as np
 
 from duffing_env.layout import Kind, layout_of
 from duffing_env.rewards import Hooks, nothing
+from estimator.engine.feeding import feeder
+from estimator.engine.tasks import input_rows
 from estimator.lanes import LANES, jit
 from estimator.parameters import FloatArray
 
@@ -67,17 +69,17 @@ def hooks(kind: Kind, code: Any) -> Hooks:
     """It compares where an episode begins, and after every update."""
     place, model = layout_of(kind), kind.belief
     first, last = place[f"MODEL_{next(iter(model.states))}"] * LANES, (place["POWER"] + 1) * LANES
-    saved_rows = model.taps if not model.is_continuous else kind.degree + 1
-    inputs = tuple(place[f"U_{k}"] * LANES for k in range(saved_rows))
+    rows = [place[row] for row in input_rows(model, kind.degree)]
+    inputs, feed = tuple(row * LANES for row in rows), feeder(model, kind.degree, rows, LANES)
     work, misfit = place["WORK"] * LANES, place["MISFIT"] * LANES
     model_move, twin_move, compare, conclude = code.model_move, code.twin_move, code.compare, code.conclude
-    steps, continuous, degree, taps = model.substeps, model.is_continuous, kind.degree, model.taps
+    steps, continuous = model.substeps, model.is_continuous
 
     @jit
     def run(W, max_input):
         """The misfits of a block's beliefs."""
-        kept = np.empty(saved_rows * LANES)
-        for k in range(saved_rows):
+        kept = np.empty(len(inputs) * LANES)
+        for k in range(len(inputs)):
             for j in range(LANES):
                 kept[k * LANES + j] = W[inputs[k] + j]
         W[first:last] = 0.0
@@ -86,15 +88,7 @@ def hooks(kind: Kind, code: Any) -> Hooks:
             before = max_input * TEST_INPUT[t - 1] if t > 0 else 0.0
             older = max_input * TEST_INPUT[t - 2] if t > 1 else 0.0
             for j in range(LANES):
-                if continuous and degree == 1:
-                    W[inputs[0] + j] = before
-                    W[inputs[1] + j] = now - before
-                else:
-                    W[inputs[0] + j] = now
-                    if not continuous and taps > 1:
-                        W[inputs[1] + j] = before
-                    if not continuous and taps > 2:
-                        W[inputs[2] + j] = older
+                feed(W, j, now, before, older)
             if continuous:
                 for s in range(steps):
                     model_move(W, s / steps)
@@ -104,7 +98,7 @@ def hooks(kind: Kind, code: Any) -> Hooks:
                 twin_move(W)
             compare(W)
         conclude(W)
-        for k in range(saved_rows):
+        for k in range(len(inputs)):
             for j in range(LANES):
                 W[inputs[k] + j] = kept[k * LANES + j]
 

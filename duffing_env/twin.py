@@ -1,7 +1,7 @@
 """The twin: the oscillator nearest to the Silverbox circuit, identified from its record.
 
 Run ``python -m duffing_env.twin`` with the record at hand to print the constants of
-`estimator.parameters.SILVERBOX_TWIN` and of `estimator.continuous.CONTINUOUS_TWIN`.
+`estimator.parameters.SILVERBOX_TWIN` and of `estimator.parameters.CONTINUOUS_TWIN`.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from duffing_env.silverbox import SilverboxRecord, load_record
-from estimator import OnlineEstimator, Rig, duffing
-from estimator.parameters import SAMPLING_STEP, Coefficients, PhysicalParameters, to_physical
+from estimator import OnlineEstimator, Rig, difference, duffing
+from estimator.parameters import SAMPLING_STEP, Parameters
+from estimator.physical import to_physical
 
 
-def identify_twin(record: SilverboxRecord) -> tuple[PhysicalParameters, float]:
+def identify_twin(record: SilverboxRecord) -> tuple[Parameters, float]:
     """Least squares of Eq. (2) with input delay 1 on the record's multisine part.
 
     Returns:
@@ -22,7 +23,10 @@ def identify_twin(record: SilverboxRecord) -> tuple[PhysicalParameters, float]:
     u, y = record.multisine.u, record.multisine.y
     regressors = np.column_stack([y[1:-1], y[1:-1] ** 3, y[:-2], u[1:-1]])
     coefficients, squares, *_ = np.linalg.lstsq(regressors, y[2:], rcond=None)
-    return to_physical(Coefficients(*coefficients)), float(np.sqrt(squares[0] / len(regressors)))
+    parameters = Parameters(
+        zip("mcab", to_physical(difference(), np.asarray(coefficients, dtype=np.float64)).tolist(), strict=True)
+    )
+    return parameters, float(np.sqrt(squares[0] / len(regressors)))
 
 
 def identify_continuous_twin(record: SilverboxRecord) -> dict[str, float]:

@@ -19,9 +19,8 @@ from duffing_env.env import DuffingEnv, SilverboxReplayEnv, action_space, observ
 from duffing_env.experiment import Experiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import OUTCOME
-from estimator.parameters import FloatArray, PhysicalParameters
-from estimator.posterior import Belief
-from estimator.truth import Parameters
+from estimator.belief import Belief
+from estimator.parameters import FloatArray, Parameters
 
 _RESET_MODES = {
     AutoresetMode.DISABLED: RESET_BY_HAND,
@@ -129,7 +128,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         return self._batch.records()
 
     @property
-    def truth(self) -> PhysicalParameters | Parameters:
+    def truth(self) -> Parameters:
         """The oscillators that are to be identified, a batch of ``num_envs``."""
         return self._batch.truth()
 
@@ -260,7 +259,8 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
         rows = np.flatnonzero(finished)
         beliefs[rows] = self._batch.beliefs(rows, final=same_step)
-        truths[rows] = self._batch.truths(rows, final=same_step)
+        for row, truth in zip(rows, self._batch.truths(rows, final=same_step), strict=True):
+            truths[row] = truth  # one by one: NumPy would take what has a length for a row of its own
         return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}
 
 

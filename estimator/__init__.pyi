@@ -1,10 +1,5 @@
 # The names of `estimator`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
 from .belief import Belief
-from .continuous import (
-    CONTINUOUS_TWIN,
-    ContinuousBelief,
-    continuous_prior,
-)
 from .ensemble import NoiseRatio
 from .information import (
     cramer_rao,
@@ -17,14 +12,12 @@ from .models.model import Model
 from .offline import PEMNARX
 from .online import OnlineEstimator
 from .parameters import (
+    CONTINUOUS_TWIN,
     SAMPLING_STEP,
     SILVERBOX_TWIN,
-    Coefficients,
-    PhysicalParameters,
-    to_coefficients,
-    to_physical,
+    Parameters,
 )
-from .prior import Prior
+from .physical import coefficients_of, to_physical
 from .priors import (
     paper_text_prior,
     published_run_prior,
@@ -44,15 +37,12 @@ __all__ = [
     "SAMPLING_STEP",
     "SILVERBOX_TWIN",
     "Belief",
-    "Coefficients",
-    "ContinuousBelief",
     "Model",
     "NoiseRatio",
     "OnlineEstimator",
-    "PhysicalParameters",
-    "Prior",
+    "Parameters",
     "Rig",
-    "continuous_prior",
+    "coefficients_of",
     "cramer_rao",
     "difference",
     "duffing",
@@ -64,7 +54,6 @@ __all__ = [
     "relative_covariance",
     "save_estimator",
     "silverbox_prior",
-    "to_coefficients",
     "to_physical",
     "weak_prior",
 ]

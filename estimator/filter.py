@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief, covariance_places
 from estimator.ensemble import LEVELS, NoiseRatio, grid, log_ratio, matched_gamma, ratio_of
 from estimator.inference import samples
 from estimator.inputs import Channel, channel, degree
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.posterior import Belief, covariance_places
 from estimator.rig import Rig
 from estimator.settings import Settings
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.engine import cache as stored
-from estimator.engine.feeding import input_degree
+from estimator.engine.feeding import feeder, input_degree
 from estimator.engine.tasks import NAMES, input_rows
 from estimator.lanes import kernel, rows
 from estimator.models.model import Model
@@ -67,20 +67,15 @@ def _compiled(model: Model, degree: int) -> Any:
 
     code = stored.load(model.name, "free-run", repr((model.digest, degree)), make, NAMES)
     move, sense, size, steps, n = code.move, code.sense, len(place), model.substeps, len(model.names)
-    first, shown, continuous, taps = place["U_0"], place["SHOWN"], model.is_continuous, len(input_rows(model, degree))
-    is_line = continuous and degree == 1
+    shown, continuous = place["SHOWN"], model.is_continuous
+    feed = feeder(model, degree, [place[row] for row in input_rows(model, degree)], 1)
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}")
     def run(start, u, y):
         W = np.zeros(size)
         W[:n] = start
         for t in range(len(u)):
-            for k in range(taps):
-                W[first + k] = u[t - k] if t >= k else 0.0
-            if is_line:
-                last = W[first + 1]
-                W[first + 1] = W[first] - last
-                W[first] = last
+            feed(W, 0, u[t], u[t - 1] if t > 0 else 0.0, u[t - 2] if t > 1 else 0.0)
             if continuous:
                 for s in range(steps):
                     move(W, s / steps)

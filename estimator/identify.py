@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief
 from estimator.engine import tasks
-from estimator.inference import DEFAULT_ITERATIONS, samples
+from estimator.inference import DEFAULT_ITERATIONS, mean_field
 from estimator.inputs import channel, degree
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
-from estimator.posterior import Belief
 from estimator.rig import Rig
 
 
@@ -58,26 +58,27 @@ def identify(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | None 
     inputs = np.concatenate([np.zeros((len(inputs), way.past)), inputs], axis=1)
     records = np.repeat(prior.record[None], len(inputs), axis=0)
     run = _compiled(prior.model, degree(prior.model, rig), prior.factorisation)
-    run(inputs, outputs, lengths, prior.record.copy(), way.stencil, DEFAULT_ITERATIONS[prior.factorisation], records)
+    run(inputs, outputs, lengths, prior.record.copy(), way.stencil, records)
     records.flags.writeable = False
     return prior.with_records(records)
 
 
 @cache
 def _compiled(model: Model, degree: int, factorisation: str) -> Any:
-    """``run(inputs, outputs, lengths, prior, stencil, iterations, records)`` of a model."""
+    """``run(inputs, outputs, lengths, prior, stencil, records)`` of a model."""
     iterations = DEFAULT_ITERATIONS[factorisation]
     if factorisation == "mean_field":
-        update_all, place = samples.mean_field_update()
+        place = mean_field.layout()
+        update_all = mean_field.updater(place)
     else:
         task = tasks.structured(model, degree, iterations=iterations)
-        update_all, place = task.update, task.layout
+        place, update_all = dict(task.layout), task.update
     is_structured = factorisation == "structured"
     u_row, y_row = place["U_0"] * LANES, place[f"Y_{next(iter(model.outputs))}"] * LANES
     height, size = len(place), len(tasks.belief_names(model))
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}_{factorisation}")
-    def run(inputs, outputs, lengths, prior, stencil, iterations, records):
+    def run(inputs, outputs, lengths, prior, stencil, records):
         W = np.empty(height * LANES)
         rows, window = stencil.shape
         for first in range(0, len(inputs), LANES):
@@ -104,7 +105,7 @@ def _compiled(model: Model, degree: int, factorisation: str) -> Any:
                 if is_structured:
                     update_all(W)
                 else:
-                    update_all(W, iterations)
+                    update_all(W, iterations, False)
                 for j in range(count):
                     if lengths[first + j] == t + 1:
                         for i in range(size):

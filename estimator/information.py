@@ -7,7 +7,7 @@ filter of the model linearised along its trajectory, ν_t the innovation, S_t it
 
 summed over the sensors too. What is left out is the sensitivity of the filter's gain and of S themselves: it enters F
 relative to the above by the squared ratio of noise to signal (1e-5 on the tracks), and what S tells needs noises that
-are known exactly. The sample's arithmetic is `estimator.engine.algebra.path_sample`.
+are known exactly. The sample's arithmetic is `estimator.engine.path.path_sample`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from estimator.engine.feeding import feeder, input_degree, places
-from estimator.engine.tasks import path
+from estimator.engine.feeding import feeder, input_degree
+from estimator.engine.tasks import input_rows, path, path_results
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
 from estimator.parameters import SAMPLING_STEP, FloatArray
@@ -227,7 +227,7 @@ def follow(
     k = model.n_coefficients
     ends = np.isnan(u)
     lengths = np.where(ends.any(axis=1), ends.argmax(axis=1), u.shape[1])
-    totals = np.zeros((len(u), places(model, degree, y is not None).n_totals))
+    totals = np.zeros((len(u), len(path_results(model))))
     start = covariance[np.triu_indices(model.n_states)]
     outputs = np.zeros((0, 0, 0)) if y is None else y
     follower(model, degree, y is not None)(points, u, outputs, lengths, start, noises, totals)
@@ -240,15 +240,17 @@ def follow(
 @cache
 def follower(model: Model, degree: int, observed: bool) -> Any:
     """The compiled loop of `follow`, with totals (n, 1 + K + K (K + 1)/2) packed."""
-    sample = path(model, degree, observed=observed).sample
-    feed = feeder(model, degree, observed, LANES)
-    at = places(model, degree, observed)
+    task = path(model, degree, observed=observed)
+    sample, at, size = task.sample, task.layout, len(task.layout)
+    feed = feeder(model, degree, [at[row] for row in input_rows(model, degree)], LANES)
     n, k, p = model.n_states, model.n_coefficients, model.n_outputs
+    first_total, first_coefficient, live = at["LOSS"], at[next(iter(model.coefficients))], at["LIVE"]
+    shown, n_totals = at[f"Y_{next(iter(model.outputs))}"] if observed else -1, len(path_results(model))
     spreads = n * (n + 1) // 2
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}_{int(observed)}")
     def run(points, u, y, lengths, start, noises, totals):
-        W = np.empty(at.size * LANES)
+        W = np.empty(size * LANES)
         for first in range(0, len(u), LANES):
             lanes = min(LANES, len(u) - first)
             W[:] = 0.0
@@ -256,9 +258,9 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
             for j in range(LANES):
                 i = first + min(j, lanes - 1)  # a spare lane repeats the last one
                 longest = max(longest, lengths[i])
-                W[at.live * LANES + j] = 1.0
+                W[live * LANES + j] = 1.0
                 for c in range(k):
-                    W[(at.coefficients + c) * LANES + j] = points[i, c]
+                    W[(first_coefficient + c) * LANES + j] = points[i, c]
                 for c in range(spreads):
                     W[(n + c) * LANES + j] = start[c]
             for t in range(longest):
@@ -270,13 +272,13 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
                     feed(W, j, now, last, u[i, t - 2] if runs and t > 1 else 0.0)
                     if observed:
                         for c in range(p):
-                            W[(at.shown + c) * LANES + j] = y[i, t, c] if runs else 0.0
+                            W[(shown + c) * LANES + j] = y[i, t, c] if runs else 0.0
                 sample(W, *noises)
                 for j in range(lanes):
                     if t + 1 == lengths[first + j]:
-                        for c in range(at.n_totals):
-                            totals[first + j, c] = W[(at.totals + c) * LANES + j]
-                        for c in range(at.n_path):  # it is over, and goes on at rest
+                        for c in range(n_totals):
+                            totals[first + j, c] = W[(first_total + c) * LANES + j]
+                        for c in range(first_total):  # it is over, and goes on at rest
                             W[c * LANES + j] = 0.0
 
     return run

@@ -43,7 +43,9 @@ def rows(*groups: str, start: int = 0) -> dict[str, int]:
     return {name: start + i for i, name in enumerate(names)}
 
 
-def lanewise(layout: Mapping[str, int], outputs: str, uniform: str = "") -> Callable[[Callable[..., Any]], Any]:
+def lanewise(
+    layout: Mapping[str, int], outputs: str, uniform: str = "", lanes: int = LANES
+) -> Callable[[Callable[..., Any]], Any]:
     """Compile a scalar function to run over all lanes of a block.
 
     The function's parameters are read from the rows of their names, its results are written to the rows named in
@@ -54,44 +56,22 @@ def lanewise(layout: Mapping[str, int], outputs: str, uniform: str = "") -> Call
         layout: name of a quantity to its row.
         outputs: the rows that the function returns, in its order, separated by spaces.
         uniform: parameters that are no rows, in the order in which the loop takes them.
+        lanes: systems in the block.
 
     Raises:
         ValueError: for a parameter that is neither a row nor uniform, or both.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        arguments, targets = _places(function, layout, outputs, uniform)
+        arguments, targets = _places(function, layout, outputs, uniform, lanes)
         source = (
             f"def {function.__name__}({', '.join(['W', *uniform.split()])}):\n"
-            f"    for j in range({LANES}):\n"
+            f"    for j in range({lanes}):\n"
             f"        {targets} = scalar({arguments})\n"
         )
-        loop = jit(_define(source, function, scalar=inlined(function)))
-        loop.declaration = (function, layout, outputs, uniform)
-        return loop
+        return jit(_define(source, function, scalar=inlined(function)))
 
     return decorate
-
-
-def relaid(loop: Any, layout: Mapping[str, int]) -> Any:
-    """A function of `lanewise` once more, over other rows of the block."""
-    function, _, outputs, uniform = loop.declaration
-    return lanewise(layout, outputs, uniform)(function)
-
-
-def alone(loop: Any, layout: Mapping[str, int] | None = None, lanes: int = LANES) -> Any:
-    """A function of `lanewise` for the first lane only, with the same arguments: for a single system.
-
-    Args:
-        loop: the function.
-        layout: other rows of the block, where it is given.
-        lanes: systems in the block.
-    """
-    function, own, outputs, uniform = loop.declaration
-    first = at_lane(own if layout is None else layout, outputs, uniform, lanes)(function)
-    arguments = ", ".join(uniform.split())
-    source = f"def {function.__name__}(W{', ' * bool(arguments)}{arguments}):\n    first(W, 0, {arguments})\n"
-    return jit(_define(source, function, first=first))
 
 
 def at_lane(
@@ -108,15 +88,13 @@ def at_lane(
             f"def {function.__name__}({', '.join(['W', 'j', *uniform.split()])}):\n"
             f"    {targets + ' =' if outputs else 'return'} scalar({arguments})\n"
         )
-        compiled = jit(_define(source, function, scalar=jit(function)))
-        compiled.declaration = (function, layout, outputs, uniform)
-        return compiled
+        return jit(_define(source, function, scalar=jit(function)))
 
     return decorate
 
 
 def _places(
-    function: Callable[..., Any], layout: Mapping[str, int], outputs: str, uniform: str, lanes: int = LANES
+    function: Callable[..., Any], layout: Mapping[str, int], outputs: str, uniform: str, lanes: int
 ) -> tuple[str, str]:
     """The arguments of a scalar function, and the places of its results, as source text."""
     names = list(inspect.signature(function).parameters)

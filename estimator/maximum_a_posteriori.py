@@ -12,11 +12,11 @@ by Gauss-Newton steps (Λ0 + F)⁻¹, damped after Levenberg and Marquardt, with
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief
 from estimator.engine.feeding import input_degree
 from estimator.information import follow, outputs_of, variances
 from estimator.models.model import Model
@@ -26,19 +26,6 @@ from estimator.parameters import FloatArray
 _STEPS, _SMALL = 60, 1e-6
 #: Damping at the start, its change after a step that fails or succeeds, and where a system is given up.
 _DAMPING, _UP, _DOWN, _STUCK = 1e-4, 10.0, 0.1, 1e12
-
-
-class Moments(Protocol):
-    """What a prior must tell: mean (K,) and covariance (K, K) of the coefficients, covariance (n, n) of the states."""
-
-    @property
-    def coefficients_mean(self) -> FloatArray: ...  # noqa: D102
-
-    @property
-    def coefficients_cov(self) -> FloatArray: ...  # noqa: D102
-
-    @property
-    def state_cov(self) -> FloatArray: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -60,7 +47,7 @@ def maximum_a_posteriori(
     model: Model,
     u: npt.ArrayLike,
     y: npt.ArrayLike,
-    prior: Moments,
+    prior: Belief,
     process_noise: float,
     measurement_noise: npt.ArrayLike,
     interpolation: str = "zero_order",
@@ -87,7 +74,7 @@ def maximum_a_posteriori(
         raise ValueError(f"u must have shape (n, T), but has {inputs.shape}")
     outputs = np.array(outputs_of(model, inputs, y))
     noises, degree = variances(model, process_noise, measurement_noise), input_degree(model, interpolation)
-    center, cov = np.asarray(prior.coefficients_mean), np.asarray(prior.coefficients_cov)
+    center, cov = prior.coefficients_mean, prior.coefficients_cov
     if center.shape != (model.n_coefficients,):
         raise ValueError(f"prior must be of {list(model.coefficients)}, but its means have shape {center.shape}")
     free = np.flatnonzero(np.diag(cov))

@@ -19,6 +19,9 @@ def to_physical(model: Model, coefficients: FloatArray, step: float = SAMPLING_S
         model: whose `Model.physical`.
         coefficients: (..., K), time counted in samples.
         step: sampling step [s].
+
+    Raises:
+        ValueError: for a step that is not positive and finite.
     """
     if not model.physical:
         return np.array(coefficients, dtype=np.float64)
@@ -43,16 +46,29 @@ def propagate(
 
 
 def coefficients_of(model: Model, parameters: Mapping[str, Any], step: float = SAMPLING_STEP) -> FloatArray:
-    """Coefficients (..., K) of physical parameters of shape (...), by name; themselves, for a model without any."""
-    if not model.inverse:
-        columns = [np.asarray(parameters[name], dtype=np.float64) for name in model.coefficients]
-        return np.stack(np.broadcast_arrays(*columns), axis=-1)
-    columns = [np.asarray(parameters[name], dtype=np.float64) for name in model.physical]
-    return _evaluate(_code(model, "inverse")[0], np.stack(np.broadcast_arrays(*columns), axis=-1), step)
+    """Coefficients (..., K) of physical parameters of shape (...), by name; themselves, for a model without any.
+
+    Args:
+        model: whose `Model.inverse`.
+        parameters: name to value, such as `estimator.Parameters`; others than the model's are not looked at.
+        step: sampling step [s].
+
+    Raises:
+        ValueError: for a parameter that is missing, or a step that is not positive and finite.
+    """
+    names = list(model.physical if model.inverse else model.coefficients)
+    missing = [name for name in names if name not in parameters]
+    if missing:
+        raise ValueError(f"parameters must have {names}, but {missing} are missing from {list(parameters)}; add them")
+    columns = [np.asarray(parameters[name], dtype=np.float64) for name in names]
+    points = np.stack(np.broadcast_arrays(*columns), axis=-1)
+    return _evaluate(_code(model, "inverse")[0], points, step) if model.inverse else points
 
 
 def _evaluate(function: Any, given: FloatArray, step: float) -> FloatArray:
     """Its results, stacked along the last axis, at given numbers along the last axis."""
+    if not 0 < step < np.inf:
+        raise ValueError(f"step must be positive and finite, but is {step}; give the seconds between two samples")
     columns = np.moveaxis(np.asarray(given, dtype=np.float64), -1, 0)
     found = [np.broadcast_to(value, columns.shape[1:]) for value in function(*columns, step)]
     return np.stack(found, axis=-1).astype(np.float64)

@@ -8,16 +8,16 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.physical import coefficients_of
-from estimator.posterior import Belief
 
-#: Points of the quadrature over all parameters together, at most; with 20 along each of four, moments converge to 1e-10
-#: for every spread up to 0.999.
-_POINTS = 160_000
+#: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
+#: converge to 1e-10 for every spread up to 0.999.
+_NODES, _POINTS = 20, 160_000
 
 
 def log_uniform_moments(
@@ -46,7 +46,7 @@ def log_uniform_moments(
     for name in names:
         if name not in center or not np.isfinite(center[name]) or center[name] == 0:
             raise ValueError(f"center must have a finite {name} other than 0, but is {dict(center)}")
-    nodes_per_axis = max(2, min(20, int(_POINTS ** (1 / len(names)) + 1e-9)))
+    nodes_per_axis = max(2, min(_NODES, int(_POINTS ** (1 / len(names)) + 1e-9)))
     nodes, weights = np.polynomial.legendre.leggauss(nodes_per_axis)
     # log(1 ± spread) = log(1 - spread²) / 2 ± artanh(spread)
     factors = np.sqrt(1 - spread**2) * np.exp(np.arctanh(spread) * nodes)
@@ -104,7 +104,6 @@ def weak_prior(
     noise_shape: float = 2.0,
     state_std: float | Sequence[float] = 1e-3,
     step: float = SAMPLING_STEP,
-    factorisation: str = "structured",
 ) -> Belief:
     """A prior of given coefficients, with weak Gamma priors of the noises and the plant near rest.
 
@@ -118,8 +117,6 @@ def weak_prior(
             such a prior binds for thousands of samples (docs/coverage.md): centre it with care.
         state_std: standard deviation of the states about 0: one number, or one for each.
         step: sampling step [s].
-        factorisation: of the inference that starts from it; for ``mean_field`` the parts of the paper's coefficients, θ
-            and η, are independent.
 
     Raises:
         ValueError: for a value out of its range, or as `Belief`.
@@ -135,20 +132,10 @@ def weak_prior(
     n, k = model.n_states, model.n_coefficients
     joint_mean, joint = np.zeros(n + k), np.zeros((n + k, n + k))
     joint_mean[n:], joint[n:, n:] = mean, cov
-    if factorisation == "mean_field":
-        joint[n:-1, -1] = joint[-1, n:-1] = 0.0
     joint[:n, :n] = np.diag(np.broadcast_to(np.asarray(state_std, dtype=np.float64) ** 2, n))
     sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
     xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
-    return Belief.of(
-        model,
-        joint_mean,
-        joint,
-        (noise_shape, noise_shape * process_noise**2),
-        xi,
-        step=step,
-        factorisation=factorisation,
-    )
+    return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, step=step)
 
 
 #: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.twin`` identifies them).
@@ -166,7 +153,7 @@ def silverbox_prior(
     """The prior of the environments: an oscillator near the Silverbox circuit, at rest.
 
     Args:
-        model: with the parameters m, c, a and b; `difference`, the paper's, where it is None.
+        model: with the parameters m, c, a, and b unless it is linear; `difference`, the paper's, where it is None.
         spread: m, c, a and b are log-uniform on the twin's times [1 - spread, 1 + spread]; in (0, 1).
         process_noise: what a sample's process noise does to the output: standard deviation [V] at which γ is centred.
         measurement_noise: standard deviation [V] at which ξ is centred.
@@ -177,7 +164,7 @@ def silverbox_prior(
         ValueError: for a model with other parameters, or a value out of its range.
     """
     model = difference() if model is None else model
-    if set(model.physical) != {"m", "c", "a", "b"} or model.name not in _TWINS:
+    if model.name not in _TWINS or not {"m", "c", "a"} <= set(model.physical) <= {"m", "c", "a", "b"}:
         raise ValueError(f"model must have the parameters m, c, a and b, but {model.name} has {list(model.physical)}")
     if not 0 < spread < 1:
         raise ValueError(f"spread must be above 0 and below 1, but is {spread}; pass the range's relative half width")
@@ -186,31 +173,43 @@ def silverbox_prior(
 
 @cache
 def _twin_moments(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
-    twin = _TWINS[model.name]
-    return log_uniform_moments(model, {name: float(getattr(twin, name)) for name in model.physical}, spread)
+    return log_uniform_moments(model, _TWINS[model.name], spread)
 
 
-def published_run_prior(nonlinear: bool = True) -> Belief:
+def published_run_prior(nonlinear: bool = True, model: Model | None = None) -> Belief:
     """The prior that the paper's published numbers were computed with (it differs from the paper's text).
 
-    Without ``nonlinear`` θ2 is known to be 0: the paper's FEM-LARX.
+    Args:
+        nonlinear: else θ2 is known to be 0: the paper's FEM-LARX.
+        model: `difference("linear")`, which has no θ2; the paper's where it is None.
     """
-    return _paper_prior("published_run", nonlinear)
+    return _paper_prior(nonlinear, model, 2.0, 1e-2, (1e8, 1e3), (1e8, 1e1))
 
 
-def paper_text_prior(nonlinear: bool = True) -> Belief:
-    """The prior as the paper's section 4 states it; the state's, not given there, is that of the published run."""
-    return _paper_prior("paper_text", nonlinear)
+def paper_text_prior(nonlinear: bool = True, model: Model | None = None) -> Belief:
+    """The prior as the paper's section 4 states it; the state's, not given there, is that of the published run.
+
+    Arguments as `published_run_prior`.
+    """
+    return _paper_prior(nonlinear, model, 1.0, 10.0, (1e3, 1e1), (1e8, 1e3))
 
 
-def _paper_prior(name: str, nonlinear: bool) -> Belief:
-    prior = named_prior(name, difference())
-    if nonlinear:
-        return prior
-    mean, cov, place = prior.mean, prior.cov, prior.model.names.index("theta2")
-    mean[place], cov[place], cov[:, place] = 0.0, 0.0, 0.0
-    gamma_shape, gamma_rate, xi_shape, xi_rate = prior.noises
-    return Belief.of(prior.model, mean, cov, (gamma_shape, gamma_rate), (xi_shape, xi_rate))
+def _paper_prior(
+    nonlinear: bool,
+    model: Model | None,
+    eta_mean: float,
+    eta_var: float,
+    gamma: tuple[float, float],
+    xi: tuple[float, float],
+) -> Belief:
+    """Means of 1 (of the states 0) and variances of 10, but for η."""
+    model = difference() if model is None else model
+    mean, variance = np.ones(len(model.names)), np.full(len(model.names), 10.0)
+    mean[: model.n_states], mean[-1], variance[-1] = 0.0, eta_mean, eta_var
+    if not nonlinear:
+        place = model.names.index("theta2")
+        mean[place] = variance[place] = 0.0
+    return Belief.of(model, mean, np.diag(variance), gamma, xi)
 
 
 def recorded_prior(
@@ -252,7 +251,7 @@ def recorded_prior(
 
 
 def _recorded_duffing(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
-    twin = coefficients_of(duffing(), {name: getattr(SILVERBOX_TWIN, name) for name in ("m", "c", "a", "b")})
+    twin = coefficients_of(duffing(), SILVERBOX_TWIN)
     main = dict(zip(duffing().coefficients, twin, strict=True))
     mean = np.array([main.get(name, 0.0) for name in model.coefficients])
     others = {"force": 0.0, "output_offset": 0.02, "cubic_damping": 0.1, "feedthrough": 0.1}
@@ -265,39 +264,10 @@ def _recorded_duffing(model: Model, spread: float) -> tuple[FloatArray, FloatArr
 
 
 def _recorded_difference(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
-    twin = coefficients_of(difference(), {name: getattr(SILVERBOX_TWIN, name) for name in ("m", "c", "a", "b")})
+    twin = coefficients_of(difference(), SILVERBOX_TWIN)
     centers = dict(zip(("x1", "x1**3", "x2"), twin[:3], strict=True))
     centers["u" if model.taps == 1 else "u1"] = twin[3]
     terms = [part.split("*", 1)[1] for part in model.next_state[0].split(" + ")]
     stds = {"V": 0.1 * spread, "1": spread}
     std = [stds.get(unit, 1 + spread) for unit in model.coefficients.values()]
     return np.array([centers.get(term, 0.0) for term in terms]), np.diag(np.square(std))
-
-
-def named_prior(name: str, model: Model, factorisation: str = "structured") -> Belief:
-    """A prior of the paper's equation by name.
-
-    Args:
-        name: ``silverbox_twin``, that of the environments; ``published_run``, with which the paper's published numbers
-            were computed; or ``paper_text``, as the paper's section 4 states it, with the state's of the published run.
-        model: `difference("paper")`, or ``"linear"``, which has no θ2.
-        factorisation: of the inference that starts from it.
-
-    Raises:
-        ValueError: for another name.
-    """
-    if name == "silverbox_twin":
-        center = {p: float(getattr(SILVERBOX_TWIN, p)) for p in model.physical}
-        mean, cov = log_uniform_moments(model, center, 0.3)
-        return weak_prior(model, mean, cov, factorisation=factorisation)
-    noises = {
-        "published_run": (2.0, 1e-2, (1e8, 1e3), (1e8, 1e1)),
-        "paper_text": (1.0, 10.0, (1e3, 1e1), (1e8, 1e3)),
-    }
-    if name not in noises:
-        raise ValueError(f"name must be one of {['silverbox_twin', *noises]}, but is {name!r}")
-    eta_mean, eta_var, gamma, xi = noises[name]
-    n, k = model.n_states, model.n_coefficients
-    mean = np.concatenate([np.zeros(n), np.ones(k - 1), [eta_mean]])
-    cov = np.diag([10.0] * (n + k - 1) + [eta_var])
-    return Belief.of(model, mean, cov, gamma, xi, factorisation=factorisation)

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from estimator.belief import Belief, record_size
 from estimator.files import write_atomically
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
-from estimator.posterior import Belief, record_size
 from estimator.rig import Rig
 
 #: Raised when the content of the files changes.

@@ -40,7 +40,7 @@ from agents.plants import believed_of
 from agents.policies.imagination import Terms
 from agents.policies.motion import View, places, scales
 from agents.policies.planning import search
-from agents.policies.pursuit import Rule, pursuit, record_places
+from agents.policies.pursuit import Rule, pursuit
 from estimator.engine.feeding import input_degree
 from estimator.parameters import FloatArray
 
@@ -180,8 +180,7 @@ class Planner:
         inputs, scores = np.empty((2, n))
         if self._energy is not None:
             energies, rule = rows[:, at.budget_left] * self._energy, Rule(terms.amplitude, terms.limit, terms.margin)
-            known = record_places(self._view.model)
-            self._pursue(records, known, left, energies, rule, last, plans, words, inputs, scores)
+            self._pursue(records, left, energies, rule, last, plans, words, inputs, scores)
         else:
             lasts = np.stack([last, before], axis=1)
             search(*self._view).plan(

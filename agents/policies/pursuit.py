@@ -13,15 +13,14 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from agents.ascent import Limits, climber, project
 from agents.design import Known, designer, half_log_det, invert
 from agents.policies.planning import uniform
+from estimator.belief import covariance_places
 from estimator.engine.tasks import belief_names
 from estimator.lanes import kernel, part
 from estimator.models.model import Model
-from estimator.posterior import covariance_places
 
 #: Input before and after a burst, in parts of that within.
 _WEAK = 0.2
@@ -36,36 +35,14 @@ _RATE = 0.2
 _FAR = 2.0
 
 
-class BeliefPlaces(NamedTuple):
-    """Where a flat record keeps what a plan begins with.
-
-    Attributes:
-        mean: (n + K,) means of states, then coefficients.
-        cov: (n + K, n + K) their covariance.
-        noises: (1 + sensors, 2) shape and rate of γ, then of each sensor's ξ.
-    """
-
-    mean: npt.NDArray[np.intp]
-    cov: npt.NDArray[np.intp]
-    noises: npt.NDArray[np.intp]
-
-
-def record_places(model: Model) -> BeliefPlaces:
-    """Those of a model's records (`estimator.posterior.Belief`)."""
-    names = belief_names(model)
-    first = names.index("GAMMA_SHAPE")
-    noises = np.arange(first, len(names)).reshape(-1, 2)
-    return BeliefPlaces(np.arange(len(model.names)), covariance_places(model), noises)
-
-
 class Pursuit(NamedTuple):
     """Compiled functions of one model and interpolation of the input.
 
     Attributes:
-        pursue: ``pursue(records, places, left, energies, rule, last, plans, words, actions, scores)``: improve the
+        pursue: ``pursue(records, left, energies, rule, last, plans, words, actions, scores)``: improve the
             plans of n environments by some gradient steps.
 
-            - ``records`` (n, size): their beliefs, which keep their numbers at ``places``.
+            - ``records`` (n, size): their beliefs, as `estimator.Belief` keeps them.
             - ``left`` (n,) samples, and ``energies`` (n,) energy, left in their episodes.
             - ``rule``: a `Rule`.
             - ``last`` (n,): the inputs applied last.
@@ -106,7 +83,7 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
     n, k, sensors = model.n_states, model.n_coefficients, model.n_outputs
     kind = f"{model.name}_{model.digest}_{degree}"
     begin = part(kind)(_beginning(n, k))
-    as_noises = found.code.noises
+    as_noises, covariance, noise = found.code.noises, covariance_places(model), belief_names(model).index("GAMMA_SHAPE")
 
     @part(kind)
     def rest(known, start, last, tape):
@@ -143,7 +120,7 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
                 x = 0.0
 
     @kernel(kind=kind)
-    def pursue(records, places, left, energies, rule, last, plans, words, actions, scores):
+    def pursue(records, left, energies, rule, last, plans, words, actions, scores):
         T = plans.shape[1]
         start, precision, coefficients = np.zeros(start_size), np.empty((k, k)), np.empty(k)
         mean, cov, variances = np.empty(n + k), np.empty((n + k, n + k)), np.empty(sensors + 1)
@@ -151,15 +128,15 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
         for i in range(len(records)):
             steps = max(1, min(T, left[i]))
             for a in range(n + k):
-                mean[a] = records[i, places.mean[a]]
+                mean[a] = records[i, a]
                 for b in range(n + k):
-                    cov[a, b] = records[i, places.cov[a, b]]
+                    cov[a, b] = records[i, covariance[a, b]]
             begin(mean, cov, precision, start)
             if start_size > n_path:
                 start[n_path] = last[i]
             coefficients[:] = mean[n:]
             for a in range(sensors + 1):
-                variances[a] = records[i, places.noises[a, 1]] / records[i, places.noises[a, 0]]
+                variances[a] = records[i, noise + 2 * a + 1] / records[i, noise + 2 * a]
             known = Known(coefficients, precision, as_noises(variances))
             _, _, spread = rest(known, start, last[i], memory.tape)
             aim = rule.limit - rule.margin * np.sqrt(spread)

@@ -12,7 +12,7 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 from estimator.engine import cache as stored
-from estimator.engine.tasks import NAMES, input_rows
+from estimator.engine.tasks import NAMES, input_rows, path_names, path_results
 from estimator.lanes import inlined
 from estimator.models.model import Model
 
@@ -52,11 +52,12 @@ def pieces(model: Model, degree: int = 0) -> Any:
 
 
 def _source(model: Model, degree: int) -> str:
-    from estimator.engine import algebra, derive, emit
+    from estimator.engine import derive, emit
+    from estimator.engine.path import path_sample
 
     coefficients, carried = list(model.coefficients), derive.carried(model) if model.is_continuous else []
-    path_rows, inputs = algebra.path_names(model), input_rows(model, degree)
-    information = [f"F_{i}_{j}" for i, j in combinations_with_replacement(coefficients, 2)]
+    path_rows, inputs = path_names(model), input_rows(model, degree)
+    information = [row for row in path_results(model) if row.startswith("F_")]
     noises = ["Q", *(f"R_{y}" for y in model.outputs)]
     shown = f"SHOWN_{next(iter(model.outputs))}"
     if model.is_continuous:
@@ -64,7 +65,7 @@ def _source(model: Model, degree: int) -> str:
     else:
         before, moved = derive.difference_step(model)
     live = {derive.symbol("LIVE"): derive.sp.S.One}
-    more, results = algebra.path_sample(model, moved, degree, observed=False)
+    more, results = path_sample(model, moved, degree, observed=False)
     lines = [(name, e.xreplace(live)) for name, e in [*before, *more]]
     path_after = [results.get(row, row) for row in path_rows]
     held: dict[str, Sequence[str]] = {"P": path_rows, "F": information, **({"M": carried} if carried else {})}

@@ -251,117 +251,62 @@ def _composed(name: str, model: Model, finish: str = "finish(W)", arguments: str
 
 @dataclass(frozen=True)
 class Path:
-    """A path at known coefficients: likelihood, Fisher information, and gradient by the inputs.
+    """A path at known coefficients: likelihood and Fisher information; `estimator.engine.gradient` has the gradient.
 
     Attributes:
         sample: ``sample(W, Q, R_<sensor>...)``: one sample of every lane.
         layout: rows of the block: the coefficients, the input, outputs, ``LIVE``, the path and what it adds up.
         lanes: systems in it.
-        pieces: for one system, ``begin(W)``, ``move(W, T)``, ``finish(W, Q, R...)`` and their reverses
-            ``move_back(W, A, T)`` and ``finish_back(W, A, Q, R...)``; None where no gradient is asked for.
     """
 
     sample: Any
     layout: Mapping[str, int]
     lanes: int
-    pieces: Any = None
+
+
+def path_names(model: Model) -> list[str]:
+    """Where a path is: the filter's state, its covariance V, and its sensitivities Z to the coefficients."""
+    covariances = [f"V_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2)]
+    return [*model.states, *covariances, *(f"Z_{i}_{c}" for i in model.states for c in model.coefficients)]
+
+
+def path_results(model: Model) -> list[str]:
+    """What a path adds up: minus the log likelihood, its slope, and the information (upper triangle)."""
+    information = [f"F_{c}_{d}" for c, d in combinations_with_replacement(model.coefficients, 2)]
+    return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *information]
 
 
 def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
     """Rows of a path's block."""
     shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
-    states, coefficients = list(model.states), list(model.coefficients)
-    upper = combinations_with_replacement
-    return rows(
-        " ".join([*states, *(f"V_{i}_{k}" for i, k in upper(states, 2))]),
-        " ".join(f"Z_{i}_{c}" for i in states for c in coefficients),
-        " ".join(["LOSS", *(f"SLOPE_{c}" for c in coefficients), *(f"F_{c}_{d}" for c, d in upper(coefficients, 2))]),
-        " ".join([*coefficients, *input_rows(model, degree), *shown, "LIVE", *carried_names(model)]),
-    )
+    given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE"]
+    return rows(" ".join([*path_names(model), *path_results(model), *given, *carried_names(model)]))
 
 
 @cache
-def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, gradient: bool = False) -> Path:
-    """The path of a model (`estimator.engine.algebra.path_sample`).
+def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -> Path:
+    """The path of a model (`estimator.engine.path.path_sample`).
 
     Args:
         model: whose equation.
         degree: of the input's polynomial over a sample.
         observed: whether the filter follows outputs.
-        lanes: systems in a block; 1 where a gradient is asked for.
-        gradient: whether to generate the reverse.
+        lanes: systems in a block.
     """
     place = path_layout(model, degree, observed)
     noises = ("Q", *(f"R_{y}" for y in model.outputs))
-    if gradient and (observed or lanes != 1):
-        raise ValueError("gradient is for the response without noise of one system: observed=False, lanes=1")
 
     def make() -> str:
-        from estimator.engine import algebra, derive, emit
+        from estimator.engine import derive, emit
+        from estimator.engine.path import path_sample
 
         lines, moved = derive.moved(model)
-        more, results = algebra.path_sample(model, moved, degree, observed)
+        more, results = path_sample(model, moved, degree, observed)
         lines += more
         source = _motion_source(model, degree, place, lanes)
         source += "@jit\n" + emit.lane_loop("finish", lines, results, place, lanes, noises, doc="Predict and see.")
         arguments = ", ".join(noises)
-        source += _composed("sample", model, f"finish(W, {arguments})", f"W, {arguments}")
-        if gradient:
-            inputs = input_rows(model, degree)
-            states = algebra.path_names(model)
-            before = derive.carried(model) if model.is_continuous else []
-            followed = {row: value for row, value in results.items() if row != "SPREAD"}
-            source += _reversed_source("finish_back", lines, followed, [*states, *before], inputs, place, noises)
-            if model.is_continuous:
-                moves = {name: f"{name}_E" for name in before}
-                step = derive.motion_step(model, degree)
-                source += _reversed_source("move_back", step, moves, before, inputs, place, ("T",))
-        return source
+        return source + _composed("sample", model, f"finish(W, {arguments})", f"W, {arguments}")
 
-    key = repr((model.digest, degree, observed, lanes, gradient))
-    code = stored.load(model.name, "path", key, make, NAMES)
-    return Path(code.sample, place, lanes, code if gradient else None)
-
-
-def _reversed_source(
-    name: str,
-    lines: Any,
-    results: Mapping[str, str],
-    overwritten: Sequence[str],
-    added: Sequence[str],
-    place: Mapping[str, int],
-    uniform: Sequence[str],
-) -> str:
-    """Source of the reverse of assignments: adjoints of rows before, from those after, both in the block ``A``.
-
-    Args:
-        name: of the function.
-        lines: forward.
-        results: row to the name that holds its value.
-        overwritten: rows whose adjoints are replaced.
-        added: rows whose adjoints add up over several calls.
-        place: the layout.
-        uniform: further arguments.
-    """
-    from estimator.engine import derive, emit
-
-    # A result that is a number, or the row itself, passes its adjoint on without a line.
-    forward = list(lines)
-    assigned = {target for target, _ in forward}
-    seeds: dict[str, str] = {}
-    for row, value in results.items():
-        if value in assigned and value not in seeds:
-            seeds[value] = f"G_{row}"
-        else:
-            copy = f"{row}_copy"
-            forward.append((copy, derive.symbol(value) if not emit.is_number(value) else emit.number(value)))
-            seeds[copy] = f"G_{row}"
-    wanted = [*overwritten, *added]
-    back = derive.reverse(forward, wanted, seeds)
-    back = [(f"B{target}" if target in {f"G_{w}" for w in wanted} else target, e) for target, e in back]
-    outcome = {f"G_{row}": f"BG_{row}" for row in overwritten}
-    summed = [(f"SG_{row}", derive.symbol(f"G_{row}") + derive.symbol(f"BG_{row}")) for row in added]
-    outcome |= {f"G_{row}": f"SG_{row}" for row in added}
-    return "@jit\n" + emit.lane_loop(
-        name, [*forward, *back, *summed], outcome, place, 1, uniform, doc="The reverse derivative."
-    )  # fmt: skip
+    key = repr((model.digest, degree, observed, lanes))
+    return Path(stored.load(model.name, "path", key, make, NAMES).sample, place, lanes)

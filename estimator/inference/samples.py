@@ -6,7 +6,6 @@ puts the inputs into their rows, updates, and judges every member by its free en
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -15,19 +14,15 @@ from typing import Any
 import numpy as np
 
 from estimator.engine import tasks
+from estimator.engine.cache import digest_of
 from estimator.engine.free_energy import free_energies
 from estimator.inference import mean_field
-from estimator.lanes import LANES, alone, at_lane, jit, kernel, part, relaid, rows
+from estimator.lanes import LANES, jit, kernel, part
 from estimator.models.difference import difference
 from estimator.models.model import Model
-from estimator.record import MEAN_FIELD_SCRATCH
 
 #: Probability per sample that the hypothesis is drawn anew: no weight stays below it for good.
 SWITCHING = 1e-6
-
-#: Rows of the paper's mean field, as `estimator.record` calls them, and as the engine calls those of the same meaning.
-_QUANTITIES = {"x0": "x1", "x1": "x2", "t1": "theta1", "t2": "theta2", "t3": "theta3", "e": "eta"}
-_NOISES = {"g_shape": "GAMMA_SHAPE", "g_rate": "GAMMA_RATE", "n_shape": "XI_SHAPE_y", "n_rate": "XI_RATE_y"}
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ def structured(model: Model, degree: int, iterations: int, expectations: str = "
     place, update = task.layout, task.update
     energies_of = free_energies(model, iterations, lanes, place)
     sensors = model.n_outputs
-    kind = f"{model.name}_{_digest(model.digest, degree, iterations, lanes, expectations)}"
+    kind = f"{model.name}_{digest_of(model.digest, degree, iterations, lanes, expectations)}"
     means = tuple(place[f"TRACE_{k}_mean"] * lanes for k in range(sensors))
     parts = tuple(
         tuple(place[f"TRACE_{k}_{what}"] * lanes for what in ("variance", f"q_{iterations - 1}", f"r_{iterations - 1}"))
@@ -95,44 +90,13 @@ def structured(model: Model, degree: int, iterations: int, expectations: str = "
     return Loop(_loop(kind, model, place, lanes, iterations, take, judge), place, lanes)
 
 
-def mean_field_layout(lanes: int) -> tuple[dict[str, int], dict[str, int]]:
-    """Rows of a block of the paper's mean field, by the engine's names, and by those of its scalar functions."""
-    model = difference()
-    place = tasks.layout(model, 0)
-    place |= rows(" ".join(MEAN_FIELD_SCRATCH), "prior_g_rate prior_n_rate", start=len(place))
-    names = {**_QUANTITIES, **_NOISES, "u": "U_0", "y": "Y_y"}
-    quantities = list(_QUANTITIES)
-    for i, first in enumerate(quantities):
-        for second in quantities[i:]:
-            names[f"P_{first}_{second}"] = f"P_{_QUANTITIES[first]}_{_QUANTITIES[second]}"
-    scratch = (*MEAN_FIELD_SCRATCH, "prior_g_rate", "prior_n_rate")
-    return place, {**{name: place[row] for name, row in names.items()}, **{name: place[name] for name in scratch}}
-
-
-@cache
-def mean_field_update() -> tuple[Any, Mapping[str, int]]:
-    """``update(W, iterations)`` of the paper's mean field in all lanes of a block, and its layout."""
-    place, named = mean_field_layout(LANES)
-    begin, iterate, end = (relaid(f, named) for f in (mean_field.begin, mean_field.iterate, mean_field.end))
-
-    @part("lanes")
-    def update(W, iterations):
-        begin(W)
-        for _ in range(iterations):
-            iterate(W, False)
-        end(W)
-
-    return update, place
-
-
 @cache
 def published(iterations: int, as_published: bool) -> Loop:
     """The paper's mean field, with or without the departures of the published run. It makes no forecasts."""
     model = difference()
-    place, named = mean_field_layout(1)
-    begin, iterate, end = (alone(f, named, 1) for f in (mean_field.begin, mean_field.iterate, mean_field.end))
-    energy = at_lane(named, lanes=1)(mean_field.free_energy.declaration[0])
-    kind = f"mean_field_{_digest(model.digest, iterations, as_published)}"
+    place = mean_field.layout()
+    begin, iterate, end, energy = mean_field.pieces(place, lanes=1)
+    kind = f"mean_field_{digest_of(model.digest, iterations, as_published)}"
 
     @part(kind)
     def take(W, before):
@@ -148,10 +112,6 @@ def published(iterations: int, as_published: bool) -> Loop:
         forecasts[:] = np.nan
 
     return Loop(_loop(kind, model, place, 1, iterations, take, judge), place, 1)
-
-
-def _digest(*parts: Any) -> str:
-    return hashlib.sha256(repr((tasks.stored.engine_digest(), parts)).encode()).hexdigest()[:12]
 
 
 @jit

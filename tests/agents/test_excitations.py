@@ -18,7 +18,8 @@ from agents.policies.signals import Limits, SignalPolicy
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.layout import observation_bounds
 from estimator.models.difference import difference
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters, to_coefficients
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
+from estimator.physical import coefficients_of
 from estimator.priors import silverbox_prior
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
@@ -120,14 +121,16 @@ def test_square_is_a_square_wave_at_the_resonance_of_the_twin():
 def test_resonance_is_where_a_free_oscillation_crosses_zero():
     for m, c, a in ((0.7, 1.0, 1.3), (1.3, 0.7, 0.7)):
         twin = SILVERBOX_TWIN
-        theta = to_coefficients(PhysicalParameters(m * twin.m, c * twin.c, a * twin.a, 1.0))
+        theta1, _, theta3, _ = coefficients_of(
+            difference(), Parameters(m=m * twin.m, c=c * twin.c, a=a * twin.a, b=1.0)
+        )
         x = [0.0, 1.0]
         while len(x) < 600:
-            x.append(theta.theta1 * x[-1] + theta.theta3 * x[-2])
+            x.append(theta1 * x[-1] + theta3 * x[-2])
         crossings = np.flatnonzero(np.diff(np.signbit(x[1:])))
         halves = crossings.size - 1
         measured = halves / (2 * SAMPLING_STEP * (crossings[-1] - crossings[0]))
-        found = resonance(np.float64(theta.theta1), np.float64(theta.theta3))
+        found = resonance(theta1, theta3)
         assert found == pytest.approx(measured, rel=2 / (crossings[-1] - crossings[0]))
     assert resonance(np.float64(1.0), np.float64(0.1)) == 10.0  # describes no oscillator
 
@@ -220,9 +223,9 @@ def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
     prior = silverbox_prior(spread=spread)
     stds = np.sqrt(np.diag(prior.coefficients_cov))
     twin = SILVERBOX_TWIN
-    believed = to_coefficients(PhysicalParameters(0.95 * twin.m, twin.c, 1.05 * twin.a, twin.b))
-    mean_t1 = (believed.theta1 - prior.coefficients_mean[0]) / stds[0]
-    mean_t3 = (believed.theta3 - prior.coefficients_mean[2]) / stds[2]
+    believed = coefficients_of(difference(), Parameters(m=0.95 * twin.m, c=twin.c, a=1.05 * twin.a, b=twin.b))
+    mean_t1 = (believed[0] - prior.coefficients_mean[0]) / stds[0]
+    mean_t3 = (believed[2] - prior.coefficients_mean[2]) / stds[2]
     row = observation(mean_theta1=mean_t1, mean_theta3=mean_t3)
     natural = np.sqrt(1.05 * twin.a / (0.95 * twin.m)) / (2 * np.pi)
     state, wave = None, []

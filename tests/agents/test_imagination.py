@@ -9,13 +9,13 @@ from agents.design import Known, designer
 from agents.policies.imagination import Terms, mind
 from agents.policies.pursuit import pursuit
 from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment
+from estimator.belief import Belief
 from estimator.engine.imagination import LOST, imagination
 from estimator.lanes import LANES
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM
-from estimator.posterior import Belief
 from estimator.priors import weak_prior
 
 DECAY = Model("decay", {"x": "V"}, {"rate": "1"}, noise=("1",), outputs={"y": "x"}, rates=("u - rate*x",))

@@ -11,13 +11,13 @@ from estimator.information import cramer_rao, fisher_information
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
 from estimator.physical import coefficients_of, to_physical
-from estimator.priors import named_prior
+from estimator.priors import silverbox_prior
 
 TRACK, SYSTEMS, SAMPLES = "duffing_env/Amplitude-v0", 16, 256
 TIME = SAMPLING_STEP * np.arange(SAMPLES)
 NOISES = (5e-4, 5e-4)
 MODEL = difference()
-PRIOR = named_prior("silverbox_twin", MODEL)
+PRIOR = silverbox_prior(MODEL)
 
 
 def bank(rng):

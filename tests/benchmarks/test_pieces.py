@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.environments import TRACK, vector_steps
 from benchmarks.pieces import NOISE, SAMPLES, EstimatorOnly, experiment_of, play
-from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, to_coefficients
+from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, coefficients_of, difference
 from estimator.lanes import LANES
 
 
@@ -24,11 +24,11 @@ def test_the_estimator_alone_is_the_estimator(factorisation: str, iterations: in
 
 def test_the_plant_alone_is_the_twin() -> None:
     data = play(1)
-    truth = to_coefficients(SILVERBOX_TWIN)
+    theta1, theta2, theta3, eta = coefficients_of(difference(), SILVERBOX_TWIN)
     x, last, u = data.outputs[1:-1], data.outputs[:-2], data.inputs[2:]
-    residual = data.outputs[2:] - (truth.theta1 * x + truth.theta2 * x**3 + truth.theta3 * last + truth.eta * u)
+    residual = data.outputs[2:] - (theta1 * x + theta2 * x**3 + theta3 * last + eta * u)
     # The process noise, and three measurement noises with their weights.
-    expected = NOISE * np.sqrt(1 + 1 + truth.theta1**2 + truth.theta3**2)
+    expected = NOISE * np.sqrt(1 + 1 + theta1**2 + theta3**2)
     assert np.std(residual) == pytest.approx(expected, rel=0.1)
 
 

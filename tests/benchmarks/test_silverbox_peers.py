@@ -14,7 +14,7 @@ from benchmarks.silverbox import MODELS, OFFLINE, PEERS, Contender
 from benchmarks.timing import Result
 from duffing_env.silverbox import Regime
 from estimator import OnlineEstimator
-from estimator.posterior import Belief
+from estimator.belief import Belief
 
 
 def time(*values: float) -> Result:

@@ -15,7 +15,7 @@ from duffing_env.batch import spawn_seeds
 from duffing_env.continuous import ContinuousEnv
 from duffing_env.rewards import REWARDS
 from duffing_env.vector_env import ContinuousVectorEnv
-from estimator.posterior import Belief
+from estimator.belief import Belief
 
 TRACK = "duffing_env/Continuous-v0"
 # Random inputs end about half of such episodes at the limit, the others at the horizon.

@@ -16,8 +16,8 @@ from rounding import U32
 from twin import PAIRS, to_coefficients
 
 from duffing_env.env import DuffingEnv
-from estimator import PhysicalParameters
-from estimator.posterior import Belief
+from estimator import Parameters
+from estimator.belief import Belief
 
 TRACK = "duffing_env/Amplitude-v0"
 FACTORISATIONS = ("structured", "mean_field")
@@ -276,7 +276,7 @@ def test_numbers_that_are_not_finite_end_the_episode_flagged(factorisation, rewa
     assert info["information_gain"] == info["log_posterior_gain"] == 0.0
     assert observation in env.observation_space
     assert same(info["belief"], before)
-    assert isinstance(info["truth"], PhysicalParameters)
+    assert isinstance(info["truth"], Parameters)
     observation, _ = env.reset()
     assert observation in env.observation_space
     assert np.isfinite(env.step([0.5])[1])

@@ -12,7 +12,7 @@ from duffing_env.replay import ReplayExperiment
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
-from estimator.priors import log_uniform_moments, named_prior, weak_prior
+from estimator.priors import log_uniform_moments, published_run_prior, weak_prior
 
 BAD = [
     ("factorisation", ["meanfield", None, [], 1]),
@@ -41,10 +41,12 @@ BAD_REPLAY = [
 ]
 
 
-def prior_of(model, twin, spread=0.3, process_noise=5e-4, measurement_noise=5e-4, noise_shape=2.0, **others):
+def prior_of(
+    model, twin, spread=0.3, process_noise=5e-4, measurement_noise=5e-4, noise_shape=2.0, factorisation="structured"
+):
     """The weak prior that fits oscillators about a twin."""
     moments = log_uniform_moments(model, {name: getattr(twin, name) for name in "mcab"}, spread)
-    return weak_prior(model, *moments, process_noise, measurement_noise, noise_shape, **others)
+    return weak_prior(model, *moments, process_noise, measurement_noise, noise_shape).factorised(factorisation)
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in BAD for value in values])
@@ -163,5 +165,5 @@ def test_a_replay_is_told_of_the_record(record):
     assert setup.horizon == experiment.samples == len(record.multisine.u) - 1
     assert ReplayExperiment(input_delay=0, regime="arrow").samples == len(record.arrow.u)
     np.testing.assert_array_equal(experiment.recorded, (record.multisine.u, record.multisine.y))
-    assert experiment.believed == named_prior("published_run", difference("linear"))
+    assert experiment.believed == published_run_prior(model=difference("linear"))
     assert ReplayExperiment(factorisation="mean_field", as_published=True).setup.as_published

@@ -13,8 +13,8 @@ from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.models.pendulum import PENDULUM, STEP
+from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
-from estimator.truth import Parameters
 
 # Random inputs end some such episodes at the limit, the others at the horizon.
 BOTH_ENDS = {"max_input": 5.0, "max_output": 0.5, "horizon": 30}

@@ -18,7 +18,7 @@ from duffing_env.own_plant import PlantEnv
 from duffing_env.rewards import REWARDS
 from estimator.models.difference import difference
 from estimator.models.pendulum import PENDULUM
-from estimator.priors import named_prior, weak_prior
+from estimator.priors import silverbox_prior, weak_prior
 
 TRACK = "duffing_env/Plant-v0"
 
@@ -205,7 +205,7 @@ def test_bad_arguments_are_refused_with_a_remedy(plant, options, message):
 
 
 def test_a_prior_of_ones_own_is_where_episodes_start():
-    twin = named_prior("silverbox_twin", difference())
+    twin = silverbox_prior()
     prior = weak_prior(twin.model, twin.coefficients_mean, twin.coefficients_cov / 9, state_std=0.2)
     env = PlantEnv(Difference(), prior=prior)
     env.reset()
@@ -216,7 +216,7 @@ def test_a_prior_of_ones_own_is_where_episodes_start():
 
 def test_a_model_without_the_cubic_term_recovers_from_a_plant_that_fails():
     # Mean field keeps rows of a θ2 that the model does not have: they must not stay NaN.
-    prior = named_prior("silverbox_twin", difference("linear"), "mean_field")
+    prior = silverbox_prior(difference("linear")).factorised("mean_field")
     env = PlantEnv(Scripted([0.01, 1e200]), prior=prior, factorisation="mean_field", max_output=1e300)
     told = []
     for _ in range(2):

@@ -20,11 +20,10 @@ import duffing_env  # noqa: F401  registers the environments
 from duffing_env import rendering
 from duffing_env.rendering import HEIGHT, SPAN, WIDTH, Screen
 from estimator.engine.tasks import belief_names
-from estimator.models.difference import difference
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, propagate_to_physical
-from estimator.priors import named_prior
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN
+from estimator.priors import silverbox_prior
 
-PRIOR = named_prior("silverbox_twin", difference())
+PRIOR = silverbox_prior()
 
 
 def changed(**entries):
@@ -136,7 +135,7 @@ def test_moments_are_those_of_each_belief():
     ]
     means, stds = rendering._physical_moments(beliefs)
     for k, belief in enumerate(beliefs[:2]):
-        mean, cov = propagate_to_physical(belief.coefficients_mean, belief.coefficients_cov)
+        mean, cov = belief.physical()
         np.testing.assert_allclose(means[:, k], mean)
         np.testing.assert_allclose(stds[:, k], np.sqrt(np.diag(cov)))
     assert np.isnan(means[:, 2:]).all()

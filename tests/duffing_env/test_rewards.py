@@ -10,12 +10,12 @@ from duffing_env.kernel import _pay
 from duffing_env.layout import layout_of
 from duffing_env.rewards import REWARDS, check_reward
 from duffing_env.sources import parts
-from estimator import SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters
+from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
+from estimator.belief import Belief
 from estimator.engine.tasks import belief_names
 from estimator.lanes import LANES, lanewise
 from estimator.models.difference import difference
-from estimator.posterior import Belief
-from estimator.priors import named_prior
+from estimator.priors import silverbox_prior
 
 PARAMETERS = ("m", "c", "a", "b")
 COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
@@ -38,7 +38,7 @@ class Lanes:
         self.active, self.nonlinear = ACTIVE[nonlinear], nonlinear
         self.place, self.code = layout_of(self.kind), parts(self.kind)
         self.rows = np.zeros((max(self.place.values()) + 1, LANES))
-        self.prior = named_prior("silverbox_twin", self.model)
+        self.prior = silverbox_prior(self.model)
         self.rows[: len(self.prior.record)] = self.prior.record[:, None]
         self.set_truth(SILVERBOX_TWIN)
         self.appraise()
@@ -94,7 +94,7 @@ def test_appraisal_is_that_of_a_gaussian(seed, nonlinear):
     if not nonlinear:
         mean[1] = cov[1, :] = cov[:, 1] = 0.0
     scales = rng.uniform(0.7, 1.3, 4)
-    truth = PhysicalParameters(*(scales * TWIN))
+    truth = Parameters(zip(PARAMETERS, scales * TWIN, strict=True))
     lanes.set_truth(truth)
     np.testing.assert_allclose([lanes[f"TRUE_{name}"][0] for name in lanes.model.coefficients], lanes.truth, rtol=1e-13)
     lanes.set_coefficients(mean, cov)
@@ -158,7 +158,7 @@ def test_an_input_costs_what_is_asked_for_it():
 
 def test_the_error_of_each_parameter_is_capped():
     lanes = Lanes()
-    far = to_coefficients(PhysicalParameters(*(TWIN * [5.0, 1.0, -1.0, 1.0])))
+    far = to_coefficients(Parameters(zip(PARAMETERS, TWIN * [5.0, 1.0, -1.0, 1.0], strict=True)))
     lanes.set_coefficients(far, lanes.belief.coefficients_cov)
     lanes.appraise()
     np.testing.assert_allclose(lanes["ERROR"], 0.5, rtol=1e-12)  # m and a are off by more than themselves

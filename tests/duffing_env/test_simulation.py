@@ -5,7 +5,7 @@ import numpy as np
 from twin import PARAMETERS, TwinContinuousEnv, TwinEnv, multisine
 
 from duffing_env.simulation import TEST_INPUT
-from estimator import CONTINUOUS_TWIN, SILVERBOX_TWIN, PhysicalParameters
+from estimator import CONTINUOUS_TWIN, SILVERBOX_TWIN, Parameters
 
 SPREAD = 0.3
 
@@ -18,7 +18,7 @@ def corners(center):
         *rng.uniform(0.7, 1.3, (100, 4)),
     ]
     middle = np.array([getattr(center, name) for name in PARAMETERS])
-    return [PhysicalParameters(*(middle * factor)) for factor in factors]
+    return [Parameters(zip("mcab", middle * factor, strict=True)) for factor in factors]
 
 
 def test_the_test_input_is_a_schroeder_multisine():

@@ -22,7 +22,7 @@ from rounding import U32
 from duffing_env.batch import spawn_seeds
 from duffing_env.env import DuffingEnv
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator.posterior import Belief
+from estimator.belief import Belief
 
 TRACK = "duffing_env/Amplitude-v0"
 # Random inputs end about half of such episodes at the limit, the others at the horizon.

@@ -12,7 +12,7 @@ from rounding import U32
 from scipy.special import digamma, gammaln
 
 from duffing_env.rewards import REWARDS
-from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters
+from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.priors import log_uniform_moments, weak_prior
@@ -328,7 +328,7 @@ class TwinEnv:
         self.jump, self.drift = jump, drift
         center = {name: getattr(self.center, name) for name in PARAMETERS}
         moments = log_uniform_moments(self.model, center, spread)
-        prior = weak_prior(self.model, *moments, process_noise, measurement_noise, factorisation=factorisation)
+        prior = weak_prior(self.model, *moments, process_noise, measurement_noise).factorised(factorisation)
         self.first_belief = Moments.of(prior)
 
     def reset(self):
@@ -336,7 +336,7 @@ class TwinEnv:
         low, high = 1.0 - self.spread, 1.0 + self.spread
         factors = [low * (high / low) ** self.stream.uniform() for _ in PARAMETERS]
         drawn = [getattr(self.center, name) * f for name, f in zip(PARAMETERS, factors, strict=True)]
-        self.truth = PhysicalParameters(*drawn)
+        self.truth = Parameters(zip(PARAMETERS, drawn, strict=True))
         self.state = np.zeros(2)
         self.u = self.last_u = self.y = self.spent = 0.0
         self.elapsed = 0
@@ -357,7 +357,7 @@ class TwinEnv:
         self.u = float(np.clip(self.u, -left, left))
         self.spent += self.u**2
         if self.jump and self.elapsed == self.jump_at:
-            self.truth = replace(self.truth, m=self.truth.m * self.jump_factor)
+            self.truth = Parameters({**self.truth, "m": self.truth.m * self.jump_factor})
             self._worth = self._appraise()
         fisher = self._fisher_gain()
         self._move()

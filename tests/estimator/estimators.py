@@ -3,12 +3,12 @@
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, difference, duffing, to_coefficients
+from estimator import SILVERBOX_TWIN, OnlineEstimator, Parameters, Rig, coefficients_of, difference, duffing
 from estimator.models.difference import Term
 from estimator.models.pendulum import PENDULUM
 from estimator.priors import weak_prior
 
-TRUTH = to_coefficients(SILVERBOX_TWIN)
+TRUTH = Parameters(zip(difference().coefficients, coefficients_of(difference(), SILVERBOX_TWIN).tolist(), strict=True))
 
 #: The physical equation as the Silverbox needs it.
 ODE = duffing(offsets=True, feedthrough=True, noise="held")

@@ -13,7 +13,7 @@ from scipy.stats import binom, chi2
 from benchmarks import coverage
 from benchmarks.coverage import HYPOTHESES, LEVEL, Case, Config, evaluate, tables, wilson
 from benchmarks.systems import MAX_INPUT, MODELS, ODE, draw, make_prior, simulate, simulate_ode
-from estimator import SILVERBOX_TWIN, recorded_prior, to_coefficients
+from estimator import SILVERBOX_TWIN, coefficients_of, difference, recorded_prior
 from estimator.models.difference import Term
 
 TAIL = 1e-4  # chance that a calibrated posterior misses one bound of one check
@@ -79,8 +79,8 @@ def test_an_ensemble_mends_wrong_noise_priors(case):
 
 
 def test_systems_that_leave_the_range_are_left_out():
-    psi = to_coefficients(SILVERBOX_TWIN)
-    one = np.array([psi.theta1, psi.theta2, psi.theta3, psi.eta])
+    one = coefficients_of(difference(), SILVERBOX_TWIN)
+    theta1, theta2, theta3, eta = one
     both = np.array([one, one * [1, 1, 1, 50]])
     terms = (Term(1), Term(3), Term(0, 1), Term(tap=0))
     u, y, stayed = simulate(terms, both, 1e-4, 1e-4, 500, np.random.default_rng(0))
@@ -88,7 +88,7 @@ def test_systems_that_leave_the_range_are_left_out():
     assert np.isfinite(y).all()
     x = x_last = 0.0
     for t in range(500):
-        x, x_last = psi.theta1 * x + psi.theta2 * x**3 + psi.theta3 * x_last + psi.eta * u[0, t], x
+        x, x_last = theta1 * x + theta2 * x**3 + theta3 * x_last + eta * u[0, t], x
         assert abs(y[0, t] - x) < 0.02  # but for the noises
     assert np.abs(u).max() <= MAX_INPUT
 
@@ -119,7 +119,7 @@ def test_the_prior_has_the_moments_of_the_draw(model):
 def test_the_physical_equation_moves_as_its_filter_expects():
     """Without noises, a filter that knows the coefficients forecasts every output."""
     from estimator import OnlineEstimator, Rig
-    from estimator.posterior import Belief
+    from estimator.belief import Belief
 
     truth = recorded_prior(ODE).coefficients_mean[None].copy()
     truth[0, 4:] = 2e-3, -0.03, 0.05  # force, y0, d

@@ -6,9 +6,9 @@ from estimators import OWN_TAPS, record
 from scipy.special import logsumexp
 
 from estimator import OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
+from estimator.belief import Belief
 from estimator.ensemble import FARTHEST, LEVELS, displaced, matched_gamma
 from estimator.inference.samples import SWITCHING, weigh
-from estimator.posterior import Belief
 
 RATIOS = 5
 MODELS = {
