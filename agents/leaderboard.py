@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from agents.evaluation import Evaluation, evaluate
+from agents.evaluation import Evaluation
 from estimator.files import write_atomically
 
 FloatArray = npt.NDArray[np.float64]
@@ -79,46 +78,6 @@ METRICS = {
 
 #: What the table of estimators shows.
 ESTIMATOR_METRICS = ("error_m", "error_c", "error_a", "error_b", "coverage", "nees")
-
-
-def compare(
-    policies: Sequence[str],
-    env_id: str,
-    systems: int,
-    options: dict[str, Any],
-    folder: Path,
-    *,
-    seed: int = 0,
-    report: bool = False,
-) -> list[Evaluation]:
-    """Evaluate policies; print the tables, and write ``evaluation.json`` and the figures or the report."""
-    from rich.console import Console
-
-    from agents.figures import draw_contraction, draw_excitations
-
-    console = Console()
-    with console.status("Evaluating") as status:
-        evaluations = evaluate(
-            policies, env_id, systems, seed, options, lambda name: status.update(f"Evaluating {name}")
-        )
-    title = f"{env_id}, {systems} systems"
-    print_table(evaluations, title)
-    print_estimators(evaluations)
-    settings = {"env": env_id, "systems": systems, "seed": seed, "options": options}
-    write_json(folder / "evaluation.json", evaluations, settings)
-    written = ["evaluation.json"]
-    if report:
-        from agents.report import write_report
-
-        write_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
-        written += ["report.html"]
-    else:
-        draw_contraction(folder / "contraction.png", evaluations, title)
-        draw_excitations(folder / "excitations.png", evaluations)
-        written += ["contraction.png", "excitations.png"]
-    for name in written:
-        print(folder / name)
-    return evaluations
 
 
 def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, Any]]:

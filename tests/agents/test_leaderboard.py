@@ -10,9 +10,10 @@ import pytest
 
 import agents.evaluation
 import agents.figures
+from agents.comparison import compare
 from agents.evaluation import Evaluation
 from agents.figures import draw_contraction, draw_excitations, draw_learning_curve
-from agents.leaderboard import ESTIMATOR_METRICS, METRICS, compare, print_estimators, print_table, summarise, write_json
+from agents.leaderboard import ESTIMATOR_METRICS, METRICS, print_estimators, print_table, summarise, write_json
 from estimator import SAMPLING_STEP
 
 # What the table must print for these values, by hand: centre, then both ends of an interval of width zero.
