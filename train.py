@@ -39,8 +39,8 @@ class Config(TrainConfig):
 
 def main(config: Config) -> None:
     """Train, compare, and say where everything is."""
-    from agents.comparison import compare
-    from agents.leaderboard import BASELINES
+    from agents.evaluation.comparison import compare
+    from agents.evaluation.leaderboard import BASELINES
 
     if config.tune:
         best = tune(config, config.tune)

@@ -16,8 +16,8 @@ import numpy as np
 from scipy import stats
 
 from agents.cli import run_script
-from agents.evaluation import roll_out
-from agents.leaderboard import METRICS, center_and_interval
+from agents.evaluation.leaderboard import METRICS, center_and_interval
+from agents.evaluation.rollout import roll_out
 from agents.policies import POLICIES, trained_policies
 from estimator.files import write_atomically
 from estimator.physical import coefficients_of

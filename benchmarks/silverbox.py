@@ -18,7 +18,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from agents.silverbox_protocol import (
+from agents.studies.silverbox_protocol import (
     GIVEN,
     LENGTHS,
     SETTINGS,
@@ -31,7 +31,7 @@ from agents.silverbox_protocol import (
     samples_until_close,
     simulation_error,
 )
-from agents.silverbox_results import submission
+from agents.studies.silverbox_results import submission
 from benchmarks.peer_process import NotAvailable, Peers
 from benchmarks.report import ratio
 from benchmarks.timing import Result, Row, measure, timed

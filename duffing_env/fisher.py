@@ -12,7 +12,7 @@ from typing import Any
 from duffing_env.expectation import imagined_sample
 from duffing_env.layout import Kind, layout_of
 from duffing_env.rewards import Hooks, nothing
-from estimator.engine.tasks import belief_names
+from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, jit
 
 

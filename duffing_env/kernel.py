@@ -20,7 +20,7 @@ from duffing_env.inference import updater
 from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, observation_bounds, parameter_names, unpacker
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
-from estimator.engine.tasks import belief_names
+from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, at_lane, jit, kernel, lanewise, part
 
 #: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.

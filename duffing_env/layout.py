@@ -1,7 +1,7 @@
 """What an experiment is compiled for, the rows of its block, and what its kernel is told.
 
 Environments lie in blocks of `estimator.lanes.LANES`. A block holds the rows of the estimator first
-(`estimator.engine.tasks.layout`), then those of the plant and of the episode.
+(`estimator.engine.rows.layout`), then those of the plant and of the episode.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
-from estimator.engine.tasks import belief_names, carried_names, layout, trace_names
+from estimator.engine.rows import belief_names, carried_names, layout, trace_names
 from estimator.lanes import inlined, rows
 from estimator.models.difference import difference
 from estimator.models.model import Model

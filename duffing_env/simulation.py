@@ -20,7 +20,7 @@ import numpy as np
 from duffing_env.layout import Kind, layout_of
 from duffing_env.rewards import Hooks, nothing
 from estimator.engine.feeding import feeder
-from estimator.engine.tasks import input_rows
+from estimator.engine.rows import input_rows
 from estimator.lanes import LANES, jit
 from estimator.parameters import FloatArray
 

@@ -11,7 +11,8 @@ from typing import Any
 from duffing_env.layout import Kind, inputs_of, layout_of, observation_bounds, parameter_names
 from duffing_env.rewards import REWARDS
 from estimator.engine import cache as stored
-from estimator.engine.tasks import NAMES, belief_names
+from estimator.engine.rows import belief_names
+from estimator.engine.tasks import NAMES
 from estimator.lanes import LANES, inlined, source_digest
 from estimator.models.model import Model
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from estimator.engine.tasks import belief_names
+from estimator.engine.rows import belief_names
 from estimator.models.model import Model
 from estimator.parameters import SAMPLING_STEP, FloatArray
 from estimator.physical import propagate
@@ -43,7 +43,7 @@ class Belief:
 
     Attributes:
         model: whose states and coefficients these are.
-        record: (size,) the numbers, as `estimator.engine.tasks.belief_names` orders them: means, the upper triangle of
+        record: (size,) the numbers, as `estimator.engine.rows.belief_names` orders them: means, the upper triangle of
             the covariance row by row, shape and rate of γ, then of each sensor's ξ. Time is counted in samples.
         step: sampling step [s], for physical parameters.
         factorisation: of the inference that made it; ``mean_field`` is the paper's.

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from estimator.engine import cache as stored
 from estimator.engine.feeding import feeder, input_degree
-from estimator.engine.tasks import NAMES, input_rows
+from estimator.engine.rows import input_rows
+from estimator.engine.tasks import NAMES
 from estimator.lanes import kernel, rows
 from estimator.models.model import Model
 from estimator.parameters import FloatArray

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.engine import tasks
+from estimator.engine.rows import belief_names
 from estimator.inference import DEFAULT_ITERATIONS, mean_field
 from estimator.inputs import channel, degree
 from estimator.lanes import LANES, kernel
@@ -75,7 +76,7 @@ def _compiled(model: Model, degree: int, factorisation: str) -> Any:
         place, update_all = dict(task.layout), task.update
     is_structured = factorisation == "structured"
     u_row, y_row = place["U_0"] * LANES, place[f"Y_{next(iter(model.outputs))}"] * LANES
-    height, size = len(place), len(tasks.belief_names(model))
+    height, size = len(place), len(belief_names(model))
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}_{factorisation}")
     def run(inputs, outputs, lengths, prior, stencil, records):

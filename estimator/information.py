@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.engine.feeding import feeder, input_degree
-from estimator.engine.tasks import input_rows, path, path_results
+from estimator.engine.rows import input_rows, path_results
+from estimator.engine.tasks import path
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
 from estimator.parameters import SAMPLING_STEP, FloatArray

@@ -5,7 +5,7 @@
 | ``square-believed`` | square wave at the linear resonance of the posterior's mean | a moving line, odd harmonics |
 | ``velocity-sign`` | ±limit with the sign of the believed velocity | the resonance of that amplitude |
 
-Velocity and resonance are those of any model (`agents.policies.motion`): of Eq. (2) x_t - x_{t-1} and the angle of the
+Velocity and resonance are those of any model (`agents.planner.motion`): of Eq. (2) x_t - x_{t-1} and the angle of the
 poles, of Eq. (1) x' and the square root of the stiffness over the mass, but for the damping.
 
 Both give ±amplitude: the amplitude limit, or the budget's RMS where that is smaller. Both brake, giving the input
@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.planner.motion import places, survey
 from agents.policies.excitations import BAND
-from agents.policies.motion import places, survey
 from agents.policies.signals import Limits, limits_of
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from estimator.parameters import SAMPLING_STEP

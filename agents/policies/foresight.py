@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.motion import View, places, regressors, scales, typical_gain
+from agents.planner.motion import View, places, regressors, scales, typical_gain
 from agents.policies.prospects import Outlook, look_at
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference

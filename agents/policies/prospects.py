@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from agents.design import half_log_det, invert
-from agents.policies.motion import View, places
+from agents.planner.design import half_log_det, invert
+from agents.planner.motion import View, places
 from duffing_env.layout import observation_bounds
 from estimator.engine.motion import motion
 from estimator.lanes import jit, kernel, part

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from agents.evaluation import make
+from agents.evaluation.batch import make
 from agents.policies import make_policy
 from agents.policies.foresight import Foresight
 from agents.policies.prospects import BOUND, EXPECTED, feature_names

@@ -12,7 +12,8 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 from estimator.engine import cache as stored
-from estimator.engine.tasks import NAMES, input_rows, path_names, path_results
+from estimator.engine.rows import input_rows, path_names, path_results
+from estimator.engine.tasks import NAMES
 from estimator.lanes import inlined
 from estimator.models.model import Model
 

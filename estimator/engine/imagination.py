@@ -14,7 +14,8 @@ from itertools import combinations_with_replacement, pairwise
 from typing import Any
 
 from estimator.engine import cache as stored
-from estimator.engine.tasks import NAMES, carried_names
+from estimator.engine.rows import carried_names
+from estimator.engine.tasks import NAMES
 from estimator.lanes import LANES, rows
 from estimator.models.model import Model
 

@@ -20,7 +20,8 @@ from typing import Any
 
 from estimator.engine import cache as stored
 from estimator.engine.imagination import coarsened, fed, inputs_of
-from estimator.engine.tasks import NAMES, carried_names
+from estimator.engine.rows import carried_names
+from estimator.engine.tasks import NAMES
 from estimator.lanes import rows
 from estimator.models.model import Model
 

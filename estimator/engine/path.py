@@ -7,7 +7,7 @@ import sympy as sp
 from estimator.engine.algebra import HALF, ZERO
 from estimator.engine.derive import Assignments, Moved, calculus, input_at_end, pair, symbol
 from estimator.engine.emit import text_of
-from estimator.engine.tasks import path_results
+from estimator.engine.rows import path_results
 from estimator.models.model import Model
 
 
@@ -18,7 +18,7 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
 
         V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
 
-    Names besides `tasks.path_names` and `tasks.path_results`: ``Q``, ``R_<sensor>`` and ``LIVE``, 0 where the series is
+    Names besides `path_names` and `path_results` of `estimator.engine.rows`: ``Q``, ``R_<sensor>`` and ``LIVE``, 0 where the series is
     over.
 
     Args:

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 
 from estimator import elementary
 from estimator.engine import cache as stored
+from estimator.engine.rows import layout, path_layout, point_names, trace_names
 from estimator.lanes import LANES, inlined, rows
 from estimator.models.model import Model
 
@@ -31,39 +31,6 @@ NAMES = {
     "sqrt": sqrt, "log": elementary.log,
     **{name: getattr(elementary, name) for name in ("sin", "cos", "exp", "tanh")},
 }  # fmt: skip
-
-
-def belief_names(model: Model) -> list[str]:
-    """The flat record of a belief: means, upper triangle of the covariance, shapes and rates of the noises."""
-    covariances = [f"P_{i}_{j}" for i, j in combinations_with_replacement(model.names, 2)]
-    return [*model.names, *covariances, *noise_names(model)]
-
-
-def noise_names(model: Model) -> list[str]:
-    """Names of the noises' Gamma beliefs: γ first, then ξ of each sensor."""
-    return ["GAMMA_SHAPE", "GAMMA_RATE", *(f"XI_{part}_{y}" for y in model.outputs for part in ("SHAPE", "RATE"))]
-
-
-def input_rows(model: Model, degree: int) -> list[str]:
-    """The input over a sample: taps of a difference equation, or coefficients of the polynomial in τ."""
-    return [f"U_{k}" for k in range(model.taps if not model.is_continuous else degree + 1)]
-
-
-def carried_names(model: Model) -> list[str]:
-    """What a differential equation carries over a sample; nothing for a difference equation."""
-    if not model.is_continuous:
-        return []
-    names = [f"M_{i}" for i in model.states]
-    names += [f"S_{i}_{j}" for i in model.states for j in model.movers]
-    if model.held:
-        return [*names, *(f"D_{i}" for i in model.states)]
-    return [*names, *(f"N_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2))]
-
-
-def layout(model: Model, degree: int) -> dict[str, int]:
-    """Rows of an estimator's block: the belief, the sample, and what is carried over it."""
-    outputs = [f"Y_{y}" for y in model.outputs]
-    return rows(" ".join([*belief_names(model), *input_rows(model, degree), *outputs, *carried_names(model)]))
 
 
 @dataclass(frozen=True)
@@ -165,16 +132,6 @@ def _structured(
     return Update(code.update, place, lanes, tuple(traced), code.spread if points else None)
 
 
-def point_names(model: Model) -> list[str]:
-    """Rows of the sigma points (`estimator.engine.points`)."""
-    columns, movers = range(len(model.movers)), model.movers
-    names = [*movers, *(i for i in model.names if i not in movers)]
-    images = [f"I_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
-    at_point = [f"X_{i}" for i in movers if i not in model.states]
-    return [*(f"L_{c}_{i}" for c in columns for i in names), *(f"WEIGHT_{c}" for c in columns), *at_point, *images,
-            "UNSOUND"]  # fmt: skip
-
-
 def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
     """Source of ``spread(W)``, and of ``update(W)`` that takes all points through the sample."""
     from estimator.engine import derive, emit, points
@@ -215,15 +172,6 @@ def _looped(model: Model, before: str, body: str) -> str:
     return head + body + "    finish(W)\n"
 
 
-def trace_names(model: Model, iterations: int) -> list[str]:
-    """Rows that `structured` leaves for the free energy, per sensor."""
-    names = []
-    for k in range(model.n_outputs):
-        names += [f"TRACE_{k}_{what}" for what in ("mean", "innovation", "variance", "shown")]
-        names += [f"TRACE_{k}_{what}_{i}" for i in range(iterations) for what in ("q", "r")]
-    return names
-
-
 def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
     """Source of ``begin(W)`` and ``move(W, T)``, which carry a state over a sample; empty for a difference equation."""
     from estimator.engine import derive, emit
@@ -262,25 +210,6 @@ class Path:
     sample: Any
     layout: Mapping[str, int]
     lanes: int
-
-
-def path_names(model: Model) -> list[str]:
-    """Where a path is: the filter's state, its covariance V, and its sensitivities Z to the coefficients."""
-    covariances = [f"V_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2)]
-    return [*model.states, *covariances, *(f"Z_{i}_{c}" for i in model.states for c in model.coefficients)]
-
-
-def path_results(model: Model) -> list[str]:
-    """What a path adds up: minus the log likelihood, its slope, and the information (upper triangle)."""
-    information = [f"F_{c}_{d}" for c, d in combinations_with_replacement(model.coefficients, 2)]
-    return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *information]
-
-
-def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
-    """Rows of a path's block."""
-    shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
-    given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE"]
-    return rows(" ".join([*path_names(model), *path_results(model), *given, *carried_names(model)]))
 
 
 @cache

@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
-from estimator.engine import tasks
 from estimator.engine.cache import digest_of
+from estimator.engine.rows import layout as layout_of_update
 from estimator.lanes import LANES, at_lane, inlined, jit, lanewise, part, rows
 from estimator.models.difference import difference
 
@@ -93,7 +93,7 @@ def updater(place: Mapping[str, int]) -> Any:
 
 def layout() -> dict[str, int]:
     """Rows of a block: those of the paper's model, and `SCRATCH`."""
-    place = tasks.layout(difference(), 0)
+    place = layout_of_update(difference(), 0)
     return place | rows(" ".join(SCRATCH), start=len(place))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from estimator.engine import tasks
 from estimator.engine.cache import digest_of
 from estimator.engine.free_energy import free_energies
+from estimator.engine.rows import belief_names
 from estimator.inference import mean_field
 from estimator.lanes import LANES, jit, kernel, part
 from estimator.models.difference import difference
@@ -175,7 +176,7 @@ def _loop(kind: str, model: Model, place: Mapping[str, int], lanes: int, scratch
     u_row = place["U_0"] * lanes
     y_row = place[f"Y_{next(iter(model.outputs))}"] * lanes
     walks = tuple(place[f"P_{c}_{c}"] * lanes for c in model.coefficients)
-    size = len(tasks.belief_names(model)) * lanes
+    size = len(belief_names(model)) * lanes
 
     @part(kind)
     def feed(W, window, stencil, output, walk, changes):

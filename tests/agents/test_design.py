@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.ascent import Limits, climber
-from agents.design import Known, designer, half_log_det, invert
+from agents.planner.ascent import Limits, climber
+from agents.planner.design import Known, designer, half_log_det, invert
 from estimator import SILVERBOX_TWIN, silverbox_prior
 from estimator.engine.gradient import pieces
 from estimator.information import fisher_information

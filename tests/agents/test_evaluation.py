@@ -10,10 +10,11 @@ import rounding
 from safetensors.numpy import load_file
 from stable_baselines3 import PPO
 
-import agents.evaluation
-import agents.metrics
+import agents.evaluation.metrics
+import agents.evaluation.rollout
 from agents import make_policy
-from agents.evaluation import evaluate, make
+from agents.evaluation.batch import make
+from agents.evaluation.rollout import evaluate
 from agents.policies.learned import WEIGHTS, load_policy, save_policy
 from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
@@ -32,7 +33,7 @@ QUANTILES = {"coverage_50": 0.6744897501960817, "coverage": 1.6448536269514722, 
 
 @pytest.fixture
 def without_record(monkeypatch):
-    monkeypatch.setattr(agents.evaluation, "record_available", lambda: False)
+    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: False)
 
 
 def true_coefficients(truth):
@@ -210,7 +211,7 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
 
 
 def test_what_a_jump_of_the_truth_takes_away_is_counted(monkeypatch):
-    monkeypatch.setattr(agents.evaluation, "record_available", lambda: True)
+    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: True)
     (evaluation,) = evaluate(["prbs"], DRIFT, SYSTEMS, SEED, options={"horizon": HORIZON})
     choose, steepest = act("prbs", {"horizon": HORIZON}), []
     for row, seed in enumerate(spawn_seeds(SEED, SYSTEMS)):
@@ -302,8 +303,8 @@ def test_the_arrow_error_is_that_of_free_runs_over_the_record(record):
 def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverges):
     rng = np.random.default_rng(0)
     arrow = Regime("arrow", scale * rng.uniform(-1, 1, 80), 0.01 * rng.normal(size=80))
-    monkeypatch.setattr(agents.evaluation, "record_available", lambda: True)
-    monkeypatch.setattr(agents.metrics, "load_record", lambda: SimpleNamespace(arrow=arrow))
+    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: True)
+    monkeypatch.setattr(agents.evaluation.metrics, "load_record", lambda: SimpleNamespace(arrow=arrow))
     options = {"horizon": HORIZON, "max_output": 2.0}
     (evaluation,) = evaluate(["uniform"], systems=SYSTEMS, seed=SEED, options=options)
     if diverges:

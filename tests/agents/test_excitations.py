@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import agents.figures
+import agents.evaluation.figures
 from agents import make_policy
 from agents.policies.excitations import EXCITATIONS, LEVELS, resonance
 from agents.policies.export import draw_signal, export_signal
@@ -346,8 +346,8 @@ def test_export_from_the_command_line(tmp_path):
 
 def test_figure_shows_every_policy(tmp_path, monkeypatch):
     shown = {}
-    monkeypatch.setattr(agents.figures, "_save", lambda figure, path: shown.update({path: figure}))
-    agents.figures.draw_policies(tmp_path / "policies.png", systems=2, samples=64)
+    monkeypatch.setattr(agents.evaluation.figures, "_save", lambda figure, path: shown.update({path: figure}))
+    agents.evaluation.figures.draw_policies(tmp_path / "policies.png", systems=2, samples=64)
     axes = shown[tmp_path / "policies.png"].axes
     titles = [each.get_title(loc="left") for each in axes]
     assert [title for title in titles if title] == [*EXCITATIONS, *FEEDBACK]

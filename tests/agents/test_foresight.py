@@ -15,7 +15,7 @@ from rounding import U32, play
 from safetensors.numpy import load_file, save_file
 
 from agents import make_policy
-from agents.evaluation import make
+from agents.evaluation.batch import make
 from agents.policies import TRAINED
 from agents.policies.foresight import Foresight
 from agents.policies.learned import load_policy
@@ -415,7 +415,8 @@ def test_rewards_that_count_no_information_stay_as_they_are():
 
 def test_the_example_brings_about_as_much_as_the_oracle():
     """In the volume of what a sample tells, within a factor of two."""
-    from agents.oracle import Oracle, Systems
+    from agents.evaluation.oracle import Oracle
+    from agents.evaluation.oracle_task import Systems
     from estimator import fisher_information
 
     systems = Systems.of(AMPLITUDE, 32)

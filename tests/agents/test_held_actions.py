@@ -6,7 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation import evaluate, make
+from agents.evaluation.batch import make
+from agents.evaluation.rollout import evaluate
 from agents.policies import make_policy
 from estimator import SAMPLING_STEP
 
@@ -72,7 +73,7 @@ def test_the_planner_refuses_and_says_what_to_do():
 
 
 def test_every_sample_is_evaluated(monkeypatch):
-    monkeypatch.setattr("agents.evaluation.record_available", lambda: False)
+    monkeypatch.setattr("agents.evaluation.rollout.record_available", lambda: False)
     options = {"hold": HOLD, "horizon": 50, "max_output": 0.3}
     (evaluation,) = evaluate(["uniform"], systems=6, seed=5, options=options)
     envs = make(TRACK, 6, options)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.design import Known, designer
-from agents.policies.imagination import Terms, mind
-from agents.policies.pursuit import pursuit
+from agents.planner.design import Known, designer
+from agents.planner.imagination import Terms, mind
+from agents.planner.pursuit import pursuit
 from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment
 from estimator.belief import Belief
 from estimator.engine.imagination import LOST, imagination

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from agents import oracle as module
-from agents import oracle_task
-from agents.evaluation import evaluate
-from agents.oracle import Config, Oracle, Systems, as_stored, design, main, search
+from agents.evaluation import oracle_search as module
+from agents.evaluation import oracle_task
+from agents.evaluation.oracle import Oracle, as_stored
+from agents.evaluation.oracle_search import Config, design, main, search
+from agents.evaluation.oracle_task import Systems
+from agents.evaluation.rollout import evaluate
 
 SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Continuous-v0"
 STORED = [SHORT, POWER, "duffing_env/Amplitude-v0", "duffing_env/Output-v0"]

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import duffing_env
+from agents.planner.motion import View, scales
+from agents.planner.policy import Planner
 from agents.policies import make_policy
-from agents.policies.motion import View, scales
-from agents.policies.planner import Planner
 from duffing_env.experiment import SimulatedExperiment
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import silverbox_protocol as module
-from agents import silverbox_results as reporting
-from agents import silverbox_selection as selection
-from agents.silverbox_protocol import GIVEN, SETTINGS, TESTS, Outcome
+from agents.studies import silverbox_protocol as module
+from agents.studies import silverbox_results as reporting
+from agents.studies import silverbox_selection as selection
+from agents.studies.silverbox_protocol import GIVEN, SETTINGS, TESTS, Outcome
 from duffing_env.silverbox import Regime, SilverboxRecord, synthesise_multisine
 
 ROOT = Path(__file__).parents[2]

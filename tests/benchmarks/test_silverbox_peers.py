@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.silverbox_protocol import LENGTHS, SETTINGS, TESTS, TRAINING_SAMPLES, Outcome, Sections, evaluate
+from agents.studies.silverbox_protocol import LENGTHS, SETTINGS, TESTS, TRAINING_SAMPLES, Outcome, Sections, evaluate
 from benchmarks import peer_process, silverbox, silverbox_peers
 from benchmarks.peer_process import NotAvailable, Peers
 from benchmarks.silverbox import MODELS, OFFLINE, PEERS, Contender
@@ -120,9 +120,9 @@ def test_a_peer_that_answers_our_means_gets_our_errors(
 ) -> None:
     ours = MODELS[name]
     lengths = (500, 3000)
-    monkeypatch.setattr("agents.silverbox_protocol.LENGTHS", lengths)
-    monkeypatch.setattr("agents.silverbox_protocol.TRAINING_SAMPLES", 3000)
-    monkeypatch.setattr("agents.silverbox_protocol.TIMINGS", 1)
+    monkeypatch.setattr("agents.studies.silverbox_protocol.LENGTHS", lengths)
+    monkeypatch.setattr("agents.studies.silverbox_protocol.TRAINING_SAMPLES", 3000)
+    monkeypatch.setattr("agents.studies.silverbox_protocol.TIMINGS", 1)
     monkeypatch.setattr(silverbox, "LENGTHS", lengths)
     monkeypatch.setattr(silverbox, "TRAINING_SAMPLES", 3000)
     outcome = evaluate(SETTINGS[ours], sections)

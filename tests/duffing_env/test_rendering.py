@@ -19,7 +19,7 @@ from scipy import stats
 import duffing_env  # noqa: F401  registers the environments
 from duffing_env import rendering
 from duffing_env.rendering import HEIGHT, SPAN, WIDTH, Screen
-from estimator.engine.tasks import belief_names
+from estimator.engine.rows import belief_names
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN
 from estimator.priors import silverbox_prior
 

@@ -12,7 +12,7 @@ from duffing_env.rewards import REWARDS, check_reward
 from duffing_env.sources import parts
 from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.belief import Belief
-from estimator.engine.tasks import belief_names
+from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, lanewise
 from estimator.models.difference import difference
 from estimator.priors import silverbox_prior

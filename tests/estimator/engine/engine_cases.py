@@ -8,6 +8,7 @@ import numpy as np
 from engine_reference import EPS, Belief, Plant
 
 from estimator.engine import tasks
+from estimator.engine.rows import input_rows
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -152,7 +153,7 @@ def random_belief(case: Case, rng: np.random.Generator, width: float = 0.1) -> B
 
 def random_inputs(case: Case, rng: np.random.Generator) -> np.ndarray:
     """Taps, or coefficients of the polynomial."""
-    return 0.5 * rng.standard_normal(len(tasks.input_rows(case.model, case.degree)))
+    return 0.5 * rng.standard_normal(len(input_rows(case.model, case.degree)))
 
 
 def put(W: np.ndarray, layout, lanes: int, lane: int, values: dict[str, float]) -> None:

@@ -6,6 +6,7 @@ from engine_cases import CASES, FIVE, block, interpreted, put, random_inputs
 from engine_reference import EPS, moved, path, spread
 
 from estimator.engine import gradient, tasks
+from estimator.engine.rows import input_rows
 
 SAMPLES = 12
 #: Variances of unit process noise and of the sensors.
@@ -37,7 +38,7 @@ def start(case, layout, z, V, c, W, lane=0, lanes=1):
 
 
 def feed(case, layout, taps, y, W, lane=0, lanes=1):
-    values = dict(zip(tasks.input_rows(case.model, case.degree), taps, strict=True))
+    values = dict(zip(input_rows(case.model, case.degree), taps, strict=True))
     if y is not None:
         values |= dict(zip((f"Y_{s}" for s in case.model.outputs), y, strict=True))
     put(W, layout, lanes, lane, values)

@@ -9,16 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from agents import metrics
+from agents.evaluation import metrics
+from agents.evaluation.batch import make
 from agents.policies import make_policy
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
-from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 from estimator.identify import identify
 from estimator.maximum_a_posteriori import maximum_a_posteriori
@@ -42,7 +41,7 @@ class Evaluation:
 
     Attributes:
         policy: its name, or that of the recipe.
-        metrics: name of a metric to its value for each system (systems,); see `agents.leaderboard.METRICS`.
+        metrics: name of a metric to its value for each system (systems,); see `agents.evaluation.leaderboard.METRICS`.
         curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats]; what a jump of the
             truth takes away is in it.
         inputs: (horizon, systems) inputs that the plant was given [V], NaN after the end of an episode.
@@ -169,13 +168,6 @@ def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str
         _, twins, _, _ = roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
         found["arrow_rmse"] = metrics.arrow_errors(np.array([twin.coefficients_mean for twin in twins]))
     return evaluation
-
-
-def make(env_id: str, systems: int, options: dict[str, Any] | None = None) -> DuffingVectorEnv:
-    """A batch of a track."""
-    envs = gym.make_vec(env_id, num_envs=systems, vectorization_mode="vector_entry_point", **(options or {}))
-    assert isinstance(envs, DuffingVectorEnv)
-    return envs
 
 
 def roll_out(

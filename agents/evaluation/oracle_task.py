@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.ascent import climber
-from agents.design import Known
-from agents.evaluation import make
-from agents.plants import plant_of
+from agents.evaluation.batch import make
+from agents.planner.ascent import climber
+from agents.planner.design import Known
+from agents.planner.plants import plant_of
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.engine.feeding import input_degree
@@ -23,7 +23,7 @@ from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 
-FOLDER = Path(__file__).parent / "oracles"
+FOLDER = Path(__file__).parents[1] / "oracles"
 
 
 @dataclass(frozen=True)

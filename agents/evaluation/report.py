@@ -13,9 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.evaluation import Evaluation
-from agents.figures import figure_of_calibration, figure_of_contraction, figure_of_information, figure_of_inputs
-from agents.leaderboard import ESTIMATOR_METRICS, METRICS, caption_of, cell_of, in_order, summarise
+from agents.evaluation.figures import (
+    figure_of_calibration,
+    figure_of_contraction,
+    figure_of_information,
+    figure_of_inputs,
+)
+from agents.evaluation.leaderboard import ESTIMATOR_METRICS, METRICS, caption_of, cell_of, in_order, summarise
+from agents.evaluation.rollout import Evaluation
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:

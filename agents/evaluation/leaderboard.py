@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from agents.evaluation import Evaluation
+from agents.evaluation.rollout import Evaluation
 from estimator.files import write_atomically
 
 FloatArray = npt.NDArray[np.float64]

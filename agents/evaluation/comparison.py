@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation import Evaluation, evaluate
-from agents.leaderboard import print_estimators, print_table, write_json
+from agents.evaluation.leaderboard import print_estimators, print_table, write_json
+from agents.evaluation.rollout import Evaluation, evaluate
 
 
 def compare(
@@ -36,12 +36,12 @@ def compare(
     write_json(folder / "evaluation.json", evaluations, settings)
     written = ["evaluation.json"]
     if report:
-        from agents.report import write_report
+        from agents.evaluation.report import write_report
 
         write_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
         written += ["report.html"]
     else:
-        from agents.figures import draw_contraction, draw_excitations
+        from agents.evaluation.figures import draw_contraction, draw_excitations
 
         draw_contraction(folder / "contraction.png", evaluations, title)
         draw_excitations(folder / "excitations.png", evaluations)

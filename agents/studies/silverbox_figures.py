@@ -13,7 +13,7 @@ from estimator import duffing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from agents.silverbox_protocol import Outcome
+    from agents.studies.silverbox_protocol import Outcome
 
 _COLOURS = {
     "paper as published": "#000000",

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from agents.cli import progress_bar
-from agents.silverbox_protocol import (
+from agents.studies.silverbox_protocol import (
     SETTINGS,
     TRAINING_SAMPLES,
     Setting,

@@ -2,9 +2,9 @@
 
 When energy is short, what matters is when to spend it: the best input rests, and then drives the oscillator up at its
 own frequency in one burst. No short horizon sees that. So the plan is for all samples that are left, and climbs the
-worth (`agents.design`) of what follows from the belief: its means as the truth, its covariance as Λ⁻¹, and the state's
-part in that as the sensitivities and the filter's covariance to start with. By the Kalman filter's separation of state
-and parameters this is the same belief propagation as that of `agents.policies.planning`.
+worth (`agents.planner.design`) of what follows from the belief: its means as the truth, its covariance as Λ⁻¹, and the
+state's part in that as the sensitivities and the filter's covariance to start with. By the Kalman filter's separation of
+state and parameters this is the same belief propagation as that of `agents.planner.search`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.ascent import Limits, climber, project
-from agents.design import Known, designer, half_log_det, invert
-from agents.policies.planning import uniform
+from agents.planner.ascent import Limits, climber, project
+from agents.planner.design import Known, designer, half_log_det, invert
+from agents.planner.search import uniform
 from estimator.belief import covariance_places
-from estimator.engine.tasks import belief_names
+from estimator.engine.rows import belief_names
 from estimator.lanes import kernel, part
 from estimator.models.model import Model
 
@@ -50,7 +50,7 @@ class Pursuit(NamedTuple):
             - ``words`` (n, 4): streams of random numbers; overwritten.
             - ``actions`` (n,) receives the first input of each plan, ``scores`` (n,) its worth [nats].
         begin: ``begin(mean, cov, precision, start)``: from the moments of states and coefficients the inverse (K, K) of
-            the coefficients' covariance, and what a path starts with (`agents.design`).
+            the coefficients' covariance, and what a path starts with (`agents.planner.design`).
         swings: ``swings(known, limit, energy, inputs, words)``: fill inputs (k, T) with bursts from rest, which push as
             the system moves.
     """
@@ -76,7 +76,7 @@ class Rule(NamedTuple):
 
 @cache
 def pursuit(model: Model, degree: int = 0) -> Pursuit:
-    """Planning the whole rest of an episode of a model; arguments as `agents.design.designer`."""
+    """Planning the whole rest of an episode of a model; arguments as `agents.planner.design.designer`."""
     found, ascend = designer(model, degree), climber(model, degree).ascend
     memory_for, start_size, n_path = found.memory, found.start_size, found.n_path
     begin_path, coefficients_of, lay, step = found.code.begin, found.code.coefficients, found.code.lay, found.code.step

@@ -1,6 +1,6 @@
 """The study: which estimator and which reward to learn by, and what that gives in nats and in true error.
 
-    python -m agents.study --steps 600000
+    python -m agents.studies.rewards --steps 600000
 
 trains PPO on Amplitude-v0 with the mean-field and with the structured estimator, for each of the rewards
 `information_gain`, `log_posterior` and `fisher`, 5 seeds each, and evaluates all on the same systems. PPO learns from
@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from agents.cli import run_script
-from agents.evaluation import AUDITOR, FACTORISATIONS, FloatArray, evaluate, pooled
-from agents.leaderboard import MEDIAN, METRICS, Metric, cell_of, center_and_interval, finite
+from agents.evaluation.leaderboard import MEDIAN, METRICS, Metric, cell_of, center_and_interval, finite
+from agents.evaluation.rollout import AUDITOR, FACTORISATIONS, FloatArray, evaluate, pooled
 from agents.policies.learned import CARD
 from agents.training import PPOSettings, TrainConfig, train
 from estimator.files import write_atomically
@@ -163,7 +163,7 @@ def show(results: dict[str, dict[str, Any]], config: Config) -> None:
 
 def main(config: Config) -> None:
     """Train, evaluate, print, and write ``study.json`` and ``study.png``."""
-    from agents.figures import draw_study
+    from agents.evaluation.figures import draw_study
 
     results = run(config)
     show(results, config)

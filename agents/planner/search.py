@@ -7,7 +7,7 @@ zero. A way's score is what it has taught together with what the rest of the epi
 the last plans. Without the latter a way would be praised for what every way teaches sooner or later.
 
 The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
-line. Each state is measured by its size when the first sensor is at its limit (`agents.policies.motion.scales`). Other
+line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.scales`). Other
 states, and older inputs, are followed with their way, and do not tell ways apart.
 
 The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one.
@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.design import half_log_det
-from agents.policies.imagination import mind
+from agents.planner.design import half_log_det
+from agents.planner.imagination import mind
 from duffing_env.noise import draw, to_unit
 from estimator.lanes import LANES, jit, kernel, part
 from estimator.models.model import Model
@@ -57,7 +57,7 @@ class Search(NamedTuple):
             - ``left`` (n,): samples left in their episodes;
             - ``horizon``: samples to plan for, at most;
             - ``rounds``: of `LANES` changed copies each;
-            - ``terms``: `agents.policies.imagination.Terms`;
+            - ``terms``: `agents.planner.imagination.Terms`;
             - ``lasts`` (n, 2): the inputs that were applied last, newest first;
             - ``plans`` (n, horizon): the last plans, begun one sample ago; overwritten by the new ones;
             - ``rates`` (n, K, K): information per sample that plans have brought, a running mean; zeros where there was
@@ -99,7 +99,7 @@ class Task(NamedTuple):
         record: the belief.
         left: samples left in the episode.
         steps: of the plan.
-        terms: `agents.policies.imagination.Terms`.
+        terms: `agents.planner.imagination.Terms`.
         lasts: (2,) the inputs that were applied last, newest first.
         M: (K, K) factor of the information per sample that is to come.
     """

@@ -20,11 +20,11 @@ true. Where an input comes to act in full only a sample later, because it goes l
 the noise of the sample between moves the next output about as much again, and no input makes up for it: the margin is
 then twice as wide.
 
-The search (`agents.policies.planning`) builds a plan sample by sample, by the best ways through the plane of the
+The search (`agents.planner.search`) builds a plan sample by sample, by the best ways through the plane of the
 model's first two states, and improves it by small changes. Horizon 1 is myopic.
 
 Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
-climbs by gradient (`agents.policies.pursuit`): then the question is when to spend, which no short horizon can answer.
+climbs by gradient (`agents.planner.pursuit`): then the question is when to spend, which no short horizon can answer.
 That search knows neither ``max_slew`` nor ``drift``.
 """
 
@@ -36,11 +36,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
-from agents.plants import believed_of
-from agents.policies.imagination import Terms
-from agents.policies.motion import View, places, scales
-from agents.policies.planning import search
-from agents.policies.pursuit import Rule, pursuit
+from agents.planner.imagination import Terms
+from agents.planner.motion import View, places, scales
+from agents.planner.plants import believed_of
+from agents.planner.pursuit import Rule, pursuit
+from agents.planner.search import search
 from estimator.engine.feeding import input_degree
 from estimator.parameters import FloatArray
 

@@ -15,8 +15,8 @@ from estimator.files import write_atomically
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from agents.evaluation import Evaluation
-    from agents.leaderboard import Metric
+    from agents.evaluation.leaderboard import Metric
+    from agents.evaluation.rollout import Evaluation
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
 _STROKES = ("-", "--", ":")
@@ -137,7 +137,7 @@ def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
 
 def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
     """Share of intervals that hold the truth against their nominal level: a panel for each estimator."""
-    from agents.metrics import LEVELS
+    from agents.evaluation.metrics import LEVELS
 
     found = [evaluation.estimators or {"": evaluation.metrics} for evaluation in evaluations]
     figure = _figure(9, 3.6)
@@ -161,8 +161,8 @@ def draw_study(path: Path, results: dict[str, dict[str, Any]], measures: dict[st
 
     Args:
         path: of the PNG file.
-        results: name of a recipe to `agents.leaderboard.center_and_interval` of each measure; those that begin with the
-            same words up to a comma have one colour.
+        results: name of a recipe to `agents.evaluation.leaderboard.center_and_interval` of each measure; those that
+            begin with the same words up to a comma have one colour.
         measures: how they are printed, by name.
     """
     figure = _figure(10, 5.2)
@@ -201,7 +201,7 @@ def draw_policies(path: Path, systems: int = 64, samples: int = 256) -> None:
     """
     from scipy.signal import periodogram
 
-    from agents.evaluation import evaluate
+    from agents.evaluation.rollout import evaluate
     from agents.policies.excitations import EXCITATIONS
     from agents.policies.export import draw_signal
     from agents.policies.feedback import FEEDBACK

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from agents.plants import plant_of
+from agents.planner.plants import plant_of
 from duffing_env.layout import parameter_names
 from duffing_env.silverbox import load_record, regime_input
 from estimator.free_run import free_run
@@ -86,8 +86,9 @@ def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatA
 
 
 def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatArray | None:
-    """(n,) D-efficiency of the systems that the track's stored oracle has (`agents.oracle`); None without one."""
-    from agents.oracle import Oracle, Systems
+    """(n,) D-efficiency of the systems that the track's stored `Oracle` has; None without one."""
+    from agents.evaluation.oracle import Oracle
+    from agents.evaluation.oracle_task import Systems
 
     try:
         oracle = Oracle.of(Systems.of(env_id, evaluation.inputs.shape[1], options))

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.design import half_log_det, invert
+from agents.planner.design import half_log_det, invert
 from estimator.engine.imagination import LOST, imagination
-from estimator.engine.tasks import belief_names
+from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, lanewise, part
 from estimator.models.model import Model
 from estimator.parameters import FloatArray

@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.design import Known, designer
+from agents.planner.design import Known, designer
 from estimator.lanes import jit, kernel, part
 from estimator.models.model import Model
 
 #: The gradient aims at this much of the displacement limit, so that what it ends with is within the limit itself.
 _AIM = 0.9995
 
-#: Penalty [nats] of displacements beyond that, see `agents.design`.
+#: Penalty [nats] of displacements beyond that, see `agents.planner.design`.
 PENALTY = 3e3
 
 #: The last step in parts of the first.
@@ -66,7 +66,7 @@ class Climber(NamedTuple):
 
 @cache
 def climber(model: Model, degree: int = 0) -> Climber:
-    """What climbs the worth of inputs to a model; arguments as `agents.design.designer`."""
+    """What climbs the worth of inputs to a model; arguments as `agents.planner.design.designer`."""
     found = designer(model, degree)
     climb, worth, memory_for, start_size = found.climb, found.worth, found.memory, found.start_size
     kind = f"{model.name}_{model.digest}_{degree}"

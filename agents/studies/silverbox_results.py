@@ -1,4 +1,4 @@
-"""Runs the official Silverbox protocol (`agents.silverbox_protocol`), and says what came out and what was aimed at."""
+"""Runs the official protocol (`agents.studies.silverbox_protocol`), and says what came out and what was aimed at."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from agents.cli import progress_bar
-from agents.silverbox_figures import draw
-from agents.silverbox_protocol import (
+from agents.studies.silverbox_figures import draw
+from agents.studies.silverbox_protocol import (
     CLOSE,
     GIVEN,
     SETTINGS,

@@ -1,6 +1,6 @@
 """Ship a trained policy: the median of its training seeds, with a card that says what all of them are worth.
 
-    python -m agents.ship --name ppo/amplitude --runs runs/ppo-amplitude-v0-[0-4]
+    python -m agents.studies.ship --name ppo/amplitude --runs runs/ppo-amplitude-v0-[0-4]
 
 evaluates the runs on the same 256 systems (seed 0), and writes the weights of the median one by D-efficiency, or by
 information gain on a track without an oracle, to `agents/policies/trained/NAME`. The card is that of its run, with the
@@ -21,8 +21,8 @@ import numpy as np
 
 from agents import policies
 from agents.cli import run_script
-from agents.evaluation import evaluate, pooled
-from agents.leaderboard import finite, print_table, summarise
+from agents.evaluation.leaderboard import finite, print_table, summarise
+from agents.evaluation.rollout import evaluate, pooled
 from agents.policies.learned import CARD, WEIGHTS
 from estimator.files import write_atomically
 

@@ -1,6 +1,6 @@
 """The headline: what a chosen sample is worth in samples of the Silverbox regime, and what 256 of them identify.
 
-    python -m agents.headline
+    python -m agents.studies.headline
 
 On common systems, each policy's information (½ log det(Λ0 + F) at the truth) is compared with that of the Silverbox
 multisine regime over ever longer stretches: as recorded, and scaled so that its peak is the limit of the input. Under
@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents import metrics
 from agents.cli import run_script
-from agents.evaluation import roll_out
-from agents.leaderboard import MEDIAN, METRICS, Metric, cell_of, center_and_interval, finite
+from agents.evaluation import metrics
+from agents.evaluation.leaderboard import MEDIAN, METRICS, Metric, cell_of, center_and_interval, finite
+from agents.evaluation.rollout import roll_out
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.silverbox import record_available, regime_input
 from estimator import SILVERBOX_TWIN, difference
