@@ -18,8 +18,8 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
 
         V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
 
-    Names besides `path_names` and `path_results` of `estimator.engine.rows`: ``Q``, ``R_<sensor>`` and ``LIVE``, 0 where the series is
-    over.
+    Names besides `path_names` and `path_results` of `estimator.engine.rows`: ``Q``, ``R_<sensor>`` and ``LIVE``, 0
+    where the series is over.
 
     Args:
         model: whose equation.
