@@ -19,7 +19,7 @@ from duffing_env.noise import stream_words
 from duffing_env.sources import parts
 from estimator.engine.tasks import structured
 from estimator.inference import mean_field
-from estimator.lanes import LANES, jit, kernel
+from estimator.lanes import LANES, kernel, part
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
 
@@ -44,7 +44,7 @@ def plant_mover() -> Any:
     """
     draw_noise, plant, u = noise_drawer(_PLACE), parts(_EXPERIMENT.kind).plant, _PLACE["U_0"] * LANES
 
-    @jit
+    @part(_EXPERIMENT.kind.name)
     def move_all(blocks, inputs, noise):
         for b in range(len(blocks)):
             W = blocks[b]

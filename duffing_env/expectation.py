@@ -16,7 +16,7 @@ from typing import Any
 
 from duffing_env.layout import Kind
 from duffing_env.rewards import Hooks, nothing, nothing_in_lane
-from estimator.lanes import jit
+from estimator.lanes import part
 
 
 def source(kind: Kind, loop: Any) -> str:
@@ -75,7 +75,7 @@ def hooks(kind: Kind, code: Any) -> Hooks:
     """It expects before the belief is updated."""
     expect = code.expect
 
-    @jit
+    @part(kind.name)
     def before_the_update(W, setup):
         expect(W)
 

@@ -13,7 +13,7 @@ from duffing_env.expectation import imagined_sample
 from duffing_env.layout import Kind, layout_of
 from duffing_env.rewards import Hooks, nothing
 from estimator.engine.rows import belief_names
-from estimator.lanes import LANES, jit
+from estimator.lanes import LANES, part
 
 
 def source(kind: Kind, loop: Any) -> str:
@@ -33,13 +33,13 @@ def hooks(kind: Kind, code: Any) -> Hooks:
     if model.n_outputs > 1:
         raise ValueError(f"reward 'fisher' is for one sensor, but {model.name!r} has {model.n_outputs}")
 
-    @jit
+    @part(kind.name)
     def begin(W, j, setup):
         if W[elapsed + j] == 0.0:  # a truth that changes in an episode does not take back what was known
             for index, row in covariances:
                 W[row + j] = setup.prior[index]
 
-    @jit
+    @part(kind.name)
     def before(W, setup):
         ideal(W, setup.process_noise**2, setup.measurement_noise[0] ** 2)
 

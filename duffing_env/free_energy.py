@@ -10,7 +10,7 @@ from duffing_env.layout import Kind, layout_of
 from duffing_env.rewards import Hooks, nothing, nothing_in_lane
 from estimator.engine.free_energy import free_energies
 from estimator.inference import mean_field
-from estimator.lanes import LANES, jit
+from estimator.lanes import LANES, part
 
 
 def source(kind: Kind, loop: Any) -> str:
@@ -22,7 +22,7 @@ def hooks(kind: Kind, code: Any) -> Hooks:
     """It reads what the update leaves."""
     free_energy, work = _free_energy_of(kind), layout_of(kind)["WORK"] * LANES
 
-    @jit
+    @part(kind.name)
     def after(W, setup):
         for j in range(LANES):
             W[work + j] = -free_energy(W, j)
@@ -37,7 +37,7 @@ def _free_energy_of(kind: Kind) -> Any:
         return mean_field.pieces(place).free_energy
     traced, last = free_energies(kind.belief, kind.iterations, LANES, place), kind.iterations - 1
 
-    @jit
+    @part(kind.name)
     def free_energy(W, j):
         after = np.empty(last + 1)
         traced(W, j, after)

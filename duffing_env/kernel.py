@@ -21,7 +21,7 @@ from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, obser
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
 from estimator.engine.rows import belief_names
-from estimator.lanes import LANES, at_lane, jit, kernel, lanewise, part
+from estimator.lanes import LANES, at_lane, kernel, lanewise, part
 
 #: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.
 RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP, RESET_NOW = 0, 1, 2, 3
@@ -150,10 +150,8 @@ def compiled(kind: Kind) -> Kernel:
     is_structured = kind.factorisation == "structured"
     settle_truth, appraise, settle, observe = code.settle_truth, code.appraise, code.settle, code.observe
     walk: Any = code.walk
-    digests = (kind.belief.digest, kind.plant.digest if kind.plant else "replay")
     unpack = unpacker(kind)
-    name = "_".join(str(word) for word in (*digests, *kind[2:]))
-    inner, entry = part(name), kernel(kind=name)
+    inner, entry = part(kind.name), kernel(kind=kind.name)
 
     @inner
     def draw_plant(W, j, setup):
@@ -333,7 +331,7 @@ def _plant_of(kind: Kind, code: Any, draw_noise: Any) -> Any:
     sense_2 = getattr(code, "sense_2", sense_0)
     continuous = model.is_continuous
 
-    @jit
+    @part(kind.name)
     def move(W, setup):
         if continuous:
             for s in range(steps):

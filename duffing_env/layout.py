@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.engine.rows import belief_names, carried_names, layout, trace_names
-from estimator.lanes import inlined, rows
+from estimator.lanes import part, rows
 from estimator.models.difference import difference
 from estimator.models.model import Model
 
@@ -48,6 +48,12 @@ class Kind(NamedTuple):
     factorisation: str = "structured"
     iterations: int = 3
     work: str = ""
+
+    @property
+    def name(self) -> str:
+        """What tells its compiled functions from those of other kinds (`estimator.lanes.part`)."""
+        digests = (self.belief.digest, self.plant.digest if self.plant else "replay")
+        return "_".join(str(word) for word in (*digests, *self[2:]))
 
     @property
     def truth(self) -> Model:
@@ -135,7 +141,7 @@ def unpacker(kind: Kind) -> Any:
         at += 1 if size is None else size
     namespace: dict[str, Any] = {"Setup": Setup}
     exec(f"def unpack(packed):\n    return Setup({', '.join(told)})\n", namespace)
-    return inlined(namespace["unpack"])
+    return part(kind.name)(namespace["unpack"])
 
 
 def observation_bounds(model: Model) -> dict[str, tuple[float, float]]:

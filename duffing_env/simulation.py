@@ -21,7 +21,7 @@ from duffing_env.layout import Kind, layout_of
 from duffing_env.rewards import Hooks, nothing
 from estimator.engine.feeding import feeder
 from estimator.engine.rows import input_rows
-from estimator.lanes import LANES, jit
+from estimator.lanes import LANES, part
 from estimator.parameters import FloatArray
 
 #: Length of the test input: 105 ms.
@@ -75,7 +75,7 @@ def hooks(kind: Kind, code: Any) -> Hooks:
     model_move, twin_move, compare, conclude = code.model_move, code.twin_move, code.compare, code.conclude
     steps, continuous = model.substeps, model.is_continuous
 
-    @jit
+    @part(kind.name)
     def run(W, max_input):
         """The misfits of a block's beliefs."""
         kept = np.empty(len(inputs) * LANES)
@@ -102,7 +102,7 @@ def hooks(kind: Kind, code: Any) -> Hooks:
             for j in range(LANES):
                 W[inputs[k] + j] = kept[k * LANES + j]
 
-    @jit
+    @part(kind.name)
     def begin(W, j, setup):
         """Of lane j alone: the other lanes keep what they had."""
         works, misfits = W[work : work + LANES].copy(), W[misfit : misfit + LANES].copy()
@@ -112,7 +112,7 @@ def hooks(kind: Kind, code: Any) -> Hooks:
             if k != j:
                 W[misfit + k] = misfits[k]
 
-    @jit
+    @part(kind.name)
     def after(W, setup):
         run(W, setup.max_input)
 

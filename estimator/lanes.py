@@ -127,8 +127,9 @@ def kernel(function: Callable[..., Any] | None = None, *, kind: str = "", **opti
 def part(kind: str) -> Any:
     """Compile a function that is defined within another, and called by other compiled functions.
 
-    ``kind`` tells it from the functions that the other defines at other times: the cache on disk, and the linker where
-    it joins what several processes compiled, go by names.
+    Never `jit`: compiled code is joined by names, and code from disk may have been compiled where another function had
+    this one's. ``kind`` tells it from the functions that the other defines at other times: the cache on disk, and the
+    linker where it joins what several processes compiled, go by names.
     """
     return lambda function: jit(_renamed(function, kind))
 

@@ -3,8 +3,8 @@
 When energy is short, what matters is when to spend it: the best input rests, and then drives the oscillator up at its
 own frequency in one burst. No short horizon sees that. So the plan is for all samples that are left, and climbs the
 worth (`agents.planner.design`) of what follows from the belief: its means as the truth, its covariance as Λ⁻¹, and the
-state's part in that as the sensitivities and the filter's covariance to start with. By the Kalman filter's separation of
-state and parameters this is the same belief propagation as that of `agents.planner.search`.
+state's part in that as the sensitivities and the filter's covariance to start with. By the Kalman filter's separation
+of state and parameters this is the same belief propagation as that of `agents.planner.search`.
 """
 
 from __future__ import annotations

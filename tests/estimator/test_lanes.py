@@ -1,8 +1,10 @@
 """Lanes: names of rows, compiled loops, and the stamp of the cache."""
 
+import ast
 import importlib
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -127,3 +129,16 @@ def test_functions_that_differ_have_names_that_differ():
         return inner
 
     assert outer("one").py_func.__qualname__ != outer("two").py_func.__qualname__
+
+
+def test_functions_within_functions_are_named_apart():
+    """Those of two kinds would have one name, and the linker would take one for the other (`estimator.lanes.part`)."""
+    root = Path(__file__).parents[2]
+    unnamed = []
+    for path in [p for package in ("estimator", "duffing_env", "agents") for p in (root / package).rglob("*.py")]:
+        for outer in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for inner in ast.walk(outer) if isinstance(outer, ast.FunctionDef) else ():
+                if isinstance(inner, ast.FunctionDef) and inner is not outer:
+                    names = [ast.unparse(decorator) for decorator in inner.decorator_list]
+                    unnamed += [f"{path.name}: {inner.name}" for name in names if name in ("jit", "inlined", "kernel")]
+    assert unnamed == []
