@@ -46,7 +46,9 @@ def case_of(name):
     return model, interpolation, size, Known(c, precision, (4e-6, *[1e-6] * model.n_outputs))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("motion", "tanks"))) for name in CASES]
+)
 def test_the_worth_is_half_the_log_determinant_of_the_precision(name):
     model, interpolation, size, known = case_of(name)
     u = size * np.random.default_rng(0).choice([-0.5, 0.5], 60)

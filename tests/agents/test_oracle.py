@@ -131,6 +131,7 @@ def test_a_search_that_starts_from_better_inputs_ends_no_worse(monkeypatch):
     assert helped > best.values[0] - 0.01
 
 
+@pytest.mark.slow  # as above
 def test_the_command_stores_and_says_where(empty_folder, capsys):
     main(Config(env=SHORT, systems=2, policies=("prbs",), rounds=0))
     assert "2 systems in" in capsys.readouterr().out

@@ -140,9 +140,9 @@ def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
     [
         ("Continuous", {"horizon": 96}),
         ("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}),
-        ("WienerHammerstein", {"horizon": 48}),
+        pytest.param("WienerHammerstein", {"horizon": 48}, marks=pytest.mark.slow),  # half a minute of compilation
         ("Amplitude", {"horizon": 64, "max_output": 1.0}),  # which is near where the difference equation blows up
-        ("Continuous", {"horizon": 48, "estimator": "nlarx"}),
+        pytest.param("Continuous", {"horizon": 48, "estimator": "nlarx"}, marks=pytest.mark.slow),
     ],
     ids=["Eq. (1)", "pendulum", "three states", "far limit", "Eq. (2) on Eq. (1)"],
 )
@@ -194,6 +194,7 @@ def test_the_map_measures_every_state_by_its_size_at_the_limit():
     assert scales(View(decay), [0.3], 1.0, 2.0) == [2.0]
 
 
+@pytest.mark.slow  # seconds of compilation
 def test_under_a_budget_plans_follow_the_differential_equation_too():
     options = {"max_rms": 0.0222, "horizon": 128}
     inputs, _, early, _ = roll_out("Continuous", 4, options=options)

@@ -167,6 +167,7 @@ def test_settings_without_feedthrough_have_none():
     assert belief.parameters()["y0"][1] > 0
 
 
+@pytest.mark.slow  # seconds of compilation
 def test_selection_uses_the_training_section_only(record, monkeypatch, capsys):
     u, y = (np.full(131_072, np.nan) for _ in range(2))
     training = slice(40_650, 40_650 + 65_062)

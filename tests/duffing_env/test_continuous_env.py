@@ -38,7 +38,7 @@ def test_the_fisher_information_is_refused_to_an_equation_that_the_plant_does_no
 
 #: Left to the evidence, because a kernel is seconds of compilation: what a free energy and a free run are is tested on
 #: the difference equation, and so is what rewards read of its beliefs.
-EVIDENCE = {"ode": ("free_energy", "simulation_error")}
+EVIDENCE = {"ode": ("free_energy", "simulation_error", "fisher")}
 EVIDENCE["nlarx"] = (*EVIDENCE["ode"], "expected_free_energy")
 PAIRS = [
     pytest.param(options, reward, marks=[pytest.mark.slow] * (reward in EVIDENCE[options["estimator"]]))
@@ -58,10 +58,10 @@ def test_env_follows_its_twin(options, reward):
 @pytest.mark.parametrize(
     "options",
     [
-        {"horizon": 7, "iterations": 1},
+        pytest.param({"horizon": 7, "iterations": 1}, marks=pytest.mark.slow),  # a kernel of its own
         {"max_output": 0.15, "horizon": 64},
         {"max_input": 0.03, "process_noise": 2e-3, "measurement_noise": 1e-5, "horizon": 64},
-        {"spread": 0.8, "iterations": 5, "horizon": 64},
+        pytest.param({"spread": 0.8, "iterations": 5, "horizon": 64}, marks=pytest.mark.slow),
     ],
     ids=str,
 )

@@ -303,7 +303,7 @@ EXTREMES = [
 
 
 #: The iterations of a structured update are generated: another kernel for another number.
-MANY = [("structured", "information_gain", {"iterations": n}) for n in (1, 50)]
+MANY = [pytest.param("structured", "information_gain", {"iterations": n}, marks=pytest.mark.slow) for n in (1, 50)]
 
 
 @pytest.mark.parametrize(

@@ -214,6 +214,7 @@ def test_a_prior_of_ones_own_is_where_episodes_start():
     assert env.belief.entropy() < PlantEnv(Difference(), prior=prior).belief.entropy()
 
 
+@pytest.mark.slow  # a kernel of its own
 def test_a_model_without_the_cubic_term_recovers_from_a_plant_that_fails():
     # Mean field keeps rows of a θ2 that the model does not have: they must not stay NaN.
     prior = silverbox_prior(difference("linear")).factorised("mean_field")

@@ -69,7 +69,7 @@ class TestWithTheRecord:
             {},
             {"factorisation": "mean_field"},
             {"factorisation": "mean_field", "as_published": True, "prior": "published_run"},
-            {"prior": "paper_text", "nonlinear": False, "iterations": 5},
+            pytest.param({"prior": "paper_text", "nonlinear": False, "iterations": 5}, marks=pytest.mark.slow),
         ],
         ids=str,
     )
@@ -121,7 +121,7 @@ class TestWithTheRecord:
 
     def test_the_regime_ends_by_truncation(self, record):
         for delay in (0, 1):
-            env = SilverboxReplayEnv(regime="arrow", input_delay=delay, iterations=1)
+            env = SilverboxReplayEnv(regime="arrow", input_delay=delay)
             env.reset()
             *steps, last = (env.step(action) for action in recorded_actions(env, env.horizon))
             assert env.horizon == len(record.arrow.u) - delay

@@ -30,6 +30,7 @@ def assert_calibrated(normalised, nees):
     assert chi2.ppf(TAIL, freedoms) <= 7 * nees.sum() <= chi2.isf(TAIL, freedoms)
 
 
+@pytest.mark.slow  # seconds of compilation
 def test_sigma_points_hold_the_truth():
     assert_calibrated(*identified("sigma_points", 0.1, 256))
     normalised, nees = identified("sigma_points", 0.3, 256)

@@ -16,7 +16,9 @@ MODELS = {
     "three-tap": (difference("three-tap"), OWN_TAPS, recorded_prior(difference("three-tap"))),
     "look-ahead": (duffing(), Rig.silverbox("look_ahead"), recorded_prior(duffing())),
 }
-ANY_MODEL = pytest.mark.parametrize("model", MODELS)
+ANY_MODEL = pytest.mark.parametrize(
+    "model", [pytest.param(name, marks=[pytest.mark.slow] * (name == "look-ahead")) for name in MODELS]
+)
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,9 @@ def records():
     return u, y
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] * (case in ("ode, held", "three-tap"))) for case in CASES]
+)
 def test_beliefs_are_those_of_one_estimator_after_the_other(case, records):
     prior, rig, same = CASES[case]
     u, y = records
@@ -44,6 +46,7 @@ def test_beliefs_are_those_of_one_estimator_after_the_other(case, records):
     assert beliefs[2] == prior
 
 
+@pytest.mark.slow  # seconds of compilation
 def test_several_sensors(records):
     estimator = pendulum_estimator()
     prior = estimator.belief
