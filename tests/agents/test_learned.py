@@ -384,7 +384,7 @@ def unpickling(source):
 
 
 def test_the_search_covers_the_package():
-    assert {"checkpoints", "evaluation", "learned", "runs", "signals", "vec_env"} <= {path.stem for path in SOURCES}
+    assert {"checkpoints", "rollout", "learned", "runs", "signals", "vec_env"} <= {path.stem for path in SOURCES}
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
