@@ -24,7 +24,7 @@ def test_examples_run(document):
     "module",
     [
         *("duffing_env.continuous", "duffing_env.limited", "duffing_env.model_env"),
-        *("estimator.models.model", "estimator.offline", "estimator.rig", "estimator.truth"),
+        *("estimator.models.model", "estimator.offline", "estimator.rig"),
     ],
 )
 def test_examples_of_the_docstrings_run(module):

@@ -155,6 +155,7 @@ def test_features_are_those_that_the_shipped_policies_were_trained_with(name):
     np.testing.assert_allclose(view.motions, stored["motions"], rtol=2e-7, atol=1e-12)
 
 
+@pytest.mark.slow  # seconds of compilation
 def test_equation_1_has_features_too_and_its_rule_is_worth_more_than_chance():
     envs = make("duffing_env/Continuous-v0", 8, {"horizon": 96})
     foresight = Foresight.of(envs, RATE)

@@ -38,8 +38,8 @@ def test_the_fisher_information_is_refused_to_an_equation_that_the_plant_does_no
 
 #: Left to the evidence, because a kernel is seconds of compilation: what a free energy and a free run are is tested on
 #: the difference equation, and so is what rewards read of its beliefs.
-EVIDENCE = {"ode": ("free_energy", "simulation_error", "fisher")}
-EVIDENCE["nlarx"] = (*EVIDENCE["ode"], "expected_free_energy")
+EVIDENCE = {"ode": ("free_energy", "simulation_error", "fisher", "expected_free_energy")}
+EVIDENCE["nlarx"] = EVIDENCE["ode"]
 PAIRS = [
     pytest.param(options, reward, marks=[pytest.mark.slow] * (reward in EVIDENCE[options["estimator"]]))
     for options in ESTIMATORS
@@ -203,6 +203,7 @@ def test_numbers_that_are_not_finite_end_the_episode_flagged(reward, name, value
     assert np.isfinite(env.step([0.5])[1])
 
 
+@pytest.mark.slow  # a kernel of its own, for a free energy
 @pytest.mark.parametrize(
     "options",
     [{"max_output": 1e6, "max_input": 1e3}, {"spread": 0.999}, {"spread": 1e-6}, {"process_noise": 1.0},

@@ -39,7 +39,7 @@ def test_env_follows_its_twin(factorisation, reward):
         {"horizon": 7, "iterations": 1},
         {"max_output": 0.2, "horizon": 40},
         {"max_input": 0.03, "process_noise": 2e-3, "measurement_noise": 1e-5, "horizon": 40},
-        {"spread": 0.8, "iterations": 5, "horizon": 40},
+        {"spread": 0.8, "horizon": 40},
         {"max_rms": 0.03, "horizon": 40},
         {"max_slew": 0.05, "input_cost": 0.3, "horizon": 40},
         {"jump": 0.5, "drift": 0.01, "horizon": 40},

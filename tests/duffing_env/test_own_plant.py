@@ -69,7 +69,7 @@ def test_example_of_the_docstring():
     ("factorisation", "reward"),
     [
         ("structured", "information_gain"),
-        ("structured", "free_energy"),
+        pytest.param("structured", "free_energy", marks=pytest.mark.slow),
         ("mean_field", "information_gain"),
         pytest.param("mean_field", "free_energy", marks=pytest.mark.slow),  # seconds of compilation
     ],

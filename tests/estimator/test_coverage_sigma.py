@@ -71,6 +71,7 @@ def test_systems_are_drawn_from_the_prior():
     np.testing.assert_allclose(truth[:, 4:].std(axis=0), [0.02, 0.02, 0.1], rtol=0.1)
 
 
+@pytest.mark.slow  # seconds of compilation
 def test_the_command_prints_its_tables(capsys, monkeypatch):
     monkeypatch.setattr(coverage_sigma, "LENGTHS", (64,))
     coverage_sigma.main(Config(systems=2))

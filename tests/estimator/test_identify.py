@@ -31,7 +31,8 @@ def records():
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=[pytest.mark.slow] * (case in ("ode, held", "three-tap"))) for case in CASES]
+    "case",
+    [pytest.param(case, marks=[pytest.mark.slow] * (case in ("ode", "ode, held", "three-tap"))) for case in CASES],
 )
 def test_beliefs_are_those_of_one_estimator_after_the_other(case, records):
     prior, rig, same = CASES[case]
