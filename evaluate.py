@@ -40,7 +40,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Compare, and say where everything is."""
-    from agents.leaderboard import compare
+    from agents.evaluation.comparison import compare
 
     folder = config.report if config.report is not None else config.output
     compare(

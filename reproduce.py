@@ -13,7 +13,7 @@ from pathlib import Path
 
 import tyro
 
-from agents.reproduction import reproduce
+from agents.studies.kouw2020 import reproduce
 from duffing_env.silverbox import RecordDamaged
 
 
@@ -59,8 +59,8 @@ class Silverbox:
 
     def run(self) -> None:
         """Runs the protocol, or compares settings."""
-        from agents.silverbox_results import run_protocol
-        from agents.silverbox_selection import select
+        from agents.studies.silverbox_results import run_protocol
+        from agents.studies.silverbox_selection import select
 
         if self.select:
             select(data=self.data)

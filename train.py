@@ -39,7 +39,8 @@ class Config(TrainConfig):
 
 def main(config: Config) -> None:
     """Train, compare, and say where everything is."""
-    from agents.leaderboard import BASELINES, compare
+    from agents.evaluation.comparison import compare
+    from agents.evaluation.leaderboard import BASELINES
 
     if config.tune:
         best = tune(config, config.tune)

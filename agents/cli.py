@@ -12,6 +12,8 @@ import gymnasium as gym
 import tyro
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.error import Error as GymnasiumError
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from tyro.constructors import PrimitiveConstructorSpec
 
 
@@ -36,6 +38,12 @@ JsonOptions = Annotated[
 ]
 
 Config = TypeVar("Config")
+
+
+def progress_bar() -> Progress:
+    """A bar on stderr that names what is being done."""
+    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    return Progress(*columns, console=Console(stderr=True))
 
 
 def check_track(env_id: str) -> None:

@@ -30,6 +30,7 @@ _ARITHMETIC = re.compile(
     r"^v(?:(?P<simple>add|sub|mul)|(?P<fused>fn?m(?:add|sub)(?:132|213|231))|(?P<division>div)|(?P<root>sqrt))"
     r"(?:p|(?P<scalar>s))d$"
 )
+_LABEL = re.compile(r"^(\.L\w+):")
 _MASK = re.compile(r"\{%k\d\}")
 _STACK = re.compile(r"\(%r[sb]p")
 
@@ -109,10 +110,18 @@ def count_text(body: str, outputs: int, name: str = "") -> Operations:
     """Count the operations in the assembly (AT&T syntax) of a loop that writes ``outputs`` rows."""
     text = Operations()
     written = 0
-    for mnemonic, operands in (match.groups() for match in map(_INSTRUCTION.match, body.splitlines()) if match):
+    lines = body.splitlines()
+    begin = _loop_begin(lines)
+    for number, match in enumerate(map(_INSTRUCTION.match, lines)):
+        if match is None:
+            continue
+        mnemonic, operands = match.groups()
         registers = _REGISTER.findall(operands)
         arithmetic = _ARITHMETIC.match(mnemonic)
         if arithmetic and arithmetic["scalar"]:
+            # What is the same in all lanes is computed once, before the loop.
+            if number < begin:
+                continue
             raise NotCounted(f"{name} is not vectorised throughout: {mnemonic} {operands.strip()}")
         if not registers or (not arithmetic and registers[-1] == "x"):
             continue
@@ -127,3 +136,15 @@ def count_text(body: str, outputs: int, name: str = "") -> Operations:
     if not passes or written < 0.8 * passes * outputs:
         raise NotCounted(f"{name} has {written} packed stores for {outputs} rows: its passes are not clear")
     return text * (1 / passes)
+
+
+def _loop_begin(lines: list[str]) -> int:
+    """The line of the first loop's label, to which a later line jumps back; 0 without a loop."""
+    for number, match in enumerate(map(_LABEL.match, lines)):
+        if match and any(_jumps_to(match[1], line) for line in lines[number:]):
+            return number
+    return 0
+
+
+def _jumps_to(label: str, line: str) -> bool:
+    return line.lstrip().startswith("j") and line.split()[-1] == label

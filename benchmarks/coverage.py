@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest, norm
 
-from benchmarks.systems import draw, make_model, make_prior
-from estimator import Belief, JointBelief, OnlineEstimator, Prior
+from benchmarks.systems import draw, make_model, make_prior, make_rig
+from estimator import OnlineEstimator
+from estimator.belief import Belief
 from estimator.files import write_atomically
 
 LEVEL = 0.90
@@ -55,7 +56,7 @@ class Case:
     model: str = "paper"
     hypotheses: int = 1
 
-    def prior(self) -> Prior | JointBelief:
+    def prior(self) -> Belief:
         """The prior that describes the population, with a weak noise prior."""
         return make_prior(self.model, *self.noise_centers, NOISE_SHAPE)
 
@@ -135,23 +136,22 @@ def _with(cases: list[Case], **changes: Any) -> list[Case]:
 def evaluate(case: Case, systems: int, rng: np.random.Generator) -> Coverage:
     """Draw systems, identify each, and compare its posterior with the truth."""
     drawn = draw(case.model, systems, case.process_noise, case.measurement_noise, case.samples, rng)
-    model, prior = make_model(case.model), case.prior()
+    model, prior, rig = make_model(case.model), case.prior(), make_rig(case.model)
     kept = np.flatnonzero(drawn.stayed)
     hits, nees, gamma, xi, ratio = [], [], [], [], []
     for i in kept:
-        estimator = OnlineEstimator(model, prior, case.factorisation, noise_hypotheses=case.hypotheses)
+        estimator = OnlineEstimator(
+            model, prior, rig, factorisation=case.factorisation, noise_hypotheses=case.hypotheses
+        )
         estimator.run(drawn.u[i], drawn.y[i])
         belief = estimator.belief
         mean, cov = belief.coefficients_mean, belief.coefficients_cov
         std, error = np.sqrt(np.diag(cov)), drawn.truth[i, : len(mean)] - mean
-        free = std > 0  # the cubic damping is known to be 0
-        names = [name for name, is_free in zip(drawn.names, free, strict=False) if is_free]
-        std, error, cov = std[free], error[free], cov[np.ix_(free, free)]
         nees.append((error / std) @ np.linalg.solve(cov / np.outer(std, std), error / std) / len(std))
-        if isinstance(belief, Belief):
+        if case.model == "paper":
             physical_mean, physical_cov = belief.physical()
-            error = drawn.truth[i] - np.concatenate([mean, physical_mean])
-            std, names = np.concatenate([std, np.sqrt(np.diag(physical_cov))]), list(drawn.names)
+            error = np.concatenate([error, drawn.truth[i, len(mean) :] - physical_mean])
+            std = np.concatenate([std, np.sqrt(np.diag(physical_cov))])
         hits.append(np.abs(error) <= QUANTILE * std)
         gamma.append(belief.gamma_mean * case.process_noise**2)
         xi.append(belief.xi_mean * case.measurement_noise**2)
@@ -159,7 +159,7 @@ def evaluate(case: Case, systems: int, rng: np.random.Generator) -> Coverage:
             ratio.append(estimator.noise_ratio.std)
     return Coverage(
         kept=len(kept),
-        hits=dict(zip(names, np.sum(hits, axis=0).tolist(), strict=True)),
+        hits=dict(zip(drawn.names, np.sum(hits, axis=0).tolist(), strict=True)),
         nees=float(np.mean(nees)),
         gamma=float(np.median(gamma)),
         xi=float(np.median(xi)),

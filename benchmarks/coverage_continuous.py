@@ -16,14 +16,16 @@ import numpy as np
 
 from benchmarks.coverage import LENGTHS, NOISES, QUANTILE, wilson
 from duffing_env.vector_env import ContinuousVectorEnv
-from estimator.continuous import COEFFICIENTS
 from estimator.files import write_atomically
+from estimator.models.duffing import duffing
 from estimator.parameters import FloatArray
+from estimator.physical import coefficients_of
 
 TRACK = "duffing_env/Continuous-v0"
 NO_LIMIT = 1e3  # V
 ESTIMATORS = ("ode", "nlarx")
-PHYSICAL = ("m", "c", "a", "b")
+COEFFICIENTS = tuple(duffing().coefficients)
+PHYSICAL = tuple(duffing().physical)
 
 
 @dataclass(frozen=True)
@@ -84,14 +86,15 @@ def evaluate(
     for _ in range(samples):
         envs.step(rng.uniform(-1, 1, (systems, 1)).astype(np.float32))
     truth = envs.truth
-    physical = np.stack([truth.m, truth.c, truth.a, truth.b], axis=-1)
+    physical = np.stack([getattr(truth, name) for name in PHYSICAL], axis=-1)
     beliefs = [envs.belief(row) for row in range(systems)]
     estimates, covariances = (np.array(moments) for moments in zip(*(b.physical() for b in beliefs), strict=True))
     hits = _hits(PHYSICAL, estimates, covariances, physical)
     if estimator == "ode":
         means = np.array([belief.coefficients_mean for belief in beliefs])
         covs = np.array([belief.coefficients_cov for belief in beliefs])
-        hits = _hits(tuple(COEFFICIENTS), means, covs, beliefs[0].coefficients_of(truth)) | hits
+        known = dict(zip(PHYSICAL, physical.T, strict=True))
+        hits = _hits(COEFFICIENTS, means, covs, coefficients_of(duffing(), known, beliefs[0].step)) | hits
     # Relative to the truth, because the scales of m, c, a and b are ten orders apart.
     error = estimates / physical - 1
     relative = covariances / (physical[:, :, None] * physical[:, None, :])

@@ -16,10 +16,11 @@ import numpy as np
 from scipy import stats
 
 from agents.cli import run_script
-from agents.evaluation import roll_out
-from agents.leaderboard import METRICS, center_and_interval
+from agents.evaluation.leaderboard import METRICS, center_and_interval
+from agents.evaluation.rollout import roll_out
 from agents.policies import POLICIES, trained_policies
 from estimator.files import write_atomically
+from estimator.physical import coefficients_of
 
 TRACKS = tuple(f"duffing_env/{name}-v0" for name in ("Amplitude", "Short", "Power", "Output", "Continuous"))
 
@@ -72,7 +73,9 @@ def measure(policy: str, track: str, systems: int, seed: int) -> Coverage:
     evaluation, beliefs, truth, _ = roll_out(policy, track, systems, seed, {})
     means = np.array([belief.coefficients_mean for belief in beliefs])
     stds = np.sqrt([np.diag(belief.coefficients_cov) for belief in beliefs])
-    inside = np.abs(means - type(beliefs[0]).coefficients_of(truth)) <= stats.norm.ppf(0.5 + LEVEL / 2) * stds
+    model = beliefs[0].model
+    known = coefficients_of(model, truth, beliefs[0].step)
+    inside = np.abs(means - known) <= stats.norm.ppf(0.5 + LEVEL / 2) * stds
     entry = center_and_interval(evaluation.metrics["coverage"][None], METRICS["coverage"])
     passed = LOWEST <= entry["mean"] <= HIGHEST
     return Coverage(policy, track, entry["mean"], entry["low"], entry["high"], inside.mean(axis=0).tolist(), passed)

@@ -12,24 +12,31 @@ import numpy as np
 
 from benchmarks.coverage import LENGTHS, QUANTILE
 from duffing_env.silverbox import synthesise_multisine
-from estimator import SAMPLING_STEP, DuffingODE, JointBelief, OnlineEstimator
-from estimator.joint_filters import EXPECTATIONS
+from estimator import SAMPLING_STEP, OnlineEstimator, Rig, duffing, recorded_prior
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
+from estimator.physical import coefficients_of
+from estimator.settings import EXPECTATIONS
 
 LEAST = 0.1  # of their means: stiffness, damping, gain and cubic stiffness are drawn again where one is below
 PROCESS_NOISE = 5e-6  # V
 MEASUREMENT_NOISE = 3e-4  # V
-CENTERS = (3e-4, 1e-3)  # V, of the measurement noise's prior: the truth, and what `DuffingODE.prior` has
+CENTERS = (3e-4, 1e-3)  # V, of the measurement noise's prior: the truth, and what `recorded_prior` has
 AMPLIFICATION = 3  # of the Silverbox's excitation
 SUBSTEPS = 12
 
-FREE = [i for i, name in enumerate(DuffingODE.names) if name != "cubic_damping"]
-SHOWN = ("a/m", "c/m", "1/m", "b/m", "u0", "y0", "d")
+#: The model, and its rig.
+MODEL = duffing(offsets=True, feedthrough=True, noise="held")
+RIG = Rig.silverbox("linear")
+
+#: What is drawn as the prior has it, in this order: per sample, but for the offsets [V].
+NAMES = ("stiffness", "damping", "gain", "cubic", "input_offset", "output_offset", "feedthrough")
+SHOWN = ("a/m", "c/m", "1/m", "b/m", "force", "y0", "d")
 
 
 @dataclass(frozen=True)
 class Config:
-    """Coverage of the 90 % intervals of `DuffingODE`, by expectations.
+    """Coverage of the 90 % intervals of `duffing`, by expectations.
 
     Attributes:
         systems: oscillators simulated for each length.
@@ -42,44 +49,54 @@ class Config:
     seed: int = 0
 
 
-def draw(prior: JointBelief, systems: int, rng: np.random.Generator) -> FloatArray:
-    """Parameters (systems, 8) from a prior; those whose first four are not all well above 0 are drawn again."""
-    mean, std = prior.coefficients_mean, np.sqrt(np.diag(prior.coefficients_cov))
+def draw(spread: float, systems: int, rng: np.random.Generator) -> FloatArray:
+    """Parameters (systems, 7) in the order of `NAMES`; those whose first four are not all well above 0 again."""
+    prior = recorded_prior(MODEL, spread)
+    found = prior.coefficients()
+    mean = np.array([found[name][0] for name in NAMES[:4]] + [0.0] * 3)
+    std = np.array([found[name][1] for name in NAMES[:4]] + [0.02, 0.02, 0.1])
     truth = mean + std * rng.standard_normal((systems, len(mean)))
     while (low := (truth[:, :4] < LEAST * mean[:4]).any(axis=1)).any():
         truth[low] = mean + std * rng.standard_normal((low.sum(), len(mean)))
-    truth[:, DuffingODE.names.index("cubic_damping")] = 0.0
     return truth
 
 
-def simulate(truth: FloatArray, samples: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Simulate oscillators from rest, each with its own multisine, linear between samples.
+def as_coefficients(truth: FloatArray) -> FloatArray:
+    """(N, 7) of the model."""
+    k, c, g, b, u0, y0, d = truth.T
+    values = {"m": SAMPLING_STEP**2 / g, "c": SAMPLING_STEP * c / g, "a": k / g, "b": b / g}
+    return coefficients_of(MODEL, {**values, "u0": u0, "y0": y0, "d": d})
 
-    In physical units and by Runge-Kutta steps of a twelfth of a sample, which share nothing with the estimator.
+
+def simulate(truth: FloatArray, samples: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Simulate oscillators from rest a sample before the first, each with its own multisine, linear between samples.
+
+    By Runge-Kutta steps of a twelfth of a sample, which share nothing with the estimator.
 
     Args:
-        truth: parameters (N, 8), in the order of `DuffingODE.names`.
+        truth: parameters (N, 7), in the order of `NAMES`.
         samples: number of samples T.
         rng: draws inputs and noises.
 
     Returns:
         Inputs and outputs (N, T) [V].
     """
-    k, c, g, b, u0, e, y0, d = truth.T
+    k, c, g, b, u0, y0, d = truth.T
     systems = len(truth)
     u = np.array([AMPLIFICATION * synthesise_multisine(rng, 1)[500 : 500 + samples] for _ in range(systems)])
     y = u * d[:, None] + MEASUREMENT_NOISE * rng.standard_normal(u.shape)
-    w = PROCESS_NOISE * rng.standard_normal(u.shape)  # an acceleration over a sample: w in x, 2 w / δ in x'
-    h = SAMPLING_STEP / SUBSTEPS
+    w = PROCESS_NOISE * rng.standard_normal(u.shape)  # a force over a sample, which alone moves x by w
+    h = 1 / SUBSTEPS
     x, v = np.zeros((2, systems))
 
     def acceleration(x: FloatArray, v: FloatArray, force: FloatArray) -> FloatArray:
-        return g * (force - u0) - c * v - k * x - b * x**3 - e * v**3
+        return g * (force - u0) - c * v - k * x - b * x**3
 
     for t in range(samples):
-        for i in range(SUBSTEPS if t else 0):
-            start, stop = u[:, t - 1], u[:, t]
-            f1, f2, f3 = (start + (stop - start) * (i + part) / SUBSTEPS for part in (0.0, 0.5, 1.0))
+        start, stop = u[:, t - 1] if t else 0 * u[:, 0], u[:, t]
+        push = 2 * w[:, t] / g
+        for i in range(SUBSTEPS):
+            f1, f2, f3 = (start + (stop - start) * (i + part) / SUBSTEPS + push for part in (0.0, 0.5, 1.0))
             a1 = acceleration(x, v, f1)
             v2 = v + h / 2 * a1
             a2 = acceleration(x + h / 2 * v, v2, f2)
@@ -89,42 +106,42 @@ def simulate(truth: FloatArray, samples: int, rng: np.random.Generator) -> tuple
             a4 = acceleration(x + h * v3, v4, f3)
             x = x + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
             v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-        x, v = x + w[:, t], v + 2 / SAMPLING_STEP * w[:, t]
         y[:, t] += x + y0
     return u, y
 
 
 def errors(
-    model: DuffingODE, prior: JointBelief, expectations: str, truth: FloatArray, u: FloatArray, y: FloatArray
+    prior: Belief, expectations: str, truth: FloatArray, u: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Identify each oscillator, by a model without cubic damping.
+    """Identify each oscillator.
 
     Returns:
-        Errors of the seven free parameters in posterior standard deviations (N, 7), and dᵀ P⁻¹ d / 7 (N,) with d these
-        errors and P their posterior covariance.
+        Errors of the seven coefficients in posterior standard deviations (N, 7), in the order of `SHOWN`, and
+        dᵀ P⁻¹ d / 7 (N,) with d these errors and P their posterior covariance.
     """
-    normalised, nees = np.empty((len(truth), len(FREE))), np.empty(len(truth))
+    order = [list(MODEL.coefficients).index(name) for name in (*NAMES[:4], "force", *NAMES[5:])]
+    normalised, nees, true = np.empty((len(truth), 7)), np.empty(len(truth)), as_coefficients(truth)
     for i in range(len(truth)):
-        estimator = OnlineEstimator(model, prior, expectations=expectations)
+        estimator = OnlineEstimator(prior.model, prior, RIG, expectations=expectations)
         estimator.run(u[i], y[i])
         belief = estimator.belief
-        cov = belief.coefficients_cov[np.ix_(FREE, FREE)]
+        cov = belief.coefficients_cov[np.ix_(order, order)]
         std = np.sqrt(np.diag(cov))
-        normalised[i] = (belief.coefficients_mean - truth[i])[FREE] / std
-        nees[i] = normalised[i] @ np.linalg.solve(cov / np.outer(std, std), normalised[i]) / len(FREE)
+        normalised[i] = (belief.coefficients_mean - true[i])[order] / std
+        nees[i] = normalised[i] @ np.linalg.solve(cov / np.outer(std, std), normalised[i]) / len(order)
     return normalised, nees
 
 
 def rows(config: Config) -> Iterator[tuple[float, tuple[str, ...]]]:
     """The centre of the noise prior and the cells of each row. The rows of one length share their oscillators."""
     for center in CENTERS:
-        prior = DuffingODE().prior(config.spread, process_noise=PROCESS_NOISE, measurement_noise=center)
+        prior = recorded_prior(MODEL, config.spread, PROCESS_NOISE, center)
         for samples in LENGTHS:
             rng = np.random.default_rng([config.seed, samples])
-            truth = draw(prior, config.systems, rng)
+            truth = draw(config.spread, config.systems, rng)
             u, y = simulate(truth, samples, rng)
             for expectations in EXPECTATIONS:
-                normalised, nees = errors(DuffingODE(), prior, expectations, truth, u, y)
+                normalised, nees = errors(prior, expectations, truth, u, y)
                 hits = (np.abs(normalised) <= QUANTILE).mean(axis=0)
                 sizes = np.mean(nees), np.median(nees), np.quantile(nees, 0.99), np.max(nees)
                 cells = (f"{hit:.2f}" for hit in hits), (f"{size:.3g}" for size in sizes)

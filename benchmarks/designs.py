@@ -13,8 +13,9 @@ import numpy as np
 import tyro
 from scipy import stats
 
-from agents.evaluation import roll_out
-from agents.oracle import Oracle, Systems
+from agents.evaluation.oracle import Oracle
+from agents.evaluation.oracle_task import Systems
+from agents.evaluation.rollout import roll_out
 from estimator.files import write_atomically
 from estimator.parameters import FloatArray
 
@@ -27,7 +28,7 @@ class Design:
         track: id.
         policy: name.
         gain: (n,) decrease of the coefficients' entropy in the belief [nats].
-        efficiency: (n,) D-efficiency, see `agents.oracle.Oracle.efficiency`.
+        efficiency: (n,) D-efficiency, see `agents.evaluation.oracle.Oracle.efficiency`.
         early: episodes that the displacement limit ended.
         peak: largest output [V].
         rms: root mean square input over all samples [V].

@@ -77,7 +77,7 @@ def _batch_rows(size: int, peers: Peers) -> list[Row]:
     rows = [Row(f"{size}: plant only", UNIT, timed(_piece(plant, size)))]
     for rule, iterations in DEFAULT_ITERATIONS.items():
         name = rule.replace("_", " ")
-        alone = EstimatorOnly(data, rule == "structured", iterations)
+        alone = EstimatorOnly(data, rule, iterations)
         rows.append(Row(f"{size}: estimator only, {name}", UNIT, timed(_piece(alone, size))))
         for threads, title in ((1, f"{size}: ours, {name}, 1 thread"), (2, f"{size}: ours, {name}, 2 threads")):
             if threads == 1 or size > LANES:

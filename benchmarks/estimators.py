@@ -12,7 +12,8 @@ from benchmarks.peer_process import Peers
 from benchmarks.report import Claim, Section, ratio
 from benchmarks.timing import Row, measure, timed
 from duffing_env.silverbox import load_record, record_available, synthesise_multisine
-from estimator import NLARX, SILVERBOX_TWIN, OnlineEstimator, Prior, to_coefficients
+from estimator import SILVERBOX_TWIN, OnlineEstimator, coefficients_of, difference, silverbox_prior
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
 
 SAMPLES = 4096
@@ -28,10 +29,10 @@ def samples() -> tuple[FloatArray, FloatArray, str]:
         return regime.u[:SAMPLES], regime.y[:SAMPLES], f"first {SAMPLES:,} samples of the record's multisine"
     rng = np.random.default_rng(0)
     u = synthesise_multisine(rng, realisations=1)[:SAMPLES]
-    truth, acting = to_coefficients(SILVERBOX_TWIN), NLARX().delayed(u)
+    (theta1, theta2, theta3, eta), acting = coefficients_of(difference(), SILVERBOX_TWIN), _delayed(u)
     x = np.zeros(SAMPLES)
     for t in range(2, SAMPLES):
-        x[t] = truth.theta1 * x[t - 1] + truth.theta2 * x[t - 1] ** 3 + truth.theta3 * x[t - 2] + truth.eta * acting[t]
+        x[t] = theta1 * x[t - 1] + theta2 * x[t - 1] ** 3 + theta3 * x[t - 2] + eta * acting[t]
         x[t] += 5e-4 * rng.standard_normal()
     y = x + 5e-4 * rng.standard_normal(SAMPLES)
     return u, y, f"{SAMPLES:,} samples of the twin under a synthesised multisine (the record is not on this machine)"
@@ -40,19 +41,22 @@ def samples() -> tuple[FloatArray, FloatArray, str]:
 def write_samples(path: Path) -> None:
     """What the peers' estimators get: the same samples, our prior, and its expected noises, which they do not learn."""
     u, y, _ = samples()
-    prior = Prior.silverbox_twin()
-    cov = np.zeros((6, 6))
-    cov[:2, :2] = prior.state_cov
-    cov[2:, 2:] = prior.coefficients_cov
+    prior = silverbox_prior()
+    gamma_shape, gamma_rate, xi_shape, xi_rate = prior.noises
     np.savez(
         path,
-        acting=NLARX().delayed(u),
+        acting=_delayed(u),
         y=y,
-        mean=np.concatenate([prior.state_mean, prior.theta_mean, [prior.eta_mean]]),
-        cov=cov,
-        process_cov=np.diag([prior.gamma_rate / prior.gamma_shape, 0, 0, 0, 0, 0]),
-        measurement_cov=np.array([[prior.xi_rate / prior.xi_shape]]),
+        mean=prior.mean,
+        cov=prior.cov,
+        process_cov=np.diag([gamma_rate / gamma_shape, 0, 0, 0, 0, 0]),
+        measurement_cov=np.array([[xi_rate / xi_shape]]),
     )
+
+
+def _delayed(u: FloatArray) -> FloatArray:
+    """The inputs (T,) that act on the outputs of the same index."""
+    return np.concatenate(([0.0], u[:-1]))
 
 
 def run(peers: Peers, repetitions: int, on_row: Callable[[str], None]) -> Section:
@@ -85,7 +89,7 @@ def run(peers: Peers, repetitions: int, on_row: Callable[[str], None]) -> Sectio
 def _passes(
     title: str, factorisation: str, u: FloatArray, y: FloatArray, coefficients: dict[str, Any]
 ) -> Callable[[int], float]:
-    prior = Prior.silverbox_twin()
+    prior = silverbox_prior()
 
     def action(count: int) -> float:
         for _ in range(count):
@@ -99,9 +103,11 @@ def _passes(
 
 def _errors(coefficients: FloatArray, u: FloatArray, y: FloatArray) -> tuple[float, float]:
     """RMSE [mV] one step ahead, and in a free run."""
-    model = NLARX()
-    predicted = model.predict(coefficients, u, y)
-    simulated = model.simulate(coefficients, u, y[:2])
+    prior = silverbox_prior()
+    record = prior.record.copy()
+    record[2:6] = coefficients
+    estimator = OnlineEstimator(difference(), Belief(difference(), record))
+    predicted, simulated = estimator.predict(u, y), estimator.simulate(u, y[:2])
     with np.errstate(over="ignore", invalid="ignore"):
         one, free = (1e3 * float(np.sqrt(np.mean((series - y)[2:] ** 2))) for series in (predicted, simulated))
     return one, free

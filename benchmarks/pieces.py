@@ -6,47 +6,81 @@ They are the functions that the environment's kernel calls, over blocks of the s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from duffing_env.layout import LAYOUT, N_ROWS
+from duffing_env.experiment import SimulatedExperiment
+from duffing_env.kernel import noise_drawer
+from duffing_env.layout import layout_of
 from duffing_env.noise import stream_words
-from duffing_env.plant import draw_noise, move_plant
-from estimator import SILVERBOX_TWIN, Prior, to_coefficients
-from estimator.inference import update
-from estimator.lanes import LANES, jit, kernel
+from duffing_env.sources import parts
+from estimator.engine.tasks import structured
+from estimator.inference import mean_field
+from estimator.lanes import LANES, kernel, part
 from estimator.parameters import FloatArray
-from estimator.record import N_ROWS as N_BELIEF_ROWS
-from estimator.record import RECORD_SIZE
+from estimator.physical import coefficients_of
 
 NOISE = 5e-4
 SAMPLES = 256
 
-_U, _Y = LAYOUT["u"] * LANES, LAYOUT["y"] * LANES
+
+def experiment_of(factorisation: str) -> SimulatedExperiment:
+    """Twins, and the default noises."""
+    return SimulatedExperiment(factorisation, plant_spread=0.0, process_noise=NOISE, measurement_noise=NOISE)
 
 
-# Not cached on disk: the cache's stamp does not know the sources of duffing_env (see `estimator.lanes.kernel`).
-@jit
-def move_all(blocks, inputs, noise):
-    """Move the plants of all blocks by one sample, noise drawn within: inputs (n,)."""
-    for b in range(len(blocks)):
-        W = blocks[b]
-        for j in range(LANES):
-            W[_U + j] = inputs[b * LANES + j]
-        draw_noise(W)
-        move_plant(W, noise, noise)
+_EXPERIMENT = experiment_of("structured")
+_PLACE = layout_of(_EXPERIMENT.kind)
 
 
-@kernel
-def infer_all(blocks, inputs, outputs, structured, iterations):
-    """Update the beliefs of all blocks with one sample each: inputs and outputs (n,)."""
-    for b in range(len(blocks)):
-        W = blocks[b]
-        for j in range(LANES):
-            W[_U + j] = inputs[b * LANES + j]
-            W[_Y + j] = outputs[b * LANES + j]
-        update(W, structured, iterations, False, W[:0])
+@cache
+def plant_mover() -> Any:
+    """``move_all(blocks, inputs, noise)``: move the plants of all blocks by one sample, noise drawn within.
+
+    Not cached on disk: the cache's stamp does not know the sources of duffing_env (see `estimator.lanes.kernel`).
+    """
+    draw_noise, plant, u = noise_drawer(_PLACE), parts(_EXPERIMENT.kind).plant, _PLACE["U_0"] * LANES
+
+    @part(_EXPERIMENT.kind.name)
+    def move_all(blocks, inputs, noise):
+        for b in range(len(blocks)):
+            W = blocks[b]
+            for j in range(LANES):
+                W[u + j] = inputs[b * LANES + j]
+            draw_noise(W)
+            plant(W, noise, noise)
+
+    return move_all
+
+
+@cache
+def updater(factorisation: str, iterations: int) -> Any:
+    """``infer_all(blocks, inputs, outputs)``, one sample for the beliefs of all blocks, and the rows of a block."""
+    is_structured, model = factorisation == "structured", _EXPERIMENT.model
+    if is_structured:
+        task = structured(model, iterations=iterations)
+        update, place = task.update, task.layout
+    else:
+        place = mean_field.layout()
+        update = mean_field.updater(place)
+    u, y = place["U_0"] * LANES, place["Y_y"] * LANES
+
+    @kernel(kind=f"{model.digest}_{factorisation}_{iterations}")
+    def infer_all(blocks, inputs, outputs):
+        for b in range(len(blocks)):
+            W = blocks[b]
+            for j in range(LANES):
+                W[u + j] = inputs[b * LANES + j]
+                W[y + j] = outputs[b * LANES + j]
+            if is_structured:
+                update(W)
+            else:
+                update(W, iterations, False)
+
+    return infer_all, place
 
 
 @dataclass(frozen=True)
@@ -57,32 +91,34 @@ class Data:
     outputs: FloatArray
 
 
-def plants(num_envs: int) -> npt.NDArray[np.float64]:
-    """Blocks of twins at rest, (n_blocks, N_ROWS * LANES), with streams of random numbers and beliefs at the prior."""
+def plants(num_envs: int, factorisation: str = "structured") -> npt.NDArray[np.float64]:
+    """Blocks of twins at rest, (n_blocks, rows * LANES), with streams of random numbers and beliefs at the prior."""
+    experiment = experiment_of(factorisation)
+    place, prior = layout_of(experiment.kind), experiment.believed.record
     n_blocks = -(-num_envs // LANES)
-    blocks = np.zeros((n_blocks, N_ROWS, LANES))
-    truth = to_coefficients(SILVERBOX_TWIN)
-    for name, value in zip(
-        ("true_t1", "true_t2", "true_t3", "true_e"), (truth.theta1, truth.theta2, truth.theta3, truth.eta), strict=True
-    ):
-        blocks[:, LAYOUT[name]] = value
-    first = LAYOUT["stream_a"]
+    blocks = np.zeros((n_blocks, max(place.values()) + 1, LANES))
+    coefficients = coefficients_of(experiment.plant, experiment.center, experiment.step)
+    truth = {f"TRUE_{name}": value for name, value in zip(experiment.plant.coefficients, coefficients, strict=True)}
+    truth |= {f"PARAM_{name}": value for name, value in experiment.center.items()}
+    for name, value in truth.items():
+        blocks[:, place[name]] = value
+    first = place["STREAM_a"]
     rng = np.random.default_rng(0)
     words = np.stack([stream_words(rng) for _ in range(LANES)], axis=-1)
     # Copies of a few streams do: nothing here depends on their independence.
     blocks[:, first : first + 4] = words
-    blocks[:, :RECORD_SIZE] = Prior.silverbox_twin().to_record()[:, None]
+    blocks[:, : len(prior)] = prior[:, None]
     return blocks.reshape(n_blocks, -1)
 
 
 def play(num_envs: int) -> Data:
     """Let the plants run, to have something to infer from."""
-    blocks = plants(num_envs)
+    blocks, move_all = plants(num_envs), plant_mover()
     inputs = np.random.default_rng(1).uniform(-0.15, 0.15, (SAMPLES, len(blocks) * LANES))
     outputs = np.empty_like(inputs)
     for t in range(SAMPLES):
         move_all(blocks, inputs[t], NOISE)
-        outputs[t] = blocks.reshape(-1, N_ROWS, LANES)[:, LAYOUT["y"]].reshape(-1)
+        outputs[t] = blocks.reshape(len(blocks), -1, LANES)[:, _PLACE["Y_y"]].reshape(-1)
     return Data(inputs, outputs)
 
 
@@ -92,25 +128,30 @@ class PlantOnly:
     def __init__(self, num_envs: int, data: Data) -> None:
         self._blocks = plants(num_envs)
         self._inputs = data.inputs
+        self._move = plant_mover()
 
     def step(self, t: int) -> None:
         """Move by the t-th sample."""
-        move_all(self._blocks, self._inputs[t % SAMPLES], NOISE)
+        self._move(self._blocks, self._inputs[t % SAMPLES], NOISE)
 
 
 class EstimatorOnly:
     """The estimators alone, on data that lie ready; every `SAMPLES` samples they begin again at the prior."""
 
-    def __init__(self, data: Data, structured: bool, iterations: int) -> None:
-        record = Prior.silverbox_twin().to_record(factorisation="structured" if structured else "mean_field")
+    def __init__(self, data: Data, factorisation: str, iterations: int) -> None:
         self._data = data
-        self._rule = (structured, iterations)
-        n_blocks = data.inputs.shape[1] // LANES
-        self._prior = np.repeat(record[:, None], LANES, axis=1).reshape(-1)
-        self._blocks = np.zeros((n_blocks, N_BELIEF_ROWS * LANES))
+        self._infer, place = updater(factorisation, iterations)
+        self._prior = np.repeat(experiment_of(factorisation).believed.record, LANES)
+        self._blocks = np.zeros((data.inputs.shape[1] // LANES, len(place) * LANES))
 
     def step(self, t: int) -> None:
         """Update with the t-th sample."""
         if t % SAMPLES == 0:
-            self._blocks[:, : RECORD_SIZE * LANES] = self._prior
-        infer_all(self._blocks, self._data.inputs[t % SAMPLES], self._data.outputs[t % SAMPLES], *self._rule)
+            self._blocks[:, : len(self._prior)] = self._prior
+        self._infer(self._blocks, self._data.inputs[t % SAMPLES], self._data.outputs[t % SAMPLES])
+
+    def records(self) -> FloatArray:
+        """(n, size) the beliefs, as flat records; a copy."""
+        size = len(self._prior) // LANES
+        blocks = self._blocks.reshape(len(self._blocks), -1, LANES)[:, :size]
+        return blocks.swapaxes(1, 2).reshape(-1, size)

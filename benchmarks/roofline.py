@@ -13,15 +13,16 @@ from typing import Any
 import numpy as np
 
 from benchmarks.assembly import NotCounted, Operations, count
-from benchmarks.pieces import plants
+from benchmarks.pieces import experiment_of, plants
 from benchmarks.report import Claim, Section
 from benchmarks.timing import Result, Row, measure, timed
 from duffing_env.batch import Batch
 from duffing_env.experiment import SimulatedExperiment
-from duffing_env.kernel import RESET_NEXT_STEP, observe
-from duffing_env.plant import draw_noise, move_plant
-from duffing_env.rewards import settle
-from estimator.inference import DEFAULT_ITERATIONS, mean_field, structured
+from duffing_env.inference import updater
+from duffing_env.kernel import RESET_NEXT_STEP, noise_drawer
+from duffing_env.layout import layout_of
+from duffing_env.sources import parts
+from estimator.inference import mean_field
 from estimator.lanes import LANES, inlined, jit, kernel, lanewise, rows
 
 SIZE = 1024
@@ -29,24 +30,14 @@ STEPS = 256
 REPEATS = 1000
 TARGET_SHARE = 30.0
 
-# The pieces of a step: lane functions, and how often a step calls them.
 _INFERENCE = {"structured": "inference, structured", "mean_field": "inference, mean field"}
-_AROUND = ("noise", "plant", "reward and end", "observation")
-_PIECES: dict[str, dict[Any, int]] = {
-    "noise": {draw_noise: 1},
-    "plant": {move_plant: 1},
-    "inference, structured": {
-        structured.predict: 1,
-        structured.learn_noise: DEFAULT_ITERATIONS["structured"],
-        structured.correct: 1,
-    },
-    "inference, mean field": {
-        mean_field.begin: 1,
-        mean_field.iterate: DEFAULT_ITERATIONS["mean_field"],
-        mean_field.end: 1,
-    },
-    "reward and end": {settle: 1},
-    "observation": {observe: 1},
+# The pieces of a step, and in whose step each is timed.
+_PIECES = {
+    "noise": "structured",
+    "plant": "structured",
+    **{name: rule for rule, name in _INFERENCE.items()},
+    "reward and end": "structured",
+    "observation": "structured",
 }
 _STEPS = {"structured": "whole step, structured", "mean_field": "whole step, mean field"}
 
@@ -119,11 +110,34 @@ def _move_often(W, repeats):
         move(W, 1e-9)
 
 
+def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
+    """The pieces of a step: lane functions, and how often a step calls them."""
+    experiment = experiment_of(factorisation)
+    kind = experiment.kind
+    code = parts(kind)
+    if factorisation == "structured":
+        inference = {updater(kind): 1}
+    else:
+        begin, iterate, end, _ = mean_field.pieces(layout_of(kind))
+        inference = {begin: 1, iterate: experiment.setup.iterations, end: 1}
+    return {
+        "noise": {noise_drawer(layout_of(kind)): 1},
+        "plant": {code.plant: 1},
+        _INFERENCE[factorisation]: inference,
+        "reward and end": {code.settle: 1},
+        "observation": {code.observe_lanes: 1},
+    }
+
+
 def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
     """Time the step, its pieces and the yardsticks, and put the ones beside the others."""
     title = "Roofline, one thread"
+    found = {rule: pieces(rule) for rule in _STEPS}
     try:
-        operations = {name: _count(functions) for name, functions in _PIECES.items()}
+        operations = {name: _count(found[rule][name]) for name, rule in _PIECES.items()}
+        wholes = {
+            name: _total([_count(functions) for functions in found[rule].values()]) for rule, name in _STEPS.items()
+        }
         per_lane = {_FUSED: 2 * count(multiply_add).fused, _DIVISIONS: count(divide).divisions,
                     _ROOTS: count(take_root).roots, _STORES: count(move).stores}  # fmt: skip
     except NotCounted as reason:
@@ -138,11 +152,10 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
         Row(name, "flop/s" if name == _FUSED else "op/s", timed(_yardstick(function, per_lane[name])))
         for name, function in yardsticks.items()
     ]
-    timed_rows += [Row(name, "env-steps/s", timed(_piece(functions))) for name, functions in _PIECES.items()]
+    timed_rows += [Row(name, "env-steps/s", timed(_piece(found[rule][name], rule))) for name, rule in _PIECES.items()]
     timed_rows += [Row(name, "env-steps/s", timed(_steps(rule))) for rule, name in _STEPS.items()]
     results = measure(timed_rows, repetitions, on_row)
-    for rule, name in _STEPS.items():
-        operations[name] = _total([operations[piece] for piece in (*_AROUND, _INFERENCE[rule])])
+    operations |= wholes
     judged = {name: (operations[name], results[name]) for name in (*_INFERENCE.values(), *_STEPS.values())}
     peak = results[_FUSED].median
     claims = [
@@ -196,9 +209,9 @@ def _yardstick(function: Any, operations_per_lane: float) -> Callable[[int], flo
     return action
 
 
-def _piece(functions: dict[Any, int]) -> Callable[[int], float]:
+def _piece(functions: dict[Any, int], factorisation: str) -> Callable[[int], float]:
     """A piece of the step, again and again on blocks that lie in the nearer caches as those of the step do."""
-    initial = plants(SIZE)
+    initial = plants(SIZE, factorisation)
     blocks = initial.copy()
     piece = _nothing
     for function, times in functions.items():

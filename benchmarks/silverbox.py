@@ -18,7 +18,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from agents.silverbox_protocol import (
+from agents.studies.silverbox_protocol import (
     GIVEN,
     LENGTHS,
     SETTINGS,
@@ -31,14 +31,14 @@ from agents.silverbox_protocol import (
     samples_until_close,
     simulation_error,
 )
-from agents.silverbox_results import submission
+from agents.studies.silverbox_results import submission
 from benchmarks.peer_process import NotAvailable, Peers
 from benchmarks.report import ratio
 from benchmarks.timing import Result, Row, measure, timed
 from duffing_env.silverbox import Regime
-from estimator import NLARX, DuffingODE, JointBelief, OnlineEstimator, Prior
-from estimator.models.ode import NOISE_DIRECTION, from_coordinates, to_coordinates
-from estimator.models.regressors import PRESETS, as_arrays
+from estimator import OnlineEstimator
+from estimator.belief import Belief
+from estimator.models.difference import PRESETS
 from estimator.parameters import FloatArray
 
 TIMED = 4096
@@ -50,13 +50,13 @@ UNIT = "µs/sample"
 BAR = 5.0
 """Ours is to be this many times as fast per sample as dynamax's filter with the same model."""
 
-MODELS: dict[str, tuple[str, NLARX | DuffingODE]] = {
-    "ode": ("ODE linear", DuffingODE()),
-    "three-tap": ("NLARX three-tap", NLARX(regressors="three-tap")),
-    "cubic": ("NLARX cubic", NLARX(regressors="cubic")),
-    "paper": ("paper structured", NLARX(regressors=PRESETS["paper"])),
+MODELS = {
+    "ode": "ODE linear",
+    "three-tap": "NLARX three-tap",
+    "cubic": "NLARX cubic",
+    "paper": "paper structured",
 }
-"""By the name that a request has: the setting of ours, and its model as peers have it."""
+"""By the name that a request has: the setting of ours."""
 
 PEERS = {
     "dynamax EKF, ODE linear": ("dynamax", "ode"),
@@ -70,8 +70,11 @@ PEERS = {
 
 OFFLINE = "fastcan NARX, offline"
 
-_MOTION = [0, 1, 2, 3, 4, 5, 6, 8, 9]
-"""Places of the joint state without the cubic damping, which is 0."""
+_MOTION = [0, 1, 2, 4, 5, 3, 6, 7, 8]
+"""Places in our joint state of z, z', stiffness, damping, gain, cubic, force, y0 and d, which is the peers' order."""
+
+_DIRECTION = np.array([1.0, 2.0])
+"""What a force that is held over a sample does to (z, z'), but for spring and damper, which ours has as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,35 +149,32 @@ def given(sections: Sections, outcomes: Mapping[str, Outcome]) -> dict[str, Any]
     for name in TESTS:
         section: Regime = getattr(sections, name)
         arrays |= {f"{name}_u": section.u, f"{name}_given": section.y[:GIVEN]}
-    for name, (ours, model) in MODELS.items():
+    for name, ours in MODELS.items():
         prior = prior_of(name)
         learned = outcomes[ours].beliefs[TRAINING_SAMPLES]
         arrays |= {
             f"{name}_process_variance": 1 / learned.gamma_mean,
             f"{name}_measurement_variance": 1 / learned.xi_mean,
         }
-        if isinstance(model, DuffingODE):
-            mean, cov = to_coordinates(prior.mean, prior.cov)
-            mean, cov, direction = mean[_MOTION], cov[np.ix_(_MOTION, _MOTION)], NOISE_DIRECTION
-            arrays[f"{name}_substeps"] = model.substeps
+        mean, cov, direction = prior.mean, prior.cov, np.array([1.0, 0.0])
+        if name == "ode":
+            mean, cov, direction = mean[_MOTION], cov[np.ix_(_MOTION, _MOTION)], _DIRECTION
+            arrays[f"{name}_substeps"] = prior.model.substeps
         else:
-            mean, cov, direction = prior.mean, prior.cov, np.array([1.0, 0.0])
-            arrays[f"{name}_terms"] = as_arrays(model.terms)
+            arrays[f"{name}_terms"] = terms_of(name)
         arrays |= {f"{name}_mean": mean, f"{name}_cov": cov, f"{name}_direction": direction}
     return arrays
 
 
-def prior_of(name: str) -> JointBelief:
+def prior_of(name: str) -> Belief:
     """Our prior for a model of `MODELS`."""
-    ours, model = MODELS[name]
-    prior, own = SETTINGS[ours].prior, model.prior()
-    if not isinstance(prior, Prior):
-        return own
-    mean = np.concatenate([prior.state_mean, prior.theta_mean, [prior.eta_mean]])
-    cov = np.zeros((len(mean), len(mean)))
-    cov[:2, :2], cov[2:, 2:] = prior.state_cov, prior.coefficients_cov
-    noises = (prior.gamma_shape, prior.gamma_rate, prior.xi_shape, prior.xi_rate)
-    return JointBelief(own.names, own.units, mean, cov, *noises)
+    return SETTINGS[MODELS[name]].estimator().belief
+
+
+def terms_of(name: str) -> FloatArray:
+    """(K, 3) powers of the lags and delay of the input, or -1, of a model's terms."""
+    delay = SETTINGS[MODELS[name]].rig.delay
+    return np.array([(t.lag1, t.lag2, -1 if t.tap is None else t.tap + delay) for t in PRESETS[name]])
 
 
 # --- What they come to ---------------------------------------------------------------------------------------------
@@ -187,7 +187,7 @@ def run(
     training = sections.training
     u, y = training.u[:TIMED], training.y[:TIMED]
     rows = []
-    for name, (ours, _) in MODELS.items():
+    for name, ours in MODELS.items():
         rows.append(Row(ours, UNIT, timed(_passes(ours, u, y))))
         rows += [
             peers.row(f"silverbox {peer} {name} time", title, UNIT)
@@ -232,7 +232,7 @@ def judge(
     name: str, answer: Mapping[str, Any], time: Result, sections: Sections, outcomes: Mapping[str, Outcome]
 ) -> Contender:
     """Measures what an online peer answered."""
-    noises = outcomes[MODELS[name][0]].beliefs[TRAINING_SAMPLES]
+    noises = outcomes[MODELS[name]].beliefs[TRAINING_SAMPLES]
     learning = {}
     for samples, mean in zip(LENGTHS, answer["means"], strict=True):
         estimator = estimator_at(name, np.array(mean), 1 / noises.gamma_mean, 1 / noises.xi_mean)
@@ -255,18 +255,11 @@ def estimator_at(
     """
     if not np.isfinite(mean).all():
         return None
-    _, model = MODELS[name]
-    prior = prior_of(name)
-    if isinstance(model, DuffingODE):
-        whole = np.zeros(len(prior.mean))
-        whole[_MOTION[2:]] = mean[2:]
-        whole, _ = from_coordinates(whole, np.eye(len(whole)))
-    else:
-        whole = np.concatenate([[0.0, 0.0], mean[2:]])
-    belief = JointBelief(
-        prior.names, prior.units, whole, prior.cov, 1.0, process_variance, 1.0, measurement_variance
-    )  # fmt: skip
-    return OnlineEstimator(model, belief)
+    prior, places = prior_of(name), _MOTION if name == "ode" else list(range(len(mean)))
+    whole = prior.mean
+    whole[places[2:]] = mean[2:]
+    noises = (1.0, process_variance), (1.0, measurement_variance)
+    return OnlineEstimator(prior.model, Belief.of(prior.model, whole, prior.cov, *noises), SETTINGS[MODELS[name]].rig)
 
 
 def _offline(peers: Peers, sections: Sections) -> Contender:
@@ -296,7 +289,7 @@ def faster(contenders: Mapping[str, Contender], title: str) -> tuple[float, bool
 
     Errors are compared as the submission line gives them, to the microvolt. NaN and False without the peer.
     """
-    theirs, ours = contenders[title], contenders[MODELS[PEERS[title][1]][0]]
+    theirs, ours = contenders[title], contenders[MODELS[PEERS[title][1]]]
     if theirs.reason:
         return float("nan"), False
     no_worse = all(round(1e6 * ours.errors[test]) <= round(1e6 * theirs.errors[test]) for test in TESTS)
@@ -320,7 +313,7 @@ def report(
     console.print(", ".join(f"{name} {versions[name]}" for name in used) or "no peers")
     console.print("\nSpeed at equal or better error:")
     for title, (times, no_worse) in claims.items():
-        ours = MODELS[PEERS[title][1]][0]
+        ours = MODELS[PEERS[title][1]]
         if np.isnan(times):
             console.print(f"  not available: {title}")
             continue

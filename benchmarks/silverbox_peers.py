@@ -55,7 +55,7 @@ def repeat(steps: int, body: Callable[[Any, Any], Any], carry: Any) -> Any:
 
 
 def flow(substeps: int, loop: Callable[..., Any] = repeat) -> Callable[[Any, Any], tuple[Any, Any]]:
-    """Moves (z, z') of a state (z, z', k, c, g, b, f, y0, d) over a sample, as `estimator.models.ode.flow` does.
+    """Moves (z, z') of a state (z, z', k, c, g, b, f, y0, d) over a sample, as `estimator.models.duffing` says.
 
     z'' = g u + f - c z' - k z - b (z - y0)³, input interpolated linearly, Runge-Kutta of order 4; time in samples.
     """

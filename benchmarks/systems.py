@@ -7,15 +7,25 @@ start tells the offsets apart, and is therefore drawn as the prior has it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from estimator import NLARX, SILVERBOX_TWIN, DuffingODE, JointBelief, PhysicalParameters, Prior, to_coefficients
-from estimator.lanes import kernel
-from estimator.models.ode import N_JOINT, N_MOTION, N_STATES, flow, to_coordinates
-from estimator.models.regressors import PRESETS, Term
-from estimator.parameters import SAMPLING_STEP, FloatArray, log_uniform_moments
+from estimator import (
+    SILVERBOX_TWIN,
+    Model,
+    Parameters,
+    Rig,
+    coefficients_of,
+    difference,
+    duffing,
+    recorded_prior,
+    silverbox_prior,
+)
+from estimator.belief import Belief
+from estimator.models.difference import PRESETS, Term
+from estimator.parameters import FloatArray
+from estimator.priors import log_uniform_moments
 
 MODELS = ("paper", "offset", "three-tap", "cubic", "ode")
 
@@ -24,13 +34,15 @@ MAX_INPUT = 0.15  # V; inputs are independent and uniform on ± this
 MAX_DISPLACEMENT = 0.75  # V; above it the difference equations blow up, where the circuit does not
 STATE_STD = 1e-3  # V, and V per sample; of the state's prior
 
-#: The terms of Eq. (2), in the order of (θ1, θ2, θ3, η), and standard deviations of the other coefficients.
-_FOUR = PRESETS["paper"]
-_OTHERS = {Term(): 2e-3, Term(tap=0): 0.05, Term(tap=2): 0.05}
+#: Standard deviations of the coefficients that Eq. (2) does not have, by unit.
+_OTHERS = {"V": 2e-3, "1": 0.05}
 _PRODUCT = 0.1
 
-#: Places of what the physical equation is not given within SPREAD: u0, y0, feedthrough.
-_OFFSETS = (4, 6, 7)
+#: The physical equation of the tables: its noise is an acceleration held over a sample.
+ODE = duffing(offsets=True, feedthrough=True, noise="held")
+
+#: What is log-uniform of it, in the order of the draws.
+_DRAWN = ("stiffness", "damping", "gain", "cubic")
 
 
 @dataclass(frozen=True)
@@ -52,39 +64,60 @@ class Systems:
     stayed: np.ndarray
 
 
-def make_model(name: str) -> NLARX | DuffingODE:
-    """The estimator's model of a population in `MODELS`. The paper's pairs u_t with the output that it leads to."""
-    if name == "ode":
-        return DuffingODE()
-    return NLARX(input_delay=0) if name == "paper" else NLARX(regressors=name)
+def make_model(name: str) -> Model:
+    """The estimator's model of a population in `MODELS`."""
+    return ODE if name == "ode" else difference(name)
 
 
-def make_prior(name: str, process_noise: float, measurement_noise: float, noise_shape: float) -> Prior | JointBelief:
+def make_rig(name: str) -> Rig:
+    """How its inputs act: the newest tap with the output of its own index; of the physical equation linearly."""
+    return Rig.silverbox("linear") if name == "ode" else Rig.silverbox("zero_order", int(name == "offset"))
+
+
+def make_prior(name: str, process_noise: float, measurement_noise: float, noise_shape: float) -> Belief:
     """The prior with the moments of the population `draw` draws from, and Gamma priors centred at the given noises."""
     if name == "paper":
-        return Prior.silverbox_twin(SPREAD, process_noise, measurement_noise, noise_shape)
+        return silverbox_prior(None, SPREAD, process_noise, measurement_noise, noise_shape)
+    model = make_model(name)
+    weak = recorded_prior(model, SPREAD, process_noise, measurement_noise, noise_shape)
+    mean, cov = weak.mean, weak.cov
     if name == "ode":
-        weak = DuffingODE().prior(SPREAD, process_noise, measurement_noise, noise_shape)
         width = np.log((1 + SPREAD) / (1 - SPREAD))
-        mean = 2 * SPREAD / width  # of a value over the twin's
-        mean_square = 2 * SPREAD / width  # half of (1 + s)² - (1 - s)², over the width
-        scale = np.ones(N_JOINT)
-        scale[N_STATES : N_STATES + 4] = np.sqrt(mean_square - mean**2) / SPREAD
-        std = scale * np.sqrt(np.diag(weak.cov))
-        std[:N_STATES] = STATE_STD, STATE_STD / SAMPLING_STEP
-        means = weak.mean.copy()
-        means[N_STATES : N_STATES + 4] *= mean
-        return replace(weak, mean=means, cov=np.diag(std**2))
-    weak = NLARX(regressors=name).prior(SPREAD, process_noise, measurement_noise, noise_shape)
-    terms = PRESETS[name]
-    mean, cov = weak.mean.copy(), np.diag([STATE_STD**2] * 2 + [_std(term) ** 2 for term in terms])
-    places = [2 + terms.index(term) for term in _FOUR]
-    mean[places], cov[np.ix_(places, places)] = log_uniform_moments(SILVERBOX_TWIN, SPREAD)
-    return replace(weak, mean=mean, cov=cov)
+        factor = 2 * SPREAD / width  # mean of a value over the twin's, and of its square
+        places = [model.names.index(coefficient) for coefficient in _DRAWN]
+        offset = model.names.index("output_offset")
+        cov[places, places] = (factor - factor**2) * mean[places] ** 2
+        mean[places] *= factor
+        cov[:2, :2] = STATE_STD**2 * np.eye(2)
+        cov[0, 0] += cov[offset, offset]
+        mean, cov = _with_force(model, mean, cov)
+    else:
+        terms, four = PRESETS[name], _paper_terms(name)
+        cov = np.diag([STATE_STD**2] * 2 + [_std(term) ** 2 for term in terms])
+        mean[2:] = 0.0
+        places = [2 + terms.index(term) for term in four]
+        mean[places], cov[np.ix_(places, places)] = log_uniform_moments(difference(), SILVERBOX_TWIN, SPREAD)
+    noises = weak.noises
+    return Belief.of(model, mean, cov, (noises[0], noises[1]), (noises[2], noises[3]))
+
+
+def _with_force(model: Model, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The force's moments, stiffness y0 - gain u0, of a stiffness and a gain that are drawn as well."""
+    k, g, f, offset = (model.names.index(name) for name in ("stiffness", "gain", "force", "output_offset"))
+    spread = cov[offset, offset]  # of u0 as well
+    cov[f, f] = spread * (mean[k] ** 2 + cov[k, k] + mean[g] ** 2 + cov[g, g])
+    for other in (0, offset):
+        cov[f, other] = cov[other, f] = mean[k] * spread
+    return mean, cov
+
+
+def _paper_terms(name: str) -> tuple[Term, ...]:
+    """The terms of Eq. (2) in the order of (θ1, θ2, θ3, η): its input acts a sample before the output."""
+    return (*PRESETS["paper"][:3], Term(tap=0 if name in ("paper", "offset") else 1))
 
 
 def _std(term: Term) -> float:
-    return _OTHERS.get(term, _PRODUCT)
+    return _OTHERS.get(term.unit, _PRODUCT)
 
 
 def draw(
@@ -95,7 +128,7 @@ def draw(
     Args:
         name: one of `MODELS`. ``paper`` and the presets: m, c, a and b are log-uniform, the other coefficients normal
             (offset 2 mV, further taps 0.05, further products 0.1 V⁻¹ or V⁻²). ``ode``: stiffness, damping, gain and
-            cubic stiffness are log-uniform, offsets and feedthrough as `DuffingODE.prior` has them.
+            cubic stiffness are log-uniform, offsets and feedthrough as `recorded_prior` has them.
         systems: their number N.
         process_noise: standard deviation of what the process noise of a sample does to the displacement [V].
         measurement_noise: standard deviation of v [V].
@@ -104,26 +137,28 @@ def draw(
     """
     factors = np.exp(rng.uniform(np.log(1 - SPREAD), np.log(1 + SPREAD), (systems, 4)))
     if name == "ode":
-        std = np.sqrt(np.diag(DuffingODE().prior().coefficients_cov))
-        truth = DuffingODE().prior().coefficients_mean * np.ones((systems, 1))
-        truth[:, :4] *= factors
-        truth[:, _OFFSETS] = std[list(_OFFSETS)] * rng.standard_normal((systems, 3))
-        return Systems(DuffingODE.names, truth, *simulate_ode(truth, process_noise, measurement_noise, samples, rng))
-    twin = np.array([SILVERBOX_TWIN.m, SILVERBOX_TWIN.c, SILVERBOX_TWIN.a, SILVERBOX_TWIN.b])
-    physical = twin * factors
-    psi = to_coefficients(PhysicalParameters(*physical.T))
-    four = dict(zip(_FOUR, (psi.theta1, psi.theta2, psi.theta3, psi.eta), strict=True))
+        weak = recorded_prior(ODE)
+        truth = dict(zip(ODE.coefficients, np.tile(weak.coefficients_mean, (systems, 1)).T, strict=True))
+        for coefficient, factor in zip(_DRAWN, factors.T, strict=True):
+            truth[coefficient] = truth[coefficient] * factor
+        u0, y0, d = ([0.02, 0.02, 0.1] * rng.standard_normal((systems, 3))).T
+        truth |= {"output_offset": y0, "feedthrough": d, "force": truth["stiffness"] * y0 - truth["gain"] * u0}
+        coefficients = np.column_stack([truth[coefficient] for coefficient in ODE.coefficients])
+        records = simulate_ode(coefficients, process_noise, measurement_noise, samples, rng)
+        return Systems(tuple(ODE.coefficients), coefficients, *records)
+    physical = np.array(list(SILVERBOX_TWIN.values())) * factors
+    known = coefficients_of(difference(), Parameters(zip("mcab", physical.T, strict=True)))
+    four = dict(zip(_paper_terms(name), known.T, strict=True))
     terms = PRESETS[name]
     coefficients = np.column_stack(
         [four[term] if term in four else _std(term) * rng.standard_normal(systems) for term in terms]
     )
-    if name == "paper":
-        terms = (*terms[:-1], Term(tap=0))
-    records = simulate(terms, coefficients, process_noise, measurement_noise, samples, rng)
+    delayed = tuple(term._replace(tap=1) if name == "offset" and term.tap == 0 else term for term in terms)
+    records = simulate(delayed, coefficients, process_noise, measurement_noise, samples, rng)
     if name == "paper":
         names = ("θ1", "θ2", "θ3", "η", "m", "c", "a", "b")
         return Systems(names, np.column_stack([coefficients, physical]), *records)
-    return Systems(tuple(term.name for term in terms), coefficients, *records)
+    return Systems(tuple(term.expression for term in terms), coefficients, *records)
 
 
 def simulate(
@@ -153,22 +188,37 @@ def simulate(
 
 
 def simulate_ode(
-    parameters: FloatArray, process_noise: float, measurement_noise: float, samples: int, rng: np.random.Generator
+    coefficients: FloatArray, process_noise: float, measurement_noise: float, samples: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Simulate the physical equation with parameters (N, 8) and an input that is linear between samples.
+    """Simulate the physical equation with coefficients (N, 7) and an input that is linear between samples.
 
-    It starts at random, with the standard deviations of the prior. Returns as `simulate`; its cubic stiffness hardens,
-    so that all systems stay.
+    It starts at random one sample before the first, with the standard deviations of the prior, under no input. Returns
+    as `simulate`; its cubic stiffness hardens, so that all systems stay.
     """
-    model = DuffingODE()
-    shape = (len(parameters), samples)
+    shape = (len(coefficients), samples)
     u, w, y = _inputs_and_noises(shape, process_noise, measurement_noise, rng)
-    starts = rng.standard_normal((len(parameters), N_STATES)) * [STATE_STD, STATE_STD / SAMPLING_STEP]
-    for i, truth in enumerate(parameters):
-        coordinates = to_coordinates(np.concatenate([starts[i], truth]), np.zeros((N_JOINT, N_JOINT)))[0]
-        z = np.empty(samples)
-        move(coordinates[:N_MOTION], model.pieces(u[i]), w[i], model.substeps, z)
-        y[i] += z + truth[-1] * u[i]
+    k, b, c, g, f, y0, d = coefficients.T
+    x, v = STATE_STD * rng.standard_normal((len(coefficients), 2)).T
+    state = np.array([x + y0, v])
+
+    def rates(state: FloatArray, force: FloatArray) -> FloatArray:
+        z, v = state
+        return np.array([v, force - c * v - k * z - b * (z - y0) ** 3])
+
+    before, h = np.zeros(len(coefficients)), 1 / ODE.substeps
+    for t in range(samples):
+        for i in range(ODE.substeps):
+            # The process noise is a force over the sample: alone, it would move z by w.
+            begin, middle, end = (
+                g * (before + (u[:, t] - before) * (i + part) * h) + f + 2 * w[:, t] for part in (0.0, 0.5, 1.0)
+            )
+            r1 = rates(state, begin)
+            r2 = rates(state + h / 2 * r1, middle)
+            r3 = rates(state + h / 2 * r2, middle)
+            r4 = rates(state + h * r3, end)
+            state = state + h / 6 * (r1 + 2 * r2 + 2 * r3 + r4)
+        before = u[:, t]
+        y[:, t] += state[0] + d * u[:, t]
     return u, y, np.ones(shape[0], dtype=bool)
 
 
@@ -177,27 +227,3 @@ def _inputs_and_noises(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     u = rng.uniform(-MAX_INPUT, MAX_INPUT, shape)
     return u, process_noise * rng.standard_normal(shape), measurement_noise * rng.standard_normal(shape)
-
-
-@kernel
-def move(start, pieces, w, substeps, z):
-    """Displacements with offset (T,) of the physical equation, into ``z``.
-
-    Args:
-        start: (N_MOTION,) the state (z, z') and the parameters, in the coordinates of `to_coordinates`.
-        pieces: (T - 1, degree + 1) the input on the way from each sample to the next.
-        w: (T,) process noise: an acceleration held over the sample, by which it moves z [V].
-        substeps: Runge-Kutta steps per sample.
-        z: (T,) receives the displacements [V].
-    """
-    sensitivities = np.empty((N_STATES, N_MOTION))
-    work = np.empty((3, N_STATES, N_MOTION))
-    position, velocity = start[0], start[1]
-    for t in range(len(z)):
-        if t > 0:
-            position, velocity = flow(
-                position, velocity, start[N_STATES:], pieces[t - 1], substeps, sensitivities, work
-            )  # fmt: skip
-        position += w[t]
-        velocity += 2.0 * w[t]
-        z[t] = position

@@ -16,8 +16,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation import evaluate
-from agents.leaderboard import BASELINES, summarise
+from agents.evaluation.leaderboard import BASELINES, summarise
+from agents.evaluation.rollout import evaluate
 from agents.policies.learned import CARD
 from agents.training import PPOSettings, TrainConfig
 from benchmarks.peer_process import ROOT

@@ -86,8 +86,8 @@ class ContinuousEnv(DuffingEnv):
     ## Information
 
     Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], ``diverged``. At the end of an
-    episode also ``belief`` (`estimator.ContinuousBelief`; with ``estimator="nlarx"`` `estimator.Belief`) and ``truth``
-    (`estimator.PhysicalParameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+    episode also ``belief`` (`estimator.Belief`) and ``truth`` (`estimator.Parameters`). At any time:
+    ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
 
     ## Arguments
 
@@ -115,7 +115,7 @@ class ContinuousEnv(DuffingEnv):
     >>> truncated = False
     >>> while not truncated:
     ...     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-    >>> list(info["belief"].parameters())
+    >>> list(info["belief"].coefficients())
     ['stiffness', 'cubic', 'damping', 'gain']
     >>> m, c, a, b = info["belief"].physical()[0]
     >>> bool(abs(m / info["truth"].m - 1) < 0.05)

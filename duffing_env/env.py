@@ -13,10 +13,11 @@ from gymnasium.error import ResetNeeded
 from duffing_env.batch import Batch
 from duffing_env.experiment import Experiment, SimulatedExperiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND
-from duffing_env.layout import OBSERVATION, SUMMED
+from duffing_env.layout import SUMMED, observation_bounds
 from duffing_env.replay import ReplayExperiment
-from estimator.belief import RecordBelief
-from estimator.parameters import FloatArray, PhysicalParameters
+from estimator.belief import Belief
+from estimator.models.model import Model
+from estimator.parameters import FloatArray, Parameters
 
 if TYPE_CHECKING:
     from duffing_env.rendering import Screen
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
 Observation = npt.NDArray[np.float32]
 
 
-def observation_space() -> spaces.Box:
-    """The observation's space: a flat float32 Box with finite bounds, one per entry of `OBSERVATION`."""
-    low, high = np.array(list(OBSERVATION.values()), dtype=np.float32).T
+def observation_space(model: Model) -> spaces.Box:
+    """The observation's space: a flat float32 Box with finite bounds (`duffing_env.layout.observation_bounds`)."""
+    low, high = np.array(list(observation_bounds(model).values()), dtype=np.float32).T
     return spaces.Box(low.copy(), high.copy(), dtype=np.float32)
 
 
@@ -106,7 +107,7 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], summed over the samples that an
     action is held for; ``diverged``. At the end of an episode also ``belief`` (`estimator.Belief`) and ``truth``
-    (`estimator.PhysicalParameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+    (`estimator.Parameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
 
     ## Arguments
 
@@ -162,10 +163,11 @@ class DuffingEnv(gym.Env[Any, Any]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be one of {self.metadata['render_modes']}, but is {render_mode!r}")
         self.experiment = make_experiment(self.experiment_kind, options)
-        self.observation_space = observation_space()
+        self.observation_space = observation_space(self.experiment.model)
         self.action_space = action_space()
         self.render_mode = render_mode
         self._batch = Batch(self.experiment, 1, RESET_BY_HAND)
+        self._sensor = next(iter(self.experiment.truth_model.outputs))
         self._streamed: np.random.Generator | None = None
         self._running = False
         self._screen: Screen | None = None
@@ -181,19 +183,19 @@ class DuffingEnv(gym.Env[Any, Any]):
         return self.experiment.samples
 
     @property
-    def belief(self) -> RecordBelief:
+    def belief(self) -> Belief:
         """The posterior now."""
         return self._batch.belief(0)
 
     @property
     def records(self) -> FloatArray:
-        """(1, RECORD_SIZE) the posterior now as the flat record of `estimator.record`, as the vector environment's."""
+        """(1, size) the posterior now as the flat record of `estimator.Belief`, as the vector environment's."""
         return self._batch.records()
 
     @property
-    def truth(self) -> PhysicalParameters:
+    def truth(self) -> Parameters:
         """The oscillator that is to be identified."""
-        return self._batch.oscillator(0)
+        return self._batch.true_of(0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -241,7 +243,7 @@ class DuffingEnv(gym.Env[Any, Any]):
                 break
             before, outcome = outcome, self._play_sample(action)
             for name in SUMMED:
-                outcome[name] += before[name]
+                outcome[name.lower()] += before[name.lower()]
         return outcome
 
     def _play_sample(self, action: float) -> dict[str, float]:
@@ -272,11 +274,11 @@ class DuffingEnv(gym.Env[Any, Any]):
             self._screen = Screen(
                 self.render_mode, self.max_input, self.experiment.max_output, self.metadata["render_fps"]
             )  # fmt: skip
-        self._screen.start(self._batch.oscillator(0), self.belief, self.horizon)
+        self._screen.start(self._batch.true_of(0), self.belief, self.horizon)
 
     def _draw(self) -> None:
         assert self._screen is not None
-        u, y = self._batch.quantity("u")[0], self._batch.quantity("y")[0]
+        u, y = self._batch.quantity("INPUT")[0], self._batch.quantity(f"Y_{self._sensor}")[0]
         self._screen.add(float(u), float(y), self.belief)
 
     def close(self) -> None:

@@ -1,61 +1,82 @@
 """The reward ``expected_free_energy``: what a sample teaches as it is expected, before its outcome is seen.
 
-The belief before the sample, with the input that is chosen, predicts an output of variance S = s + 1/E[γ] + 1/E[ξ] and
-of covariance c with the coefficients, linearised at the belief's mean. Of the mutual information of output and
-coefficients, which is what the expected free energy counts as epistemic, there is then
+The belief before the sample, with the input that is chosen, predicts the outputs. Conditioning on them shrinks the
+coefficients' covariance from C to C', whatever they turn out to be, to first order:
 
-    I = -½ log(1 - cᵀ C⁻¹ c / S)    [nats],
+    I = ½ log det C - ½ log det C'    [nats],
 
-with C the coefficients' covariance: the decrease of their entropy that conditioning on the output brings, whatever the
-output is. For the physical equation S has N_xx/E[γ] in the place of 1/E[γ] (`estimator.inference.continuous`).
-
-The prediction is the structured one for every belief; of a mean-field one the covariances between its factors are zero.
+which is what the expected free energy counts as epistemic: the mutual information of outputs and coefficients. The
+prediction is the structured one for every belief; of a mean-field one the covariances between its factors are zero.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from duffing_env.layout import LAYOUT
-from duffing_env.rewards import log_det_and_density
-from estimator.elementary import log
-from estimator.inference import continuous as ode
-from estimator.inference import structured
-from estimator.lanes import jit, lanewise, relaid
-from estimator.record import MEAN_FIELD_SCRATCH, NOISES
-
-# The belief stays as it is: what a prediction makes of its noises goes to rows that only a mean-field update uses.
-_MADE = (*NOISES, "prior_g_rate", "prior_n_rate", "next_process_variance", "next_measurement_variance")
-_LAYOUT = {**LAYOUT, **{name: LAYOUT[row] for name, row in zip(_MADE, MEAN_FIELD_SCRATCH, strict=False)}}
-
-_predict_difference = relaid(structured.predict, _LAYOUT)
-_predict_continuous = relaid(ode.predict, _LAYOUT)
+from duffing_env.layout import Kind
+from duffing_env.rewards import Hooks, nothing, nothing_in_lane
+from estimator.lanes import part
 
 
-@lanewise(LAYOUT, "surprise", uniform="nonlinear continuous")
-def _expect(
-    predicted_variance, c_t1, c_t2, c_t3, c_e, N_xx,
-    P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e,
-    g_shape, g_rate, n_shape, n_rate, nonlinear, continuous,
-):  # fmt: skip
-    P = (P_t1_t1, P_t1_t2, P_t1_t3, P_t1_e, P_t2_t2, P_t2_t3, P_t2_e, P_t3_t3, P_t3_e, P_e_e)
-    process_variance = g_rate / g_shape * (N_xx if continuous != 0.0 else 1.0)
-    scale = 1.0 / np.sqrt(predicted_variance + process_variance + n_rate / n_shape)
-    log_det, log_density, _ = log_det_and_density(
-        0.0, 0.0, 0.0, 0.0, P, c_t1 * scale, c_t2 * scale, c_t3 * scale, c_e * scale, nonlinear != 0.0
-    )  # fmt: skip
-    explained = -2.0 * log_density - log_det  # cᵀ C⁻¹ c / S
-    return 0.5 * log(1.0 - explained)
+def source(kind: Kind, loop: Any) -> str:
+    """``expect(W)``: an imagined sample at the belief."""
+    from estimator.engine.derive import symbol
+
+    # γ counts the noise as the first sensor shows that of one sample; N is of unit strength.
+    noises = {"Q": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
+    noises |= {f"R_{y}": symbol(f"XI_RATE_{y}") / symbol(f"XI_SHAPE_{y}") for y in kind.belief.outputs}
+    return imagined_sample("expect", kind, loop, noises)
 
 
-@jit
-def foresee(W, nonlinear, continuous):
-    """The expected free energy of the coming sample, in rows ``surprise``; its input stands in row ``u``."""
-    if continuous != 0.0:
-        ode.begin(W)
-        for s in range(ode.SUBSTEPS):
-            ode.move(W, s / ode.SUBSTEPS, 1.0 / ode.SUBSTEPS)
-        _predict_continuous(W)
-    else:
-        _predict_difference(W)
-    _expect(W, nonlinear, continuous)
+def imagined_sample(
+    name: str, kind: Kind, loop: Any, at: Mapping[str, Any], told: Sequence[str] = (), keeps: bool = False
+) -> str:
+    """Source of ``name(W, *told)``: outputs as expected; leaves ½ log det C - ½ log det C' in ``WORK`` [nats].
+
+    Args:
+        name: of the function.
+        kind: whose model is believed.
+        loop: as `duffing_env.sources` makes it.
+        at: quantity of the model to what stands in its place: another row, or an expression.
+        told: further arguments.
+        keeps: whether the covariance afterwards is kept, in the rows of ``at``.
+    """
+    import sympy as sp
+
+    from duffing_env.sources import log_det_and_density
+    from estimator.engine import algebra, derive
+
+    model, text, body = kind.belief, "", ""
+    lines, motion = derive.moved(model)
+    if model.is_continuous:
+        carried = derive.carried(model)
+        start = [(f"V_{row}", value) for row, value in derive.carried_at_start(model).items()]
+        text += loop(
+            f"{name}_begin", "The point that moves.", derive.renamed(start, at), {row: f"V_{row}" for row in carried}
+        )
+        step = derive.renamed(derive.motion_step(model, kind.degree), at)
+        text += loop(f"{name}_move", "One Runge-Kutta step.", step, {row: f"{row}_E" for row in carried}, "T")
+        steps = model.substeps
+        body = f"    {name}_begin(W)\n    for s in range({steps}):\n        {name}_move(W, s / {steps})\n"
+    more, results = algebra.expected_sample(model, motion, kind.degree)
+    log, covariances = sp.Function("log"), [row for row in results if row.startswith("P_")]
+    before, now, _, _ = log_det_and_density(model, tag="B")
+    entries = {row: derive.symbol(results[row]) for row in covariances}
+    after, then, _, _ = log_det_and_density(model, entries=entries, tag="A")
+    lines = derive.renamed([*lines, *more, *before, *after, ("GAINED", (log(now) - log(then)) / 2)], at)
+    kept = {at[row]: str(derive.renamed([("", entries[row])], at)[0][1]) for row in covariances} if keeps else {}
+    text += loop(f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept, "WORK": "GAINED"}, *told)
+    arguments = ", ".join(["W", *told])
+    return text + f"@jit\ndef {name}({arguments}):\n{body}    {name}_finish({arguments})\n"
+
+
+def hooks(kind: Kind, code: Any) -> Hooks:
+    """It expects before the belief is updated."""
+    expect = code.expect
+
+    @part(kind.name)
+    def before_the_update(W, setup):
+        expect(W)
+
+    return Hooks(nothing_in_lane, nothing, before_the_update, nothing)

@@ -12,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from duffing_env.layout import OSCILLATOR, SETTINGS
-from duffing_env.rewards import reward_number
-from estimator.belief import Belief, RecordBelief
-from estimator.continuous import CONTINUOUS_TWIN, ContinuousBelief, continuous_prior
+from duffing_env.layout import Kind, Setup, parameter_names
+from duffing_env.rewards import REWARDS, check_reward
+from estimator.belief import Belief
 from estimator.inference import DEFAULT_ITERATIONS
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray, PhysicalParameters
-from estimator.prior import Prior
-from estimator.record import COEFFICIENTS, RECORD
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.models.model import Model
+from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.priors import log_uniform_moments, weak_prior
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Experiment:
             raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {self.factorisation!r}")
         if self.iterations is not None:
             self._check_count("iterations")
-        reward_number(self.reward)
+        check_reward(self.reward)
         self._check_positive("max_input")
         self._check_positive("max_output")
         self._check_count("hold")
@@ -80,83 +81,98 @@ class Experiment:
         raise NotImplementedError
 
     @property
-    def believed(self) -> Prior:
+    def model(self) -> Model:
+        """The model that is believed."""
+        return difference()
+
+    @property
+    def plant(self) -> Model | None:
+        """The model that is simulated; None where a record is replayed."""
+        return None
+
+    @property
+    def truth_model(self) -> Model:
+        """The model whose parameters the truth has."""
+        return self.plant or self.model
+
+    @property
+    def degree(self) -> int:
+        """Of the input over a sample of a differential equation: 0 held, 1 linear from the last input to this one."""
+        return 0
+
+    @property
+    def step(self) -> float:
+        """Sampling step [s]."""
+        return SAMPLING_STEP
+
+    @property
+    def believed(self) -> Belief:
         """The belief that every episode starts from."""
         raise NotImplementedError
 
     @property
-    def twin(self) -> PhysicalParameters:
-        """The oscillator in the middle of the range."""
-        return SILVERBOX_TWIN
-
-    @property
-    def plant_kind(self) -> str:
-        """The plant's name in `duffing_env.kernel.PLANTS`."""
-        return "difference"
-
-    @property
-    def estimator_kind(self) -> str:
-        """The estimator's name in `duffing_env.kernel.ESTIMATORS`."""
-        return self.factorisation
-
-    @property
-    def is_nonlinear(self) -> bool:
-        """Whether the estimator's model has the cubic term."""
-        return True
+    def center(self) -> dict[str, float]:
+        """The plant in the middle of the range."""
+        return twin_of(self.truth_model)
 
     @property
     def recorded(self) -> tuple[FloatArray, FloatArray]:
-        """Recorded input and output [V]; of one sample each where the plant is simulated."""
+        """Recorded input and output; of one sample each where the plant is simulated."""
         return np.zeros(1), np.zeros(1)
 
     @property
-    def plant_settings(self) -> dict[str, float]:
-        """Entries of `SETTINGS` that describe the plant."""
+    def plant_setup(self) -> dict[str, Any]:
+        """Fields of `Setup` that describe the plant."""
         return {}
 
     @property
-    def prior_record(self) -> FloatArray:
-        """The prior as the record (RECORD_SIZE,) that the kernel copies at a reset."""
-        return self.believed.to_record(factorisation=self.factorisation, nonlinear=self.is_nonlinear)
-
-    def to_belief(self, record: FloatArray) -> RecordBelief:
-        """The readable face of a record (RECORD_SIZE,)."""
-        return Belief(record, self.factorisation, self.is_nonlinear)
+    def _iterations(self) -> int:
+        return int(self.iterations or DEFAULT_ITERATIONS[self.factorisation])
 
     @property
-    def settings(self) -> FloatArray:
-        """The experiment as the kernel is told of it, (len(SETTINGS),)."""
-        prior = dict(zip(RECORD, self.prior_record, strict=True))
-        values = {
-            "max_input": self.max_input,
-            "max_output": self.max_output,
-            "horizon": self.samples,
+    def kind(self) -> Kind:
+        """What the kernel is compiled for."""
+        return Kind(
+            self.model, self.plant, self.degree, self.factorisation,
+            self._iterations if self.factorisation == "structured" else 0,
+            self.reward if REWARDS[self.reward].hooks is not None else "",
+        )  # fmt: skip
+
+    @property
+    def setup(self) -> Setup:
+        """The experiment as the kernel is told of it."""
+        prior, model = self.believed, self.model
+        names = parameter_names(self.truth_model)
+        values: dict[str, Any] = {
+            "max_input": float(self.max_input),
+            "max_output": float(self.max_output),
+            "horizon": float(self.samples),
             "hold": 1,
+            "iterations": self._iterations,
             "process_noise": 0.0,
-            "measurement_noise": 0.0,
+            "measurement_noise": np.zeros(self.truth_model.n_outputs),
+            "step": self.step,
+            "center": np.array([self.center[name] for name in names]),
+            "width": np.zeros(len(names)),
+            "spread": 0.0,
             "budget": np.inf,
             "max_slew": np.inf,
-            "input_cost": 0.0,
+            "input_price": 0.0,
             "jump": 0.0,
-            **{f"walk_{c}": 0.0 for c in COEFFICIENTS},
-            "spread": 0.0,
-            **{f"center_{name}": getattr(self.twin, name) for name in OSCILLATOR},
-            "step": SAMPLING_STEP,
-            "reward": reward_number(self.reward),
+            "drifts": False,
+            "walk": np.zeros(model.n_coefficients),
+            "weights": np.array(REWARDS[self.reward].weights),
             "terminal": self.terminal,
             "forfeits": self.terminated_return is not None,
-            "terminated_return": self.terminated_return or 0.0,
-            "iterations": self.iterations or DEFAULT_ITERATIONS[self.factorisation],
+            "terminated_return": float(self.terminated_return or 0.0),
             "as_published": False,
-            "nonlinear": self.is_nonlinear,
             "delay": 0,
-            **{f"prior_{c}": prior[c] for c in ("t1", "t2", "t3", "e")},
-            **{f"scale_{c}": _inverse_std(prior[f"P_{c}_{c}"]) for c in ("t1", "t2", "t3", "e")},
-            "prior_log_gamma": np.log(prior["g_shape"] / prior["g_rate"]),
-            "prior_log_xi": np.log(prior["n_shape"] / prior["n_rate"]),
-            **self.plant_settings,
+            "prior": prior.record.copy(),
+            "inverse_std": 1.0 / np.sqrt(np.diag(prior.coefficients_cov)),
+            "log_precisions": np.log(prior.noises[::2] / prior.noises[1::2]),
+            **self.plant_setup,
         }
-        return np.array([values[name] for name in SETTINGS], dtype=np.float64)
+        return Setup(**values)
 
 
 @dataclass(frozen=True)
@@ -217,29 +233,36 @@ class SimulatedExperiment(Experiment):
         """The horizon."""
         return self.horizon
 
+    @property
+    def plant(self) -> Model:
+        """The paper's difference equation."""
+        return difference()
+
     @cached_property
-    def believed(self) -> Prior:
-        """The prior that fits oscillators so drawn, and the noises."""
-        return Prior.silverbox_twin(self.spread, self.process_noise, self.measurement_noise, self.noise_shape)
+    def believed(self) -> Belief:
+        """The prior that fits plants so drawn, and the noises."""
+        return self.prior_of(self.model, self.factorisation)
+
+    def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
+        """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
+        mean, cov = log_uniform_moments(model, self.center, self.spread, self.step)
+        noises = self.process_noise, self.measurement_noise, self.noise_shape
+        return weak_prior(model, mean, cov, *noises, step=self.step).factorised(factorisation)
 
     @property
-    def plant_settings(self) -> dict[str, float]:
-        """The noises, and the range of the oscillators."""
+    def plant_setup(self) -> dict[str, Any]:
+        """The noises, and the range of the plants."""
         return {
-            "process_noise": self.process_noise,
-            "measurement_noise": self.measurement_noise,
-            "spread": self.spread if self.plant_spread is None else self.plant_spread,
+            "process_noise": float(self.process_noise),
+            "measurement_noise": np.full(self.plant.n_outputs, float(self.measurement_noise)),
+            "spread": float(self.spread if self.plant_spread is None else self.plant_spread),
             "budget": np.inf if self.max_rms is None else self.horizon * self.max_rms * self.max_rms,
-            "max_slew": np.inf if self.max_slew is None else self.max_slew,
-            "input_cost": self.input_cost / self.max_input / self.max_input,
-            "jump": self.jump,
-            **{f"walk_{c}": (self.drift * std) ** 2 for c, std in zip(COEFFICIENTS, self._prior_stds, strict=True)},
+            "max_slew": np.inf if self.max_slew is None else float(self.max_slew),
+            "input_price": float(np.sqrt(self.input_cost)) / self.max_input,
+            "jump": float(self.jump),
+            "drifts": self.drift > 0,
+            "walk": self.drift**2 * np.diag(self.believed.coefficients_cov),
         }
-
-    @property
-    def _prior_stds(self) -> FloatArray:
-        prior = dict(zip(RECORD, self.prior_record, strict=True))
-        return np.sqrt([prior[f"P_{c}_{c}"] for c in COEFFICIENTS])
 
 
 @dataclass(frozen=True)
@@ -260,8 +283,10 @@ class ContinuousExperiment(SimulatedExperiment):
         super().__post_init__()
         if self.estimator not in ["ode", "nlarx"]:
             raise ValueError(f"estimator must be one of ['ode', 'nlarx'], but is {self.estimator!r}")
-        if self.reward == "fisher":
-            raise ValueError("reward must not be 'fisher' here: it is that of the difference equation, not the plant's")
+        if self.reward == "fisher" and self.estimator != "ode":
+            raise ValueError(
+                "reward must not be 'fisher' for estimator='nlarx', whose equation the plant does not obey"
+            )
         if self.estimator == "ode" and self.factorisation != "structured":
             raise ValueError(
                 f"factorisation must be 'structured' for estimator='ode', but is {self.factorisation!r}; mean field "
@@ -269,40 +294,25 @@ class ContinuousExperiment(SimulatedExperiment):
             )
 
     @property
-    def twin(self) -> PhysicalParameters:
-        """The circuit as the differential equation sees it."""
-        return CONTINUOUS_TWIN
-
-    @property
-    def plant_kind(self) -> str:
+    def plant(self) -> Model:
         """The differential equation."""
-        return "sde"
+        return duffing()
 
     @property
-    def estimator_kind(self) -> str:
-        """The plant's equation, or the factorisation of the paper's."""
-        return "ode" if self.estimator == "ode" else self.factorisation
-
-    @cached_property
-    def believed(self) -> Prior:
-        """The prior of ``nlarx`` that fits oscillators so drawn, by Eq. (3)."""
-        noises = self.process_noise, self.measurement_noise, self.noise_shape
-        return Prior.silverbox_twin(self.spread, *noises, center=self.twin)
+    def model(self) -> Model:
+        """The plant's equation, or the paper's."""
+        return self.plant if self.estimator == "ode" else difference()
 
     @property
-    def physical_prior(self) -> ContinuousBelief:
-        """The prior of ``ode`` that fits oscillators so drawn, and the noises."""
-        noises = self.process_noise, self.measurement_noise, self.noise_shape
-        return continuous_prior(self.twin, self.spread, *noises)
+    def degree(self) -> int:
+        """The input goes linearly from one action to the next."""
+        return 1
 
-    @property
-    def prior_record(self) -> FloatArray:
-        """That of the estimator at hand."""
-        return super().prior_record if self.estimator == "nlarx" else self.physical_prior.record
 
-    def to_belief(self, record: FloatArray) -> RecordBelief:
-        """The readable face of a record (RECORD_SIZE,)."""
-        return ContinuousBelief(record) if self.estimator == "ode" else super().to_belief(record)
+def twin_of(model: Model) -> dict[str, float]:
+    """The Silverbox circuit as a model of it sees it; of other models the parameters are not known here: all 1."""
+    twin = CONTINUOUS_TWIN if model.is_continuous else SILVERBOX_TWIN
+    return {name: twin.get(name, 1.0) for name in parameter_names(model)}
 
 
 def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:
@@ -318,7 +328,3 @@ def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experime
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool)
-
-
-def _inverse_std(variance: float) -> float:
-    return 1.0 / np.sqrt(variance) if variance > 0 else 0.0

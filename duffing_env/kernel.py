@@ -1,360 +1,351 @@
 """One step of the experiment, compiled: input → plant → measurement → belief → reward → observation.
 
-It exists once, and is put together from what the experiment needs (`compiled`): its plant, its estimator and, where the
-reward takes work of its own, its reward. A single environment is a batch with one live lane, so both faces give
-bit-identical trajectories.
+It exists once, and is put together from what the engine makes of the models (`compiled`). A single environment is a
+batch with one live lane, so both faces give bit-identical trajectories.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numba import prange
 
-from duffing_env.layout import ENDED, LAYOUT, N_OBSERVATION, N_OUTCOME, N_ROWS, OSCILLATOR, SETTINGS, SUMMED
-from duffing_env.observation import observe
-from duffing_env.oscillator import draw_jump, draw_oscillator, jump_mass
-from duffing_env.plant import draw_noise, integrate_plant, limit_input, move_plant, play_record
-from duffing_env.rewards import appraise, pay, settle
-from estimator.inference import continuous as ode
-from estimator.inference import mean_field, structured, update_mean_field, update_structured, walk
-from estimator.lanes import LANES, jit, kernel, part
-from estimator.record import RECORD_SIZE
+from duffing_env import sources
+from duffing_env.inference import updater
+from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, observation_bounds, parameter_names, unpacker
+from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
+from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
+from estimator.engine.rows import belief_names
+from estimator.lanes import LANES, at_lane, kernel, lanewise, part
 
-#: How finished environments are reset: by hand, in the step after, or in the same step.
-RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP = 0, 1, 2
+#: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.
+RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP, RESET_NOW = 0, 1, 2, 3
 
-# Where rows that the loops below touch by index begin in a block, and in one of what ended.
-_U, _Y, _X, _LAST_X = (LAYOUT[name] * LANES for name in ("u", "y", "x", "last_x"))
-_ASKED, _SPENT, _JUMP_AT = (LAYOUT[name] * LANES for name in ("asked", "spent", "jump_at"))
-_LAST_U, _VELOCITY = LAYOUT["last_u"] * LANES, LAYOUT["velocity"] * LANES
-_ELAPSED, _WAITING = LAYOUT["elapsed"] * LANES, LAYOUT["waiting"] * LANES
-_RECORDED_U, _RECORDED_Y = LAYOUT["recorded_u"] * LANES, LAYOUT["recorded_y"] * LANES
-_OUTCOME, _OBS = LAYOUT["reward"] * LANES, LAYOUT["obs_mean_t1"] * LANES
-_TERMINATED, _TRUNCATED = LAYOUT["terminated"] * LANES, LAYOUT["truncated"] * LANES
-_DIVERGED, _OFF_RECORD = LAYOUT["diverged"] * LANES, LAYOUT["off_record"] * LANES
-_SURPRISE, _OSCILLATOR = LAYOUT["surprise"] * LANES, LAYOUT["m"] * LANES
-_ENDED_OSCILLATOR, _N_OSCILLATOR = ENDED["m"] * LANES, len(OSCILLATOR)
-_EARNED, _ERROR, _MISFIT = (LAYOUT[name] * LANES for name in ("earned", "error", "misfit"))
-_SUMMED = tuple(LAYOUT[name] * LANES for name in SUMMED)
-_RECORD = RECORD_SIZE * LANES
-
-# Where settings stand.
-_MAX_INPUT, _MAX_OUTPUT, _HORIZON = (SETTINGS[name] for name in ("max_input", "max_output", "horizon"))
-_PROCESS_NOISE, _MEASUREMENT_NOISE = SETTINGS["process_noise"], SETTINGS["measurement_noise"]
-_BUDGET, _MAX_SLEW, _INPUT_COST = (SETTINGS[name] for name in ("budget", "max_slew", "input_cost"))
-_JUMP, _WALK = SETTINGS["jump"], SETTINGS["walk_t1"]
-_SPREAD, _CENTER, _STEP = SETTINGS["spread"], SETTINGS["center_m"], SETTINGS["step"]
-_REWARD, _ITERATIONS, _HOLD = (SETTINGS[name] for name in ("reward", "iterations", "hold"))
-_TERMINAL, _FORFEITS = SETTINGS["terminal"], SETTINGS["forfeits"]
-_TERMINATED_RETURN = SETTINGS["terminated_return"]
-_AS_PUBLISHED, _NONLINEAR, _DELAY = SETTINGS["as_published"], SETTINGS["nonlinear"], SETTINGS["delay"]
-_PRIOR_T1, _SCALE_T1 = SETTINGS["prior_t1"], SETTINGS["scale_t1"]
-_PRIOR_LOG_GAMMA, _PRIOR_LOG_XI = SETTINGS["prior_log_gamma"], SETTINGS["prior_log_xi"]
+# A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).
+_FLOAT32_ROUNDING = 2.0**-22
 
 
-@jit
-def _move(W, settings, recorded_u, recorded_y):
-    move_plant(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE])
-
-
-@jit
-def _integrate(W, settings, recorded_u, recorded_y):
-    integrate_plant(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE], settings[_STEP])
-
-
-@jit
-def _replay(W, settings, recorded_u, recorded_y):
-    last = len(recorded_y) - 1
-    for j in range(LANES):
-        t = np.int64(W[_ELAPSED + j])
-        W[_RECORDED_U + j] = recorded_u[min(t, last)]
-        W[_RECORDED_Y + j] = recorded_y[min(t + np.int64(settings[_DELAY]), last)]
-    play_record(W, settings[_MAX_INPUT])
-
-
-#: Name of a plant to its step, ``f(W, settings, recorded_u, recorded_y)``.
-PLANTS = {"difference": _move, "replay": _replay, "sde": _integrate}
-
-
-@jit
-def _infer_mean_field(W, settings):
-    update_mean_field(W, np.int64(settings[_ITERATIONS]), settings[_AS_PUBLISHED] != 0.0, W[:0])
-
-
-@jit
-def _infer_structured(W, settings):
-    update_structured(W, np.int64(settings[_ITERATIONS]), W[:0])
-
-
-@jit
-def _infer_ode(W, settings):
-    ode.update(W, np.int64(settings[_ITERATIONS]), ode.SUBSTEPS)
-
-
-#: Name of an estimator to its update, ``f(W, settings)``, and to the free energy of the sample, ``f(W, lane)``.
-ESTIMATORS = {
-    "mean_field": (_infer_mean_field, mean_field.free_energy),
-    "structured": (_infer_structured, structured.free_energy),
-    "ode": (_infer_ode, structured.free_energy),
-}
-
-
-@jit
-def _swap_inputs(W):
-    for j in range(LANES):
-        W[_U + j], W[_LAST_U + j] = W[_LAST_U + j], W[_U + j]
-
-
-@jit
-def _write_observations(W, settings, observations):
-    """Compute the observations of a block and write them to (LANES, N_OBSERVATION) float32."""
-    observe(
-        W, settings[_PRIOR_T1], settings[_PRIOR_T1 + 1], settings[_PRIOR_T1 + 2], settings[_PRIOR_T1 + 3],
-        settings[_SCALE_T1], settings[_SCALE_T1 + 1], settings[_SCALE_T1 + 2], settings[_SCALE_T1 + 3],
-        settings[_PRIOR_LOG_GAMMA], settings[_PRIOR_LOG_XI],
-        settings[_MAX_INPUT], settings[_MAX_OUTPUT], settings[_HORIZON], settings[_BUDGET],
+def _draw_noise(STREAM_a, STREAM_b, STREAM_c, STREAM_d, WAITING):
+    """Two standard normal numbers. The stream of an environment that waits for its reset stands still."""
+    first, a, b, c, d = draw(as_word(STREAM_a), as_word(STREAM_b), as_word(STREAM_c), as_word(STREAM_d))
+    second, a, b, c, d = draw(a, b, c, d)
+    w, v = normal_pair(to_unit(first), to_unit(second))
+    live = WAITING == 0.0
+    return (
+        as_bits(a) if live else STREAM_a, as_bits(b) if live else STREAM_b,
+        as_bits(c) if live else STREAM_c, as_bits(d) if live else STREAM_d, w, v,
     )  # fmt: skip
-    for j in range(LANES):
-        for k in range(N_OBSERVATION):
-            observations[j, k] = W[_OBS + k * LANES + j]
+
+
+def noise_drawer(place: Mapping[str, int]) -> Any:
+    """``draw_noise(W)``: two standard normal numbers in every lane, into rows ``NOISE_w`` and ``NOISE_v``."""
+    return lanewise(place, "STREAM_a STREAM_b STREAM_c STREAM_d NOISE_w NOISE_v")(_draw_noise)
+
+
+def _limit_input(ASKED, INPUT, LAST_INPUT, SPENT, budget, max_slew):
+    """The input that the generator gives when it is asked for one: near enough to the last, and paid for.
+
+    ``SPENT`` is the energy Σ u²; what is left of the budget bounds the next input, so it cannot be exceeded.
+    """
+    given = min(max(ASKED, INPUT - max_slew), INPUT + max_slew)
+    left = np.sqrt(max(budget - SPENT, 0.0))
+    given = min(max(given, -left), left)
+    return given, INPUT, LAST_INPUT, given - INPUT, SPENT + given * given
+
+
+def _play_record(INPUT, RECORDED_u, RECORDED_y, max_input):
+    """The recorded plant: a record answers the recorded input only."""
+    deviates = abs(INPUT - RECORDED_u) > _FLOAT32_ROUNDING * max_input
+    return RECORDED_u, RECORDED_y, 1.0 if deviates else 0.0
+
+
+def _pay(REWARD, EARNED, TERMINATED, TRUNCATED, terminal, forfeits, terminated_return):
+    """When the reward is paid, and what an episode that is terminated returns.
+
+    ``EARNED`` is what the episode gave so far, as if it were paid sample by sample.
+    """
+    received = 0.0 if terminal else EARNED
+    EARNED += REWARD
+    if terminal:
+        REWARD = EARNED if TERMINATED + TRUNCATED != 0.0 else 0.0
+    if forfeits and TERMINATED != 0.0:
+        REWARD = terminated_return - received
+    return REWARD, EARNED
+
+
+def _draw_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
+    """The sample at which the first parameter jumps, in the middle half of the episode, and its log-uniform factor."""
+    low = math.log(1.0 - jump)
+    first, a, b, c, d = draw(as_word(STREAM_a), as_word(STREAM_b), as_word(STREAM_c), as_word(STREAM_d))
+    second, a, b, c, d = draw(a, b, c, d)
+    at = math.floor(horizon * (0.25 + 0.5 * to_unit(first)))
+    factor = math.exp(low + (math.log(1.0 + jump) - low) * to_unit(second))
+    return as_bits(a), as_bits(b), as_bits(c), as_bits(d), at, factor
 
 
 @dataclass(frozen=True)
 class Kernel:
     """The entry points of one kind of experiment.
 
-    They work on ``blocks`` (n_blocks, N_ROWS * LANES), the environments, of which there are n = n_blocks * LANES; are
-    told ``settings`` (len(SETTINGS),) and ``prior`` (RECORD_SIZE,), the belief that episodes start from; and write
-    ``observations`` (n, N_OBSERVATION) float32.
+    They work on ``blocks`` (n_blocks, rows * LANES), the environments, of which there are n = n_blocks * LANES, and are
+    told ``packed``, the `duffing_env.layout.Setup` as one array.
 
     Attributes:
-        reset: ``reset(blocks, mask, settings, prior, observations)`` starts episodes in the environments of ``mask``
-            (n,), and writes all observations.
-        step: ``step(blocks, saved, actions, settings, prior, recorded_u, recorded_y, reset_mode, observations,
-            final_observations, ended)`` steps all blocks on the calling thread. ``saved`` (n_threads, RECORD_SIZE *
-            LANES) is work space, ``actions`` (n,) are inputs in parts of the largest, ``recorded_u`` and ``recorded_y``
-            (T,) the record of the plant ``replay`` and one sample elsewhere, ``reset_mode`` is RESET_BY_HAND,
-            RESET_NEXT_STEP or RESET_SAME_STEP. What the step leaves is in the rows `OUTCOME` of the blocks. Where
-            environments were reset in this very step, it writes ``final_observations``, like ``observations``, and
-            ``ended`` (n_blocks, len(ENDED) * LANES).
-        step_parallel: the same on ``n_threads`` of Numba's threads.
+        step: ``step(first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask,
+            observations, outcomes, final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the
+            calling thread. ``saved`` (2 rows * LANES,) is work space, ``actions`` (n,) are inputs in parts of the
+            largest, ``recorded_u`` and ``recorded_y`` (T,) the record that is replayed and one sample elsewhere,
+            ``reset_mode`` says how finished environments are reset; RESET_NOW does nothing but start episodes in those
+            of ``mask`` (n,). It writes ``observations`` (n, entries) float32, and ``outcomes`` (len(OUTCOME), n).
+            Where environments were reset in this very step, it writes ``final_observations``, like ``observations``,
+            and ``ended`` (n_blocks, rows * LANES), their rows as the episode left them.
+        step_parallel: all blocks on Numba's threads, as many as ``saved`` (threads, 2 rows * LANES) has rows.
     """
 
-    reset: Any
     step: Any
     step_parallel: Any
 
 
-#: The rewards that take work of their own.
-_WORKED = ("fisher", "free_energy", "expected_free_energy", "simulation_error")
-
-
-def compiled(plant: str, estimator: str, reward: str) -> Kernel:
-    """The kernel of an experiment; names as in `PLANTS`, `ESTIMATORS` and `duffing_env.rewards.REWARDS`.
-
-    Its parts are compiled when they are called first, and kept on disk.
-    """
-    return _compiled(plant, estimator, reward if reward in _WORKED else "")
-
-
 @cache
-def _compiled(plant: str, estimator: str, worked: str) -> Kernel:
-    """The kernel of all experiments that differ at most in settings; ``worked`` is a reward that takes work."""
-    move, (infer, free_energy) = PLANTS[plant], ESTIMATORS[estimator]
-    # Constants to the compiler, which leaves out what they make idle.
-    is_fisher, is_free_energy = worked == "fisher", worked == "free_energy"
-    is_expected, is_simulation = worked == "expected_free_energy", worked == "simulation_error"
-    # Nobody waits for what another reward needs.
-    fisher: Any = import_module("duffing_env.fisher") if is_fisher else None
-    expectation: Any = import_module("duffing_env.expectation") if is_expected else None
-    simulation: Any = import_module("duffing_env.simulation") if is_simulation else None
-    # Eq. (2) takes the input at x_t. Between two actions of the plant ``sde`` that is the last one.
-    takes_last_input = plant == "sde" and estimator != "ode"
-    continuous = 1.0 if estimator == "ode" else 0.0
-    kind = "_".join((plant, estimator, worked))
-    inner, entry = part(kind), kernel(kind=kind)
+def compiled(kind: Kind) -> Kernel:
+    """The kernel of a kind of experiment. Its parts are compiled when they are called first, and kept on disk."""
+    place, code = layout_of(kind), sources.parts(kind)
+    n_rows = max(place.values()) + 1
+    row = {name: number * LANES for name, number in place.items()}
+    n_record, n_parameters = len(belief_names(kind.belief)), len(parameter_names(kind.truth))
+    n_observation, n_outcome = len(observation_bounds(kind.belief)), len(OUTCOME)
+    n_saved = n_record * LANES
+    stream, drawn = row["STREAM_a"], row[f"PARAM_{parameter_names(kind.truth)[0]}"]
+    asked, elapsed, waiting = row["ASKED"], row["ELAPSED"], row["WAITING"]
+    terminated, truncated, diverged, off_record = (row[name] for name in OUTCOME[3:])
+    outcome, observed = row["REWARD"], row[f"OBS_{next(iter(observation_bounds(kind.belief)))}"]
+    recorded_u_row, recorded_y_row = row["RECORDED_u"], row["RECORDED_y"]
+    jump_at, jump_factor = row["JUMP_AT"], row["JUMP_FACTOR"]
+    summed = tuple(row[name] for name in SUMMED)
+    sensors = [f"Y_{y}" for y in kind.truth.outputs]
+    cleared = ["INPUT", "LAST_INPUT", "OLDER_INPUT", "SPENT", "EARNED", "ELAPSED", "WAITING", "WORK"]
+    # Mean field's rows of a θ2 that the model does not have must be 0, also after an episode that ended with NaN.
+    cleared += left_out(kind)
+    at_rest = tuple(row[name] for name in [*cleared, *sensors, *(f"X_{x}" for x in kind.truth.states)])
+
+    draw_noise = noise_drawer(place)
+    limit_input = lanewise(place, "INPUT LAST_INPUT OLDER_INPUT RISE SPENT", uniform="budget max_slew")(_limit_input)
+    play_record = lanewise(place, f"INPUT {sensors[0]} OFF_RECORD", uniform="max_input")(_play_record)
+    pay = lanewise(place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(_pay)
+    streams = "STREAM_a STREAM_b STREAM_c STREAM_d"
+    draw_jump = at_lane(place, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon")(_draw_jump)
+
+    simulated = kind.plant is not None
+    move: Any = _plant_of(kind, code, draw_noise) if simulated else None
+    infer = updater(kind)
+    make_hooks = REWARDS[kind.work].hooks if kind.work else None
+    hooks = Hooks(nothing_in_lane, nothing, nothing, nothing) if make_hooks is None else make_hooks(kind, code)
+    begin_work, before, expect, after = hooks
+    is_worked = make_hooks is not None
+    is_structured = kind.factorisation == "structured"
+    settle_truth, appraise, settle, observe = code.settle_truth, code.appraise, code.settle, code.observe
+    walk: Any = code.walk
+    unpack = unpacker(kind)
+    inner, entry = part(kind.name), kernel(kind=kind.name)
 
     @inner
-    def judge(W, j, settings):
-        """Measure lane j's belief beside its oscillator, where either is new."""
-        appraise(W, j, settings[_STEP], settings[_NONLINEAR], continuous)
-        if is_simulation:
-            simulation.compare(W, settings[_MAX_INPUT], continuous)
-            W[_ERROR + j] = W[_MISFIT + j]
+    def draw_plant(W, j, setup):
+        """The parameters of lane j's plant, each log-uniform about its centre, or from a Gaussian."""
+        a, b = as_word(W[stream + j]), as_word(W[stream + LANES + j])
+        c, d = as_word(W[stream + 2 * LANES + j]), as_word(W[stream + 3 * LANES + j])
+        low = math.log(1.0 - setup.spread)
+        width = math.log(1.0 + setup.spread) - low
+        for p in range(n_parameters):
+            first, a, b, c, d = draw(a, b, c, d)
+            if setup.width[p] > 0.0:
+                second, a, b, c, d = draw(a, b, c, d)
+                deviation, _ = normal_pair(to_unit(first), to_unit(second))
+                W[drawn + p * LANES + j] = setup.center[p] + setup.width[p] * deviation
+            else:
+                W[drawn + p * LANES + j] = setup.center[p] * math.exp(low + width * to_unit(first))
+        W[stream + j], W[stream + LANES + j] = as_bits(a), as_bits(b)
+        W[stream + 2 * LANES + j], W[stream + 3 * LANES + j] = as_bits(c), as_bits(d)
 
     @inner
-    def reset_lane(W, j, settings, prior):
-        """Start an episode in lane j: draw its oscillator, put it at rest, and put the belief to the prior."""
-        for i in range(RECORD_SIZE):
-            W[i * LANES + j] = prior[i]
-        draw_oscillator(
-            W, j, settings[_SPREAD], settings[_CENTER], settings[_CENTER + 1], settings[_CENTER + 2],
-            settings[_CENTER + 3], settings[_STEP], continuous,
-        )  # fmt: skip
-        W[_JUMP_AT + j] = -1.0
-        if settings[_JUMP] > 0.0:
-            draw_jump(W, j, settings[_JUMP], settings[_HORIZON])
-        for row in (_U, _Y, _X, _LAST_X, _VELOCITY, _ELAPSED, _WAITING, _SPENT, _EARNED):
-            W[row + j] = 0.0
-        judge(W, j, settings)
-        if is_fisher:
-            fisher.begin(W, j, prior, settings[_NONLINEAR])
+    def reset_lane(W, j, setup, is_new):
+        """Start an episode in lane j: draw its plant, put it at rest, and put the belief to the prior.
 
-    @inner
-    def limit(W, actions, settings):
-        """The inputs that are given, of actions (LANES,), and what else happens before a sample."""
-        for j in range(LANES):
-            W[_LAST_U + j] = W[_U + j]
-            W[_ASKED + j] = settings[_MAX_INPUT] * max(-1.0, min(1.0, actions[j]))
-        limit_input(W, settings[_BUDGET], settings[_MAX_SLEW])
-        if settings[_JUMP] > 0.0:
-            for j in range(LANES):
-                if W[_ELAPSED + j] == W[_JUMP_AT + j]:
-                    jump_mass(W, j, settings[_STEP], continuous)
-                    judge(W, j, settings)
+        With ``is_new`` False only its true coefficients are settled anew, after its parameters changed.
+        """
+        if is_new:
+            for i in range(n_record):
+                W[i * LANES + j] = setup.prior[i]
+            draw_plant(W, j, setup)
+            W[jump_at + j] = -1.0
+            if setup.jump > 0.0:
+                draw_jump(W, j, setup.jump, setup.horizon)
+            for r in at_rest:
+                W[r + j] = 0.0
+        settle_truth(W, j, setup.step)
+        appraise(W, j, setup.step)
+        if is_worked:
+            begin_work(W, j, setup)
 
-    @inner
-    def sample(W, saved, settings, recorded_u, recorded_y):
-        """Plant, measurement, belief and reward for all lanes of a block; their inputs stand in row ``u``."""
-        draw_noise(W)
-        if is_fisher:
-            fisher.inform(W, settings[_PROCESS_NOISE], settings[_MEASUREMENT_NOISE], settings[_NONLINEAR])
-        move(W, settings, recorded_u, recorded_y)
-        # What to return to where the step comes to nothing.
-        for i in range(_RECORD):
-            saved[i] = W[i]
-        if settings[_WALK] > 0.0:
-            walk(W, settings[_WALK], settings[_WALK + 1], settings[_WALK + 2], settings[_WALK + 3])
-        if takes_last_input:
-            _swap_inputs(W)
-        if is_expected:
-            expectation.foresee(W, settings[_NONLINEAR], continuous)
-        infer(W, settings)
-        if takes_last_input:
-            _swap_inputs(W)
-        if is_free_energy:
-            for j in range(LANES):
-                W[_SURPRISE + j] = free_energy(W, j)
-        if is_simulation:
-            simulation.compare(W, settings[_MAX_INPUT], continuous)
-        settle(
-            W, settings[_MAX_OUTPUT], settings[_HORIZON], settings[_STEP], settings[_NONLINEAR], continuous,
-            settings[_REWARD], settings[_INPUT_COST],
-        )  # fmt: skip
-        if settings[_TERMINAL] + settings[_FORFEITS] > 0.0:
-            pay(W, settings[_TERMINAL], settings[_FORFEITS], settings[_TERMINATED_RETURN])
-        void = 0
-        for j in range(LANES):
-            void += (W[_DIVERGED + j] != 0.0) | (W[_OFF_RECORD + j] != 0.0)
-        if void:
-            for j in range(LANES):
-                if W[_DIVERGED + j] != 0.0 or W[_OFF_RECORD + j] != 0.0:
-                    for i in range(RECORD_SIZE):
-                        W[i * LANES + j] = saved[i * LANES + j]
-
-    @inner
-    def begin_or_end(W, settings, prior, reset_mode):
-        """Start the episodes that are due, and mark those that have finished; gives their number."""
-        concerned = 0
-        for j in range(LANES):
-            concerned += (W[_WAITING + j] != 0.0) | (W[_TERMINATED + j] != 0.0) | (W[_TRUNCATED + j] != 0.0)
-        finished = 0
-        if concerned:
-            for j in range(LANES):
-                if W[_WAITING + j] != 0.0 and reset_mode == RESET_NEXT_STEP:
-                    reset_lane(W, j, settings, prior)
-                    for k in range(N_OUTCOME):
-                        W[_OUTCOME + k * LANES + j] = 0.0
-                elif W[_TERMINATED + j] + W[_TRUNCATED + j] != 0.0:
-                    W[_WAITING + j] = 1.0
-                    finished += 1
-        return finished
-
-    @inner
-    def play(W, saved, actions, settings, recorded_u, recorded_y):
-        """Apply the actions for as many samples as they hold; an environment that ends meanwhile stays as it ended."""
-        for s in range(np.int64(settings[_HOLD])):
-            before = W.copy() if s > 0 else W[:0]
-            limit(W, actions, settings)
-            sample(W, saved, settings, recorded_u, recorded_y)
-            if s > 0:
-                for j in range(LANES):
-                    if before[_TERMINATED + j] + before[_TRUNCATED + j] != 0.0:
-                        for row in range(N_ROWS):
-                            W[row * LANES + j] = before[row * LANES + j]
-                    else:
-                        for row in _SUMMED:
-                            W[row + j] += before[row + j]
-
-    @inner
-    def step_block(
-        W, saved, actions, settings, prior, recorded_u, recorded_y, reset_mode, observations, final_observations, ended
-    ):  # fmt: skip
-        """One step of a block: actions (LANES,), observations (LANES, N_OBSERVATION)."""
-        waiting = 0
-        for j in range(LANES):
-            waiting += W[_WAITING + j] != 0.0
-        if waiting < LANES:
-            play(W, saved, actions, settings, recorded_u, recorded_y)
-        finished = begin_or_end(W, settings, prior, reset_mode)
-        _write_observations(W, settings, observations)
-        if reset_mode == RESET_SAME_STEP and finished:
-            for j in range(LANES):
-                if W[_WAITING + j] != 0.0:
-                    for k in range(N_OBSERVATION):
-                        final_observations[j, k] = observations[j, k]
-                    for i in range(RECORD_SIZE):
-                        ended[i * LANES + j] = W[i * LANES + j]
-                    for i in range(_N_OSCILLATOR):
-                        ended[_ENDED_OSCILLATOR + i * LANES + j] = W[_OSCILLATOR + i * LANES + j]
-                    reset_lane(W, j, settings, prior)
-            _write_observations(W, settings, observations)
-
-    @entry
-    def reset(blocks, mask, settings, prior, observations):
-        for b in range(len(blocks)):
-            for j in range(LANES):
-                if mask[b * LANES + j]:
-                    reset_lane(blocks[b], j, settings, prior)
-            _write_observations(blocks[b], settings, observations[b * LANES : (b + 1) * LANES])
-
-    @inner
     def step_blocks(
-        first, last, blocks, saved, actions, settings, prior, recorded_u, recorded_y, reset_mode, observations,
+        first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations, outcomes,
         final_observations, ended,
     ):  # fmt: skip
-        for b in range(first, last):
-            lanes = slice(b * LANES, (b + 1) * LANES)
-            step_block(
-                blocks[b], saved, actions[lanes], settings, prior, recorded_u, recorded_y, reset_mode,
-                observations[lanes], final_observations[lanes], ended[b],
-            )  # fmt: skip
+        """Step some blocks, or start episodes in them.
 
-    @entry
-    def step(
-        blocks, saved, actions, settings, prior, recorded_u, recorded_y, reset_mode, observations, final_observations,
-        ended,
-    ):  # fmt: skip
-        step_blocks(
-            0, len(blocks), blocks, saved[0], actions, settings, prior, recorded_u, recorded_y, reset_mode,
-            observations, final_observations, ended,
-        )  # fmt: skip
+        Few functions and no more layers: every layer is compiled, and everything below it once more with it.
+        """
+        setup = unpack(packed)
+        for b in range(first, stop):
+            W = blocks[b]
+            lane = b * LANES
+            idle = 0
+            for j in range(LANES):
+                idle += W[waiting + j] != 0.0
+            # Apply the actions for as many samples as they hold; an environment that ends meanwhile stays as it ended.
+            for s in range(setup.hold if idle < LANES and reset_mode != RESET_NOW else 0):
+                if s > 0:
+                    for i in range(n_rows * LANES):
+                        saved[n_saved + i] = W[i]
+                for j in range(LANES):
+                    W[asked + j] = setup.max_input * max(-1.0, min(1.0, actions[lane + j]))
+                limit_input(W, setup.budget, setup.max_slew)
+                if setup.jump > 0.0:
+                    for j in range(LANES):
+                        if W[elapsed + j] == W[jump_at + j]:
+                            W[drawn + j] *= W[jump_factor + j]
+                            reset_lane(W, j, setup, False)
+                draw_noise(W)
+                if is_worked:
+                    before(W, setup)
+                if simulated:
+                    move(W, setup)
+                else:
+                    last = len(recorded_y) - 1
+                    for j in range(LANES):
+                        t = np.int64(W[elapsed + j])
+                        W[recorded_u_row + j] = recorded_u[min(t, last)]
+                        W[recorded_y_row + j] = recorded_y[min(t + setup.delay, last)]
+                    play_record(W, setup.max_input)
+                # What to return to if the update breaks the belief.
+                for i in range(n_saved):
+                    saved[i] = W[i]
+                if setup.drifts:
+                    walk(W, setup.walk)
+                if is_worked:
+                    expect(W, setup)
+                if is_structured:
+                    infer(W)
+                else:
+                    infer(W, setup.iterations, setup.as_published)
+                if is_worked:
+                    after(W, setup)
+                settle(
+                    W, setup.step, setup.max_output, setup.horizon, setup.input_price, setup.weights[0],
+                    setup.weights[1], setup.weights[2], setup.weights[3],
+                )  # fmt: skip
+                if setup.terminal or setup.forfeits:
+                    pay(W, setup.terminal, setup.forfeits, setup.terminated_return)
+                void = 0
+                for j in range(LANES):
+                    void += (W[diverged + j] != 0.0) | (W[off_record + j] != 0.0)
+                if void:
+                    for j in range(LANES):
+                        if W[diverged + j] != 0.0 or W[off_record + j] != 0.0:
+                            for i in range(n_record):
+                                W[i * LANES + j] = saved[i * LANES + j]
+                if s > 0:
+                    for j in range(LANES):
+                        if saved[n_saved + terminated + j] + saved[n_saved + truncated + j] != 0.0:
+                            for i in range(n_rows):
+                                W[i * LANES + j] = saved[n_saved + i * LANES + j]
+                        else:
+                            for r in summed:
+                                W[r + j] += saved[n_saved + r + j]
+            # Start the episodes that are due, and mark those that have finished.
+            finished = 0
+            for j in range(LANES):
+                if (
+                    mask[lane + j]
+                    if reset_mode == RESET_NOW
+                    else W[waiting + j] != 0.0 and reset_mode == RESET_NEXT_STEP
+                ):
+                    reset_lane(W, j, setup, True)
+                    for k in range(n_outcome):
+                        W[outcome + k * LANES + j] = 0.0
+                elif reset_mode != RESET_NOW and W[terminated + j] + W[truncated + j] != 0.0:
+                    W[waiting + j] = 1.0
+                    finished += 1
+            for k in range(n_outcome):
+                for j in range(LANES):
+                    outcomes[k, lane + j] = W[outcome + k * LANES + j]
+            for again in range(2):
+                observe(
+                    W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output,
+                    1.0 / setup.max_input, setup.horizon, setup.budget,
+                )  # fmt: skip
+                for j in range(LANES):
+                    for k in range(n_observation):
+                        observations[lane + j, k] = W[observed + k * LANES + j]
+                if again or reset_mode != RESET_SAME_STEP or not finished:
+                    break
+                for j in range(LANES):
+                    if W[waiting + j] != 0.0:
+                        for k in range(n_observation):
+                            final_observations[lane + j, k] = observations[lane + j, k]
+                        for i in range(n_rows):
+                            ended[b, i * LANES + j] = W[i * LANES + j]
+                        reset_lane(W, j, setup, True)
+
+    step, inner_step = entry(step_blocks), inner(step_blocks)
 
     @entry(parallel=True)
     def step_parallel(
-        blocks, saved, actions, settings, prior, recorded_u, recorded_y, reset_mode, observations, final_observations,
-        ended,
+        blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations, outcomes,
+        final_observations, ended,
     ):  # fmt: skip
         n = len(saved)
         for t in prange(n):
-            step_blocks(
-                t * len(blocks) // n, (t + 1) * len(blocks) // n, blocks, saved[t], actions, settings, prior,
-                recorded_u, recorded_y, reset_mode, observations, final_observations, ended,
+            inner_step(
+                t * len(blocks) // n, (t + 1) * len(blocks) // n, blocks, saved[t], actions, packed, recorded_u,
+                recorded_y, reset_mode, mask, observations, outcomes, final_observations, ended,
             )  # fmt: skip
 
-    return Kernel(reset, step, step_parallel)
+    return Kernel(step, step_parallel)
+
+
+def _plant_of(kind: Kind, code: Any, draw_noise: Any) -> Any:
+    """``move(W, setup)``: the simulated plant over a sample with its noise, and its sensors. Noise has been drawn."""
+    assert kind.plant is not None
+    model, n_outputs = kind.plant, kind.plant.n_outputs
+    if n_outputs > 3:
+        raise ValueError(f"outputs must be at most 3 in an environment, but {model.name!r} has {n_outputs}")
+    plant, steps, draws_each_step = code.plant, model.substeps, not model.held
+    length, root, root_3 = 1.0 / steps, math.sqrt(1.0 / steps), math.sqrt(3.0)
+    sense_0: Any = getattr(code, "sense_0", None)
+    sense_1 = getattr(code, "sense_1", sense_0)
+    sense_2 = getattr(code, "sense_2", sense_0)
+    continuous = model.is_continuous
+
+    @part(kind.name)
+    def move(W, setup):
+        if continuous:
+            for s in range(steps):
+                plant(W, s / steps, setup.process_noise, length, root, root_3)
+                if draws_each_step:
+                    draw_noise(W)
+            sense_0(W, setup.measurement_noise[0])
+        else:
+            plant(W, setup.measurement_noise[0], setup.process_noise)
+        if n_outputs > 1:
+            draw_noise(W)
+            sense_1(W, setup.measurement_noise[1])
+        if n_outputs > 2:
+            draw_noise(W)
+            sense_2(W, setup.measurement_noise[2])
+
+    return move

@@ -71,7 +71,7 @@ class PowerEnv(DuffingEnv):
     >>> import gymnasium as gym
     >>> env = gym.make("duffing_env/Power-v0")
     >>> observation, info = env.reset(seed=0)
-    >>> for _ in range(6):
+    >>> for _ in range(7):
     ...     observation, *_ = env.step([1.0])
     >>> float(observation[18]), float(observation[21])
     (0.0, 0.0)

@@ -10,9 +10,12 @@ import numpy as np
 
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import Experiment
-from duffing_env.rewards import NEED_THE_TRUTH
-from estimator.parameters import PhysicalParameters
-from estimator.prior import Prior
+from duffing_env.rewards import REWARDS
+from estimator.belief import Belief
+from estimator.models.difference import difference
+from estimator.models.model import Model
+from estimator.parameters import Parameters
+from estimator.priors import silverbox_prior
 
 
 class Plant(Protocol):
@@ -36,33 +39,43 @@ class PlantExperiment(Experiment):
     """
 
     horizon: int = 256
-    prior: Prior | None = None
+    prior: Belief | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_count("horizon")
-        if self.reward in NEED_THE_TRUTH:
+        if REWARDS[self.reward].needs_truth:
             raise ValueError(
                 f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "
                 "use 'information_gain', 'expected_free_energy' or 'free_energy'"
             )
-        if self.prior is not None and not isinstance(self.prior, Prior):
-            raise ValueError(f"prior must be an estimator.Prior or None, but is {self.prior!r}")
+        if self.prior is not None and not isinstance(self.prior, Belief):
+            raise ValueError(f"prior must be an estimator.Belief or None, but is {self.prior!r:.60}")
+        if self.model.n_outputs != 1:
+            raise ValueError(
+                f"prior must be of a model with one sensor, but {self.model.name!r} has {self.model.n_outputs}; "
+                "a plant gives one number"
+            )
 
     @property
     def samples(self) -> int:
         """The horizon."""
         return self.horizon
 
-    @cached_property
-    def believed(self) -> Prior:
-        """The prior as given, or that of Amplitude-v0."""
-        return self.prior or Prior.silverbox_twin()
+    @property
+    def model(self) -> Model:
+        """That of the prior; the paper's where there is none."""
+        return difference() if self.prior is None else self.prior.model
 
     @property
-    def plant_kind(self) -> str:
-        """A record of one sample, which is written anew before every step."""
-        return "replay"
+    def step(self) -> float:
+        """That of the prior."""
+        return self.believed.step
+
+    @cached_property
+    def believed(self) -> Belief:
+        """The prior as given, or that of Amplitude-v0."""
+        return self.prior or silverbox_prior().factorised(self.factorisation)
 
 
 class PlantEnv(DuffingEnv):
@@ -81,8 +94,8 @@ class PlantEnv(DuffingEnv):
     environment's ``step``, and nothing after the end of an episode until ``reset``: that of the plant must switch its
     input off. The compiled step is ready before the plant is first touched.
 
-    The plant's sampling step need not be 1.6384 ms; the coefficients are those of Eq. (2) at its own. Only
-    ``belief.physical()`` takes 1.6384 ms for granted: `estimator.parameters.propagate_to_physical` takes another step.
+    The plant's sampling step need not be 1.6384 ms; the coefficients are those of the prior's model at its own, and
+    ``belief.physical()`` those of the prior's ``step``.
 
     ## Action space, observation space
 
@@ -122,7 +135,7 @@ class PlantEnv(DuffingEnv):
     | ``plant`` | | the plant; it stays the caller's, who closes it |
     | ``reward`` | ``information_gain`` | or ``expected_free_energy``, ``free_energy`` |
     | ``horizon`` | 256 | samples of an episode |
-    | ``prior`` | None | an `estimator.Prior`; None: that of Amplitude-v0 |
+    | ``prior`` | None | an `estimator.Belief`, whose model is then believed; None: that of Amplitude-v0 |
 
     A plant and a prior are Python objects, so the specification of an environment made with them is not JSON-able; and
     an environment is copied and pickled with its plant, if the plant can be. One plant is one environment: `make_vec`
@@ -145,7 +158,7 @@ class PlantEnv(DuffingEnv):
     ...     done = terminated or truncated
     >>> sorted(info), truncated
     (['belief', 'diverged', 'information_gain'], True)
-    >>> bool(abs(info["belief"].eta_mean - 0.4) < 0.01)
+    >>> bool(abs(info["belief"].coefficients_mean[3] - 0.4) < 0.01)
     True
 
     ## Version history
@@ -167,7 +180,7 @@ class PlantEnv(DuffingEnv):
         self._batch.step(0.0)
 
     @property
-    def truth(self) -> PhysicalParameters:
+    def truth(self) -> Parameters:
         """The plant's true parameters are not known.
 
         Raises:

@@ -16,9 +16,10 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from estimator.belief import RecordBelief
+from estimator.belief import Belief
 from estimator.files import write_atomically
-from estimator.parameters import SAMPLING_STEP, FloatArray, PhysicalParameters
+from estimator.parameters import SAMPLING_STEP, FloatArray, Parameters
+from estimator.physical import propagate
 
 Frame = npt.NDArray[np.uint8]
 
@@ -38,6 +39,8 @@ PARAMETERS = (
     ("stiffness a", 1.0),
     ("cubic stiffness b [V⁻²]", 1.0),
 )
+
+NAMES = ("m", "c", "a", "b")
 
 MILLISECONDS = 1e3 * SAMPLING_STEP
 
@@ -67,17 +70,17 @@ class Screen:
         self._picture: _Picture | None = None
         self._window = _Window(fps) if render_mode == "human" else None
 
-    def start(self, truth: PhysicalParameters, belief: RecordBelief, horizon: int) -> None:
+    def start(self, truth: Parameters, belief: Belief, horizon: int) -> None:
         """Begin an episode of at most ``horizon`` samples; ``belief`` is the prior."""
-        self._truth = np.array([truth.m, truth.c, truth.a, truth.b])
+        self._truth = np.array([getattr(truth, name, np.nan) for name in NAMES])
         self._horizon = horizon
         self._samples = 0
         self._prior_entropy = belief.entropy()
         # Input, output and the belief after them; nothing was applied before the prior.
-        self._history: deque[tuple[float, float, RecordBelief]] = deque([(np.nan, np.nan, belief)], maxlen=SPAN + 1)
+        self._history: deque[tuple[float, float, Belief]] = deque([(np.nan, np.nan, belief)], maxlen=SPAN + 1)
         self._show()
 
-    def add(self, u: float, y: float, belief: RecordBelief) -> None:
+    def add(self, u: float, y: float, belief: Belief) -> None:
         """Take note of a sample: the input applied [V], the output that followed [V] and the belief after it."""
         self._samples += 1
         self._history.append((u, y, belief))
@@ -114,19 +117,25 @@ class Screen:
         return {**self.__dict__, "_picture": None, "_window": None}
 
 
-def _physical_moments(beliefs: Sequence[RecordBelief]) -> tuple[FloatArray, FloatArray]:
+def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray]:
     """(4, n) means and standard deviations of m, c, a and b, first order.
 
-    NaN where a belief has none: the map divides by the gain (η), whose mean is about 0.4 but may pass 0 on the way.
+    NaN where a model has no such parameter, or a belief none: the map divides by the gain (η), whose mean is about 0.4
+    but may pass 0 on the way.
     """
+    model, step = beliefs[0].model, beliefs[0].step
     mean = np.array([belief.coefficients_mean for belief in beliefs])
     cov = np.array([belief.coefficients_cov for belief in beliefs])
     known = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2)) & (np.abs(mean[:, -1]) > 1e-9)
-    means, stds = np.full((2, *mean.shape), np.nan)
+    means, stds = np.full((2, len(NAMES), len(beliefs)), np.nan)
     with np.errstate(all="ignore"):
-        means[known], physical_cov = beliefs[0].propagate(mean[known], cov[known])
-        stds[known] = np.sqrt(np.diagonal(physical_cov, axis1=-2, axis2=-1))
-    return means.T, stds.T
+        physical, physical_cov = propagate(model, mean[known], cov[known], step)
+        variances = np.diagonal(physical_cov, axis1=-2, axis2=-1)
+    for place, name in enumerate(model.physical):
+        if name in NAMES:
+            means[NAMES.index(name), known] = physical[:, place]
+            stds[NAMES.index(name), known] = np.sqrt(variances[:, place])
+    return means, stds
 
 
 class _Picture:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
 from duffing_env.experiment import Experiment
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
+from estimator.belief import Belief
+from estimator.models.difference import difference
+from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.prior import Prior
+from estimator.priors import paper_text_prior, published_run_prior, silverbox_prior
 
-_PRIORS = ("silverbox_twin", "published_run", "paper_text")
+#: Name of a prior to what makes it of a model.
+_PRIORS: dict[str, Callable[[Model], Belief]] = {
+    "silverbox_twin": silverbox_prior,
+    "published_run": partial(published_run_prior, True),
+    "paper_text": partial(paper_text_prior, True),
+}
 
 
 @dataclass(frozen=True)
@@ -66,16 +76,15 @@ class ReplayExperiment(Experiment):
         """The samples of the regime that have an output."""
         return len(self._regime.u) - self.input_delay
 
-    @cached_property
-    def believed(self) -> Prior:
-        """The prior of that name."""
-        prior: Prior = getattr(Prior, self.prior)()
-        return prior
-
     @property
-    def is_nonlinear(self) -> bool:
-        """As asked for."""
-        return self.nonlinear
+    def model(self) -> Model:
+        """The paper's, with the cubic term or without."""
+        return difference("paper" if self.nonlinear else "linear")
+
+    @cached_property
+    def believed(self) -> Belief:
+        """The prior of that name."""
+        return _PRIORS[self.prior](self.model).factorised(self.factorisation)
 
     @property
     def recorded(self) -> tuple[FloatArray, FloatArray]:
@@ -83,11 +92,6 @@ class ReplayExperiment(Experiment):
         return self._regime.u, self._regime.y
 
     @property
-    def plant_kind(self) -> str:
-        """The record."""
-        return "replay"
-
-    @property
-    def plant_settings(self) -> dict[str, float]:
+    def plant_setup(self) -> dict[str, Any]:
         """How the record is played, and how the estimator departs from the model."""
         return {"as_published": self.as_published, "delay": self.input_delay}

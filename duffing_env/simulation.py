@@ -8,23 +8,26 @@ The believed one has the posterior's means for its coefficients. One that runs a
 
 The test input is a Schroeder multisine of `SAMPLES` samples: the first 20 multiples of 9.5 Hz, so up to 191 Hz as the
 Silverbox's, all of one size. Its peak is half of ``max_input``, with which oscillators of the standard tracks come to
-0.35 V at most. Physical oscillators are integrated in two Runge-Kutta steps per sample, and compared after each.
+0.35 V at most.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from duffing_env.layout import LAYOUT
-from estimator.inference.continuous import runge_kutta
-from estimator.lanes import jit, lanewise
+from duffing_env.layout import Kind, layout_of
+from duffing_env.rewards import Hooks, nothing
+from estimator.engine.feeding import feeder
+from estimator.engine.rows import input_rows
+from estimator.lanes import LANES, part
 from estimator.parameters import FloatArray
-from estimator.record import MEAN_FIELD_SCRATCH
 
 #: Length of the test input: 105 ms.
 SAMPLES = 64
 
-_HARMONICS, _PEAK, _SUBSTEPS = 20, 0.5, 2
+_HARMONICS, _PEAK = 20, 0.5
 
 
 def _schroeder() -> FloatArray:
@@ -38,56 +41,79 @@ def _schroeder() -> FloatArray:
 
 TEST_INPUT = _schroeder()
 
-# Both oscillators' two states and the two sums, in rows that lie idle but during a mean-field update.
-_SUMS = ("model_x", "model_v", "twin_x", "twin_v", "deviation", "power")
-_LAYOUT = {**LAYOUT, **{name: LAYOUT[row] for name, row in zip(_SUMS, MEAN_FIELD_SCRATCH, strict=False)}}
+
+def source(kind: Kind, loop: Any) -> str:
+    """``model_move`` and ``twin_move``: the believed and the true plant; ``compare`` adds up, ``conclude`` ends."""
+    import sympy as sp
+
+    from estimator.engine.derive import calculus, renamed, state_step, symbol
+
+    model = kind.belief
+    believed = {x: f"MODEL_{x}" for x in model.states} | {c: c for c in model.coefficients}
+    true = {x: f"TWIN_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
+    at = ("T",) if model.is_continuous else ()
+    text = loop("model_move", "The believed plant moves.", *state_step(model, kind.degree, believed), *at)
+    text += loop("twin_move", "The true plant moves.", *state_step(model, kind.degree, true), *at)
+    shown = calculus(model).outputs[0].subs(symbol("u"), 0)
+    ours, theirs = (renamed([("", shown)], names)[0][1] for names in (believed, true))
+    lines = [("E_d", symbol("DEVIATION") + (ours - theirs) ** 2), ("E_p", symbol("POWER") + theirs**2)]
+    text += loop("compare", "Add up what differs.", lines, {"DEVIATION": "E_d", "POWER": "E_p"})
+    misfit = sp.sqrt(symbol("DEVIATION") / symbol("POWER"))
+    # ``reaches`` is 0 for NaN, which so counts as 1.
+    kept = sp.Function("select")(sp.Function("reaches")(sp.S.One, symbol("RATIO")), symbol("RATIO"), sp.S.One)
+    lines = [("RATIO", misfit), ("KEPT", kept), ("FALL", symbol("MISFIT") - symbol("KEPT"))]
+    return text + loop("conclude", "The misfit, and its decrease.", lines, {"WORK": "FALL", "MISFIT": "KEPT"})
 
 
-@lanewise(_LAYOUT, " ".join(_SUMS))
-def _rest():
-    return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+def hooks(kind: Kind, code: Any) -> Hooks:
+    """It compares where an episode begins, and after every update."""
+    place, model = layout_of(kind), kind.belief
+    first, last = place[f"MODEL_{next(iter(model.states))}"] * LANES, (place["POWER"] + 1) * LANES
+    rows = [place[row] for row in input_rows(model, kind.degree)]
+    inputs, feed = tuple(row * LANES for row in rows), feeder(model, kind.degree, rows, LANES)
+    work, misfit = place["WORK"] * LANES, place["MISFIT"] * LANES
+    model_move, twin_move, compare, conclude = code.model_move, code.twin_move, code.compare, code.conclude
+    steps, continuous = model.substeps, model.is_continuous
 
+    @part(kind.name)
+    def run(W, max_input):
+        """The misfits of a block's beliefs."""
+        kept = np.empty(len(inputs) * LANES)
+        for k in range(len(inputs)):
+            for j in range(LANES):
+                kept[k * LANES + j] = W[inputs[k] + j]
+        W[first:last] = 0.0
+        for t in range(SAMPLES):
+            now = max_input * TEST_INPUT[t]
+            before = max_input * TEST_INPUT[t - 1] if t > 0 else 0.0
+            older = max_input * TEST_INPUT[t - 2] if t > 1 else 0.0
+            for j in range(LANES):
+                feed(W, j, now, before, older)
+            if continuous:
+                for s in range(steps):
+                    model_move(W, s / steps)
+                    twin_move(W, s / steps)
+            else:
+                model_move(W)
+                twin_move(W)
+            compare(W)
+        conclude(W)
+        for k in range(len(inputs)):
+            for j in range(LANES):
+                W[inputs[k] + j] = kept[k * LANES + j]
 
-@lanewise(_LAYOUT, " ".join(_SUMS), uniform="played")
-def _move_by_difference(
-    model_x, model_v, twin_x, twin_v, deviation, power, t1, t2, t3, e, true_t1, true_t2, true_t3, true_e, played
-):  # fmt: skip
-    """Eq. (2) over one sample; the second state is x_{t-1}."""
-    model = t1 * model_x + t2 * model_x * model_x * model_x + t3 * model_v + e * played
-    twin = true_t1 * twin_x + true_t2 * twin_x * twin_x * twin_x + true_t3 * twin_v + true_e * played
-    return model, model_x, twin, twin_x, deviation + (model - twin) * (model - twin), power + twin * twin
+    @part(kind.name)
+    def begin(W, j, setup):
+        """Of lane j alone: the other lanes keep what they had."""
+        works, misfits = W[work : work + LANES].copy(), W[misfit : misfit + LANES].copy()
+        run(W, setup.max_input)
+        for k in range(LANES):
+            W[work + k] = works[k]
+            if k != j:
+                W[misfit + k] = misfits[k]
 
+    @part(kind.name)
+    def after(W, setup):
+        run(W, setup.max_input)
 
-@lanewise(_LAYOUT, " ".join(_SUMS), uniform="u0 u1 u2 length")
-def _integrate(
-    model_x, model_v, twin_x, twin_v, deviation, power, t1, t2, t3, e, true_t1, true_t2, true_t3, true_e,
-    u0, u1, u2, length,
-):  # fmt: skip
-    """Eq. (1) over ``length`` of a sample; the second state is x'."""
-    model, model_v, _, _, _, _, _, _ = runge_kutta(model_x, model_v, t1, t2, t3, e, u0, u1, u2, length)
-    twin, twin_v, _, _, _, _, _, _ = runge_kutta(twin_x, twin_v, true_t1, true_t2, true_t3, true_e, u0, u1, u2, length)
-    return model, model_v, twin, twin_v, deviation + (model - twin) * (model - twin), power + twin * twin
-
-
-@lanewise(_LAYOUT, "misfit")
-def _conclude(deviation, power):
-    """The misfit; whatever is no number, or above 1, counts as 1."""
-    misfit = np.sqrt(deviation / power)
-    return misfit if misfit < 1.0 else 1.0
-
-
-@jit
-def compare(W, max_input, continuous):
-    """Write the misfits of a block's beliefs to its rows ``misfit``."""
-    _rest(W)
-    for t in range(SAMPLES):
-        u = max_input * TEST_INPUT[t]
-        if continuous != 0.0:
-            begin = max_input * TEST_INPUT[t - 1] if t > 0 else 0.0
-            rise = (u - begin) / (2 * _SUBSTEPS)
-            for s in range(_SUBSTEPS):
-                at = begin + 2 * s * rise
-                _integrate(W, at, at + rise, at + 2 * rise, 1.0 / _SUBSTEPS)
-        else:
-            _move_by_difference(W, u)
-    _conclude(W)
+    return Hooks(begin, nothing, nothing, after)

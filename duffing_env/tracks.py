@@ -37,6 +37,37 @@ TRACKS: dict[str, dict[str, Any]] = {
         "vector_entry_point": "duffing_env.vector_env:ContinuousVectorEnv",
         "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
     },
+    # The pendulum of IO-SMC²: angle and velocity are seen without noise (here 1 µrad), every 0.05 s.
+    "duffing_env/Pendulum-v0": {
+        "entry_point": "duffing_env.model_env:ModelEnv",
+        "vector_entry_point": "duffing_env.model_env:ModelVectorEnv",
+        "kwargs": {
+            "system": "pendulum",
+            "mean": {"p1": 14.7, "p2": 0.0, "p3": 3.0},
+            "std": {"p1": 0.1**0.5, "p2": 0.1, "p3": 0.1**0.5},
+            "sampling_step": 0.05,
+            # Diffusion 0.1 of q'', counted as what a sample of it does to q: 0.1 δ^1.5 / √3.
+            "process_noise": 6.454972e-4,
+            "measurement_noise": 1e-6,
+            "noise_shape": 1e6,
+            "horizon": 50,
+            "max_input": 1.0,
+            "max_output": 6.283185307179586,
+        },
+    },
+    "duffing_env/WienerHammerstein-v0": {
+        "entry_point": "duffing_env.model_env:ModelEnv",
+        "vector_entry_point": "duffing_env.model_env:ModelVectorEnv",
+        "kwargs": {
+            "system": "wiener_hammerstein",
+            "mean": {"stiffness": 0.5, "damping": 0.15, "cubic": 1.0, "decay": 0.4},
+            "process_noise": 1e-3,
+            "measurement_noise": 1e-3,
+            "horizon": 256,
+            "max_input": 1.0,
+            "max_output": 20.0,
+        },
+    },
     "duffing_env/SilverboxReplay-v0": {
         "entry_point": "duffing_env.env:SilverboxReplayEnv",
         "vector_entry_point": "duffing_env.vector_env:SilverboxReplayVectorEnv",

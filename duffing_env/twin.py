@@ -1,7 +1,7 @@
 """The twin: the oscillator nearest to the Silverbox circuit, identified from its record.
 
 Run ``python -m duffing_env.twin`` with the record at hand to print the constants of
-`estimator.parameters.SILVERBOX_TWIN` and of `estimator.continuous.CONTINUOUS_TWIN`.
+`estimator.parameters.SILVERBOX_TWIN` and of `estimator.parameters.CONTINUOUS_TWIN`.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from duffing_env.silverbox import SilverboxRecord, load_record
-from estimator import DuffingODE, OnlineEstimator
-from estimator.parameters import Coefficients, PhysicalParameters, to_physical
+from estimator import OnlineEstimator, Rig, difference, duffing
+from estimator.parameters import SAMPLING_STEP, Parameters
+from estimator.physical import to_physical
 
 
-def identify_twin(record: SilverboxRecord) -> tuple[PhysicalParameters, float]:
+def identify_twin(record: SilverboxRecord) -> tuple[Parameters, float]:
     """Least squares of Eq. (2) with input delay 1 on the record's multisine part.
 
     Returns:
@@ -22,18 +23,24 @@ def identify_twin(record: SilverboxRecord) -> tuple[PhysicalParameters, float]:
     u, y = record.multisine.u, record.multisine.y
     regressors = np.column_stack([y[1:-1], y[1:-1] ** 3, y[:-2], u[1:-1]])
     coefficients, squares, *_ = np.linalg.lstsq(regressors, y[2:], rcond=None)
-    return to_physical(Coefficients(*coefficients)), float(np.sqrt(squares[0] / len(regressors)))
+    parameters = Parameters(
+        zip("mcab", to_physical(difference(), np.asarray(coefficients, dtype=np.float64)).tolist(), strict=True)
+    )
+    return parameters, float(np.sqrt(squares[0] / len(regressors)))
 
 
 def identify_continuous_twin(record: SilverboxRecord) -> dict[str, float]:
     """Stiffness, damping, gain and cubic stiffness of the differential equation, from the record's multisine part.
 
-    By `DuffingODE` with the spline through all inputs. Its offsets and feedthrough are identified along, and left away:
-    they are the circuit's and the sensor's, not the oscillator's.
+    By `duffing` with the spline through all inputs. Its offsets and feedthrough are identified along, and left away:
+    they are the circuit's and the sensor's, not the oscillator's. In seconds and volts.
     """
-    estimator = OnlineEstimator(DuffingODE("spline"))
+    model = duffing(offsets=True, feedthrough=True, noise="held")
+    estimator = OnlineEstimator(model, rig=Rig.silverbox("spline"))
     estimator.run(record.multisine.u, record.multisine.y)
-    return dict(zip(DuffingODE.names, estimator.belief.coefficients_mean.tolist(), strict=True))
+    scales = {"stiffness": -2, "damping": -1, "gain": -2, "cubic": -2}
+    found = estimator.belief.coefficients()
+    return {name: found[name][0] * SAMPLING_STEP**power for name, power in scales.items()}
 
 
 def main() -> None:

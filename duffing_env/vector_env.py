@@ -18,14 +18,19 @@ from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv, SilverboxReplayEnv, action_space, observation_space
 from duffing_env.experiment import Experiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
-from estimator.belief import RecordBelief
-from estimator.parameters import FloatArray, PhysicalParameters
+from duffing_env.layout import OUTCOME
+from estimator.belief import Belief
+from estimator.parameters import FloatArray, Parameters
 
 _RESET_MODES = {
     AutoresetMode.DISABLED: RESET_BY_HAND,
     AutoresetMode.NEXT_STEP: RESET_NEXT_STEP,
     AutoresetMode.SAME_STEP: RESET_SAME_STEP,
 }
+
+#: Name of what a step leaves to its place in a batch's outcomes.
+_PLACES = {name.lower(): place for place, name in enumerate(OUTCOME)}
+_TERMINATED, _TRUNCATED = _PLACES["terminated"], _PLACES["truncated"]
 
 Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -91,20 +96,21 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         self.num_envs = int(num_envs)
         self.metadata = {**type(self).metadata, "autoreset_mode": self._autoreset_mode}
         self.render_mode = None
-        self.single_observation_space = observation_space()
-        self.single_action_space = action_space()
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
         if max_episode_steps is not None and max_episode_steps * self.experiment.hold < self.experiment.samples:
             options["horizon"] = max_episode_steps * self.experiment.hold
             self.experiment = make_experiment(self.single.experiment_kind, options)
+        self.single_observation_space = observation_space(self.experiment.model)
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
         reset_mode = _RESET_MODES[self._autoreset_mode]
         self._batch = Batch(self.experiment, self.num_envs, reset_mode, int(threads), self.experiment.hold)
         self._copy = copy
         self._seeded: Flags = np.zeros(self.num_envs, dtype=np.bool_)
         self._finished: Flags = np.ones(self.num_envs, dtype=np.bool_)
         self._everywhere: Flags = np.ones(self.num_envs, dtype=np.bool_)
+        self._any_due = True
 
     @property
     def max_input(self) -> float:
@@ -118,15 +124,15 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
 
     @property
     def records(self) -> FloatArray:
-        """(num_envs, RECORD_SIZE) the posteriors now, as the flat records of `estimator.record`; a copy."""
+        """(num_envs, size) the posteriors now, as the flat records of `estimator.Belief`; a copy."""
         return self._batch.records()
 
     @property
-    def truth(self) -> PhysicalParameters:
+    def truth(self) -> Parameters:
         """The oscillators that are to be identified, a batch of ``num_envs``."""
         return self._batch.truth()
 
-    def belief(self, index: int) -> RecordBelief:
+    def belief(self, index: int) -> Belief:
         """The posterior of row ``index`` now."""
         return self._batch.belief(index)
 
@@ -147,6 +153,8 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         self._seed(seed, mask)
         self._batch.reset(mask)
         self._finished[mask] = False
+        due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
+        self._any_due = bool(due.any())
         return self._observations(), {}
 
     def step(
@@ -161,23 +169,25 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         actions = np.asarray(actions)
         if actions.shape != (self.num_envs, 1):
             raise ValueError(f"actions must have shape {(self.num_envs, 1)}, but have {actions.shape}; one per row")
-        if not np.isfinite(actions).all():
+        if not np.isfinite(actions.sum()) and not np.isfinite(actions).all():
             row = int(np.argmin(np.isfinite(actions)))
             raise ValueError(f"actions must be finite, but row {row} is {actions[row, 0]}; pass values in [-1, 1]")
         if actions.dtype != np.float32:
             actions = np.clip(actions, -1.0, 1.0)
-        due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
-        if due.any():
+        if self._any_due:
+            due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
             rows = np.flatnonzero(due).tolist()
             raise ResetNeeded(f"rows {rows} have finished or not begun: reset them with options={{'reset_mask': mask}}")
-        batch = self._batch
-        batch.step(actions[:, 0])
-        terminated = batch.quantity("terminated") != 0.0
-        truncated = batch.quantity("truncated") != 0.0
+        self._batch.step(actions[:, 0])
+        outcomes = self._batch.outcomes.copy()
+        flags = outcomes != 0.0
+        terminated, truncated = flags[_TERMINATED], flags[_TRUNCATED]
         finished = terminated | truncated
-        infos = self._infos(was_finished=self._finished, finished=finished)
+        infos = self._infos(outcomes, flags, was_finished=self._finished, finished=finished)
         self._finished = finished
-        return self._observations(), batch.quantity("reward"), terminated, truncated, infos
+        if self._autoreset_mode == AutoresetMode.DISABLED:
+            self._any_due = bool(finished.any())
+        return self._observations(), outcomes[0], terminated, truncated, infos
 
     def _observations(self) -> Observations:
         return self._batch.observations.copy() if self._copy else self._batch.observations
@@ -210,14 +220,17 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
                 self._batch.seed(row, generator)
         self._seeded |= mask
 
-    def _infos(self, was_finished: Flags, finished: Flags) -> dict[str, Any]:
+    def _infos(
+        self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], was_finished: Flags, finished: Flags
+    ) -> dict[str, Any]:
         """What is told of a step, by the rows that had finished before it and those that finished in it."""
-        infos = self._step_infos(~was_finished if self._autoreset_mode == AutoresetMode.NEXT_STEP else self._everywhere)
+        told = ~was_finished if self._autoreset_mode == AutoresetMode.NEXT_STEP else self._everywhere
+        infos = self._step_infos(outcomes, flags, told)
         if not finished.any():
             return infos
         if self._autoreset_mode != AutoresetMode.SAME_STEP:
             return infos | self._endings(finished)
-        final_infos = self._step_infos(finished)
+        final_infos = self._step_infos(outcomes.copy(), flags.copy(), finished)
         for name in (*self.single._reported, *self.single._flags):
             final_infos[name][~finished] = 0
             infos[name][finished] = 0
@@ -232,14 +245,12 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
             "_final_info": finished.copy(),
         }
 
-    def _step_infos(self, mask: Flags) -> dict[str, Any]:
+    def _step_infos(self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], mask: Flags) -> dict[str, Any]:
         infos: dict[str, Any] = {}
-        for name in self.single._reported:
-            infos[name] = self._batch.quantity(name)
-            infos[f"_{name}"] = mask.copy()
-        for name in self.single._flags:
-            infos[name] = self._batch.quantity(name) != 0.0
-            infos[f"_{name}"] = mask.copy()
+        for names, values in ((self.single._reported, outcomes), (self.single._flags, flags)):
+            for name in names:
+                infos[name] = values[_PLACES[name]]
+                infos[f"_{name}"] = mask.copy()
         return infos
 
     def _endings(self, finished: Flags) -> dict[str, Any]:
@@ -248,7 +259,8 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
         rows = np.flatnonzero(finished)
         beliefs[rows] = self._batch.beliefs(rows, final=same_step)
-        truths[rows] = self._batch.oscillators(rows, final=same_step)
+        for row, truth in zip(rows, self._batch.truths(rows, final=same_step), strict=True):
+            truths[row] = truth  # one by one: NumPy would take what has a length for a row of its own
         return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}
 
 

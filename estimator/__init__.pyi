@@ -1,31 +1,31 @@
 # The names of `estimator`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
 from .belief import Belief
-from .continuous import (
-    CONTINUOUS_TWIN,
-    ContinuousBelief,
-    continuous_prior,
-)
 from .ensemble import NoiseRatio
-from .fisher import (
+from .information import (
     cramer_rao,
     fisher_information,
-    ode_information,
     relative_covariance,
 )
-from .gaussian import JointBelief
-from .models.nlarx import NLARX
-from .models.ode import DuffingODE
+from .models.difference import difference
+from .models.duffing import duffing
+from .models.model import Model
 from .offline import PEMNARX
 from .online import OnlineEstimator
 from .parameters import (
+    CONTINUOUS_TWIN,
     SAMPLING_STEP,
     SILVERBOX_TWIN,
-    Coefficients,
-    PhysicalParameters,
-    to_coefficients,
-    to_physical,
+    Parameters,
 )
-from .prior import Prior
+from .physical import coefficients_of, to_physical
+from .priors import (
+    paper_text_prior,
+    published_run_prior,
+    recorded_prior,
+    silverbox_prior,
+    weak_prior,
+)
+from .rig import Rig
 from .saving import (
     load_estimator,
     save_estimator,
@@ -33,26 +33,27 @@ from .saving import (
 
 __all__ = [
     "CONTINUOUS_TWIN",
-    "NLARX",
     "PEMNARX",
     "SAMPLING_STEP",
     "SILVERBOX_TWIN",
     "Belief",
-    "Coefficients",
-    "ContinuousBelief",
-    "DuffingODE",
-    "JointBelief",
+    "Model",
     "NoiseRatio",
     "OnlineEstimator",
-    "PhysicalParameters",
-    "Prior",
-    "continuous_prior",
+    "Parameters",
+    "Rig",
+    "coefficients_of",
     "cramer_rao",
+    "difference",
+    "duffing",
     "fisher_information",
     "load_estimator",
-    "ode_information",
+    "paper_text_prior",
+    "published_run_prior",
+    "recorded_prior",
     "relative_covariance",
     "save_estimator",
-    "to_coefficients",
+    "silverbox_prior",
     "to_physical",
+    "weak_prior",
 ]

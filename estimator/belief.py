@@ -1,233 +1,229 @@
-"""The belief: the readable face of the flat record that the kernels update."""
+"""The belief: one Gaussian over states and coefficients of a model, and Gamma densities of its noises' precisions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.gaussian import GaussianCoefficients
-from estimator.parameters import (
-    Coefficients,
-    FloatArray,
-    PhysicalParameters,
-    propagate_to_physical,
-    to_coefficients,
-)
-from estimator.record import RECORD, RECORD_SIZE
+from estimator.engine.rows import belief_names
+from estimator.models.model import Model
+from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.physical import propagate
 
-_INDEX = {name: i for i, name in enumerate(RECORD)}
-_MEANS = slice(0, 7)
-_STATES = 3
+Self = TypeVar("Self", bound="Belief")
 
 
-def _covariance_index() -> npt.NDArray[np.intp]:
-    """(7, 7) positions of the covariance's entries in a record."""
-    index = np.empty((7, 7), dtype=np.intp)
-    upper = np.triu_indices(7)
-    index[upper] = index.T[upper] = np.arange(_INDEX["P_x0_x0"], _INDEX["P_e_e"] + 1)
-    return index
+@cache
+def covariance_places(model: Model) -> npt.NDArray[np.intp]:
+    """(d, d) places of the covariance's entries in a record, for d states and coefficients."""
+    d = len(model.names)
+    places = np.empty((d, d), dtype=np.intp)
+    upper = np.triu_indices(d)
+    places[upper] = places.T[upper] = d + np.arange(len(upper[0]))
+    return places
 
 
-_COVARIANCE = _covariance_index()
-_NOISES = slice(_INDEX["g_shape"], RECORD_SIZE)
-
-
-def to_moments(record: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean (7,), covariance (7, 7), and shapes and rates of γ and ξ (4,) of a flat record; copies."""
-    return record[_MEANS].copy(), record[_COVARIANCE], record[_NOISES].copy()
-
-
-def from_moments(mean: FloatArray, cov: FloatArray, noises: FloatArray) -> FloatArray:
-    """The flat record (RECORD_SIZE,) with these moments."""
-    record = np.empty(RECORD_SIZE)
-    record[_MEANS] = mean
-    record[_COVARIANCE] = cov
-    record[_NOISES] = noises
-    return record
-
-
-Self = TypeVar("Self", bound="RecordBelief")
+@cache
+def record_size(model: Model) -> int:
+    """Numbers in a record."""
+    return len(belief_names(model))
 
 
 @dataclass(frozen=True, eq=False)
-class RecordBelief(GaussianCoefficients):
-    """A posterior as the kernels hold it: state and coefficients Gaussian, q(γ) and q(ξ) Gamma.
+class Belief:
+    """A prior or posterior: q(states, coefficients) Gaussian, q(γ) and q(ξ) of each sensor Gamma.
 
-    A copy; later updates do not change it.
+    A copy: later updates do not change it. A coefficient of variance 0 is known. γ is the precision of what a sample's
+    process noise alone does to the first sensor.
 
     Attributes:
-        record: (RECORD_SIZE,) the flat record.
+        model: whose states and coefficients these are.
+        record: (size,) the numbers, as `estimator.engine.rows.belief_names` orders them: means, the upper triangle of
+            the covariance row by row, shape and rate of γ, then of each sensor's ξ. Time is counted in samples.
+        step: sampling step [s], for physical parameters.
+        factorisation: of the inference that made it; ``mean_field`` is the paper's.
+
+    Raises:
+        ValueError: naming the part, for a wrong size, numbers that are not finite, a covariance that is not positive
+            semi-definite, or a shape or rate that is not positive.
     """
 
+    model: Model
     record: FloatArray
+    step: float = SAMPLING_STEP
+    factorisation: str = "structured"
 
     def __post_init__(self) -> None:
         record = np.array(self.record, dtype=np.float64)
+        if record.shape != (record_size(self.model),):
+            raise ValueError(
+                f"record must have shape {(record_size(self.model),)} for the model {self.model.name!r}, but has "
+                f"{record.shape}; make it with Belief.of"
+            )
+        if not np.isfinite(record).all():
+            bad = belief_names(self.model)[int(np.argmin(np.isfinite(record)))]
+            raise ValueError(f"record must be finite, but {bad} is not; replace it")
+        noises = record[-2 - 2 * self.model.n_outputs :]
+        if (noises <= 0).any():
+            raise ValueError(f"shapes and rates of the noises must be positive, but are {noises.tolist()}")
+        if not 0 < self.step < np.inf:
+            raise ValueError(f"step must be positive and finite, but is {self.step}; give the seconds between samples")
+        cov = record[covariance_places(self.model)]
+        std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+        unit = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
+        if (np.diag(cov) < 0).any() or np.linalg.eigvalsh(cov / unit)[0] < -1e-9 * len(cov):
+            raise ValueError(f"covariance must be positive semi-definite, but has the diagonal {np.diag(cov).tolist()}")
         record.flags.writeable = False
         object.__setattr__(self, "record", record)
 
+    @classmethod
+    def of(
+        cls: type[Self],
+        model: Model,
+        mean: npt.ArrayLike,
+        cov: npt.ArrayLike,
+        gamma: tuple[float, float],
+        xi: tuple[float, float] | Sequence[tuple[float, float]],
+        **others: Any,
+    ) -> Self:
+        """From moments.
+
+        Args:
+            model: whose states and coefficients.
+            mean: (d,) of the states, then the coefficients.
+            cov: (d, d) their covariance.
+            gamma: shape and rate of the process precision.
+            xi: shape and rate of the measurement precision; one pair for each sensor where there are several.
+            others: ``step`` and ``factorisation``.
+
+        Raises:
+            ValueError: as the class, or for shapes that do not fit.
+        """
+        d = len(model.names)
+        first, second = np.array(mean, dtype=np.float64), np.array(cov, dtype=np.float64)
+        if first.shape != (d,) or second.shape != (d, d):
+            raise ValueError(
+                f"mean and cov must have shapes {(d,)} and {(d, d)} for the model {model.name!r}, but have "
+                f"{first.shape} and {second.shape}"
+            )
+        noises = np.ravel([gamma, *np.reshape(np.asarray(xi, dtype=np.float64), (-1, 2))])
+        record = np.empty(record_size(model))
+        if len(noises) != 2 + 2 * model.n_outputs:
+            raise ValueError(f"xi must have a pair for each of {list(model.outputs)}, but is {xi!r}")
+        if not np.allclose(second, second.T, rtol=1e-9, atol=0):
+            raise ValueError("cov must be symmetric; pass (C + C.T) / 2")
+        record[:d] = first
+        record[covariance_places(model)] = second
+        record[-len(noises) :] = noises
+        return cls(model, record, **others)
+
     def __eq__(self, other: object) -> bool:
         """Whether all numbers are the same, as Gymnasium's checker asks of two episodes of one seed."""
-        if not isinstance(other, RecordBelief):
+        if not isinstance(other, Belief):
             return NotImplemented
         return self._kind == other._kind and np.array_equal(self.record, other.record)
 
     def __hash__(self) -> int:
         return hash((self._kind, self.record.tobytes()))
 
+    @property
+    def _kind(self) -> tuple[Any, ...]:
+        return (self.model.digest, self.step, self.factorisation)
+
     def with_records(self: Self, records: FloatArray) -> list[Self]:
-        """Beliefs of the same kind with other records (n, RECORD_SIZE), which must not be written to any more."""
+        """Beliefs of the same kind with other records (n, size), which must not be written to any more."""
         beliefs = []
         for record in records:
-            # Past the copy that a belief makes, which takes as long as 20 steps of one of a thousand environments.
+            # Past the checks, which take as long as 20 steps of one of a thousand environments.
             belief = object.__new__(type(self))
             belief.__dict__.update(self.__dict__, record=record)
             beliefs.append(belief)
         return beliefs
 
-    @property
-    def _kind(self) -> tuple[Any, ...]:
-        """What tells beliefs of the same numbers apart."""
-        return (type(self),)
+    def factorised(self: Self, factorisation: str) -> Self:
+        """This belief as an inference of another factorisation begins with it.
+
+        In ``mean_field``, the paper's, states, θ and η are independent: their cross-covariances are left out.
+        """
+        record, places, n = self.record.copy(), covariance_places(self.model), self.model.n_states
+        if factorisation == "mean_field":
+            record[places[:n, n:]] = 0.0
+            record[places[n:-1, -1]] = 0.0
+        return replace(self, record=record, factorisation=factorisation)
 
     @property
-    def _lags(self) -> int:
-        """Numbers of the record that are the state's."""
-        return 2
+    def names(self) -> tuple[str, ...]:
+        """Of the coefficients."""
+        return tuple(self.model.coefficients)
 
-    @staticmethod
-    def propagate(coefficients_mean: FloatArray, coefficients_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Moments (..., 4) and (..., 4, 4) of (m, c, a, b) from those of the coefficients, to first order."""
-        raise NotImplementedError
+    @property
+    def mean(self) -> FloatArray:
+        """(d,) means of states and coefficients."""
+        return self.record[: len(self.model.names)].copy()
 
-    @staticmethod
-    def coefficients_of(parameters: PhysicalParameters) -> FloatArray:
-        """(..., 4) the coefficients of one oscillator or a batch of shape (...)."""
-        raise NotImplementedError
+    @property
+    def cov(self) -> FloatArray:
+        """(d, d) their covariance."""
+        return self.record[covariance_places(self.model)]
 
     @property
     def state_mean(self) -> FloatArray:
-        """(k,) means of the state."""
-        return self.record[: self._lags].copy()
+        """(n,) means of the states."""
+        return self.record[: self.model.n_states].copy()
 
     @property
     def state_cov(self) -> FloatArray:
-        """(k, k) covariance of the state."""
-        return self.record[_COVARIANCE[: self._lags, : self._lags]]
+        """(n, n) covariance of the states."""
+        n = self.model.n_states
+        return self.record[covariance_places(self.model)[:n, :n]]
 
     @property
     def coefficients_mean(self) -> FloatArray:
-        """(4,) means of the coefficients."""
-        return self.record[_STATES:7].copy()
+        """(K,) means of the coefficients."""
+        return self.record[self.model.n_states : len(self.model.names)].copy()
 
     @property
     def coefficients_cov(self) -> FloatArray:
-        """(4, 4) covariance of the coefficients."""
-        return self.record[_COVARIANCE[_STATES:, _STATES:]]
+        """(K, K) covariance of the coefficients."""
+        n = self.model.n_states
+        return self.record[covariance_places(self.model)[n:, n:]]
 
     @property
-    def gamma_shape(self) -> float:
-        """Shape of q(γ)."""
-        return float(self.record[_INDEX["g_shape"]])
-
-    @property
-    def gamma_rate(self) -> float:
-        """Rate of q(γ) [V²]."""
-        return float(self.record[_INDEX["g_rate"]])
-
-    @property
-    def xi_shape(self) -> float:
-        """Shape of q(ξ)."""
-        return float(self.record[_INDEX["n_shape"]])
-
-    @property
-    def xi_rate(self) -> float:
-        """Rate of q(ξ) [V²]."""
-        return float(self.record[_INDEX["n_rate"]])
+    def noises(self) -> FloatArray:
+        """(2 + 2 sensors,) shape and rate of γ, then of each ξ."""
+        return self.record[-2 - 2 * self.model.n_outputs :].copy()
 
     @property
     def gamma_mean(self) -> float:
-        """E[γ] [1/V²]."""
-        return self.gamma_shape / self.gamma_rate
+        """E[γ], the process precision."""
+        return float(self.noises[0] / self.noises[1])
 
     @property
     def xi_mean(self) -> float:
-        """E[ξ] [1/V²]."""
-        return self.xi_shape / self.xi_rate
+        """E[ξ], the measurement precision of the first sensor."""
+        return float(self.noises[2] / self.noises[3])
 
-    def physical(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (4,) and covariance (4, 4) of (m, c, a, b), first order."""
-        return self.propagate(self.coefficients_mean, self.coefficients_cov)
+    def coefficients(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of each coefficient, by name; time is counted in samples."""
+        stds = np.sqrt(np.diag(self.coefficients_cov)).tolist()
+        return dict(zip(self.names, zip(self.coefficients_mean.tolist(), stds, strict=True), strict=True))
 
+    def entropy(self) -> float:
+        """Entropy of the coefficients in nats."""
+        active, cov = self._unknown()
+        sign, log_det = np.linalg.slogdet(cov)
+        return float(0.5 * (len(active) * np.log(2 * np.pi * np.e) + log_det)) if sign > 0 else float("nan")
 
-@dataclass(frozen=True, eq=False)
-class Belief(RecordBelief):
-    """A posterior: q(x, θ, η) Gaussian, q(γ) and q(ξ) Gamma. A copy; later updates do not change it.
-
-    The coefficients are θ1 [1], θ2 [1/V²], θ3 [1] and η [1], the state is x_t, x_{t-1}, (x_{t-2})  [V].
-
-    Attributes:
-        record: (RECORD_SIZE,) the flat record.
-        factorisation: ``structured`` (three lags of the state, jointly with θ and η) or ``mean_field`` (two lags,
-            θ and η independent of them and of each other).
-        nonlinear: False where θ2 is fixed at 0; densities are then over (θ1, θ3, η).
-    """
-
-    factorisation: str = "structured"
-    nonlinear: bool = True
-
-    @property
-    def _kind(self) -> tuple[Any, ...]:
-        return (Belief, self.factorisation, self.nonlinear)
-
-    @property
-    def _lags(self) -> int:
-        return 3 if self.factorisation == "structured" else 2
-
-    @staticmethod
-    def propagate(coefficients_mean: FloatArray, coefficients_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Moments (..., 4) and (..., 4, 4) of (m, c, a, b) from those of θ and η, Eq. (4), to first order."""
-        return propagate_to_physical(coefficients_mean, coefficients_cov)
-
-    @staticmethod
-    def coefficients_of(parameters: PhysicalParameters) -> FloatArray:
-        """(..., 4) θ1, θ2, θ3, η of one oscillator or a batch, Eq. (3)."""
-        psi = to_coefficients(parameters)
-        return np.stack([psi.theta1, psi.theta2, psi.theta3, psi.eta], axis=-1)
-
-    @property
-    def theta_mean(self) -> FloatArray:
-        """(3,) means of θ1 [1], θ2 [1/V²], θ3 [1]."""
-        return self.coefficients_mean[:3]
-
-    @property
-    def theta_cov(self) -> FloatArray:
-        """(3, 3) covariance of θ."""
-        return self.coefficients_cov[:3, :3]
-
-    @property
-    def eta_mean(self) -> float:
-        """Mean of η [1]."""
-        return float(self.record[_INDEX["e"]])
-
-    @property
-    def eta_var(self) -> float:
-        """Variance of η."""
-        return float(self.record[_INDEX["P_e_e"]])
-
-    def coefficients(self) -> Coefficients:
-        """The posterior means as coefficients."""
-        theta1, theta2, theta3, eta = self.coefficients_mean.tolist()
-        return Coefficients(theta1, theta2, theta3, eta, self.gamma_mean, self.xi_mean)
-
-    def log_prob(self, coefficients: Coefficients | npt.ArrayLike) -> float | FloatArray:
-        """Log density of q(θ, η) at given coefficients.
+    def log_prob(self, coefficients: npt.ArrayLike) -> float | FloatArray:
+        """Log density at given coefficients.
 
         Args:
-            coefficients: `Coefficients`, or values (..., 4) of θ1, θ2, θ3, η.
+            coefficients: values (..., K), in the order of ``coefficients_mean``.
 
         Returns:
             Log density in nats, of shape (...): a float for one point.
@@ -235,7 +231,33 @@ class Belief(RecordBelief):
         Raises:
             ValueError: for a wrong shape, or values that are not finite.
         """
-        if isinstance(coefficients, Coefficients):
-            c = coefficients
-            coefficients = np.stack([c.theta1, c.theta2, c.theta3, c.eta], axis=-1)
-        return super().log_prob(coefficients)
+        points = np.asarray(coefficients, dtype=np.float64)
+        size = len(self.coefficients_mean)
+        if points.ndim == 0 or points.shape[-1] != size:
+            raise ValueError(f"coefficients must have shape (..., {size}), but has {points.shape}; pass one per name")
+        if not np.isfinite(points).all():
+            raise ValueError("coefficients must be finite, but has entries that are not; remove them")
+        active, cov = self._unknown()
+        factor = np.linalg.cholesky(cov)
+        deviation = (points - self.coefficients_mean)[..., active]
+        whitened = np.linalg.solve(factor, deviation[..., None])[..., 0]
+        log_det = 2 * np.log(np.diag(factor)).sum()
+        value = -0.5 * ((whitened**2).sum(-1) + log_det + len(active) * np.log(2 * np.pi))
+        return float(value) if np.ndim(value) == 0 else value
+
+    def _unknown(self) -> tuple[npt.NDArray[np.intp], FloatArray]:
+        """The coefficients that are not known, and their covariance."""
+        cov = self.coefficients_cov
+        active = np.flatnonzero(np.diag(cov) != 0)
+        return active, cov[np.ix_(active, active)]
+
+    def physical(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (p,) and covariance (p, p) of the physical parameters, to first order; the coefficients without any."""
+        return propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.step)
+
+    def parameters(self) -> dict[str, tuple[float, float, str]]:
+        """Mean, standard deviation and unit of each physical parameter, by name."""
+        mean, cov = self.physical()
+        units = self.model.physical_units or self.model.coefficients
+        rows = zip(self.model.physical or self.model.coefficients, mean.tolist(), np.sqrt(np.diag(cov)), strict=True)
+        return {name: (value, float(std), units[name]) for name, value, std in rows}

@@ -32,6 +32,11 @@ def series(name: str, values: npt.ArrayLike, missing: bool = False) -> FloatArra
 
 def _numbers(name: str, values: npt.ArrayLike) -> FloatArray:
     """A float64 copy: writeable, because read-only arrays are another type to Numba, and would compile kernels anew."""
+    if isinstance(values, np.ma.MaskedArray):
+        raise ValueError(
+            f"{name} must not be a masked array, whose hidden values would be used; pass {name}.filled(np.nan) to "
+            f"run(..., missing=True)"
+        )
     try:
         return np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:

@@ -16,6 +16,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ from numba.core import event
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
+
+from estimator.files import write_atomically
 
 
 @cache
@@ -65,17 +68,8 @@ def _places() -> list[Path]:
 
 def write(path: Path, content: bytes) -> None:
     """Write a file in one piece; a full disk only costs the next process the time to make it again."""
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-    except OSError:
-        pass
+    with suppress(OSError):
+        write_atomically(path, content)
 
 
 class Compilation(event.Listener):

@@ -1,112 +1,115 @@
 """Many records at once: the belief that each of them leaves, in a lane of its own.
 
-The beliefs are those that an environment's estimator, or `OnlineEstimator`, would end with; a batch of records takes a
-fraction of the time that they take one by one.
+The beliefs are those that `OnlineEstimator` would end with; a batch of records takes a fraction of the time that they
+take one by one.
 """
 
 from __future__ import annotations
 
-from typing import TypeVar
+from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.belief import Belief, RecordBelief
-from estimator.continuous import ContinuousBelief
-from estimator.inference import DEFAULT_ITERATIONS, update
-from estimator.inference import continuous as ode
-from estimator.lanes import LANES, jit, kernel
-from estimator.record import LAYOUT, N_ROWS, RECORD_SIZE
-
-_U, _Y, _LAST_U = (LAYOUT[name] * LANES for name in ("u", "y", "last_u"))
-
-AnyBelief = TypeVar("AnyBelief", bound=RecordBelief)
+from estimator.belief import Belief
+from estimator.engine import tasks
+from estimator.engine.rows import belief_names
+from estimator.inference import DEFAULT_ITERATIONS, mean_field
+from estimator.inputs import channel, degree
+from estimator.lanes import LANES, kernel
+from estimator.models.model import Model
+from estimator.rig import Rig
 
 
-def identify(u: npt.ArrayLike, y: npt.ArrayLike, prior: AnyBelief) -> list[AnyBelief]:
-    """Identify an oscillator from each of n records, sample by sample, from rest.
+def identify(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | None = None) -> list[Belief]:
+    """Identify a system from each of n records, sample by sample.
 
     Args:
-        u: (n, T) inputs [V]. With a `Belief` the t-th acts on the displacement of the sample before; with a
-            `ContinuousBelief` it is the input at the sample, to which the input goes linearly from the one before. A
-            record ends before its first NaN, so that episodes of different lengths fit into one array.
-        y: (n, T) the outputs that followed [V].
-        prior: what is believed before the first sample, of all records: a `Belief`, whose factorisation is that of the
-            updates, or a `ContinuousBelief`.
+        u: (n, T) inputs. A record ends before its first NaN, so that episodes of different lengths fit into one array.
+        y: (n, T) outputs, paired with u by index as the rig says; (n, T, sensors) where there are several.
+        prior: `Belief` before the first sample, of all records; its factorisation is that of the updates.
+        rig: what the inputs do. Where it is None, pairs are those of an environment: a difference equation's t-th
+            input acts on the state before the t-th output, and a differential equation's input goes linearly from the
+            one before to it. Not ``look_ahead`` or ``spline``.
 
     Returns:
         The n posteriors, each after the last sample of its record.
 
     Raises:
-        ValueError: for shapes that are not (n, T), or a prior of another kind.
+        ValueError: for shapes that do not fit, a prior of another kind, or another rig.
     """
+    if not isinstance(prior, Belief):
+        raise ValueError(f"prior must be a Belief, but is {prior!r:.60}; see estimator.priors")
     inputs, outputs = np.array(u, dtype=np.float64), np.array(y, dtype=np.float64)
-    if inputs.ndim != 2 or inputs.shape != outputs.shape:
-        raise ValueError(f"u and y must have one shape (n, T), but have {inputs.shape} and {outputs.shape}")
-    start: RecordBelief = prior
-    if not isinstance(start, Belief | ContinuousBelief):
-        raise ValueError(f"prior must be a Belief or a ContinuousBelief, but is {prior!r:.60}; pass one of the two")
+    sensors = prior.model.n_outputs
+    if sensors == 1 and outputs.shape == inputs.shape:
+        outputs = outputs[..., None]
+    if inputs.ndim != 2 or outputs.shape != (*inputs.shape, sensors):
+        raise ValueError(f"u and y must have one shape (n, T), but have {inputs.shape} and {np.shape(y)}")
+    rig = Rig(prior.step) if rig is None else rig
+    way = channel(prior.model, rig)
+    if way.fills:
+        raise ValueError(f"interpolation must be 'zero_order' or 'linear', but is {rig.interpolation!r}; or use run()")
     ended = np.isnan(inputs)
     lengths = np.where(ended.any(axis=1), ended.argmax(axis=1), inputs.shape[1])
-    records = np.repeat(start.record[None], len(inputs), axis=0)
-    if isinstance(start, ContinuousBelief):
-        iterations = DEFAULT_ITERATIONS["structured"]
-        _run_continuous(inputs, outputs, lengths, start.record.copy(), iterations, records)
-    else:
-        structured, iterations = start.factorisation == "structured", DEFAULT_ITERATIONS[start.factorisation]
-        _run_difference(inputs, outputs, lengths, start.record.copy(), structured, iterations, records)
+    for row, length in enumerate(lengths):
+        if not (np.isfinite(inputs[row, :length]).all() and np.isfinite(outputs[row, :length]).all()):
+            raise ValueError(f"u and y must be finite up to the end of a record, but those of record {row} are not")
+    inputs = np.concatenate([np.zeros((len(inputs), way.past)), inputs], axis=1)
+    records = np.repeat(prior.record[None], len(inputs), axis=0)
+    run = _compiled(prior.model, degree(prior.model, rig), prior.factorisation)
+    run(inputs, outputs, lengths, prior.record.copy(), way.stencil, records)
     records.flags.writeable = False
     return prior.with_records(records)
 
 
-@jit
-def _begin(W, prior):
-    """Put every lane to the prior (RECORD_SIZE,)."""
-    W[:] = 0.0
-    for i in range(RECORD_SIZE):
-        for j in range(LANES):
-            W[i * LANES + j] = prior[i]
+@cache
+def _compiled(model: Model, degree: int, factorisation: str) -> Any:
+    """``run(inputs, outputs, lengths, prior, stencil, records)`` of a model."""
+    iterations = DEFAULT_ITERATIONS[factorisation]
+    if factorisation == "mean_field":
+        place = mean_field.layout()
+        update_all = mean_field.updater(place)
+    else:
+        task = tasks.structured(model, degree, iterations=iterations)
+        place, update_all = dict(task.layout), task.update
+    is_structured = factorisation == "structured"
+    u_row, y_row = place["U_0"] * LANES, place[f"Y_{next(iter(model.outputs))}"] * LANES
+    height, size = len(place), len(belief_names(model))
 
+    @kernel(kind=f"{model.name}_{model.digest}_{degree}_{factorisation}")
+    def run(inputs, outputs, lengths, prior, stencil, records):
+        W = np.empty(height * LANES)
+        rows, window = stencil.shape
+        for first in range(0, len(inputs), LANES):
+            W[:] = 0.0
+            count = min(LANES, len(inputs) - first)
+            longest = 0
+            for j in range(LANES):
+                for i in range(size):
+                    W[i * LANES + j] = prior[i]
+            for j in range(count):
+                longest = max(longest, lengths[first + j])
+                for i in range(size):
+                    records[first + j, i] = prior[i]
+            for t in range(longest):
+                for j in range(LANES):
+                    sounds = j < count and t < lengths[first + j]
+                    for i in range(rows):
+                        value = 0.0
+                        for w in range(window):
+                            value += inputs[first + j, t + w] * stencil[i, w] if sounds else 0.0
+                        W[u_row + i * LANES + j] = value
+                    for k in range(outputs.shape[2]):
+                        W[y_row + k * LANES + j] = outputs[first + j, t, k] if sounds else 0.0
+                if is_structured:
+                    update_all(W)
+                else:
+                    update_all(W, iterations, False)
+                for j in range(count):
+                    if lengths[first + j] == t + 1:
+                        for i in range(size):
+                            records[first + j, i] = W[i * LANES + j]
 
-@jit
-def _feed(W, u, y, lengths, first, t):
-    """The samples t of the records from ``first`` on; silence where a record is over, and in spare lanes."""
-    for j in range(LANES):
-        i = first + j
-        sounds = i < len(u) and t < lengths[i]
-        W[_LAST_U + j] = W[_U + j]
-        W[_U + j] = u[i, t] if sounds else 0.0
-        W[_Y + j] = y[i, t] if sounds else 0.0
-
-
-@jit
-def _keep(W, lengths, first, t, records):
-    """Write the beliefs of the records whose last sample is t to ``records`` (n, RECORD_SIZE)."""
-    for j in range(min(LANES, len(lengths) - first)):
-        if lengths[first + j] == t + 1:
-            for i in range(RECORD_SIZE):
-                records[first + j, i] = W[i * LANES + j]
-
-
-@kernel
-def _run_difference(u, y, lengths, prior, is_structured, iterations, records):
-    """By Eq. (2), in either factorisation."""
-    W = np.empty(N_ROWS * LANES)
-    for first in range(0, len(u), LANES):
-        _begin(W, prior)
-        for t in range(u.shape[1]):
-            _feed(W, u, y, lengths, first, t)
-            update(W, is_structured, iterations, False, W[:0])
-            _keep(W, lengths, first, t, records)
-
-
-@kernel
-def _run_continuous(u, y, lengths, prior, iterations, records):
-    """By Eq. (1)."""
-    W = np.empty(N_ROWS * LANES)
-    for first in range(0, len(u), LANES):
-        _begin(W, prior)
-        for t in range(u.shape[1]):
-            _feed(W, u, y, lengths, first, t)
-            ode.update(W, iterations, ode.SUBSTEPS)
-            _keep(W, lengths, first, t, records)
+    return run

@@ -43,7 +43,9 @@ def rows(*groups: str, start: int = 0) -> dict[str, int]:
     return {name: start + i for i, name in enumerate(names)}
 
 
-def lanewise(layout: Mapping[str, int], outputs: str, uniform: str = "") -> Callable[[Callable[..., Any]], Any]:
+def lanewise(
+    layout: Mapping[str, int], outputs: str, uniform: str = "", lanes: int = LANES
+) -> Callable[[Callable[..., Any]], Any]:
     """Compile a scalar function to run over all lanes of a block.
 
     The function's parameters are read from the rows of their names, its results are written to the rows named in
@@ -54,48 +56,34 @@ def lanewise(layout: Mapping[str, int], outputs: str, uniform: str = "") -> Call
         layout: name of a quantity to its row.
         outputs: the rows that the function returns, in its order, separated by spaces.
         uniform: parameters that are no rows, in the order in which the loop takes them.
+        lanes: systems in the block.
 
     Raises:
         ValueError: for a parameter that is neither a row nor uniform, or both.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        arguments, targets = _places(function, layout, outputs, uniform)
+        arguments, targets = _places(function, layout, outputs, uniform, lanes)
         source = (
             f"def {function.__name__}({', '.join(['W', *uniform.split()])}):\n"
-            f"    for j in range({LANES}):\n"
+            f"    for j in range({lanes}):\n"
             f"        {targets} = scalar({arguments})\n"
         )
-        loop = jit(_define(source, function, scalar=inlined(function)))
-        loop.declaration = (function, layout, outputs, uniform)
-        return loop
+        return jit(_define(source, function, scalar=inlined(function)))
 
     return decorate
 
 
-def relaid(loop: Any, layout: Mapping[str, int]) -> Any:
-    """A function of `lanewise` once more, over other rows of the block."""
-    function, _, outputs, uniform = loop.declaration
-    return lanewise(layout, outputs, uniform)(function)
-
-
-def alone(loop: Any) -> Any:
-    """A function of `lanewise` for the first lane only, with the same arguments: for a single system."""
-    function, layout, outputs, uniform = loop.declaration
-    first = at_lane(layout, outputs, uniform)(function)
-    arguments = ", ".join(uniform.split())
-    source = f"def {function.__name__}(W{', ' * bool(arguments)}{arguments}):\n    first(W, 0, {arguments})\n"
-    return jit(_define(source, function, first=first))
-
-
-def at_lane(layout: Mapping[str, int], outputs: str = "", uniform: str = "") -> Callable[[Callable[..., Any]], Any]:
+def at_lane(
+    layout: Mapping[str, int], outputs: str = "", uniform: str = "", lanes: int = LANES
+) -> Callable[[Callable[..., Any]], Any]:
     """Compile a scalar function to run on one lane: ``f(W, j, *uniform)``, otherwise as `lanewise`.
 
-    Without ``outputs`` it writes nothing, and returns its results.
+    Without ``outputs`` it writes nothing, and returns its results. A block holds ``lanes`` systems.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        arguments, targets = _places(function, layout, outputs, uniform)
+        arguments, targets = _places(function, layout, outputs, uniform, lanes)
         source = (
             f"def {function.__name__}({', '.join(['W', 'j', *uniform.split()])}):\n"
             f"    {targets + ' =' if outputs else 'return'} scalar({arguments})\n"
@@ -106,15 +94,15 @@ def at_lane(layout: Mapping[str, int], outputs: str = "", uniform: str = "") -> 
 
 
 def _places(
-    function: Callable[..., Any], layout: Mapping[str, int], outputs: str, uniform: str
-) -> tuple[str, str]:  # fmt: skip
+    function: Callable[..., Any], layout: Mapping[str, int], outputs: str, uniform: str, lanes: int
+) -> tuple[str, str]:
     """The arguments of a scalar function, and the places of its results, as source text."""
     names = list(inspect.signature(function).parameters)
     for name in names:
         if (name in layout) == (name in uniform.split()):
             raise ValueError(f"{name} of {function.__name__} must be a row or uniform, and not both; rename it")
-    arguments = ", ".join(f"W[{layout[n] * LANES} + j]" if n in layout else n for n in names)
-    targets = ", ".join(f"W[{layout[n] * LANES} + j]" for n in outputs.split())
+    arguments = ", ".join(f"W[{layout[n] * lanes} + j]" if n in layout else n for n in names)
+    targets = ", ".join(f"W[{layout[n] * lanes} + j]" for n in outputs.split())
     return arguments, targets
 
 
@@ -132,15 +120,16 @@ def kernel(function: Callable[..., Any] | None = None, *, kind: str = "", **opti
     if function is None:
         return partial(kernel, kind=kind, **options)
     dispatcher = numba.njit(**OPTIONS | options)(_renamed(function, kind))
-    dispatcher._cache = Compiled(function, _source_digest(Path(function.__code__.co_filename).parent), named=bool(kind))
+    dispatcher._cache = Compiled(function, source_digest(Path(function.__code__.co_filename).parent), named=bool(kind))
     return dispatcher
 
 
 def part(kind: str) -> Any:
     """Compile a function that is defined within another, and called by other compiled functions.
 
-    ``kind`` tells it from the functions that the other defines at other times: the cache on disk, and the linker where
-    it joins what several processes compiled, go by names.
+    Never `jit`: compiled code is joined by names, and code from disk may have been compiled where another function had
+    this one's. ``kind`` tells it from the functions that the other defines at other times: the cache on disk, and the
+    linker where it joins what several processes compiled, go by names.
     """
     return lambda function: jit(_renamed(function, kind))
 
@@ -151,7 +140,8 @@ def _renamed(function: Callable[..., Any], kind: str) -> Callable[..., Any]:
 
 
 @cache
-def _source_digest(package: Path) -> str:
+def source_digest(package: Path) -> str:
+    """Of the sources of a package, and of this one."""
     digest = hashlib.sha256()
     for folder in sorted({Path(__file__).parent, package}):
         for path in sorted(folder.rglob("*.py")):

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 
+from estimator.belief import Belief
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP, FloatArray
-from estimator.posterior import Belief, coefficients_of
+from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.physical import coefficients_of
 
-#: Points of the quadrature over all parameters together, at most; with 20 along each of four, moments converge to 1e-10
-#: for every spread up to 0.999.
-_POINTS = 160_000
+#: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
+#: converge to 1e-10 for every spread up to 0.999.
+_NODES, _POINTS = 20, 160_000
 
 
 def log_uniform_moments(
@@ -42,7 +46,7 @@ def log_uniform_moments(
     for name in names:
         if name not in center or not np.isfinite(center[name]) or center[name] == 0:
             raise ValueError(f"center must have a finite {name} other than 0, but is {dict(center)}")
-    nodes_per_axis = max(2, min(20, int(_POINTS ** (1 / len(names)) + 1e-9)))
+    nodes_per_axis = max(2, min(_NODES, int(_POINTS ** (1 / len(names)) + 1e-9)))
     nodes, weights = np.polynomial.legendre.leggauss(nodes_per_axis)
     # log(1 ± spread) = log(1 - spread²) / 2 ± artanh(spread)
     factors = np.sqrt(1 - spread**2) * np.exp(np.arctanh(spread) * nodes)
@@ -51,7 +55,40 @@ def log_uniform_moments(
     for _ in names:
         probabilities = np.outer(probabilities, weights / 2).ravel()  # the weights sum to 2, the length of [-1, 1]
     points = coefficients_of(model, {name: center[name] * row for name, row in zip(names, grid, strict=True)}, step)
-    # Plain sums, because the last digits of a BLAS product depend on its number of threads.
+    return _moments(points, probabilities)
+
+
+def gaussian_moments(
+    model: Model, mean: Mapping[str, float], std: Mapping[str, float], step: float = SAMPLING_STEP
+) -> tuple[FloatArray, FloatArray]:
+    """Moments of the coefficients of a plant whose parameters are independent and Gaussian.
+
+    Exact where the coefficients are linear in the parameters; else integrated by tensor Gauss-Hermite quadrature.
+
+    Args:
+        model: whose coefficients.
+        mean: parameter to its mean.
+        std: parameter to its standard deviation; 0 for one that is known.
+        step: sampling step [s].
+
+    Returns:
+        Mean (K,) and covariance (K, K).
+    """
+    names = list(model.physical or model.coefficients)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(max(2, min(7, int(_POINTS ** (1 / len(names))))))
+    grid = np.stack(np.meshgrid(*[nodes] * len(names), indexing="ij")).reshape(len(names), -1)
+    probabilities = np.ones(1)
+    for _ in names:
+        probabilities = np.outer(probabilities, weights / weights.sum()).ravel()
+    drawn = {name: mean[name] + std.get(name, 0.0) * row for name, row in zip(names, grid, strict=True)}
+    return _moments(coefficients_of(model, drawn, step), probabilities)
+
+
+def _moments(points: FloatArray, probabilities: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of weighed points (N, K).
+
+    Plain sums, because the last digits of a BLAS product depend on its number of threads.
+    """
     mean = np.array([(probabilities * column).sum() for column in points.T])
     deviations = points - mean
     cov = np.array([[(probabilities * (one * other)).sum() for one in deviations.T] for other in deviations.T])
@@ -99,3 +136,138 @@ def weak_prior(
     sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
     xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
     return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, step=step)
+
+
+#: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.twin`` identifies them).
+_TWINS = {"difference": SILVERBOX_TWIN, "duffing": CONTINUOUS_TWIN}
+
+
+def silverbox_prior(
+    model: Model | None = None,
+    spread: float = 0.3,
+    process_noise: float = 5e-4,
+    measurement_noise: float = 5e-4,
+    noise_shape: float = 2.0,
+    state_std: float = 1e-3,
+) -> Belief:
+    """The prior of the environments: an oscillator near the Silverbox circuit, at rest.
+
+    Args:
+        model: with the parameters m, c, a, and b unless it is linear; `difference`, the paper's, where it is None.
+        spread: m, c, a and b are log-uniform on the twin's times [1 - spread, 1 + spread]; in (0, 1).
+        process_noise: what a sample's process noise does to the output: standard deviation [V] at which γ is centred.
+        measurement_noise: standard deviation [V] at which ξ is centred.
+        noise_shape: see `weak_prior`.
+        state_std: standard deviation of the states about rest [V].
+
+    Raises:
+        ValueError: for a model with other parameters, or a value out of its range.
+    """
+    model = difference() if model is None else model
+    if model.name not in _TWINS or not {"m", "c", "a"} <= set(model.physical) <= {"m", "c", "a", "b"}:
+        raise ValueError(f"model must have the parameters m, c, a and b, but {model.name} has {list(model.physical)}")
+    if not 0 < spread < 1:
+        raise ValueError(f"spread must be above 0 and below 1, but is {spread}; pass the range's relative half width")
+    return weak_prior(model, *_twin_moments(model, spread), process_noise, measurement_noise, noise_shape, state_std)
+
+
+@cache
+def _twin_moments(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
+    return log_uniform_moments(model, _TWINS[model.name], spread)
+
+
+def published_run_prior(nonlinear: bool = True, model: Model | None = None) -> Belief:
+    """The prior that the paper's published numbers were computed with (it differs from the paper's text).
+
+    Args:
+        nonlinear: else θ2 is known to be 0: the paper's FEM-LARX.
+        model: `difference("linear")`, which has no θ2; the paper's where it is None.
+    """
+    return _paper_prior(nonlinear, model, 2.0, 1e-2, (1e8, 1e3), (1e8, 1e1))
+
+
+def paper_text_prior(nonlinear: bool = True, model: Model | None = None) -> Belief:
+    """The prior as the paper's section 4 states it; the state's, not given there, is that of the published run.
+
+    Arguments as `published_run_prior`.
+    """
+    return _paper_prior(nonlinear, model, 1.0, 10.0, (1e3, 1e1), (1e8, 1e3))
+
+
+def _paper_prior(
+    nonlinear: bool,
+    model: Model | None,
+    eta_mean: float,
+    eta_var: float,
+    gamma: tuple[float, float],
+    xi: tuple[float, float],
+) -> Belief:
+    """Means of 1 (of the states 0) and variances of 10, but for η."""
+    model = difference() if model is None else model
+    mean, variance = np.ones(len(model.names)), np.full(len(model.names), 10.0)
+    mean[: model.n_states], mean[-1], variance[-1] = 0.0, eta_mean, eta_var
+    if not nonlinear:
+        place = model.names.index("theta2")
+        mean[place] = variance[place] = 0.0
+    return Belief.of(model, mean, np.diag(variance), gamma, xi)
+
+
+def recorded_prior(
+    model: Model,
+    spread: float = 0.3,
+    process_noise: float = 5e-6,
+    measurement_noise: float = 1e-3,
+    noise_shape: float = 2.0,
+) -> Belief:
+    """A weak prior about the Silverbox twin, for recorded data that begin in motion: 0.1 V in every state.
+
+    Args:
+        model: `estimator.models.duffing.duffing` with any terms, or `estimator.models.difference.difference`.
+        spread: relative standard deviation of stiffness, cubic, damping and gain; the offsets are 0 with one of 20 mV,
+            feedthrough and cubic damping (per sample) 0 with one of 0.1. Of a difference equation: standard deviation
+            of the coefficients of lags and inputs, which are centred on those of Eq. (2) where that has them; those of
+            products have 1 + spread about 0, an offset a tenth of it in volts.
+        process_noise: see `silverbox_prior`.
+        measurement_noise: see `silverbox_prior`.
+        noise_shape: see `weak_prior`.
+
+    Raises:
+        ValueError: for another model, or a value out of its range.
+    """
+    if model.name not in _TWINS:
+        raise ValueError(f"model must be a duffing or difference equation, but is {model.name}; use weak_prior")
+    moments = _recorded_duffing(model, spread) if model.name == "duffing" else _recorded_difference(model, spread)
+    mean, cov = moments
+    n = model.n_states
+    joint_mean = np.concatenate([np.zeros(n), mean])
+    joint = np.zeros((len(joint_mean), len(joint_mean)))
+    joint[:n, :n], joint[n:, n:] = 0.1**2 * np.eye(n), cov
+    if "output_offset" in model.coefficients:  # the state is the displacement with its offset
+        place = n + list(model.coefficients).index("output_offset")
+        joint[0, :] += joint[place, :]
+        joint[:, 0] += joint[:, place]
+    noises = (noise_shape, noise_shape * process_noise**2), (noise_shape, noise_shape * measurement_noise**2)
+    return Belief.of(model, joint_mean, joint, *noises)
+
+
+def _recorded_duffing(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
+    twin = coefficients_of(duffing(), SILVERBOX_TWIN)
+    main = dict(zip(duffing().coefficients, twin, strict=True))
+    mean = np.array([main.get(name, 0.0) for name in model.coefficients])
+    others = {"force": 0.0, "output_offset": 0.02, "cubic_damping": 0.1, "feedthrough": 0.1}
+    cov = np.diag([(spread * main[name] if name in main else others[name]) ** 2 for name in model.coefficients])
+    if "force" in model.coefficients:  # stiffness y0 - gain u0, of independent u0 and y0
+        force, offset = (list(model.coefficients).index(name) for name in ("force", "output_offset"))
+        cov[force, force] = (0.02 * main["stiffness"]) ** 2 + (0.02 * main["gain"]) ** 2
+        cov[force, offset] = cov[offset, force] = main["stiffness"] * 0.02**2
+    return mean, cov
+
+
+def _recorded_difference(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
+    twin = coefficients_of(difference(), SILVERBOX_TWIN)
+    centers = dict(zip(("x1", "x1**3", "x2"), twin[:3], strict=True))
+    centers["u" if model.taps == 1 else "u1"] = twin[3]
+    terms = [part.split("*", 1)[1] for part in model.next_state[0].split(" + ")]
+    stds = {"V": 0.1 * spread, "1": spread}
+    std = [stds.get(unit, 1 + spread) for unit in model.coefficients.values()]
+    return np.array([centers.get(term, 0.0) for term in terms]), np.diag(np.square(std))

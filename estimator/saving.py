@@ -1,25 +1,27 @@
-"""Estimators in one file, without pickle."""
+"""Estimators in one file, without pickle; nothing in a file is used before it was checked."""
 
 from __future__ import annotations
 
 import io
 import json
+import zipfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from estimator.belief import Belief, record_size
 from estimator.files import write_atomically
-from estimator.models.nlarx import NLARX
-from estimator.models.ode import DuffingODE
-from estimator.models.regressors import Term
+from estimator.models.model import Model
 from estimator.online import OnlineEstimator
+from estimator.rig import Rig
 
 #: Raised when the content of the files changes.
-FORMAT = 1
+FORMAT = 2
 
-_MODELS = {"NLARX": NLARX, "DuffingODE": DuffingODE}
+#: No estimator needs more [bytes]; a file that claims more is refused before it is read.
+_LARGEST = 64 * 2**20
 
 
 def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
@@ -29,18 +31,13 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
     """
     description = {
         "format": FORMAT,
-        "model": type(estimator.model).__name__,
-        "options": asdict(estimator.model),
-        "factorisation": estimator.factorisation,
-        "iterations": estimator.iterations,
-        "as_published": estimator.as_published,
-        "drift": estimator.drift,
-        "expectations": estimator.expectations,
-        "noise_hypotheses": estimator.noise_hypotheses,
+        "model": estimator.model.to_dict(),
+        "rig": asdict(estimator.rig),
+        "settings": asdict(estimator.settings),
     }
-    arrays: dict[str, Any] = {**estimator.arrays(), "description": np.array(json.dumps(description))}
+    text = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **estimator.arrays(), description=text)  # type: ignore[arg-type]
     write_atomically(Path(path), buffer.getvalue())
 
 
@@ -48,30 +45,53 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
     """Read an estimator that `save_estimator` wrote.
 
     Raises:
-        ValueError: if the file is not one, or of a format that this version does not know.
+        ValueError: for a file that is damaged, of another kind, or of a format that this version does not know.
         FileNotFoundError: if there is no such file.
     """
+    place = Path(path)
+    if not place.exists():
+        raise FileNotFoundError(f"path must be a file of save_estimator, but there is no {place}")
+    if not place.is_file():
+        raise ValueError(f"path must be a file of save_estimator, but {place} is none; name the file itself")
+    if place.stat().st_size > _LARGEST:
+        raise ValueError(f"path must be a file of save_estimator, but {place} is larger than any; name another")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        description = json.loads(str(arrays.pop("description")))
-    except (ValueError, KeyError, OSError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        raise ValueError(f"path must be a file of save_estimator, but {path} is not one ({error})") from error
-    if description.get("format") != FORMAT:
-        raise ValueError(f"path must be of format {FORMAT}, but {path} is of {description.get('format')!r}")
-    options = description["options"]
-    if not isinstance(options.get("regressors", ""), str):
-        options["regressors"] = tuple(Term(*term) for term in options["regressors"])
-    estimator = OnlineEstimator(
-        _MODELS[description["model"]](**options),
-        factorisation=description["factorisation"],
-        iterations=description["iterations"],
-        as_published=description["as_published"],
-        drift=description["drift"],
-        expectations=description.get("expectations", "first_order"),  # files from before it was an option
-        noise_hypotheses=description.get("noise_hypotheses", 1),  # older files do not name it
-    )
+        return _built(_read(place))
+    except Exception as error:  # whatever a file that is none of ours makes of the readers
+        raise ValueError(
+            f"path must be a whole file of save_estimator, but {place} is not ({type(error).__name__}: {error}); save "
+            f"the estimator again"
+        ) from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The arrays of an archive."""
+    with zipfile.ZipFile(path) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+    if size > _LARGEST:
+        raise ValueError(f"it unpacks to {size} bytes")
+    with np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def _built(arrays: dict[str, Any]) -> OnlineEstimator:
+    """The estimator that arrays describe."""
+    text = arrays.pop("description")
+    if text.dtype != np.uint8 or text.ndim != 1:
+        raise ValueError("its description is of another version" if text.ndim == 0 else "its description is no text")
+    description = json.loads(text.tobytes())
+    if not isinstance(description, dict) or description.get("format") != FORMAT:
+        found = description.get("format") if isinstance(description, dict) else None
+        raise ValueError(f"it is of format {found!r}, not {FORMAT}")
+    declared: dict[str, Any] = {
+        name: tuple(v) if isinstance(v, list) else v for name, v in description["model"].items()
+    }
+    model, settings = Model(**declared), description["settings"]
+    rig = Rig(**description["rig"])
+    first = arrays.get("first")
+    if first is None or first.dtype != np.float64 or first.shape != (record_size(model),):
+        raise ValueError("its prior does not fit its model")
+    prior = Belief(model, first, step=rig.step, factorisation=settings["factorisation"])
+    estimator = OnlineEstimator(model, prior, rig, **settings)
     estimator.restore(arrays)
     return estimator

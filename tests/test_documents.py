@@ -1,6 +1,7 @@
 """The documents' examples run, and what they point to is there."""
 
 import doctest
+import importlib
 import re
 from pathlib import Path
 
@@ -16,6 +17,19 @@ DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs
 def test_examples_run(document):
     failures, examples = doctest.testfile(str(ROOT / document), module_relative=False, verbose=False)
     assert examples > 10
+    assert failures == 0
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        *("duffing_env.continuous", "duffing_env.limited", "duffing_env.model_env"),
+        *("estimator.models.model", "estimator.offline", "estimator.rig"),
+    ],
+)
+def test_examples_of_the_docstrings_run(module):
+    failures, examples = doctest.testmod(importlib.import_module(module))
+    assert examples > 0
     assert failures == 0
 
 

@@ -15,9 +15,9 @@ from gymnasium import Env
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
+from agents.planner.policy import Planner
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
-from agents.policies.planner import Planner
 from agents.policies.signals import make_signal
 
 

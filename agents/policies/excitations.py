@@ -34,7 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duffing_env.silverbox import regime_input
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray, to_coefficients
+from estimator.models.difference import difference
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.physical import coefficients_of
 
 Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
 
@@ -195,8 +197,8 @@ def draw_square(max_input: float) -> Draw:
     linear one falls out of step as it grows, and beats. To stay in step, the frequency must follow what the
     oscillator does: see ``square-believed`` and ``velocity-sign`` in `agents.policies.feedback`.
     """
-    twin = to_coefficients(SILVERBOX_TWIN)
-    step = 2.0 * np.pi * SAMPLING_STEP * resonance(np.float64(twin.theta1), np.float64(twin.theta3))
+    theta1, _, theta3, _ = coefficients_of(difference(), SILVERBOX_TWIN)
+    step = 2.0 * np.pi * SAMPLING_STEP * resonance(theta1, theta3)
 
     def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
         from scipy.signal import square

@@ -3,7 +3,10 @@
 | Name | Input | Frequency content |
 |------|-------|-------------------|
 | ``square-believed`` | square wave at the linear resonance of the posterior's mean | a moving line, odd harmonics |
-| ``velocity-sign`` | ±limit with the sign of the believed velocity x_t - x_{t-1} | the resonance of that amplitude |
+| ``velocity-sign`` | ±limit with the sign of the believed velocity | the resonance of that amplitude |
+
+Velocity and resonance are those of any model (`agents.planner.motion`): of Eq. (2) x_t - x_{t-1} and the angle of the
+poles, of Eq. (1) x' and the square root of the stiffness over the mass, but for the damping.
 
 Both give ±amplitude: the amplitude limit, or the budget's RMS where that is smaller. Both brake, giving the input
 against the velocity, while the amplitude that the oscillation is believed to have is beyond `TURN` of the displacement
@@ -21,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.policies.excitations import resonance
+from agents.planner.motion import places, survey
+from agents.policies.excitations import BAND
 from agents.policies.signals import Limits, limits_of
 from duffing_env.experiment import Experiment, SimulatedExperiment
-from duffing_env.layout import OBSERVATION, SETTINGS
 from estimator.parameters import SAMPLING_STEP
 
 TURN = 0.7
@@ -35,7 +38,8 @@ there must be room for more than one. Of 2,048 episodes of each track with a lim
 the largest displacement was 0.78 of the limit on Amplitude-v0, 0.93 on Output-v0 and 0.98 on Drift-v0.
 """
 
-_ENTRY = {name: i for i, name in enumerate(OBSERVATION)}
+#: Cycles per sample between which a resonance is looked for.
+_BAND = (BAND[0] * SAMPLING_STEP, BAND[1] * SAMPLING_STEP)
 
 
 class FeedbackPolicy:
@@ -53,35 +57,62 @@ class FeedbackPolicy:
             experiment: That of the environment.
         """
         self.limits = limits
-        settings = experiment.settings
-        self._centers = settings[[SETTINGS["prior_t1"], SETTINGS["prior_t3"]]]
-        self._stds = 1.0 / settings[[SETTINGS["scale_t1"], SETTINGS["scale_t3"]]]
+        self._model, self._step = experiment.model, experiment.step
+        self._places = places(experiment.model)
+        self._limit = float(experiment.max_output)
+        self._centers = experiment.believed.coefficients_mean
+        self._stds = np.sqrt(np.diag(experiment.believed.coefficients_cov))
 
     def frequency(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The linear resonance that is believed, shape `(n,)` [Hz], of observations `(n, 22)`."""
-        means = observations[:, [_ENTRY["mean_t1"], _ENTRY["mean_t3"]]]
-        theta1, theta3 = (self._centers + self._stds * means).T
-        return resonance(theta1, theta3)
+        """The linear resonance that is believed, shape `(n,)` [Hz], of observations `(n, features)`."""
+        return self._look(observations)[2] / self._step
 
     def amplitude(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The amplitude that is believed, shape `(n,)`, in parts of the displacement limit.
+        """The amplitude that is believed, shape `(n,)`, in parts of the displacement limit; see `_amplitude`."""
+        return self._amplitude(*self._look(observations))
 
-        Two samples of a free oscillation at the believed resonance, φ rad apart, tell its amplitude wherever in the
+    def _look(self, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """What the sensor shows and its velocity, in parts of the limit, and the resonance in cycles per sample."""
+        at, k, n = self._places, self._model.n_coefficients, self._model.n_states
+        means = self._centers + self._stds * rows[:, at.mean : at.mean + k]
+        states = self._limit * rows[:, at.state : at.state + n]
+        shown, velocities, cycles = survey(self._model, means, states)
+        return shown / self._limit, velocities / self._limit, np.clip(cycles, *_BAND)
+
+    def _amplitude(
+        self, shown: NDArray[np.float64], velocities: NDArray[np.float64], cycles: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The amplitude of a free oscillation at the believed resonance, φ rad per sample.
+
+        Of a differential equation A² = x² + (x' / φ)². Two samples of a difference equation tell it wherever in the
         swing they were taken: A² = (x_t² + x_{t-1}² - 2 x_t x_{t-1} cos φ) / sin² φ. A hardening oscillator swings
         faster than that near the middle, so there A is taken for larger than it is.
         """
-        x0, x1 = observations[:, _ENTRY["state_x0"]], observations[:, _ENTRY["state_x1"]]
-        angle = 2.0 * np.pi * SAMPLING_STEP * self.frequency(observations)
-        return np.sqrt(x0**2 + x1**2 - 2.0 * x0 * x1 * np.cos(angle)) / np.sin(angle)
+        angles = 2.0 * np.pi * cycles
+        if self._model.is_continuous:
+            return np.hypot(shown, velocities / angles)
+        before = shown - velocities
+        return np.sqrt(shown**2 + before**2 - 2.0 * shown * before * np.cos(angles)) / np.sin(angles)
 
     def _actions(
-        self, observation: ArrayLike, rows: NDArray[np.float64], signs: NDArray[np.float64]
+        self, observation: ArrayLike, seen: tuple[NDArray[np.float64], ...], signs: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """These signs `(n,)` at full size, or braking where the amplitude is large; in the observation's shape."""
-        signs = np.where(self.amplitude(rows) > TURN, -np.sign(_velocity(rows)), signs)
+        signs = np.where(self._amplitude(*seen) > TURN, -np.sign(seen[1]), signs)
         # An input of one magnitude has that magnitude as its RMS.
         size = self.limits.fit(np.array([self.limits.max_input])).item()
         return (size * signs).astype(np.float32).reshape(*np.shape(observation)[:-1], 1)
+
+    def _rows(self, observation: ArrayLike) -> NDArray[np.float64]:
+        """The observations as a batch `(n, features)`."""
+        observed = np.asarray(observation, dtype=np.float64)
+        size = self._places.size
+        if observed.ndim not in (1, 2) or observed.shape[-1] != size:
+            raise ValueError(
+                f"observation must have the shape ({size},) or (environments, {size}), as those of duffing_env have, "
+                f"but its shape is {observed.shape}; a policy with feedback needs them as they are"
+            )
+        return np.atleast_2d(observed)
 
 
 class VelocitySign(FeedbackPolicy):
@@ -101,7 +132,7 @@ class VelocitySign(FeedbackPolicy):
         """Gives the next input of each environment, as Stable-Baselines3's policies do.
 
         Args:
-            observation: Shape `(n, 22)` for n environments, or `(22,)` for one.
+            observation: Shape `(n, features)` for n environments, or `(features,)` for one.
             state: Not used, and handed back.
             episode_start: Not used.
             deterministic: Without effect.
@@ -112,9 +143,9 @@ class VelocitySign(FeedbackPolicy):
         Raises:
             ValueError: `observation` is not one of duffing_env.
         """
-        rows = _rows(observation)
-        pumping = np.where(_velocity(rows) < 0.0, -1.0, 1.0)
-        return self._actions(observation, rows, pumping), state
+        seen = self._look(self._rows(observation))
+        pumping = np.where(seen[1] < 0.0, -1.0, 1.0)
+        return self._actions(observation, seen, pumping), state
 
 
 class SquareBelieved(FeedbackPolicy):
@@ -133,7 +164,7 @@ class SquareBelieved(FeedbackPolicy):
         """Gives the next input of each environment, as Stable-Baselines3's policies do.
 
         Args:
-            observation: Shape `(n, 22)` for n environments, or `(22,)` for one.
+            observation: Shape `(n, features)` for n environments, or `(features,)` for one.
             state: What the last call returned: the phases, shape `(n,)`, in periods. None: all begin at 0.
             episode_start: Shape `(n,)`: which environments begin an episode, and so at phase 0. None: none does.
             deterministic: Without effect.
@@ -145,7 +176,7 @@ class SquareBelieved(FeedbackPolicy):
             ValueError: `observation` is not one of duffing_env, or `state` or `episode_start` is for another number
                 of environments.
         """
-        rows = _rows(observation)
+        rows = self._rows(observation)
         phase = np.zeros(len(rows)) if state is None else state
         starts = np.zeros(len(rows), dtype=bool) if episode_start is None else np.atleast_1d(episode_start)
         for name, given in (("state", phase), ("episode_start", starts)):
@@ -156,24 +187,9 @@ class SquareBelieved(FeedbackPolicy):
                 )
         phase = np.where(starts, 0.0, phase)
         wave = np.where(phase < 0.5, 1.0, -1.0)
-        following = (phase + self.limits.hold * SAMPLING_STEP * self.frequency(rows)) % 1.0
-        return self._actions(observation, rows, wave), following
-
-
-def _rows(observation: ArrayLike) -> NDArray[np.float64]:
-    """The observations as a batch `(n, 22)`."""
-    observed = np.asarray(observation, dtype=np.float64)
-    if observed.ndim not in (1, 2) or observed.shape[-1] != len(OBSERVATION):
-        raise ValueError(
-            f"observation must have the shape ({len(OBSERVATION)},) or (environments, {len(OBSERVATION)}), as those of "
-            f"duffing_env have, but its shape is {observed.shape}; a policy with feedback needs them as they are"
-        )
-    return np.atleast_2d(observed)
-
-
-def _velocity(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The believed x_t - x_{t-1}, shape `(n,)`, in parts of the displacement limit."""
-    return rows[:, _ENTRY["state_x0"]] - rows[:, _ENTRY["state_x1"]]
+        seen = self._look(rows)
+        following = (phase + self.limits.hold * seen[2]) % 1.0
+        return self._actions(observation, seen, wave), following
 
 
 def make_feedback(kind: type[VelocitySign] | type[SquareBelieved], env: Any, seed: int) -> Any:

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.policies.foresight import Foresight
-from duffing_env.layout import N_OBSERVATION
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
@@ -91,7 +90,9 @@ class LearnedPolicy:
         if network.spread is not None:
             self._spread = tensors[network.spread] if network.spread in tensors else layer(network.spread)
         self._features = (self._layers[0][0] if self._memory is None else self._memory.from_input).shape[1]
-        self._foresight = Foresight.from_array(tensors["foresight"]) if network.foresight else None
+        self._foresight = None
+        if network.foresight:
+            self._foresight = Foresight.from_array(tensors["foresight"], card.get("foresight"))
         self._rng = np.random.default_rng(seed)
 
     def move_to(self, env: Any) -> None:
@@ -122,7 +123,7 @@ class LearnedPolicy:
         forgets them where ``episode_start``; None is a memory of nothing. Without a memory it is handed on unused.
         """
         hidden = np.asarray(observation, dtype=np.float32)
-        seen = self._features if self._foresight is None else N_OBSERVATION
+        seen = self._features if self._foresight is None else self._foresight.observation_size
         if hidden.shape[-1:] != (seen,):
             raise ValueError(f"observation must have {seen} entries, but has shape {hidden.shape}")
         if self._foresight is not None:
@@ -208,6 +209,8 @@ def save_policy(folder: Path, model: BaseAlgorithm, card: dict[str, Any]) -> Non
         network, tensors["foresight"] = replace(network, foresight=True), foresight.to_array()
     write_atomically(folder / WEIGHTS, save(tensors))
     described = {"format": FORMAT, "network": asdict(network), **card}
+    if foresight is not None:
+        described["foresight"] = foresight.describe()
     write_atomically(folder / CARD, json.dumps(described, indent=2).encode())
 
 

@@ -1,6 +1,6 @@
 """What a belief expects of some simple inputs, compiled: the numbers behind `agents.policies.foresight`.
 
-From the means of a belief the oscillator is imagined for `HORIZONS`[-1] samples without noise. The first input is a
+From the means of a belief the system is imagined for `HORIZONS`[-1] samples without noise. The first input is a
 push up, none, or a push down; then follows one of `CONTINUATIONS`:
 
 - ``best``: those signs of the next three pushes that bring most, and then ``pump``,
@@ -8,36 +8,39 @@ push up, none, or a push down; then follows one of `CONTINUATIONS`:
 - ``brake``: pushes against the motion,
 - ``rest``: none.
 
-What a sequence of inputs *brings* is Σ_t φ_tᵀ W φ_t / (2 σ²) with φ = (x_t, x_t³, x_{t-1}, u_t) and the variance σ² of
-an output: to first order the growth of ½ log det(C⁻¹ + J), with C the coefficients' covariance, J what the rest of the
-episode will tell anyway, and W = (C⁻¹ + J)⁻¹. So it counts what will be lacking at the end. A displacement whose margin
-of `MARGIN` standard deviations reaches beyond the limit takes away more than anything brings.
+What a sequence of inputs *brings* is Σ_t φ_tᵀ W φ_t / (2 σ²) with φ the derivative by the coefficients of what the
+first sensor shows after a sample from a known state, (x_t, x_t³, x_{t-1}, u_t) for Eq. (2), and the variance σ² of an
+output: to first order the growth of ½ log det(C⁻¹ + J), with C the coefficients' covariance, J what the rest of the
+episode will tell anyway, and W = (C⁻¹ + J)⁻¹. So it counts what will be lacking at the end. An output whose margin of
+`MARGIN` standard deviations reaches beyond the limit takes away more than anything brings.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from agents.design import half_log_det, invert
-from duffing_env.layout import OBSERVATION
-from estimator.lanes import inlined, jit, kernel
+from agents.planner.design import half_log_det, invert
+from agents.planner.motion import View, places
+from duffing_env.layout import observation_bounds
+from estimator.engine.motion import motion
+from estimator.lanes import jit, kernel, part
+from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.record import COEFFICIENTS
 
 CONTINUATIONS = ("best", "pump", "brake", "rest")
 HORIZONS = (4, 8, 16)
 FIRST_INPUTS = ("up", "none", "down")
 
-#: Predictive standard deviations that a displacement is to keep from the limit.
+#: Predictive standard deviations that an output is to keep from the limit.
 MARGIN = 4.0
 
-#: What an observation becomes: itself, turned upright, and then what is expected.
-FEATURES = (
-    *OBSERVATION,
+#: What every observation becomes besides itself: what is expected.
+EXPECTED = (
     *(
         f"{continuation}_{name}"
         for continuation in CONTINUATIONS
@@ -52,24 +55,23 @@ FEATURES = (
 #: Largest size of a feature.
 BOUND = 10.0
 
-# Places in the observation.
-_PLACE = {name: i for i, name in enumerate(OBSERVATION)}
-_LOG_STD, _CORRELATION = _PLACE["log_std_t1"], _PLACE["corr_12"]
-_X0, _X1, _TIME_LEFT, _BUDGET_LEFT = (_PLACE[name] for name in ("state_x0", "state_x1", "time_left", "budget_left"))
-_ODD = tuple(_PLACE[name] for name in ("state_x0", "state_x1", "last_input", "last_output"))
-_PAIRS = tuple(combinations(range(len(COEFFICIENTS)), 2))
-_OWN = len(OBSERVATION)
+
+def feature_names(model: Model) -> tuple[str, ...]:
+    """What an observation becomes: itself, turned upright, and then what is expected."""
+    return (*observation_bounds(model), *EXPECTED)
+
 
 #: Pushes of ``best`` after the first input; all of their signs are tried.
 _TRIED = 3
 
-#: Samples in which a displacement can still be kept within the limit: half a period, where the oscillator is slowest.
+#: Samples in which an output can still be kept within the limit: half a period, where an oscillator of the
+#: tracks is slowest.
 _IN_REACH = 8
 
 #: Where ``pump`` turns, in parts of the limit.
 _TURN = 0.95
 
-#: What a displacement of twice the limit takes away, in parts of what a whole episode brings.
+#: What an output of twice the limit takes away, in parts of what a whole episode brings.
 _BEYOND = 500.0
 
 #: Covariances of float32 correlations are made positive definite by this much.
@@ -83,14 +85,15 @@ class Outlook(NamedTuple):
     """What an observation is relative to, and what is ahead.
 
     Attributes:
-        center: (4,) prior means of (θ1, θ2, θ3, η).
-        std: (4,) their standard deviations.
-        max_input: amplitude limit [V].
-        max_output: limit of the displacement [V].
+        center: (K,) prior means of the coefficients.
+        std: (K,) their standard deviations.
+        max_input: amplitude limit.
+        max_output: limit of the first sensor.
         samples: of an episode.
-        energy: limit of Σ u² [V²]; inf where there is none.
-        variance: σ² of an output about its prediction [V²].
-        rate: (4, 4) information about the coefficients that a sample brings.
+        energy: limit of Σ u²; inf where there is none.
+        variance: σ² of the first sensor's output about its prediction.
+        rate: (K, K) information about the coefficients that a sample brings.
+        scales: (n,) sizes of the states when the first sensor is at its limit.
     """
 
     center: FloatArray
@@ -101,75 +104,229 @@ class Outlook(NamedTuple):
     energy: float
     variance: float
     rate: FloatArray
+    scales: FloatArray
 
 
-@kernel
-def look(observations, outlook, features, safe, signs, motions):
-    """What n observations become.
+class Prospect(NamedTuple):
+    """What is imagined with, of one observation.
 
-    Args:
-        observations: (n, N_OBSERVATION).
-        outlook: see there.
-        features: (n, len(FEATURES)) float32, receives the features, all finite and at most `BOUND` in size.
-        safe: (n, 3) bool, receives which first inputs need not lead beyond the limit; one of them is the safest.
-        signs: (n,) receives -1.0 where the observation was turned over, so that x_t is not negative.
-        motions: (n,) receives what an input that is all of the motion would be [V], upright.
+    Attributes:
+        start: (rows,) the block of the motion, at the state that is believed.
+        C: (K, K) the coefficients' covariance.
+        W: (K, K) what is still unknown at the end, weighted.
+        push: size of a push.
+        limit: of the first sensor.
+        variance: see `Outlook`.
+        scales: see `Outlook`.
     """
-    center, std, max_input, limit, samples, energy, variance, rate = outlook
-    theta, scale = np.empty(4), np.empty(4)
-    C, W, work = np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4))
-    for i in range(len(observations)):
-        seen, shown = observations[i].astype(np.float64), features[i]
-        for j in range(4):
-            theta[j] = center[j] + std[j] * seen[j]
-            scale[j] = std[j] * np.exp(seen[_LOG_STD + j])
-            C[j, j] = (1.0 + _RIDGE) * scale[j] * scale[j]
-        for k in range(len(_PAIRS)):
-            a, b = _PAIRS[k]
-            C[b, a] = C[a, b] = seen[_CORRELATION + k] * scale[a] * scale[b]
-        left = max(1.0, seen[_TIME_LEFT] * samples)
-        share, push = seen[_TIME_LEFT], max_input
-        if energy < np.inf:
-            # What is still to come takes time and energy.
-            share = 0.5 * (share + seen[_BUDGET_LEFT])
-            push = min(push, _THRIFT * np.sqrt(max(0.0, seen[_BUDGET_LEFT]) * energy / left))
-        to_come = _weigh(C, rate, share * samples, W, work)
-        weight = samples / (8.0 * variance)
-        W *= weight
-        sign = -1.0 if seen[_X0] < 0.0 else 1.0
-        for j in _ODD:
-            seen[j] *= sign
-        signs[i] = sign
-        x0, x1 = limit * seen[_X0], limit * seen[_X1]
-        shown[:_OWN] = seen
-        _try(x0, x1, theta, C, W, variance, push, limit, shown, safe[i])
-        place = len(FEATURES) - 6
-        motions[i] = (_move(theta, x0, x1, 0.0) - x1) / max(theta[3], 0.1 * center[3])
-        for _ in range(3):
-            x0, x1 = max(-2.0 * limit, min(_move(theta, x0, x1, 0.0), 2.0 * limit)), x0
-            shown[place] = x0 / limit
-            place += 1
-        shown[place] = 5.0 * theta[3] * push / limit
-        shown[place + 1] = to_come
+
+    start: Any
+    C: Any
+    W: Any
+    push: float
+    limit: float
+    variance: float
+    scales: Any
+
+
+@cache
+def lookout(view: View) -> Any:
+    """``look(observations, outlook, features, safe, signs, motions)``: what n observations of a model become.
+
+    - ``observations`` (n, entries) float32;
+    - ``outlook``: `Outlook`;
+    - ``features`` (n, len(feature_names)) float32, receives the features, all finite and at most `BOUND` in size;
+    - ``safe`` (n, 3) bool, receives which first inputs need not lead beyond the limit; one of them is the safest;
+    - ``signs`` (n,) receives -1.0 where the observation was turned over, so that the first sensor shows nothing
+      negative; all 1.0 for a model that is not the same turned over;
+    - ``motions`` (n,) receives what an input that is all of the motion in two samples would be, upright.
+    """
+    model = view.model
+    found, at = motion(*view), places(model)
+    row, sense, glance, step = found.layout, found.sense, found.glance, found.step
+    n, k, size, is_odd = model.n_states, model.n_coefficients, len(row), found.is_odd
+    u, last, older, now, velocity, gain, shown_row = (
+        row[name] for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN")
+    )
+    phi = row[f"PHI_{next(iter(model.coefficients))}"]
+    pairs = tuple(combinations(range(k), 2))
+    odd = (*range(at.state, at.state + n), at.last_input, *range(at.last_output, at.last_output + model.n_outputs))
+    own, n_features = at.size, len(feature_names(model))
+    kind = f"{model.name}_{model.digest}_{view.degree}_{view.lag}"
+    inner, entry = part(kind), kernel(kind=kind)
+
+    @inner
+    def square(A, W):
+        """φᵀ A φ."""
         total = 0.0
-        for j in range(4):
-            for k in range(4):
-                total += W[j, k] * rate[j, k]
-        shown[place + 2] = np.log(0.25 * samples / weight * total + 1e-3)
-        for j in range(len(shown)):
-            # A number that is none, of a belief that is none, becomes 0.
-            shown[j] = max(-BOUND, min(shown[j], BOUND)) if shown[j] == shown[j] else 0.0
+        for i in range(k):
+            total += A[i, i] * W[phi + i] * W[phi + i]
+            for j in range(i):
+                total += 2.0 * A[i, j] * W[phi + i] * W[phi + j]
+        return total
+
+    @inner
+    def bound(W, scales):
+        """Keep a state that runs away where it can be calculated with."""
+        for i in range(n):
+            W[i] = max(-2.0 * scales[i], min(W[i], 2.0 * scales[i]))
+
+    @inner
+    def play(prospect, W, first, continuation, code, brought):
+        """Play a sequence: fills what it has brought by each horizon, and gives the highest output with its margin."""
+        push, limit = prospect.push, prospect.limit
+        W[:] = prospect.start
+        total, peak, h = 0.0, 0.0, 0
+        for t in range(HORIZONS[-1]):
+            if t == 0:
+                W[u] = first
+            elif continuation == 0 and t <= _TRIED:
+                W[u] = push if (code >> (t - 1)) & 1 else -push
+            elif continuation == 3:
+                W[u] = 0.0
+            else:
+                sense(W)
+                W[u] = push if W[velocity] >= 0.0 else -push
+                if continuation == 2:
+                    W[u] = -W[u]
+                else:
+                    glance(W)
+                    if abs(W[shown_row]) > _TURN * limit:
+                        W[u] = -W[u]
+            step(W)
+            bound(W, prospect.scales)
+            total += square(prospect.W, W)
+            reach = min(abs(W[shown_row]), 2.0 * limit) + MARGIN * np.sqrt(square(prospect.C, W) + prospect.variance)
+            if t < _IN_REACH:
+                peak = max(peak, reach)
+            total -= _BEYOND * max(0.0, reach / limit - 1.0)
+            if t + 1 == HORIZONS[h]:
+                brought[h] = total
+                h += 1
+        return peak
+
+    @inner
+    def attempt(prospect, W, shown, safe):
+        """Play all first inputs and continuations; fills their features, and which first inputs are safe."""
+        played, brought, best = np.empty(len(HORIZONS)), np.empty((3, len(HORIZONS))), np.empty(3)
+        lowest = np.full(3, np.inf)
+        place, most = own, 0.0
+        for continuation in range(len(CONTINUATIONS)):
+            for first in range(3):
+                brought[first], best[first] = -np.inf, np.inf
+                for code in range(1 << _TRIED if continuation == 0 else 1):
+                    peak = play(prospect, W, (1.0 - first) * prospect.push, continuation, code, played)
+                    best[first] = min(best[first], peak)
+                    for h in range(len(HORIZONS)):
+                        brought[first, h] = max(brought[first, h], played[h])
+                lowest[first] = min(lowest[first], best[first])
+            for h in range(len(HORIZONS)):
+                up, none, down = brought[0, h], brought[1, h], brought[2, h]
+                shown[place] = np.arcsinh(up - down)
+                shown[place + 1] = np.arcsinh(none - max(up, down))
+                place += 2
+            for first in range(3):
+                shown[place] = best[first] / prospect.limit
+                place += 1
+            if continuation == 0:
+                most = max(0.0, brought[:, -1].max())
+        shown[place] = np.log(most + 1e-3)
+        for first in range(3):
+            safe[first] = lowest[first] <= prospect.limit or lowest[first] == lowest.min()
+
+    @inner
+    def believe(seen, outlook, start, C):
+        """Put the means and the covariance that an observation tells into the block and ``C``."""
+        scale = np.empty(k)
+        for j in range(k):
+            start[n + j] = outlook.center[j] + outlook.std[j] * seen[at.mean + j]
+            scale[j] = outlook.std[j] * np.exp(seen[at.log_std + j])
+            C[j, j] = (1.0 + _RIDGE) * scale[j] * scale[j]
+        for i in range(len(pairs)):
+            a, b = pairs[i]
+            C[b, a] = C[a, b] = seen[at.correlation + i] * scale[a] * scale[b]
+
+    @inner
+    def stand(seen, outlook, start):
+        """Put the state and the last inputs into the block, upright; gives the sign of what was turned."""
+        sign = 1.0
+        for turn in range(2):
+            for i in range(n):
+                start[i] = outlook.max_output * seen[at.state + i]
+            start[last] = start[older] = outlook.max_input * seen[at.last_input]
+            sense(start)
+            if turn == 0:
+                if not (is_odd and start[now] < 0.0):
+                    break
+                sign = -1.0
+                for j in odd:
+                    seen[j] = -seen[j]
+        return sign
+
+    @inner
+    def drift(start, prospect, outlook, shown, place):
+        """Follow the system without input; fills three features, and gives the motion in terms of an input."""
+        W, limit = start.copy(), prospect.limit
+        typical = start.copy()
+        typical[n : n + k] = outlook.center
+        sense(typical)
+        way = 1.0 if typical[gain] > 0.0 else -1.0
+        motion = start[velocity] - start[now]
+        for t in range(3):
+            W[u] = 0.0
+            step(W)
+            if t == 0:
+                motion += W[shown_row]
+            bound(W, prospect.scales)
+            shown[place + t] = max(-2.0 * limit, min(W[shown_row], 2.0 * limit)) / limit
+        return way * motion / max(way * start[gain], 0.1 * way * typical[gain])
+
+    @entry
+    def look(observations, outlook, features, safe, signs, motions):
+        samples, limit, rate = outlook.samples, outlook.max_output, outlook.rate
+        C, unknown, work = np.empty((k, k)), np.empty((k, k)), np.empty((k, k))
+        start, W = np.zeros(size), np.zeros(size)
+        for i in range(len(observations)):
+            seen, shown = observations[i].astype(np.float64), features[i]
+            believe(seen, outlook, start, C)
+            left = max(1.0, seen[at.time_left] * samples)
+            share, push = seen[at.time_left], outlook.max_input
+            if outlook.energy < np.inf:
+                # What is still to come takes time and energy.
+                share = 0.5 * (share + seen[at.budget_left])
+                push = min(push, _THRIFT * np.sqrt(max(0.0, seen[at.budget_left]) * outlook.energy / left))
+            to_come = weigh(C, rate, share * samples, unknown, work)
+            weight = samples / (2.0 * k * outlook.variance)
+            unknown *= weight
+            signs[i] = stand(seen, outlook, start)
+            shown[:own] = seen
+            prospect = Prospect(start, C, unknown, push, limit, outlook.variance, outlook.scales)
+            attempt(prospect, W, shown, safe[i])
+            place = n_features - 6
+            motions[i] = drift(start, prospect, outlook, shown, place)
+            shown[place + 3] = 5.0 * start[gain] * push / limit
+            shown[place + 4] = to_come
+            total = 0.0
+            for a in range(k):
+                for b in range(k):
+                    total += unknown[a, b] * rate[a, b]
+            shown[place + 5] = np.log(samples / k / weight * total + 1e-3)
+            for j in range(len(shown)):
+                # NaN becomes 0.
+                shown[j] = max(-BOUND, min(shown[j], BOUND)) if shown[j] == shown[j] else 0.0
+
+    return look
 
 
 @jit
-def _weigh(C, rate, count, W, work):
+def weigh(C, rate, count, W, work):
     """W = (C⁻¹ + count rate)⁻¹, and ½ log det(I + count rate C) [nats], which is still to come."""
     work[:] = C
     known = half_log_det(work)
     if known == -np.inf:  # rounding has made correlations impossible; without them the covariance is one again
-        for j in range(4):
-            for k in range(4):
-                work[j, k] = C[j, k] if j == k else 0.0
+        for i in range(len(C)):
+            for j in range(len(C)):
+                work[i, j] = C[i, j] if i == j else 0.0
         known = half_log_det(work)
     invert(work, W)
     work[:] = W + count * rate
@@ -178,90 +335,13 @@ def _weigh(C, rate, count, W, work):
     return known
 
 
-@jit
-def _try(x0, x1, theta, C, W, variance, push, limit, shown, safe):
-    """Play all first inputs and continuations; fills their features, and which first inputs are safe."""
-    played, brought, best = np.empty(len(HORIZONS)), np.empty((3, len(HORIZONS))), np.empty(3)
-    lowest = np.full(3, np.inf)
-    place = _OWN
-    for continuation in range(len(CONTINUATIONS)):
-        for first in range(3):
-            brought[first], best[first] = -np.inf, np.inf
-            for code in range(1 << _TRIED if continuation == 0 else 1):
-                peak = _play(
-                    x0, x1, theta, C, W, variance, push, limit, (1.0 - first) * push, continuation, code, played
-                )
-                best[first] = min(best[first], peak)
-                for h in range(len(HORIZONS)):
-                    brought[first, h] = max(brought[first, h], played[h])
-            lowest[first] = min(lowest[first], best[first])
-        for h in range(len(HORIZONS)):
-            up, none, down = brought[0, h], brought[1, h], brought[2, h]
-            shown[place] = np.arcsinh(up - down)
-            shown[place + 1] = np.arcsinh(none - max(up, down))
-            place += 2
-        for first in range(3):
-            shown[place] = best[first] / limit
-            place += 1
-        if continuation == 0:
-            most = max(0.0, brought[:, -1].max())
-    shown[place] = np.log(most + 1e-3)
-    for first in range(3):
-        safe[first] = lowest[first] <= limit or lowest[first] == lowest.min()
-
-
-@jit
-def _play(x0, x1, theta, C, W, variance, push, limit, first, continuation, code, brought):
-    """Play one sequence: fills what it has brought by each horizon, and gives the highest |x| with its margin [V]."""
-    total, peak, h = 0.0, 0.0, 0
-    for t in range(HORIZONS[-1]):
-        if t == 0:
-            u = first
-        elif continuation == 0 and t <= _TRIED:
-            u = push if (code >> (t - 1)) & 1 else -push
-        elif continuation == 3:
-            u = 0.0
-        else:
-            u = push if x0 >= x1 else -push
-            if continuation == 2 or abs(_move(theta, x0, x1, u)) > _TURN * limit:
-                u = -u
-        total += _square(W, x0, x1, u)
-        margin = MARGIN * np.sqrt(_square(C, x0, x1, u) + variance)
-        x0, x1 = max(-2.0 * limit, min(_move(theta, x0, x1, u), 2.0 * limit)), x0
-        reach = abs(x0) + margin
-        if t < _IN_REACH:
-            peak = max(peak, reach)
-        total -= _BEYOND * max(0.0, reach / limit - 1.0)
-        if t + 1 == HORIZONS[h]:
-            brought[h] = total
-            h += 1
-    return peak
-
-
-@inlined
-def _move(theta, x0, x1, u):
-    """The displacement that is expected next."""
-    return theta[0] * x0 + theta[1] * x0 * x0 * x0 + theta[2] * x1 + theta[3] * u
-
-
-@inlined
-def _square(A, x0, x1, u):
-    """φᵀ A φ."""
-    c = x0 * x0 * x0
-    return (
-        A[0, 0] * x0 * x0 + A[1, 1] * c * c + A[2, 2] * x1 * x1 + A[3, 3] * u * u
-        + 2.0 * (A[0, 1] * x0 * c + A[0, 2] * x0 * x1 + A[0, 3] * x0 * u)
-        + 2.0 * (A[1, 2] * c * x1 + A[1, 3] * c * u + A[2, 3] * x1 * u)
-    )  # fmt: skip
-
-
 def look_at(
-    observations: npt.ArrayLike, outlook: Outlook
+    observations: npt.ArrayLike, outlook: Outlook, view: View
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_], FloatArray, FloatArray]:
-    """Features, safe, signs and motions of observations (n, N_OBSERVATION); see `look`."""
+    """Features, safe, signs and motions of observations (n, entries); see `lookout`."""
     seen = np.ascontiguousarray(observations, dtype=np.float32)
     n = len(seen)
-    features, safe = np.empty((n, len(FEATURES)), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
+    features, safe = np.empty((n, len(feature_names(view.model))), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
     signs, motions = np.empty(n), np.empty(n)
-    look(seen, outlook, features, safe, signs, motions)
+    lookout(view)(seen, outlook, features, safe, signs, motions)
     return features, safe, signs, motions

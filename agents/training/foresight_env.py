@@ -11,10 +11,10 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from agents.evaluation import make
+from agents.evaluation.batch import make
 from agents.policies import make_policy
 from agents.policies.foresight import Foresight
-from agents.policies.prospects import BOUND, FEATURES
+from agents.policies.prospects import BOUND, EXPECTED, feature_names
 from agents.vec_env import DuffingVecEnv
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.parameters import FloatArray
@@ -28,7 +28,8 @@ IN_NATS = ("information_gain", "log_posterior", "fisher", "expected_free_energy"
 #: Systems whose episodes show how much a sample brings.
 _EXAMPLES = 64
 
-_TO_COME, _BEST = FEATURES.index("to_come"), FEATURES.index("best_up_4")
+# Places in the features; what is expected stands behind the observation, which is longer or shorter by the model.
+_TO_COME, _BEST = (EXPECTED.index(name) - len(EXPECTED) for name in ("to_come", "best_up_4"))
 
 
 class ForesightVecEnv(VecEnvWrapper):
@@ -54,7 +55,7 @@ class ForesightVecEnv(VecEnvWrapper):
         self.foresight = foresight
         self._weight = np.float32(in_nats)
         self._levels = np.linspace(-1.0, 1.0, levels) if levels else None
-        space = gym.spaces.Box(-BOUND, BOUND, (len(FEATURES),), np.float32)
+        space = gym.spaces.Box(-BOUND, BOUND, (len(feature_names(venv.envs.experiment.model)),), np.float32)
         super().__init__(venv, space, gym.spaces.Discrete(levels) if levels else venv.action_space)
 
     def reset(self) -> VecEnvObs:
@@ -85,7 +86,7 @@ class ForesightVecEnv(VecEnvWrapper):
 
 
 def example_rate(env_id: str, options: dict[str, Any], seed: int) -> FloatArray:
-    """(4, 4) information about the coefficients that a sample brings on average, by a simple rule's example.
+    """(K, K) information about the coefficients that a sample brings on average, by a simple rule's example.
 
     The rule is that of foresight without a network: the push that brings most in four samples; or, of a drive, the same
     strength throughout. It needs a rate itself, which a feedback law's example gives.
@@ -113,7 +114,7 @@ def _rate(envs: DuffingVectorEnv, act: Callable[[Any], Any], seed: int) -> Float
     """The mean information per sample of one episode in every environment."""
     observations, _ = envs.reset(seed=seed)
     before = np.linalg.inv(envs.belief(0).coefficients_cov)
-    rates, running = np.zeros((envs.num_envs, 4, 4)), np.ones(envs.num_envs, dtype=np.bool_)
+    rates, running = np.zeros((envs.num_envs, *before.shape)), np.ones(envs.num_envs, dtype=np.bool_)
     for t in range(envs.horizon):
         observations, _, terminated, truncated, infos = envs.step(act(observations))
         for row in np.flatnonzero(running & (terminated | truncated)):

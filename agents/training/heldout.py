@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.evaluation import roll_out
+from agents.evaluation.rollout import roll_out
 from agents.policies.learned import CARD, save_policy
 from estimator.files import write_atomically
 

@@ -188,7 +188,7 @@ class _Training:
     def run(self) -> Run:
         from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
-        from agents.figures import draw_learning_curve
+        from agents.evaluation.figures import draw_learning_curve
         from agents.training.callbacks import ContinuedCSV
 
         if not (self._folder / "config.json").exists():

@@ -41,7 +41,7 @@ REFERENCE = {
         "agents.training.TQCSettings",
         "agents.training.RecurrentPPOSettings",
         "agents.training.foresight_env.ForesightVecEnv",
-        "agents.evaluation",
+        "agents.evaluation.rollout",
         "agents.vec_env",
     ],
 }

@@ -28,6 +28,11 @@ def engine_digest() -> str:
     return digest.hexdigest()
 
 
+def digest_of(*parts: Any) -> str:
+    """Twelve digits that tell code which is compiled for these parts, by this engine, from other code."""
+    return hashlib.sha256(repr((engine_digest(), parts)).encode()).hexdigest()[:12]
+
+
 def load(model: str, task: str, key: str, make: Callable[[], str], names: Mapping[str, Any]) -> SimpleNamespace:
     """Execute generated source, from disk where it is there and whole, and give what it defines.
 

@@ -284,6 +284,24 @@ def plain_step(model: Model, degree: int) -> Assignments:
     return input_over_step(degree, model.substeps) + runge_kutta(names, plain_stage(model), model.substeps)
 
 
+def state_step(model: Model, degree: int, names: Mapping[str, str]) -> tuple[Assignments, dict[str, str]]:
+    """Assignments of the state alone over a sample, or over a Runge-Kutta step of it, of renamed quantities.
+
+    Returns:
+        The assignments, and what each of the renamed states becomes.
+    """
+    if model.is_continuous:
+        mapping = {**names, **{f"M_{x}": names[x] for x in model.states}}
+        lines = renamed(plain_step(model, degree), mapping)
+        return lines, {names[x]: f"M_{x}_E" for x in model.states}
+    lines, motion = difference_step(model)
+    results = {}
+    for x, value in zip(model.states, motion.state, strict=True):
+        lines.append((f"NEXT_{x}", value))
+        results[names[x]] = f"NEXT_{x}"
+    return renamed(lines, names), results
+
+
 def input_at_end(model: Model, degree: int) -> sp.Expr:
     """The input that a sensor sees: the newest tap, or the polynomial's value at the end of the sample."""
     return sum((symbol(f"U_{k}") for k in range(degree + 1)), sp.S.Zero) if model.is_continuous else symbol("U_0")
@@ -310,8 +328,10 @@ def reverse(assignments: Assignments, wanted: Sequence[str], seeds: Mapping[str,
             continue
         own = symbol(f"G_{name}")
         lines.append((str(own), sum(parts, sp.S.Zero)))
+        inverted = expression.base if expression.is_Pow and expression.exp == -1 else None
         for used in sorted(expression.free_symbols, key=str):
-            slope = sp.diff(expression, used)
+            # The slope of 1/x needs no further division.
+            slope = sp.diff(expression, used) if inverted is None else -(symbol(name) ** 2) * sp.diff(inverted, used)
             adjoints.setdefault(str(used), []).append(slope * own)
     lines += [(f"G_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in wanted]
     return lines

@@ -13,6 +13,18 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from estimator.engine.derive import Assignments
 
+#: Functions that are written out: a call is compiled on its own, and costs more than what it does. Arguments that stand
+#: there twice must be names.
+_INLINE = {
+    "present": "(1.0 if {0} == {0} else 0.0)",
+    "finite": "(1.0 if {0} - {0} == 0.0 else 0.0)",
+    "below": "(0.0 if {0} >= 0.0 else 1.0)",
+    "positive": "(1.0 if {0} > 0.0 else 0.0)",
+    "reaches": "(1.0 if {0} >= {1} else 0.0)",
+    "select": "({1} if {0} > 0.0 else {2})",
+    "clip": "({1} if not {0} > {1} else ({0} if {0} < {2} else {2}))",
+}
+
 
 class _Printer(PythonCodePrinter):
     """Floats for numbers, products for small powers, bare names for functions."""
@@ -39,7 +51,10 @@ class _Printer(PythonCodePrinter):
         return f"({self._print(base)})**({self._print(exponent)})"
 
     def _print_Function(self, expr: sp.Function) -> str:
-        return f"{expr.func.__name__}({', '.join(self._print(a) for a in expr.args)})"
+        name, given = expr.func.__name__, [self._print(argument) for argument in expr.args]
+        if name in _INLINE:
+            return _INLINE[name].format(*given)
+        return f"{name}({', '.join(given)})"
 
     _print_sin = _print_cos = _print_tanh = _print_exp = _print_log = _print_Function
 
@@ -60,6 +75,7 @@ def lane_loop(
     lanes: int,
     uniform: Sequence[str] = (),
     doc: str = "",
+    one: bool = False,
 ) -> str:
     """Source of ``name(W, *uniform)``, which executes assignments in every lane of a block.
 
@@ -72,12 +88,16 @@ def lane_loop(
         lanes: systems in a block; the loop is left out for 1.
         uniform: names that are the same in all lanes, and become arguments.
         doc: a line for the reader.
+        one: write ``name(W, j, *uniform)``, for lane j alone.
 
     Raises:
         ValueError: for a name that is neither assigned, nor a row, nor uniform.
     """
     kept = _needed(lines, {str(v) for v in results.values()})
     assigned = {target for target, _ in kept}
+    taken = sorted(assigned & set(layout))
+    if taken:
+        raise ValueError(f"{name} assigns {taken}, which are rows; give the results other names first")
     used = {str(s) for _, e in kept for s in e.free_symbols} | {
         str(v) for v in results.values() if not is_number(str(v))
     }
@@ -96,10 +116,11 @@ def lane_loop(
     body = [f"{row} = {place(row)}" for row in read]
     body += [f"{target} = {text_of(e)}" for target, e in kept]
     body += [f"{place(row)} = {value}" for row, value in results.items()]
-    source = [f"def {name}({', '.join(['W', *(['A'] if adjoint else []), *uniform])}):", f'    """{doc}"""']
-    if lanes > 1:
+    blocks = ["W", *(["A"] if adjoint else []), *(["LANE"] if one else [])]
+    source = [f"def {name}({', '.join([*blocks, *uniform])}):", f'    """{doc}"""']
+    if lanes > 1 and not one:
         source.append(f"    for LANE in range({lanes}):")
-    indent = "        " if lanes > 1 else "    "
+    indent = "        " if lanes > 1 and not one else "    "
     return "\n".join(source + [indent + line for line in body]) + "\n"
 
 
@@ -126,3 +147,38 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def scalar_function(
+    name: str,
+    lines: Assignments,
+    results: Sequence[Sequence[str]],
+    arguments: Mapping[str, Sequence[str]],
+    uniform: Sequence[str] = (),
+    doc: str = "",
+) -> str:
+    """Source of ``name(*arguments, *uniform)`` of tuples of scalars, which stay in registers from call to call.
+
+    Args:
+        name: of the function.
+        lines: in the order of execution; those that no result needs are left out.
+        results: the names (or numbers) that each tuple returned holds; one tuple is returned by itself.
+        arguments: name of a tuple to the names that it holds.
+        uniform: further arguments, each a scalar.
+        doc: a line for the reader.
+
+    Raises:
+        ValueError: for a name that is neither assigned nor an argument.
+    """
+    wanted = {str(value) for group in results for value in group}
+    kept = _needed(lines, wanted)
+    used = {str(s) for _, e in kept for s in e.free_symbols} | {v for v in wanted if not is_number(v)}
+    given = {held for group in arguments.values() for held in group} | set(uniform)
+    unknown = sorted(used - given - {target for target, _ in kept})
+    if unknown:
+        raise ValueError(f"{name} uses {unknown}, which no line assigns and no argument brings")
+    body = [f"({', '.join(held)},) = {group}" for group, held in arguments.items() if used & set(held)]
+    body += [f"{target} = {text_of(e)}" for target, e in kept]
+    gathered = [f"({', '.join(group)},)" for group in results]
+    source = [f"def {name}({', '.join([*arguments, *uniform])}):", f'    """{doc}"""']
+    return "\n".join([*source, *(f"    {line}" for line in body), f"    return {', '.join(gathered)}"]) + "\n"

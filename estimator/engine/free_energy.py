@@ -8,9 +8,25 @@ from typing import Any
 
 from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
 from estimator.engine import cache as stored
-from estimator.inference.noise import half_noise_powers
-from estimator.lanes import jit
+from estimator.lanes import inlined, jit
 from estimator.models.model import Model
+
+
+@inlined
+def half_noise_powers(innovation, variance, q, r):
+    """Half of E[w²] and of E[v²] under the Kalman step with noise variances q and r.
+
+    Args:
+        innovation: what was seen less what was predicted.
+        variance: of the prediction, without this sample's noises.
+        q: variance of the process noise as the sensor shows it, 1/E[γ].
+        r: variance of the sensor's noise, 1/E[ξ].
+    """
+    weight = 1.0 / (variance + q + r)
+    step = innovation * weight
+    w = q * step
+    v = r * step
+    return 0.5 * (w * w + q * (1.0 - q * weight)), 0.5 * (v * v + r * (1.0 - r * weight))
 
 
 @jit
@@ -38,9 +54,9 @@ def precision_part(half_power, variance, shape, rate):
 def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str, int]) -> Any:
     """Compile ``f(W, lane, out)``: the free energy [nats] that the last update left a lane with, after each iteration.
 
-    It is that of `estimator.inference.noise.sample_free_energy`, summed over the sensors: the first that shows the
-    process noise counts for γ and its own ξ, each further one for its ξ. A missing output counts for nothing. ``out``
-    is (iterations,).
+    F = KL[q(states, coefficients) || prior, transition, likelihood] + KL[q(γ) || prior] + KL[q(ξ) || prior] to first
+    order, summed over the sensors: the first that shows the process noise counts for γ and its own ξ, each further one
+    for its ξ. A missing output counts for nothing. ``out`` is (iterations,).
 
     Args:
         model: whose belief.

@@ -1,4 +1,6 @@
-"""Sigma points, as assignments: a belief's motion by the cubature rule of `estimator.inference.sigma_points`.
+"""Sigma points, as assignments: a belief's motion by the cubature rule of degree 3.
+
+(Arasaratnam and Haykin 2009, doi:10.1109/TAC.2009.2019800; an unscented transform whose centre has no weight.)
 
 The points lie along the columns of √pairs L, L Lᵀ = P over the *movers*, the quantities on which the motion depends;
 the other rows of L say how the rest goes along. A mover of variance 0, or one that depends on those before it, leaves a
@@ -29,8 +31,10 @@ from estimator.engine.derive import (
     renamed,
     symbol,
 )  # fmt: skip
-from estimator.inference.sigma_points import ROUNDING
 from estimator.models.model import Model
+
+#: What rounding leaves of the variance of a dimension that depends on those before it, as a part of that variance.
+ROUNDING = 1e-14
 
 #: The second of three where the first is positive, else the third; and 1 for what is negative or no number, else 0.
 select, below = sp.Function("select"), sp.Function("below")
@@ -114,14 +118,16 @@ def point_sample(model: Model) -> tuple[Assignments, dict[str, str]]:
 
 
 def moments(model: Model) -> tuple[Assignments, Moved]:
-    """Mean M and covariance Q of the images, without process noise, whose covariance is that at the mean."""
+    """Mean and covariance Q of the images, without process noise, whose covariance is that at the mean."""
     states, m = list(model.states), len(model.movers)
     lines: Assignments = []
     weight = [symbol(f"WEIGHT_{c}") for c in range(m)]
     image = lambda p, i: symbol(f"I_{p}_{i}")  # noqa: E731
     for i in states:
-        lines.append((f"M_{i}", sum((weight[c] * (image(2 * c, i) + image(2 * c + 1, i)) for c in range(m)), ZERO)))
-        lines += [(f"OFF_{p}_{i}", image(p, i) - symbol(f"M_{i}")) for p in range(2 * m)]
+        lines.append(
+            (f"MIDDLE_{i}", sum((weight[c] * (image(2 * c, i) + image(2 * c + 1, i)) for c in range(m)), ZERO))
+        )
+        lines += [(f"OFF_{p}_{i}", image(p, i) - symbol(f"MIDDLE_{i}")) for p in range(2 * m)]
         lines += [(f"LEAN_{c}_{i}", weight[c] * (image(2 * c, i) - image(2 * c + 1, i))) for c in range(m)]
     off = lambda p, i: symbol(f"OFF_{p}_{i}")  # noqa: E731
     for a, i in enumerate(states):
@@ -132,4 +138,4 @@ def moments(model: Model) -> tuple[Assignments, Moved]:
             total = sum((symbol(f"LEAN_{c}_{i}") * symbol(f"L_{c}_{j}") for c in range(m)), ZERO)
             lines.append((f"Q_{i}_{j}", total))
     moved = carried_at_end(model) if model.is_continuous else difference_step(model)[1]
-    return lines, Moved(tuple(symbol(f"M_{i}") for i in states), (), moved.noise)
+    return lines, Moved(tuple(symbol(f"MIDDLE_{i}") for i in states), (), moved.noise)

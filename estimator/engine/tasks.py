@@ -9,33 +9,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 
 from estimator import elementary
 from estimator.engine import cache as stored
+from estimator.engine.rows import layout, path_layout, point_names, trace_names
 from estimator.lanes import LANES, inlined, rows
 from estimator.models.model import Model
-
-
-@inlined
-def present(value):
-    """1 for a number, 0 for NaN."""
-    return 1.0 if value == value else 0.0
-
-
-@inlined
-def select(condition, first, second):
-    """``first`` where the condition is positive."""
-    return first if condition > 0.0 else second
-
-
-@inlined
-def below(value):
-    """1 for what is negative or no number, 0 for others."""
-    return 0.0 if value >= 0.0 else 1.0
 
 
 @inlined
@@ -46,42 +28,9 @@ def sqrt(value):
 
 #: What generated code may use.
 NAMES = {
-    "present": present, "select": select, "below": below, "sqrt": sqrt, "log": elementary.log,
+    "sqrt": sqrt, "log": elementary.log,
     **{name: getattr(elementary, name) for name in ("sin", "cos", "exp", "tanh")},
 }  # fmt: skip
-
-
-def belief_names(model: Model) -> list[str]:
-    """The flat record of a belief: means, upper triangle of the covariance, shapes and rates of the noises."""
-    covariances = [f"P_{i}_{j}" for i, j in combinations_with_replacement(model.names, 2)]
-    return [*model.names, *covariances, *noise_names(model)]
-
-
-def noise_names(model: Model) -> list[str]:
-    """Names of the noises' Gamma beliefs: γ first, then ξ of each sensor."""
-    return ["GAMMA_SHAPE", "GAMMA_RATE", *(f"XI_{part}_{y}" for y in model.outputs for part in ("SHAPE", "RATE"))]
-
-
-def input_rows(model: Model, degree: int) -> list[str]:
-    """The input over a sample: taps of a difference equation, or coefficients of the polynomial in τ."""
-    return [f"U_{k}" for k in range(model.taps if not model.is_continuous else degree + 1)]
-
-
-def carried_names(model: Model) -> list[str]:
-    """What a differential equation carries over a sample; nothing for a difference equation."""
-    if not model.is_continuous:
-        return []
-    names = [f"M_{i}" for i in model.states]
-    names += [f"S_{i}_{j}" for i in model.states for j in model.movers]
-    if model.held:
-        return [*names, *(f"D_{i}" for i in model.states)]
-    return [*names, *(f"N_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2))]
-
-
-def layout(model: Model, degree: int) -> dict[str, int]:
-    """Rows of an estimator's block: the belief, the sample, and what is carried over it."""
-    outputs = [f"Y_{y}" for y in model.outputs]
-    return rows(" ".join([*belief_names(model), *input_rows(model, degree), *outputs, *carried_names(model)]))
 
 
 @dataclass(frozen=True)
@@ -168,7 +117,12 @@ def _structured(
 
             lines, moved = moments(model)
         more, results = algebra.update(model, moved, degree, iterations, trace, missing)
-        finish = "@jit\n" + emit.lane_loop("finish", lines + more, results, place, lanes, doc="Predict and condition.")
+        # Every layer of functions is compiled: what a difference equation finishes is all of its update.
+        whole = not (points or model.is_continuous)
+        name = "update" if whole else "finish"
+        finish = "@jit\n" + emit.lane_loop(name, lines + more, results, place, lanes, doc="Predict and condition.")
+        if whole:
+            return finish
         if points:
             return finish + _points_source(model, degree, place, lanes)
         return _motion_source(model, degree, place, lanes) + finish + _composed("update", model)
@@ -176,16 +130,6 @@ def _structured(
     key = repr((model.digest, degree, iterations, lanes, sorted(place.items()), trace, missing, expectations))
     code = stored.load(model.name, "update", key, make, NAMES)
     return Update(code.update, place, lanes, tuple(traced), code.spread if points else None)
-
-
-def point_names(model: Model) -> list[str]:
-    """Rows of the sigma points (`estimator.engine.points`)."""
-    columns, movers = range(len(model.movers)), model.movers
-    names = [*movers, *(i for i in model.names if i not in movers)]
-    images = [f"I_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
-    at_point = [f"X_{i}" for i in movers if i not in model.states]
-    return [*(f"L_{c}_{i}" for c in columns for i in names), *(f"WEIGHT_{c}" for c in columns), *at_point, *images,
-            "UNSOUND"]  # fmt: skip
 
 
 def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
@@ -228,15 +172,6 @@ def _looped(model: Model, before: str, body: str) -> str:
     return head + body + "    finish(W)\n"
 
 
-def trace_names(model: Model, iterations: int) -> list[str]:
-    """Rows that `structured` leaves for the free energy, per sensor."""
-    names = []
-    for k in range(model.n_outputs):
-        names += [f"TRACE_{k}_{what}" for what in ("mean", "innovation", "variance", "shown")]
-        names += [f"TRACE_{k}_{what}_{i}" for i in range(iterations) for what in ("q", "r")]
-    return names
-
-
 def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
     """Source of ``begin(W)`` and ``move(W, T)``, which carry a state over a sample; empty for a difference equation."""
     from estimator.engine import derive, emit
@@ -264,116 +199,43 @@ def _composed(name: str, model: Model, finish: str = "finish(W)", arguments: str
 
 @dataclass(frozen=True)
 class Path:
-    """A path at known coefficients: likelihood, Fisher information, and gradient by the inputs.
+    """A path at known coefficients: likelihood and Fisher information; `estimator.engine.gradient` has the gradient.
 
     Attributes:
         sample: ``sample(W, Q, R_<sensor>...)``: one sample of every lane.
         layout: rows of the block: the coefficients, the input, outputs, ``LIVE``, the path and what it adds up.
         lanes: systems in it.
-        pieces: for one system, ``begin(W)``, ``move(W, T)``, ``finish(W, Q, R...)`` and their reverses
-            ``move_back(W, A, T)`` and ``finish_back(W, A, Q, R...)``; None where no gradient is asked for.
     """
 
     sample: Any
     layout: Mapping[str, int]
     lanes: int
-    pieces: Any = None
-
-
-def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
-    """Rows of a path's block."""
-    shown = [f"{'Y' if observed else 'SHOWN'}_{y}" for y in model.outputs]
-    states, coefficients = list(model.states), list(model.coefficients)
-    upper = combinations_with_replacement
-    return rows(
-        " ".join([*states, *(f"V_{i}_{k}" for i, k in upper(states, 2))]),
-        " ".join(f"Z_{i}_{c}" for i in states for c in coefficients),
-        " ".join(["LOSS", *(f"SLOPE_{c}" for c in coefficients), *(f"F_{c}_{d}" for c, d in upper(coefficients, 2))]),
-        " ".join([*coefficients, *input_rows(model, degree), *shown, "LIVE", *carried_names(model)]),
-    )
 
 
 @cache
-def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, gradient: bool = False) -> Path:
-    """The path of a model (`estimator.engine.algebra.path_sample`).
+def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -> Path:
+    """The path of a model (`estimator.engine.path.path_sample`).
 
     Args:
         model: whose equation.
         degree: of the input's polynomial over a sample.
         observed: whether the filter follows outputs.
-        lanes: systems in a block; 1 where a gradient is asked for.
-        gradient: whether to generate the reverse.
+        lanes: systems in a block.
     """
     place = path_layout(model, degree, observed)
     noises = ("Q", *(f"R_{y}" for y in model.outputs))
-    if gradient and (observed or lanes != 1):
-        raise ValueError("gradient is for the response without noise of one system: observed=False, lanes=1")
 
     def make() -> str:
-        from estimator.engine import algebra, derive, emit
+        from estimator.engine import derive, emit
+        from estimator.engine.path import path_sample
 
         lines, moved = derive.moved(model)
-        more, results = algebra.path_sample(model, moved, degree, observed)
+        more, results = path_sample(model, moved, degree, observed)
         lines += more
         source = _motion_source(model, degree, place, lanes)
         source += "@jit\n" + emit.lane_loop("finish", lines, results, place, lanes, noises, doc="Predict and see.")
         arguments = ", ".join(noises)
-        source += _composed("sample", model, f"finish(W, {arguments})", f"W, {arguments}")
-        if gradient:
-            inputs = input_rows(model, degree)
-            states = algebra.path_names(model)
-            before = derive.carried(model) if model.is_continuous else []
-            source += _reversed_source("finish_back", lines, results, [*states, *before], inputs, place, noises)
-            if model.is_continuous:
-                moves = {name: f"{name}_E" for name in before}
-                step = derive.motion_step(model, degree)
-                source += _reversed_source("move_back", step, moves, before, inputs, place, ("T",))
-        return source
+        return source + _composed("sample", model, f"finish(W, {arguments})", f"W, {arguments}")
 
-    key = repr((model.digest, degree, observed, lanes, gradient))
-    code = stored.load(model.name, "path", key, make, NAMES)
-    return Path(code.sample, place, lanes, code if gradient else None)
-
-
-def _reversed_source(
-    name: str,
-    lines: Any,
-    results: Mapping[str, str],
-    overwritten: Sequence[str],
-    added: Sequence[str],
-    place: Mapping[str, int],
-    uniform: Sequence[str],
-) -> str:
-    """Source of the reverse of assignments: adjoints of rows before, from those after, both in the block ``A``.
-
-    Args:
-        name: of the function.
-        lines: forward.
-        results: row to the name that holds its value.
-        overwritten: rows whose adjoints are replaced.
-        added: rows whose adjoints add up over several calls.
-        place: the layout.
-        uniform: further arguments.
-    """
-    from estimator.engine import derive, emit
-
-    # A result that is a number, or the row itself, passes its adjoint on without a line.
-    forward = list(lines)
-    assigned = {target for target, _ in forward}
-    seeds: dict[str, str] = {}
-    for row, value in results.items():
-        if value in assigned and value not in seeds:
-            seeds[value] = f"G_{row}"
-        else:
-            copy = f"{row}_copy"
-            forward.append((copy, derive.symbol(value) if not emit.is_number(value) else emit.number(value)))
-            seeds[copy] = f"G_{row}"
-    wanted = [*overwritten, *added]
-    back = derive.reverse(forward, wanted, seeds)
-    back = [(f"B{target}" if target in {f"G_{w}" for w in wanted} else target, e) for target, e in back]
-    outcome = {f"G_{row}": f"BG_{row}" for row in overwritten}
-    summed = [(f"SG_{row}", derive.symbol(f"G_{row}") + derive.symbol(f"BG_{row}")) for row in added]
-    outcome |= {f"G_{row}": f"SG_{row}" for row in added}
-    return "@jit\n" + emit.lane_loop(
-        name, [*forward, *back, *summed], outcome, place, 1, uniform, doc="The reverse derivative."
-    )  # fmt: skip
+    key = repr((model.digest, degree, observed, lanes))
+    return Path(stored.load(model.name, "path", key, make, NAMES).sample, place, lanes)

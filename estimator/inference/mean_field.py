@@ -12,59 +12,124 @@ message to z_{t-1} lacks the linearisation offset g(m) - Jₓᵀm, and the rate 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
-from estimator.lanes import at_lane, inlined, jit, lanewise
-from estimator.record import LAYOUT
+from estimator.engine.cache import digest_of
+from estimator.engine.rows import layout as layout_of_update
+from estimator.lanes import LANES, at_lane, inlined, jit, lanewise, part, rows
+from estimator.models.difference import difference
 
 #: Precision of the identity x_{t-1} = x_{t-1} between z_t and z_{t-1}: 1/ε of the paper.
 TIE = 1e12
 
+_COVARIANCES = """
+    P_theta1_theta1 P_theta1_theta2 P_theta1_theta3 P_theta2_theta2 P_theta2_theta3 P_theta3_theta3 P_eta_eta
+"""
 
-@lanewise(
-    LAYOUT,
-    "prior_t1 prior_t2 prior_t3 prior_e "
-    "prior_V_11 prior_V_12 prior_V_13 prior_V_22 prior_V_23 prior_V_33 prior_e_variance "
-    "prior_L_00 prior_L_01 prior_L_11 prior_h_0 prior_h_1 prior_g_rate prior_n_rate "
-    "prior_x0 prior_x1 z0 z1 z0_variance q0 q1 gamma xi g_shape n_shape",
-)
+#: The prior factors of a sample, which its iterations share.
+_FACTORS = """
+    prior_theta1 prior_theta2 prior_theta3 prior_eta
+    prior_V_11 prior_V_12 prior_V_13 prior_V_22 prior_V_23 prior_V_33 prior_eta_variance
+    prior_L_00 prior_L_01 prior_L_11 prior_h_0 prior_h_1 prior_gamma_rate prior_xi_rate prior_x1 prior_x2
+"""
+
+#: The marginals of z_t = (z0, z1) and of z_{t-1} = (q0, q1), and what the free energy needs.
+_MARGINALS = "z0 z1 z0_variance q0 q1"
+_SPREADS = """
+    Q_00 Q_01 Q_11
+    eta_information theta_information theta_shift residual_power error_power gamma_increment xi_increment
+"""
+
+#: Rows that lie idle but during an update.
+SCRATCH = tuple(f"{_FACTORS} {_MARGINALS} gamma xi {_SPREADS}".split())
+
+
+class Pieces(NamedTuple):
+    """The update over the rows of a block.
+
+    Attributes:
+        begin: ``begin(W)``: the last marginals become this sample's prior factors.
+        iterate: ``iterate(W, as_published)``: the six updates.
+        end: ``end(W)``: q(z_t) becomes the state.
+        free_energy: ``free_energy(W, j)`` of lane j after an iteration [nats]; before ``end``, or after it.
+    """
+
+    begin: Any
+    iterate: Any
+    end: Any
+    free_energy: Any
+
+
+def pieces(place: Mapping[str, int], lanes: int = LANES) -> Pieces:
+    """Compile the update for a block of ``lanes`` systems whose rows, and those of `SCRATCH`, stand in ``place``."""
+    return Pieces(
+        lanewise(place, f"{_FACTORS} {_MARGINALS} gamma xi GAMMA_SHAPE XI_SHAPE_y", lanes=lanes)(begin),
+        lanewise(
+            place,
+            f"theta1 theta2 theta3 eta {_COVARIANCES} {_MARGINALS} GAMMA_RATE XI_RATE_y gamma xi {_SPREADS}",
+            "as_published",
+            lanes,
+        )(iterate),
+        lanewise(place, "x1 x2 P_x1_x1 P_x1_x2 P_x2_x2", lanes=lanes)(end),
+        at_lane(place, lanes=lanes)(free_energy),
+    )
+
+
+def updater(place: Mapping[str, int]) -> Any:
+    """``update(W, iterations, as_published)``: every lane's belief with its rows ``U_0`` and ``Y_y``."""
+    begin, iterate, end, _ = pieces(place)
+
+    @part(digest_of(sorted(place.items())))
+    def update(W, iterations, as_published):
+        begin(W)
+        for _ in range(iterations):
+            iterate(W, as_published)
+        end(W)
+
+    return update
+
+
+def layout() -> dict[str, int]:
+    """Rows of a block: those of the paper's model, and `SCRATCH`."""
+    place = layout_of_update(difference(), 0)
+    return place | rows(" ".join(SCRATCH), start=len(place))
+
+
 def begin(
-    x0, x1, t1, t2, t3, e, P_x0_x0, P_x0_x1, P_x1_x1,
-    P_t1_t1, P_t1_t2, P_t1_t3, P_t2_t2, P_t2_t3, P_t3_t3, P_e_e, g_shape, g_rate, n_shape, n_rate,
+    x1, x2, theta1, theta2, theta3, eta, P_x1_x1, P_x1_x2, P_x2_x2,
+    P_theta1_theta1, P_theta1_theta2, P_theta1_theta3, P_theta2_theta2, P_theta2_theta3, P_theta3_theta3, P_eta_eta,
+    GAMMA_SHAPE, GAMMA_RATE, XI_SHAPE_y, XI_RATE_y,
 ):  # fmt: skip
     """Make the last marginals this step's prior factors; the state's in information form (L, h)."""
-    determinant = P_x0_x0 * P_x1_x1 - P_x0_x1 * P_x0_x1
-    l00 = P_x1_x1 / determinant
-    l01 = -P_x0_x1 / determinant
-    l11 = P_x0_x0 / determinant
+    determinant = P_x1_x1 * P_x2_x2 - P_x1_x2 * P_x1_x2
+    l00 = P_x2_x2 / determinant
+    l01 = -P_x1_x2 / determinant
+    l11 = P_x1_x1 / determinant
     return (
-        t1, t2, t3, e,
-        P_t1_t1, P_t1_t2, P_t1_t3, P_t2_t2, P_t2_t3, P_t3_t3, P_e_e,
-        l00, l01, l11, l00 * x0 + l01 * x1, l01 * x0 + l11 * x1, g_rate, n_rate,
-        x0, x1, x0, x1, P_x0_x0, x0, x1, g_shape / g_rate, n_shape / n_rate, g_shape + 0.5, n_shape + 0.5,
+        theta1, theta2, theta3, eta,
+        P_theta1_theta1, P_theta1_theta2, P_theta1_theta3, P_theta2_theta2, P_theta2_theta3, P_theta3_theta3, P_eta_eta,
+        l00, l01, l11, l00 * x1 + l01 * x2, l01 * x1 + l11 * x2, GAMMA_RATE, XI_RATE_y,
+        x1, x2, x1, x2, P_x1_x1, x1, x2,
+        GAMMA_SHAPE / GAMMA_RATE, XI_SHAPE_y / XI_RATE_y, GAMMA_SHAPE + 0.5, XI_SHAPE_y + 0.5,
     )  # fmt: skip
 
 
-@lanewise(
-    LAYOUT,
-    "t1 t2 t3 e P_t1_t1 P_t1_t2 P_t1_t3 P_t2_t2 P_t2_t3 P_t3_t3 P_e_e "
-    "z0 z1 z0_variance q0 q1 Q_00 Q_01 Q_11 g_rate n_rate gamma xi "
-    "e_information theta_information theta_shift residual_power error_power g_increment n_increment",
-    uniform="as_published",
-)
 def iterate(
-    t1, t2, t3, z0, q0, q1, u, y, gamma, xi, g_shape, n_shape,
-    prior_t1, prior_t2, prior_t3, prior_e,
-    prior_V_11, prior_V_12, prior_V_13, prior_V_22, prior_V_23, prior_V_33, prior_e_variance,
-    prior_L_00, prior_L_01, prior_L_11, prior_h_0, prior_h_1, prior_g_rate, prior_n_rate,
+    theta1, theta2, theta3, z0, q0, q1, U_0, Y_y, gamma, xi, GAMMA_SHAPE, XI_SHAPE_y,
+    prior_theta1, prior_theta2, prior_theta3, prior_eta,
+    prior_V_11, prior_V_12, prior_V_13, prior_V_22, prior_V_23, prior_V_33, prior_eta_variance,
+    prior_L_00, prior_L_01, prior_L_11, prior_h_0, prior_h_1, prior_gamma_rate, prior_xi_rate,
     as_published,
 ):  # fmt: skip
     """One iteration of the six updates. Both noises' shapes already count this sample."""
+    u, y = U_0, Y_y
     # η: the residual E[x_t] - g under the last θ.
-    regression = t1 * q0 + t2 * (q0 * q0 * q0) + t3 * q1
-    e_information = gamma * u * u * prior_e_variance
-    e_variance = prior_e_variance / (1.0 + e_information)
-    e = prior_e + e_variance * gamma * u * (z0 - regression - prior_e * u)
+    regression = theta1 * q0 + theta2 * (q0 * q0 * q0) + theta3 * q1
+    eta_information = gamma * u * u * prior_eta_variance
+    eta_variance = prior_eta_variance / (1.0 + eta_information)
+    eta = prior_eta + eta_variance * gamma * u * (z0 - regression - prior_eta * u)
 
     # θ: rank one in J = ∂g/∂θ.
     j1 = q0
@@ -76,10 +141,10 @@ def iterate(
     leverage = j1 * s1 + j2 * s2 + j3 * s3
     theta_information = gamma * leverage
     weight = gamma / (1.0 + theta_information)
-    step = weight * (z0 - e * u - (j1 * prior_t1 + j2 * prior_t2 + j3 * prior_t3))
-    t1 = prior_t1 + s1 * step
-    t2 = prior_t2 + s2 * step
-    t3 = prior_t3 + s3 * step
+    step = weight * (z0 - eta * u - (j1 * prior_theta1 + j2 * prior_theta2 + j3 * prior_theta3))
+    theta1 = prior_theta1 + s1 * step
+    theta2 = prior_theta2 + s2 * step
+    theta3 = prior_theta3 + s3 * step
     V_11 = prior_V_11 - weight * s1 * s1
     V_12 = prior_V_12 - weight * s1 * s2
     V_13 = prior_V_13 - weight * s1 * s3
@@ -88,16 +153,16 @@ def iterate(
     V_33 = prior_V_33 - weight * s3 * s3
 
     # z_t: transition times likelihood; its second component repeats x_{t-1}.
-    regression = t1 * j1 + t2 * j2 + t3 * j3
+    regression = theta1 * j1 + theta2 * j2 + theta3 * j3
     z0_variance = 1.0 / (gamma + xi)
-    z0 = (gamma * (regression + e * u) + xi * y) * z0_variance
+    z0 = (gamma * (regression + eta * u) + xi * y) * z0_variance
     z1 = q0
 
     # z_{t-1}: prior times the message backward through the transition, linearised at the last mean.
-    a0 = t1 + 3.0 * t2 * q0 * q0
-    a1 = t3
+    a0 = theta1 + 3.0 * theta2 * q0 * q0
+    a1 = theta3
     offset = 0.0 if as_published else regression - a0 * q0 - a1 * q1
-    pull = gamma * (z0 - e * u - offset)
+    pull = gamma * (z0 - eta * u - offset)
     l00 = prior_L_00 + gamma * a0 * a0 + TIE
     l01 = prior_L_01 + gamma * a0 * a1
     l11 = prior_L_11 + gamma * a1 * a1
@@ -112,71 +177,73 @@ def iterate(
 
     # γ and ξ: half the expected squared noises.
     residual_power = _residual_power(
-        t1, t2, t3, e, u, z0, z0_variance, q0, q1, Q_00, Q_01, Q_11, V_11, V_12, V_13, V_22, V_23, V_33, e_variance
+        theta1, theta2, theta3, eta, u, z0, z0_variance, q0, q1, Q_00, Q_01, Q_11,
+        V_11, V_12, V_13, V_22, V_23, V_33, eta_variance,
     )  # fmt: skip
     error = y - z0
     error_power = error * error + z0_variance
-    g_increment = 0.5 * (residual_power + (q0 * q0 if as_published else 0.0))
-    n_increment = 0.5 * error_power
-    g_rate = prior_g_rate + g_increment
-    n_rate = prior_n_rate + n_increment
+    gamma_increment = 0.5 * (residual_power + (q0 * q0 if as_published else 0.0))
+    xi_increment = 0.5 * error_power
+    gamma_rate = prior_gamma_rate + gamma_increment
+    xi_rate = prior_xi_rate + xi_increment
     return (
-        t1, t2, t3, e, V_11, V_12, V_13, V_22, V_23, V_33, e_variance,
-        z0, z1, z0_variance, q0, q1, Q_00, Q_01, Q_11, g_rate, n_rate, g_shape / g_rate, n_shape / n_rate,
-        e_information, theta_information, step * step * leverage,
-        residual_power, error_power, g_increment, n_increment,
+        theta1, theta2, theta3, eta, V_11, V_12, V_13, V_22, V_23, V_33, eta_variance,
+        z0, z1, z0_variance, q0, q1,
+        gamma_rate, xi_rate, GAMMA_SHAPE / gamma_rate, XI_SHAPE_y / xi_rate,
+        Q_00, Q_01, Q_11, eta_information, theta_information, step * step * leverage,
+        residual_power, error_power, gamma_increment, xi_increment,
     )  # fmt: skip
 
 
 @inlined
 def _residual_power(
-    t1, t2, t3, e, u, z0, z0_variance, q0, q1, Q_00, Q_01, Q_11, V_11, V_12, V_13, V_22, V_23, V_33, e_variance
+    theta1, theta2, theta3, eta, u, z0, z0_variance, q0, q1, Q_00, Q_01, Q_11,
+    V_11, V_12, V_13, V_22, V_23, V_33, eta_variance,
 ):  # fmt: skip
     """E[(x_t - g - η u)²] to first order."""
     j2 = q0 * q0 * q0
-    a0 = t1 + 3.0 * t2 * q0 * q0
-    residual = z0 - (t1 * q0 + t2 * j2 + t3 * q1) - e * u
-    from_state = a0 * a0 * Q_00 + 2.0 * a0 * t3 * Q_01 + t3 * t3 * Q_11
+    a0 = theta1 + 3.0 * theta2 * q0 * q0
+    residual = z0 - (theta1 * q0 + theta2 * j2 + theta3 * q1) - eta * u
+    from_state = a0 * a0 * Q_00 + 2.0 * a0 * theta3 * Q_01 + theta3 * theta3 * Q_11
     from_theta = V_11 * q0 * q0 + V_22 * j2 * j2 + V_33 * q1 * q1
     cross = V_12 * q0 * j2 + V_13 * q0 * q1 + V_23 * j2 * q1
-    return residual * residual + z0_variance + from_state + from_theta + 2.0 * cross + u * u * e_variance
+    return residual * residual + z0_variance + from_state + from_theta + 2.0 * cross + u * u * eta_variance
 
 
-@lanewise(LAYOUT, "x0 x1 P_x0_x0 P_x0_x1 P_x1_x1")
 def end(z0, z1, z0_variance):
     """Keep q(z_t) as the state belief; the coefficients and noises are in their rows already."""
     return z0, z1, z0_variance, 0.0, 1.0 / TIE
 
 
-@at_lane(LAYOUT)
 def free_energy(
-    e, g_shape, g_rate, n_shape, n_rate, prior_x0, prior_x1, prior_e, prior_e_variance,
-    prior_L_00, prior_L_01, prior_L_11, prior_g_rate, prior_n_rate,
+    eta, GAMMA_SHAPE, GAMMA_RATE, XI_SHAPE_y, XI_RATE_y, prior_x1, prior_x2, prior_eta, prior_eta_variance,
+    prior_L_00, prior_L_01, prior_L_11, prior_gamma_rate, prior_xi_rate,
     z1, z0_variance, q0, q1, Q_00, Q_01, Q_11, gamma, xi,
-    e_information, theta_information, theta_shift, residual_power, error_power, g_increment, n_increment,
+    eta_information, theta_information, theta_shift, residual_power, error_power, gamma_increment, xi_increment,
 ):  # fmt: skip
     """Free energy of this sample in nats after an iteration (before `end`), expectations of g to first order.
 
     F = Σ KL[q || prior factor] over θ, η, z_{t-1}, γ, ξ, minus the entropy of q(z_t), minus the expected log
     transition and log likelihood. θ and η moved by an update of rank one, so their divergences are scalars.
     """
-    e_shift = (e - prior_e) * (e - prior_e) / prior_e_variance
-    coefficients = _rank_one_divergence(theta_information, theta_shift) + _rank_one_divergence(e_information, e_shift)
+    eta_shift = (eta - prior_eta) * (eta - prior_eta) / prior_eta_variance
+    coefficients = _rank_one_divergence(theta_information, theta_shift)
+    coefficients += _rank_one_divergence(eta_information, eta_shift)
 
-    d0 = q0 - prior_x0
-    d1 = q1 - prior_x1
+    d0 = q0 - prior_x1
+    d1 = q1 - prior_x2
     overlap = prior_L_00 * Q_00 + 2.0 * prior_L_01 * Q_01 + prior_L_11 * Q_11
     shift = prior_L_00 * d0 * d0 + 2.0 * prior_L_01 * d0 * d1 + prior_L_11 * d1 * d1
     volumes = (prior_L_00 * prior_L_11 - prior_L_01 * prior_L_01) * (Q_00 * Q_11 - Q_01 * Q_01)
     last_state = 0.5 * (overlap - 2.0 + shift - math.log(volumes))
 
-    noises = gamma_step_divergence(g_shape - 0.5, prior_g_rate, g_increment)
-    noises += gamma_step_divergence(n_shape - 0.5, prior_n_rate, n_increment)
+    noises = gamma_step_divergence(GAMMA_SHAPE - 0.5, prior_gamma_rate, gamma_increment)
+    noises += gamma_step_divergence(XI_SHAPE_y - 0.5, prior_xi_rate, xi_increment)
 
     tie_power = (z1 - q0) * (z1 - q0) + 1.0 / TIE + Q_00
     transition = LOG_2PI + 0.5 * (gamma * residual_power + TIE * tie_power)
-    transition -= 0.5 * (expected_log_gamma(g_shape, g_rate) + math.log(TIE))
-    likelihood = 0.5 * (LOG_2PI - expected_log_gamma(n_shape, n_rate) + xi * error_power)
+    transition -= 0.5 * (expected_log_gamma(GAMMA_SHAPE, GAMMA_RATE) + math.log(TIE))
+    likelihood = 0.5 * (LOG_2PI - expected_log_gamma(XI_SHAPE_y, XI_RATE_y) + xi * error_power)
     state_entropy = LOG_2PI + 1.0 + 0.5 * (math.log(z0_variance) - math.log(TIE))
     return coefficients + last_state + noises + transition + likelihood - state_entropy
 

@@ -1,1 +1,19 @@
-"""Models: what the next output is, given the last ones, the input and the coefficients."""
+"""Models: what the next output is, given the last ones, the input and the coefficients. One file a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.models.model import Model
+from estimator.models.pendulum import PENDULUM
+from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
+
+#: Name of a model to what makes it.
+MODELS: dict[str, Callable[[], Model]] = {
+    "difference": difference,
+    "duffing": duffing,
+    "pendulum": lambda: PENDULUM,
+    "wiener_hammerstein": lambda: WIENER_HAMMERSTEIN,
+}

@@ -66,6 +66,7 @@ _PHYSICAL = {
     "a": "(1 - theta1 - theta3)/eta",
     "b": "-theta2/eta",
 }
+_UNITS = {"m": "s²", "c": "s", "a": "1", "b": "V⁻²"}
 
 
 @cache
@@ -74,7 +75,8 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
 
     Args:
         preset: a name of `PRESETS`, or terms of one's own. The coefficients of ``paper`` are called theta1, theta2,
-            theta3 and eta, and know m, c, a and b by Eqs. (3) and (4); those of other terms are k0, k1, ...
+            theta3 and eta, and know m, c, a and b by Eqs. (3) and (4); ``linear`` has no theta2 and no b; those of
+            other terms are k0, k1, ...
 
     Raises:
         ValueError: for an unknown preset, or terms that repeat or are none.
@@ -84,9 +86,11 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
     terms = PRESETS[preset] if isinstance(preset, str) else preset
     if not terms or len(set(terms)) < len(terms):
         raise ValueError(f"preset must have different terms, at least one, but is {preset!r}")
-    paper = preset == "paper"
-    names = list(_INVERSE) if paper else [f"k{i}" for i in range(len(terms))]
+    known = preset in ("paper", "linear")
+    kept = {"paper": list(_INVERSE), "linear": ["theta1", "theta3", "eta"]}.get(str(preset), [])
+    names = kept if known else [f"k{i}" for i in range(len(terms))]
     moved = " + ".join(f"{name}*{term.expression}" for name, term in zip(names, terms, strict=True))
+    physical = {p: text for p, text in _PHYSICAL.items() if known and (p != "b" or preset == "paper")}
     return Model(
         name="difference",
         states={"x1": "V", "x2": "V"},
@@ -94,7 +98,7 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
         next_state=(moved, "x1"),
         noise=("1", "0"),
         outputs={"y": "x1"},
-        physical=_PHYSICAL if paper else {},
-        physical_units={"m": "s²", "c": "s", "a": "1", "b": "V⁻²"} if paper else {},
-        inverse=_INVERSE if paper else {},
+        physical=physical,
+        physical_units={p: _UNITS[p] for p in physical},
+        inverse={name: _INVERSE[name] for name in names} if known else {},
     )

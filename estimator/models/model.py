@@ -11,7 +11,7 @@ import json
 import keyword
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 
 #: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
@@ -152,7 +152,9 @@ class Model:
     @cached_property
     def digest(self) -> str:
         """Twelve hexadecimal digits that tell models apart."""
-        described = json.dumps({key: dict(v) if isinstance(v, Mapping) else v for key, v in vars(self).items()})
+        # Not all that the object holds: what it has calculated of itself is no part of it.
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        described = json.dumps({key: dict(v) if isinstance(v, Mapping) else v for key, v in values.items()})
         return hashlib.sha256(described.encode()).hexdigest()[:12]
 
     def __eq__(self, other: object) -> bool:

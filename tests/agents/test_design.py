@@ -1,73 +1,106 @@
-"""The worth of inputs and its gradient: against the Fisher information, differences, and the limits."""
+"""The worth of inputs to any model and its gradient: against the Fisher information, differences, and the limits."""
+
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from agents.ascent import improve
-from agents.design import climb, half_log_det, invert, worth
-from estimator import SILVERBOX_TWIN, Prior, to_coefficients
-from estimator.fisher import as_rows, fisher_information
+from agents.planner.ascent import Limits, climber
+from agents.planner.design import Known, designer, half_log_det, invert
+from estimator import SILVERBOX_TWIN, silverbox_prior
+from estimator.engine.gradient import pieces
+from estimator.information import fisher_information
+from estimator.models.difference import difference
+from estimator.physical import coefficients_of
+
+sys.path.append(str(Path(__file__).parents[1] / "estimator"))
+from filtering import CASES
 
 Q, R, LIMIT, AMPLITUDE = 5e-4, 3e-4, 0.3, 0.1
-TWIN = to_coefficients(SILVERBOX_TWIN)
-THETA = as_rows(TWIN)
-PRECISION = np.linalg.inv(Prior.silverbox_twin().coefficients_cov)
+PAPER = difference()
+THETA = coefficients_of(PAPER, {name: getattr(SILVERBOX_TWIN, name) for name in "mcab"})
+PRECISION = np.linalg.inv(silverbox_prior(PAPER).coefficients_cov)
+TWIN = Known(THETA, PRECISION, (Q**2, R**2))
 
 
-def evaluated(u, start=None, penalty=0.0, gradient=None):
-    start = np.zeros(13) if start is None else start
-    tape, F = np.empty((len(u) + 1, 13)), np.empty((4, 4))
-    told = (THETA, PRECISION, Q**2, R**2, LIMIT, penalty, start, u, tape, F)
-    return worth(*told) if gradient is None else climb(*told, gradient)
+def evaluated(u, start=None, penalty=0.0, climbs=False, limit=LIMIT, known=TWIN, found=None):
+    """Worth and peak, or worth, peak and gradient."""
+    found = found or designer(PAPER)
+    start, memory = np.zeros(found.start_size) if start is None else start, found.memory(len(u))
+    told = (known, limit, penalty, start, u, memory)
+    return (*found.climb(*told), memory.gradient) if climbs else found.worth(*told)
 
 
 def improved(inputs, energy=np.inf):
     inputs, values = inputs.copy(), np.empty(len(inputs))
-    improve(THETA, PRECISION, Q**2, R**2, LIMIT, AMPLITUDE, energy, 0.3, 100, inputs, values)
+    climber(PAPER).improve(TWIN, Limits(LIMIT, LIMIT, AMPLITUDE, energy), 0.3, 100, inputs, values)
     return inputs, values
 
 
-def test_the_worth_is_half_the_log_determinant_of_the_precision():
-    u = np.random.default_rng(0).choice([-0.03, 0.03], 60)
-    value, _ = evaluated(u)
-    expected = 0.5 * np.linalg.slogdet(PRECISION + fisher_information(TWIN, u, Q, R))[1]
-    assert value == pytest.approx(expected, rel=1e-12)
+def case_of(name):
+    """Model, interpolation, and what is known: with a prior that matters."""
+    model, interpolation, c, size = CASES[name]
+    c = np.array(c, dtype=np.float64)
+    precision = np.diag(1 / (0.1 * np.maximum(np.abs(c), 0.01)) ** 2)
+    return model, interpolation, size, Known(c, precision, (4e-6, *[1e-6] * model.n_outputs))
 
 
-def test_factor_and_inverse():
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("motion", "tanks"))) for name in CASES]
+)
+def test_the_worth_is_half_the_log_determinant_of_the_precision(name):
+    model, interpolation, size, known = case_of(name)
+    u = size * np.random.default_rng(0).choice([-0.5, 0.5], 60)
+    value, _ = evaluated(u, limit=np.inf, known=known, found=designer(model, int(interpolation == "linear")))
+    told = fisher_information(model, known.coefficients, u, 2e-3, 1e-3, interpolation=interpolation)
+    assert value == pytest.approx(0.5 * np.linalg.slogdet(known.precision + told)[1], rel=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 4, 7])
+def test_factor_and_inverse(size):
     rng = np.random.default_rng(1)
-    A = rng.standard_normal((4, 6)) @ rng.standard_normal((6, 4))
-    A = A @ A.T + np.eye(4)
-    L, inverse = A.copy(), np.empty((4, 4))
+    A = rng.standard_normal((size, size + 2))
+    A = A @ A.T + np.eye(size)
+    L, inverse = A.copy(), np.empty((size, size))
     assert half_log_det(L) == pytest.approx(0.5 * np.linalg.slogdet(A)[1], rel=1e-12)
     invert(L, inverse)
-    np.testing.assert_allclose(inverse @ A, np.eye(4), atol=1e-12)
-    assert half_log_det(-np.eye(4)) == -np.inf
+    np.testing.assert_allclose(inverse @ A, np.eye(size), atol=1e-12)
+    assert half_log_det(-np.eye(size)) == -np.inf
 
 
+@pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("moving", [False, True])
-def test_the_gradient_is_that_of_differences(moving):
+def test_the_gradient_is_that_of_differences(name, moving):
+    model, interpolation, size, known = case_of(name)
+    found = designer(model, int(interpolation == "linear"))
     rng = np.random.default_rng(2)
-    u = 0.135 * rng.uniform(-1, 1, 40)
-    start = np.zeros(13)
+    u, n = size * rng.uniform(-1, 1, 40), model.n_states
+    start = np.zeros(found.start_size)
     if moving:
-        start[:5] = 0.1, -0.05, 3e-7, 1e-7, 2e-7
-        start[5:] = rng.normal(0, 0.2, 8)
-    gradient = np.empty(40)
-    value, peak = evaluated(u, start, 100.0, gradient)
-    assert value == evaluated(u, start, 100.0)[0]
-    assert LIMIT < peak < 1.2 * LIMIT  # so that the penalty has its part
-    h = 1e-6
+        spread = np.array([[2e-6, 5e-7], [5e-7, 1e-6]])
+        start[:n] = 0.1, -0.05
+        start[n : n + 3] = spread[np.triu_indices(n)]
+        start[n + 3 : found.n_path] = rng.normal(0, 0.2, found.n_path - n - 3)
+        start[found.n_path :] = 0.3 * size
+    peak = evaluated(u, start, limit=np.inf, known=known, found=found)[1]
+    told = {"penalty": 100.0, "limit": 0.9 * peak, "known": known, "found": found}  # so that the penalty has its part
+    value, _, gradient = evaluated(u, start, climbs=True, **told)
+    assert value == evaluated(u, start, **told)[0]
+    assert value < evaluated(u, start, **{**told, "penalty": 0.0})[0]
+    h = 2e-5 * size
+    slopes = np.empty(40)
     for t in range(40):
         step = h * (np.arange(40) == t)
-        slope = (evaluated(u + step, start, 100.0)[0] - evaluated(u - step, start, 100.0)[0]) / (2 * h)
-        assert gradient[t] == pytest.approx(slope, rel=1e-5, abs=1e-4 * np.abs(gradient).max())
+        ahead, behind = ([evaluated(u + s * m * step, start, **told)[0] for s in (1, -1)] for m in (1, 2))
+        # Of order 4, so that the third derivative does not count.
+        slopes[t] = (8 * (ahead[0] - ahead[1]) - (behind[0] - behind[1])) / (12 * h)
+    np.testing.assert_allclose(gradient, slopes, rtol=0, atol=1e-6 * np.abs(gradient).max())
 
 
 def test_a_trajectory_that_is_lost_counts_until_then():
     u = np.full(60, 0.3)
-    gradient = np.empty(60)
-    value, peak = evaluated(u, None, 0.0, gradient)
+    value, peak, gradient = evaluated(u, climbs=True)
     assert LIMIT * 1.2 <= peak < 1.0
     used = np.flatnonzero(gradient)[-1] + 1
     assert 0 < used < 60
@@ -93,3 +126,8 @@ def test_improvement_keeps_an_energy():
     assert np.all((inputs**2).sum(axis=1) <= energy)
     assert np.all((inputs**2).sum(axis=1) > 0.99 * energy)
     assert np.isfinite(values).all()
+
+
+def test_a_spline_is_refused():
+    with pytest.raises(ValueError, match="degree must be 0 or 1"):
+        pieces(PAPER, 5)

@@ -10,15 +10,16 @@ import rounding
 from safetensors.numpy import load_file
 from stable_baselines3 import PPO
 
-import agents.evaluation
-import agents.metrics
+import agents.evaluation.metrics
+import agents.evaluation.rollout
 from agents import make_policy
-from agents.evaluation import evaluate, make
+from agents.evaluation.batch import make
+from agents.evaluation.rollout import evaluate
 from agents.policies.learned import WEIGHTS, load_policy, save_policy
 from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
 from duffing_env.silverbox import Regime, regime_input
-from estimator import NLARX, SAMPLING_STEP, OnlineEstimator, Prior
+from estimator import SAMPLING_STEP, OnlineEstimator, Rig, difference, silverbox_prior
 
 TRACK = "duffing_env/Amplitude-v0"
 CONTINUOUS = "duffing_env/Continuous-v0"
@@ -32,7 +33,7 @@ QUANTILES = {"coverage_50": 0.6744897501960817, "coverage": 1.6448536269514722, 
 
 @pytest.fixture
 def without_record(monkeypatch):
-    monkeypatch.setattr(agents.evaluation, "record_available", lambda: False)
+    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: False)
 
 
 def true_coefficients(truth):
@@ -132,7 +133,7 @@ def run_single(name, options):
             observation, _, terminated, truncated, _ = env.step(action)
             beliefs.append(env.unwrapped.belief)
             inputs.append(options.get("max_input", 0.15) * float(np.clip(action[0], -1, 1)))
-            outputs.append(env.unwrapped._batch.quantity("y")[0])
+            outputs.append(env.unwrapped._batch.quantity("Y_y")[0])
             done = terminated or truncated
         yield SimpleNamespace(truth=truth, beliefs=beliefs, inputs=inputs, outputs=outputs, terminated=terminated)
 
@@ -191,7 +192,7 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
         assert measured.pop("input_peak") == pytest.approx(peak, rel=slack)
         assert measured.pop("crest_factor") == pytest.approx(peak / np.sqrt(power), rel=slack)
         assert measured.pop("decision_time") > 0
-        full_prior = Prior.silverbox_twin(options.get("spread", 0.3))  # mean field leaves out its cross-covariances
+        full_prior = silverbox_prior(spread=options.get("spread", 0.3))  # mean field leaves out its cross-covariances
         gain = fisher_gain(coefficients, single.inputs, single.outputs, full_prior)
         assert measured.pop("fisher_gain") == pytest.approx(gain, abs=1e-3)
         assert measured.pop("silverbox_equivalent") > 0
@@ -210,7 +211,7 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
 
 
 def test_what_a_jump_of_the_truth_takes_away_is_counted(monkeypatch):
-    monkeypatch.setattr(agents.evaluation, "record_available", lambda: True)
+    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: True)
     (evaluation,) = evaluate(["prbs"], DRIFT, SYSTEMS, SEED, options={"horizon": HORIZON})
     choose, steepest = act("prbs", {"horizon": HORIZON}), []
     for row, seed in enumerate(spawn_seeds(SEED, SYSTEMS)):
@@ -302,8 +303,8 @@ def test_the_arrow_error_is_that_of_free_runs_over_the_record(record):
 def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverges):
     rng = np.random.default_rng(0)
     arrow = Regime("arrow", scale * rng.uniform(-1, 1, 80), 0.01 * rng.normal(size=80))
-    monkeypatch.setattr(agents.evaluation, "record_available", lambda: True)
-    monkeypatch.setattr(agents.metrics, "load_record", lambda: SimpleNamespace(arrow=arrow))
+    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: True)
+    monkeypatch.setattr(agents.evaluation.metrics, "load_record", lambda: SimpleNamespace(arrow=arrow))
     options = {"horizon": HORIZON, "max_output": 2.0}
     (evaluation,) = evaluate(["uniform"], systems=SYSTEMS, seed=SEED, options=options)
     if diverges:
@@ -336,7 +337,7 @@ def test_the_replay_environment_is_evaluated(record):
     u, y = record.arrow.u, record.arrow.y
     samples = int(np.argmax(np.abs(y[1:]) > limit)) + 1  # the episode ends when y, one sample later, is beyond
     assert samples > 1000
-    estimator = OnlineEstimator(NLARX(input_delay=0), Prior.silverbox_twin())
+    estimator = OnlineEstimator(difference(), silverbox_prior(), Rig(interpolation="zero_order", delay=0))
     before = entropy(estimator.belief)
     estimator.run(u[:samples], y[1 : samples + 1])
     np.testing.assert_allclose(on_record.metrics["information_gain"], before - entropy(estimator.belief), rtol=1e-9)

@@ -9,15 +9,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import agents.figures
+import agents.evaluation.figures
 from agents import make_policy
 from agents.policies.excitations import EXCITATIONS, LEVELS, resonance
 from agents.policies.export import draw_signal, export_signal
 from agents.policies.feedback import FEEDBACK, TURN
 from agents.policies.signals import Limits, SignalPolicy
 from duffing_env.experiment import SimulatedExperiment
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, PhysicalParameters, to_coefficients
-from estimator.prior import Prior
+from duffing_env.layout import observation_bounds
+from estimator.models.difference import difference
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
+from estimator.physical import coefficients_of
+from estimator.priors import silverbox_prior
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 RECORDED = ("silverbox-multisine", "silverbox-arrow")
@@ -118,14 +121,16 @@ def test_square_is_a_square_wave_at_the_resonance_of_the_twin():
 def test_resonance_is_where_a_free_oscillation_crosses_zero():
     for m, c, a in ((0.7, 1.0, 1.3), (1.3, 0.7, 0.7)):
         twin = SILVERBOX_TWIN
-        theta = to_coefficients(PhysicalParameters(m * twin.m, c * twin.c, a * twin.a, 1.0))
+        theta1, _, theta3, _ = coefficients_of(
+            difference(), Parameters(m=m * twin.m, c=c * twin.c, a=a * twin.a, b=1.0)
+        )
         x = [0.0, 1.0]
         while len(x) < 600:
-            x.append(theta.theta1 * x[-1] + theta.theta3 * x[-2])
+            x.append(theta1 * x[-1] + theta3 * x[-2])
         crossings = np.flatnonzero(np.diff(np.signbit(x[1:])))
         halves = crossings.size - 1
         measured = halves / (2 * SAMPLING_STEP * (crossings[-1] - crossings[0]))
-        found = resonance(np.float64(theta.theta1), np.float64(theta.theta3))
+        found = resonance(theta1, theta3)
         assert found == pytest.approx(measured, rel=2 / (crossings[-1] - crossings[0]))
     assert resonance(np.float64(1.0), np.float64(0.1)) == 10.0  # describes no oscillator
 
@@ -188,19 +193,17 @@ def test_feedback_ends_no_episode_and_uses_the_room(name, options):
 
 
 def observation(**entries):
-    from duffing_env.layout import OBSERVATION
-
-    return np.array([entries.get(name, 0.0) for name in OBSERVATION], dtype=np.float32)
+    return np.array([entries.get(name, 0.0) for name in observation_bounds(difference())], dtype=np.float32)
 
 
 def test_velocity_sign_pumps_with_the_velocity_and_brakes_beyond_the_amplitude():
     policy = make_policy("velocity-sign")
     assert policy.predict(observation())[0] == 1.0
-    assert policy.predict(observation(state_x0=0.1, state_x1=0.05))[0] == 1.0
-    assert policy.predict(observation(state_x0=0.1, state_x1=0.15))[0] == -1.0
-    turning = observation(state_x0=TURN + 0.05, state_x1=TURN)
+    assert policy.predict(observation(state_x1=0.1, state_x2=0.05))[0] == 1.0
+    assert policy.predict(observation(state_x1=0.1, state_x2=0.15))[0] == -1.0
+    turning = observation(state_x1=TURN + 0.05, state_x2=TURN)
     assert policy.predict(turning)[0] == -1.0
-    swinging = observation(state_x0=0.0, state_x1=-0.6)  # through the middle, too fast
+    swinging = observation(state_x1=0.0, state_x2=-0.6)  # through the middle, too fast
     assert policy.predict(swinging)[0] == -1.0
 
 
@@ -209,7 +212,7 @@ def test_amplitude_is_that_of_a_sampled_sine():
     frequency = policy.frequency(observation()[np.newaxis])
     for phase in np.linspace(0, 6, 7):
         x0, x1 = 0.3 * np.sin(phase - 2 * np.pi * frequency[0] * SAMPLING_STEP * np.arange(2))
-        row = observation(state_x0=x0, state_x1=x1)[np.newaxis].astype(np.float64)
+        row = observation(state_x1=x0, state_x2=x1)[np.newaxis].astype(np.float64)
         assert policy.amplitude(row) == pytest.approx(0.3, rel=1e-4)
 
 
@@ -217,13 +220,13 @@ def test_amplitude_is_that_of_a_sampled_sine():
 def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
     env = SimpleNamespace(unwrapped=SimpleNamespace(max_input=0.15, experiment=SimulatedExperiment(spread=spread)))
     policy = make_policy("square-believed", env)
-    prior = Prior.silverbox_twin(spread)
+    prior = silverbox_prior(spread=spread)
     stds = np.sqrt(np.diag(prior.coefficients_cov))
     twin = SILVERBOX_TWIN
-    believed = to_coefficients(PhysicalParameters(0.95 * twin.m, twin.c, 1.05 * twin.a, twin.b))
-    mean_t1 = (believed.theta1 - prior.theta_mean[0]) / stds[0]
-    mean_t3 = (believed.theta3 - prior.theta_mean[2]) / stds[2]
-    row = observation(mean_t1=mean_t1, mean_t3=mean_t3)
+    believed = coefficients_of(difference(), Parameters(m=0.95 * twin.m, c=twin.c, a=1.05 * twin.a, b=twin.b))
+    mean_t1 = (believed[0] - prior.coefficients_mean[0]) / stds[0]
+    mean_t3 = (believed[2] - prior.coefficients_mean[2]) / stds[2]
+    row = observation(mean_theta1=mean_t1, mean_theta3=mean_t3)
     natural = np.sqrt(1.05 * twin.a / (0.95 * twin.m)) / (2 * np.pi)
     state, wave = None, []
     for _ in range(400):
@@ -233,6 +236,29 @@ def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
     rises = np.flatnonzero(np.diff(wave) > 0)
     measured = (rises.size - 1) / (SAMPLING_STEP * (rises[-1] - rises[0]))
     assert measured == pytest.approx(natural, rel=0.01)
+
+
+@pytest.mark.parametrize("name", FEEDBACK)
+def test_feedback_pumps_equation_1_too(name):
+    asked, seen, ended = roll_out(name, "duffing_env/Continuous-v0", 16, horizon=128)
+    assert ended == 0
+    assert set(np.unique(np.abs(asked))) == {1.0}
+    # The first state of its observation is the displacement too.
+    assert np.median(np.abs(seen[:, :, 16]).max(axis=0)) > 0.5
+
+
+def test_resonance_and_amplitude_are_read_off_equation_1():
+    env = gym.make("duffing_env/Continuous-v0").unwrapped
+    policy, model = make_policy("square-believed", env), env.experiment.model
+    prior = env.experiment.believed.coefficients_mean
+    row = np.zeros((1, len(observation_bounds(model))))
+    expected = np.sqrt(prior[0] - prior[2] ** 2 / 4) / (2 * np.pi * SAMPLING_STEP)  # of m, c and a
+    assert policy.frequency(row)[0] == pytest.approx(expected, rel=1e-9)
+    omega = 2 * np.pi * SAMPLING_STEP * expected
+    for phase in np.linspace(0, 6, 7):
+        row[0, list(observation_bounds(model)).index("state_x")] = 0.3 * np.sin(phase)
+        row[0, list(observation_bounds(model)).index("state_v")] = 0.3 * omega * np.cos(phase)
+        assert policy.amplitude(row)[0] == pytest.approx(0.3, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", FEEDBACK)
@@ -320,8 +346,8 @@ def test_export_from_the_command_line(tmp_path):
 
 def test_figure_shows_every_policy(tmp_path, monkeypatch):
     shown = {}
-    monkeypatch.setattr(agents.figures, "_save", lambda figure, path: shown.update({path: figure}))
-    agents.figures.draw_policies(tmp_path / "policies.png", systems=2, samples=64)
+    monkeypatch.setattr(agents.evaluation.figures, "_save", lambda figure, path: shown.update({path: figure}))
+    agents.evaluation.figures.draw_policies(tmp_path / "policies.png", systems=2, samples=64)
     axes = shown[tmp_path / "policies.png"].axes
     titles = [each.get_title(loc="left") for each in axes]
     assert [title for title in titles if title] == [*EXCITATIONS, *FEEDBACK]

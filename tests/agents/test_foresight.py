@@ -1,8 +1,10 @@
 """Foresight: its features against a plain twin, its shield and drive, its rewards, and policies that have it."""
 
+import json
 import shutil
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,19 +15,24 @@ from rounding import U32, play
 from safetensors.numpy import load_file, save_file
 
 from agents import make_policy
-from agents.evaluation import make
+from agents.evaluation.batch import make
 from agents.policies import TRAINED
 from agents.policies.foresight import Foresight
 from agents.policies.learned import load_policy
-from agents.policies.prospects import BOUND, FEATURES, HORIZONS, MARGIN, Outlook
+from agents.policies.prospects import BOUND, HORIZONS, MARGIN, Outlook, feature_names
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.algorithms import SACSettings
 from agents.training.callbacks import Watch
 from agents.training.foresight_env import ForesightVecEnv, example_rate
 from agents.vec_env import DuffingVecEnv
-from duffing_env.layout import N_OBSERVATION, OBSERVATION
-from estimator import Prior
+from duffing_env.layout import observation_bounds
+from estimator.models.difference import difference
+from estimator.priors import silverbox_prior
 
+OBSERVATION = tuple(observation_bounds(difference()))
+FEATURES = feature_names(difference())
+N_OBSERVATION = len(OBSERVATION)
+COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 PLACE = {name: i for i, name in enumerate(FEATURES)}
 AMPLITUDE, POWER, OUTPUT = (f"duffing_env/{name}-v0" for name in ("Amplitude", "Power", "Output"))
 RATE = np.diag([590.0, 150.0, 680.0, 240.0]) @ (0.5 * np.eye(4) + 0.5) @ np.diag([590.0, 150.0, 680.0, 240.0])
@@ -46,12 +53,11 @@ def observations_of(env_id, samples=40, count=24):
 def twin(o, outlook):
     """Features, safety, sign and motion of one observation, with matrices."""
     o = dict(zip(OBSERVATION, np.float64(o), strict=True))
-    names = ("t1", "t2", "t3", "e")
-    theta = outlook.center + outlook.std * [o[f"mean_{n}"] for n in names]
-    stds = outlook.std * np.exp([o[f"log_std_{n}"] for n in names])
+    theta = outlook.center + outlook.std * [o[f"mean_{n}"] for n in COEFFICIENTS]
+    stds = outlook.std * np.exp([o[f"log_std_{n}"] for n in COEFFICIENTS])
     correlation = (1 + 1e-6) * np.eye(4)
-    for (i, j), pair in {(0, 1): "12", (0, 2): "13", (0, 3): "1e", (1, 2): "23", (1, 3): "2e", (2, 3): "3e"}.items():
-        correlation[i, j] = correlation[j, i] = o[f"corr_{pair}"]
+    for i, j in combinations(range(4), 2):
+        correlation[i, j] = correlation[j, i] = o[f"corr_{COEFFICIENTS[i]}_{COEFFICIENTS[j]}"]
     C = np.diag(stds) @ correlation @ np.diag(stds)
     share, push = o["time_left"], outlook.max_input
     if np.isfinite(outlook.energy):
@@ -60,11 +66,11 @@ def twin(o, outlook):
         share = (share + o["budget_left"]) / 2
     J = share * outlook.samples * outlook.rate
     W = np.linalg.inv(np.linalg.inv(C) + J)
-    sign = -1.0 if o["state_x0"] < 0 else 1.0
-    for name in ("state_x0", "state_x1", "last_input", "last_output"):
+    sign = -1.0 if o["state_x1"] < 0 else 1.0
+    for name in ("state_x1", "state_x2", "last_input", "last_y"):
         o[name] *= sign
     limit = outlook.max_output
-    start = limit * o["state_x0"], limit * o["state_x1"]
+    start = limit * o["state_x1"], limit * o["state_x2"]
 
     def phi(x0, x1, u):
         return np.array([x0, x0**3, x1, u])
@@ -138,6 +144,63 @@ def test_features_are_those_of_the_twin(env_id):
     assert 0 < turned < len(observations)
 
 
+@pytest.mark.parametrize("name", ["Amplitude", "Power"])
+def test_features_are_those_that_the_shipped_policies_were_trained_with(name):
+    """The numbers of the code that they were trained with, within the rounding of float32."""
+    stored = json.loads((Path(__file__).parent / "data" / "foresight-eq2.json").read_text())[name]
+    view = Foresight.of(make(f"duffing_env/{name}-v0", 1), RATE).look(stored["observations"])
+    np.testing.assert_allclose(view.features, stored["features"], rtol=4e-7, atol=1e-9)
+    np.testing.assert_array_equal(view.safe, stored["safe"])
+    np.testing.assert_array_equal(view.signs, stored["signs"])
+    np.testing.assert_allclose(view.motions, stored["motions"], rtol=2e-7, atol=1e-12)
+
+
+@pytest.mark.slow  # seconds of compilation
+def test_equation_1_has_features_too_and_its_rule_is_worth_more_than_chance():
+    envs = make("duffing_env/Continuous-v0", 8, {"horizon": 96})
+    foresight = Foresight.of(envs, RATE)
+    model = envs.experiment.model
+    assert foresight.observation_size == envs.single_observation_space.shape[0]
+    best, free = (feature_names(model).index(name) for name in ("best_up_4", "free_1"))
+    gains = {}
+    for name in ("rule", "prbs"):
+        policy = make_policy("prbs", envs, seed=1)
+        observations, _ = envs.reset(seed=0)
+        gains[name], state, gone = 0.0, None, np.zeros(8, dtype=bool)
+        for _ in range(envs.horizon):
+            view = foresight.look(observations)
+            assert np.isfinite(view.features).all()
+            push = np.where(view.features[:, best] >= 0, 1.0, -1.0)
+            actions, state = policy.predict(observations, state)
+            actions = foresight.act(push, view) if name == "rule" else actions
+            observations, rewards, terminated, _, _ = envs.step(actions.astype(np.float32))
+            gains[name] += (~gone * rewards).mean()
+            gone |= terminated
+    assert gains["rule"] > gains["prbs"] + 0.5
+    # What comes without input is the Runge-Kutta step of the state alone.
+    at = list(observation_bounds(model)).index
+    row = np.zeros((1, foresight.observation_size), dtype=np.float32)
+    row[0, at("state_x")], row[0, at("state_v")], row[0, at("time_left")] = 0.3, 0.2, 1.0
+    stiffness, cubic, damping, _ = envs.experiment.believed.coefficients_mean
+
+    def rates(z):
+        return np.array([z[1], -stiffness * z[0] - cubic * z[0] ** 3 - damping * z[1]])
+
+    z = 0.6 * np.array([0.3, 0.2])
+    for _ in range(200):
+        k1 = rates(z)
+        z = z + rates(z + k1 / 400) / 200
+    assert foresight.look(row).features[0, free] == pytest.approx(z[0] / 0.6, abs=1e-3)
+
+
+def test_foresight_of_another_model_survives_being_written():
+    envs = make("duffing_env/Continuous-v0", 2)
+    foresight = Foresight.of(envs, RATE)
+    observations, _ = envs.reset(seed=0)
+    again = Foresight.from_array(foresight.to_array(), json.loads(json.dumps(foresight.describe())))
+    np.testing.assert_array_equal(again.look(observations).features, foresight.look(observations).features)
+
+
 def test_an_observation_looks_the_same_alone_and_in_a_batch():
     envs, observations = observations_of(AMPLITUDE)
     foresight = Foresight.of(envs, RATE)
@@ -150,8 +213,8 @@ def test_turning_the_task_over_turns_the_action_over():
     envs, observations = observations_of(AMPLITUDE)
     foresight = Foresight.of(envs, RATE)
     over = observations.copy()
-    over[:, [list(OBSERVATION).index(n) for n in ("state_x0", "state_x1", "last_input", "last_output")]] *= -1
-    moving = observations[:, list(OBSERVATION).index("state_x0")] != 0
+    over[:, [list(OBSERVATION).index(n) for n in ("state_x1", "state_x2", "last_input", "last_y")]] *= -1
+    moving = observations[:, list(OBSERVATION).index("state_x1")] != 0
     one, other = foresight.look(observations[moving]), foresight.look(over[moving])
     np.testing.assert_array_equal(one.features, other.features)
     choices = np.random.default_rng(0).uniform(-1, 1, len(one.features))
@@ -232,16 +295,9 @@ def test_it_survives_being_written():
         np.testing.assert_array_equal(again.look(observations).features, foresight.look(observations).features)
 
 
-@pytest.mark.parametrize(
-    ("env_id", "options", "message"),
-    [
-        ("duffing_env/Continuous-v0", {}, "must believe the difference equation"),
-        (AMPLITUDE, {"hold": 2}, "hold must be 1 for foresight, but is 2"),
-    ],
-)
-def test_where_it_makes_no_sense_it_says_so(env_id, options, message):
-    with pytest.raises(ValueError, match=message):
-        Foresight.of(make(env_id, 1, options), RATE)
+def test_where_it_makes_no_sense_it_says_so():
+    with pytest.raises(ValueError, match="hold must be 1 for foresight, but is 2"):
+        Foresight.of(make(AMPLITUDE, 1, {"hold": 2}), RATE)
 
 
 @pytest.mark.parametrize("env_id", [AMPLITUDE, POWER, "duffing_env/Drift-v0"])
@@ -272,10 +328,10 @@ def test_on_a_plant_of_ones_own_it_takes_the_prior_and_the_limits():
         def step(self, u):
             return 0.0
 
-    prior = Prior.silverbox_twin(0.1, 1e-4, 2e-4, noise_shape=5.0)
+    prior = silverbox_prior(spread=0.1, process_noise=1e-4, measurement_noise=2e-4, noise_shape=5.0)
     env = gym.make("duffing_env/Plant-v0", plant=Silent(), max_output=0.4, prior=prior).unwrapped
     moved = Foresight.of(make(AMPLITUDE, 1), RATE).moved_to(env)._outlook
-    np.testing.assert_allclose(moved.center, [*prior.theta_mean, prior.eta_mean])
+    np.testing.assert_allclose(moved.center, prior.coefficients_mean)
     np.testing.assert_allclose(moved.std, np.sqrt(np.diag(prior.coefficients_cov)))
     assert (moved.max_output, moved.energy) == (0.4, np.inf)
     assert moved.variance == pytest.approx(1e-4**2 + 2e-4**2)
@@ -360,16 +416,14 @@ def test_rewards_that_count_no_information_stay_as_they_are():
 
 def test_the_example_brings_about_as_much_as_the_oracle():
     """In the volume of what a sample tells, within a factor of two."""
-    from agents.oracle import Oracle, Systems
-    from estimator.fisher import fisher_information
-    from estimator.parameters import to_coefficients
+    from agents.evaluation.oracle import Oracle
+    from agents.evaluation.oracle_task import Systems
+    from estimator import fisher_information
 
     systems = Systems.of(AMPLITUDE, 32)
-    envs = make(AMPLITUDE, 32)
-    envs.reset(seed=0)
     task = systems.task
     told = fisher_information(
-        to_coefficients(envs.truth), Oracle.of(systems).inputs[:32], task.process_noise, task.measurement_noise
+        task.model, systems.theta, Oracle.of(systems).inputs[:32], task.process_noise, task.measurement_noise
     )
     best = told.mean(axis=0) / task.samples
     example = example_rate(AMPLITUDE, {}, seed=0)

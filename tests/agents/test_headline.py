@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from agents import headline
-from agents.evaluation import evaluate
-from agents.headline import Config, main
+from agents.evaluation.rollout import evaluate
+from agents.studies import headline
+from agents.studies.headline import Config, main
 
 AMPLITUDE = "duffing_env/Amplitude-v0"
 

@@ -6,9 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation import evaluate, make
+from agents.evaluation.batch import make
+from agents.evaluation.rollout import evaluate
 from agents.policies import make_policy
-from duffing_env.layout import OBSERVATION
 from estimator import SAMPLING_STEP
 
 TRACK = "duffing_env/Amplitude-v0"
@@ -25,7 +25,7 @@ def play(policy, rows, steps):
     """Actions (steps, rows)."""
     state, told = None, []
     for _ in range(steps):
-        actions, state = policy.predict(np.zeros((rows, len(OBSERVATION))), state)
+        actions, state = policy.predict(np.zeros((rows, 22)), state)
         told.append(actions[:, 0])
     return np.array(told)
 
@@ -73,7 +73,7 @@ def test_the_planner_refuses_and_says_what_to_do():
 
 
 def test_every_sample_is_evaluated(monkeypatch):
-    monkeypatch.setattr("agents.evaluation.record_available", lambda: False)
+    monkeypatch.setattr("agents.evaluation.rollout.record_available", lambda: False)
     options = {"hold": HOLD, "horizon": 50, "max_output": 0.3}
     (evaluation,) = evaluate(["uniform"], systems=6, seed=5, options=options)
     envs = make(TRACK, 6, options)

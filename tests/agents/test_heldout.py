@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents import make_policy
-from agents.evaluation import evaluate
+from agents.evaluation.rollout import evaluate
 from agents.training import PPOSettings, TrainConfig, train
 from agents.training.heldout import METRICS, HeldOut
 

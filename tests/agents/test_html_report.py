@@ -7,8 +7,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from agents.evaluation import evaluate
-from agents.report import write_report
+from agents.evaluation.report import write_report
+from agents.evaluation.rollout import evaluate
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 VOID = {"meta", "br", "link", "img", "path", "use", "rect", "circle"}

@@ -8,11 +8,19 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-import agents.evaluation
-import agents.figures
-from agents.evaluation import Evaluation
-from agents.figures import draw_contraction, draw_excitations, draw_learning_curve
-from agents.leaderboard import ESTIMATOR_METRICS, METRICS, compare, print_estimators, print_table, summarise, write_json
+import agents.evaluation.figures
+import agents.evaluation.rollout
+from agents.evaluation.comparison import compare
+from agents.evaluation.figures import draw_contraction, draw_excitations, draw_learning_curve
+from agents.evaluation.leaderboard import (
+    ESTIMATOR_METRICS,
+    METRICS,
+    print_estimators,
+    print_table,
+    summarise,
+    write_json,
+)
+from agents.evaluation.rollout import Evaluation
 from estimator import SAMPLING_STEP
 
 # What the table must print for these values, by hand: centre, then both ends of an interval of width zero.
@@ -52,8 +60,8 @@ def make_evaluation(policy="policy", *, samples=20, systems=30, seed=0, shift=0.
 
 
 def test_every_metric_of_an_evaluation_has_a_column(monkeypatch):
-    monkeypatch.setattr(agents.evaluation, "record_available", lambda: False)
-    (evaluation,) = agents.evaluation.evaluate(["uniform"], systems=2, options={"horizon": 5})
+    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: False)
+    (evaluation,) = agents.evaluation.rollout.evaluate(["uniform"], systems=2, options={"horizon": 5})
     assert [*evaluation.metrics, "arrow_rmse"] == [name for name in METRICS if name != "efficiency"]
     assert set(CONSTANTS) == set(METRICS)
 
@@ -256,7 +264,7 @@ def check_picture(path, width, height, colours=1):
     picture = np.round(255 * matplotlib.image.imread(path)[:, :, :3]).astype(int)
     assert picture.shape[:2] == (height, width)
     found = set(map(tuple, picture.reshape(-1, 3)))
-    lines = [tuple(int(name[i : i + 2], 16) for i in (1, 3, 5)) for name in agents.figures._COLOURS]
+    lines = [tuple(int(name[i : i + 2], 16) for i in (1, 3, 5)) for name in agents.evaluation.figures._COLOURS]
     assert [line in found for line in lines[:colours]] == [True] * colours
     assert len(found) > 50
     assert np.mean(np.any(picture != 255, axis=2)) > 0.02
@@ -275,7 +283,7 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
     assert written["settings"] == {
         "env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 5, "options": {"horizon": 30},
     }  # fmt: skip
-    again = agents.evaluation.evaluate(["uniform", "prbs"], systems=4, seed=5, options={"horizon": 30})
+    again = agents.evaluation.rollout.evaluate(["uniform", "prbs"], systems=4, seed=5, options={"horizon": 30})
     for evaluation, repeated in zip(evaluations, again, strict=True):
         timed = {"estimators": ANY, "decision_time": ANY}
         assert written["policies"][evaluation.policy] == {**summarise(repeated), **timed}
@@ -292,7 +300,7 @@ def drawn(monkeypatch):
         figure.draw_without_rendering()
         figures.append(figure)
 
-    monkeypatch.setattr(agents.figures, "_save", keep)
+    monkeypatch.setattr(agents.evaluation.figures, "_save", keep)
     return figures
 
 

@@ -15,7 +15,7 @@ from safetensors.numpy import load_file, save_file
 
 import agents
 from agents import make_policy
-from agents.evaluation import evaluate
+from agents.evaluation.rollout import evaluate
 from agents.policies import trained_policies
 from agents.policies.learned import CARD, WEIGHTS, load_policy, save_policy
 from agents.training import ALGORITHMS
@@ -384,7 +384,7 @@ def unpickling(source):
 
 
 def test_the_search_covers_the_package():
-    assert {"checkpoints", "evaluation", "learned", "runs", "signals", "vec_env"} <= {path.stem for path in SOURCES}
+    assert {"checkpoints", "rollout", "learned", "runs", "signals", "vec_env"} <= {path.stem for path in SOURCES}
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)

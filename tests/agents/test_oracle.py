@@ -3,17 +3,20 @@
 import numpy as np
 import pytest
 
-from agents import oracle as module
-from agents.evaluation import evaluate
-from agents.oracle import Config, Oracle, Systems, as_stored, design, main, search
+from agents.evaluation import oracle_search as module
+from agents.evaluation import oracle_task
+from agents.evaluation.oracle import Oracle, as_stored
+from agents.evaluation.oracle_search import Config, design, main, search
+from agents.evaluation.oracle_task import Systems
+from agents.evaluation.rollout import evaluate
 
-SHORT, POWER = "duffing_env/Short-v0", "duffing_env/Power-v0"
+SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Continuous-v0"
 STORED = [SHORT, POWER, "duffing_env/Amplitude-v0", "duffing_env/Output-v0"]
 
 
 @pytest.fixture
 def empty_folder(monkeypatch, tmp_path):
-    monkeypatch.setattr(module, "FOLDER", tmp_path)
+    monkeypatch.setattr(oracle_task, "FOLDER", tmp_path)
     return tmp_path
 
 
@@ -64,6 +67,24 @@ def test_under_a_budget_the_search_spends_it_in_a_burst():
 
 
 @pytest.mark.slow  # the search is twenty seconds of compilation
+@pytest.mark.parametrize("options", [{}, {"horizon": 96, "max_rms": 0.03}])
+def test_the_search_serves_the_differential_equation_too(options, empty_folder):
+    systems = Systems.of(CONTINUOUS, 1, {"horizon": 48, **options})
+    rng = np.random.default_rng(0)
+    given = 0.03 * rng.choice([-1.0, 1.0], (1, systems.task.samples))
+    u, value = search(systems, 0, given, rng, rounds=1)
+    values, peaks = systems.worth(u[None])
+    assert np.abs(u).max() <= 0.15
+    assert (u**2).sum() <= systems.task.energy
+    assert peaks[0] <= 0.6
+    assert value == values[0]
+    assert value > systems.worth(given)[0][0] + 2.0
+    oracle = Oracle(systems, u[None], values)
+    oracle.save()
+    np.testing.assert_allclose(Oracle.of(systems).inputs[0], u, atol=1e-12)
+
+
+@pytest.mark.slow  # the search is twenty seconds of compilation
 def test_what_is_better_takes_its_place_and_nothing_else(empty_folder):
     systems = Systems.of(SHORT, 2)
     with pytest.raises(FileNotFoundError, match="no oracle is stored"):
@@ -110,6 +131,7 @@ def test_a_search_that_starts_from_better_inputs_ends_no_worse(monkeypatch):
     assert helped > best.values[0] - 0.01
 
 
+@pytest.mark.slow  # as above
 def test_the_command_stores_and_says_where(empty_folder, capsys):
     main(Config(env=SHORT, systems=2, policies=("prbs",), rounds=0))
     assert "2 systems in" in capsys.readouterr().out
@@ -150,8 +172,9 @@ def test_stored_oracles_keep_the_limits_of_their_tracks(track):
 
 
 def test_tracks_without_an_oracle_say_so():
-    for track in ("Drift-v0", "Continuous-v0"):
-        with pytest.raises(ValueError, match="difference equation without jump"):
-            Systems.of(f"duffing_env/{track}", 1)
+    with pytest.raises(ValueError, match="plant without jump and slew limit"):
+        Systems.of("duffing_env/Drift-v0", 1)
+    with pytest.raises(FileNotFoundError, match="no oracle is stored"):
+        Oracle.of(Systems.of(CONTINUOUS, 1, {"horizon": 31}))
     with pytest.raises(ValueError, match="inputs must have shape"):
         Systems.of(SHORT, 1).worth(np.zeros((2, 48)))

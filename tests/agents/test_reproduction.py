@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import reproduction as module
-from agents.reproduction import PUBLISHED, SETTINGS, prediction_mse, reproduce, simulation_mse
+from agents.studies import kouw2020 as module
+from agents.studies.kouw2020 import PUBLISHED, SETTINGS, prediction_mse, reproduce, simulation_mse
 from duffing_env.silverbox import CSV_NAME
 from estimator.offline import PEMNARX
 

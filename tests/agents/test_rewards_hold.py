@@ -6,13 +6,18 @@ import pytest
 from scipy import signal, stats
 
 from duffing_env.batch import spawn_seeds
-from estimator import SAMPLING_STEP, Prior, cramer_rao, fisher_information, to_coefficients
+from estimator import SAMPLING_STEP
+from estimator.information import cramer_rao, fisher_information
 from estimator.maximum_a_posteriori import maximum_a_posteriori
-from estimator.parameters import propagate_to_physical
+from estimator.models.difference import difference
+from estimator.physical import coefficients_of, to_physical
+from estimator.priors import silverbox_prior
 
 TRACK, SYSTEMS, SAMPLES = "duffing_env/Amplitude-v0", 16, 256
 TIME = SAMPLING_STEP * np.arange(SAMPLES)
 NOISES = (5e-4, 5e-4)
+MODEL = difference()
+PRIOR = silverbox_prior(MODEL)
 
 
 def bank(rng):
@@ -56,8 +61,8 @@ def played():
 
 def test_rewards_rank_inputs_as_an_auditor_s_errors_do(played):
     truth, u, y, returns, _ = played
-    fit = maximum_a_posteriori(u, y, Prior.silverbox_twin(0.3, *NOISES), *NOISES)
-    estimates, _ = propagate_to_physical(fit.mean, fit.cov)
+    fit = maximum_a_posteriori(MODEL, u, y, PRIOR, *NOISES)
+    estimates = to_physical(MODEL, fit.mean)
     true = np.stack([truth.m, truth.c, truth.a, truth.b], axis=-1)
     errors = np.log(np.abs(estimates / true - 1) + 1e-9).reshape(-1, SYSTEMS, 4).mean(axis=(1, 2))
     for name in ("information_gain", "log_posterior_gain", "fisher"):
@@ -67,8 +72,9 @@ def test_rewards_rank_inputs_as_an_auditor_s_errors_do(played):
 
 def test_no_posterior_is_smaller_than_the_cramer_rao_bound(played):
     truth, u, y, returns, _ = played
-    prior = np.linalg.inv(Prior.silverbox_twin(0.3, *NOISES).coefficients_cov)
-    information = fisher_information(to_coefficients(truth), u, *NOISES, y=y)
+    prior = np.linalg.inv(PRIOR.coefficients_cov)
+    parameters = {name: getattr(truth, name) for name in MODEL.physical}
+    information = fisher_information(MODEL, coefficients_of(MODEL, parameters), u, *NOISES, y=y)
     gains = 0.5 * (-np.linalg.slogdet(cramer_rao(information, prior))[1] + np.linalg.slogdet(prior)[1])
     # Of one episode the information along its outputs is one draw; over the systems the excess must vanish.
     excess = returns["information_gain"] - gains.reshape(-1, SYSTEMS)

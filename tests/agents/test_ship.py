@@ -6,9 +6,9 @@ import pytest
 from stable_baselines3 import PPO
 
 from agents import make_policy, policies
-from agents.evaluation import evaluate
+from agents.evaluation.rollout import evaluate
 from agents.policies.learned import load_policy, save_policy
-from agents.ship import Config, median_index, ship
+from agents.studies.ship import Config, median_index, ship
 from agents.vec_env import DuffingVecEnv
 
 SHORT = "duffing_env/Short-v0"

@@ -5,17 +5,17 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from agents import silverbox_protocol as module
-from agents import silverbox_results as reporting
-from agents import silverbox_selection as selection
-from agents.silverbox_protocol import GIVEN, SETTINGS, TESTS, Outcome, Setting
+from agents.studies import silverbox_protocol as module
+from agents.studies import silverbox_results as reporting
+from agents.studies import silverbox_selection as selection
+from agents.studies.silverbox_protocol import GIVEN, SETTINGS, TESTS, Outcome
 from duffing_env.silverbox import Regime, SilverboxRecord, synthesise_multisine
-from estimator import NLARX, DuffingODE, OnlineEstimator
 
 ROOT = Path(__file__).parents[2]
 MANUAL = ROOT / "docs" / "silverbox.md"
@@ -112,7 +112,7 @@ def simulated():
     """Training and test records that follow one another, made with the linear interpolation, and a sensor's noise."""
     rng = np.random.default_rng(0)
     u = synthesise_multisine(rng, realisations=1)[:4000]
-    y = OnlineEstimator(DuffingODE()).simulate(u, [0.0, 0.0]) + 3e-4 * rng.standard_normal(4000)
+    y = SETTINGS["ODE linear"].estimator().simulate(u, [0.0, 0.0]) + 3e-4 * rng.standard_normal(4000)
     return Regime("training", u[:2500], y[:2500]), Regime("test", u[2500:], y[2500:])
 
 
@@ -120,19 +120,19 @@ def simulated():
 def test_identify_counts_the_first_pass(simulated, passes, monkeypatch):
     training, _ = simulated
     monkeypatch.setattr(module, "perf_counter", iter([10.0, 14.0]).__next__)
-    estimator, free_energy, seconds = module.identify(Setting(DuffingODE(), passes=passes), training, 2000)
-    expected = OnlineEstimator(DuffingODE())
+    estimator, free_energy, seconds = module.identify(replace(SETTINGS["ODE linear"], passes=passes), training, 2000)
+    expected = SETTINGS["ODE linear"].estimator()
     assert free_energy == expected.run(training.u[:2000], training.y[:2000])[:, -1].sum()
     if passes == 2:
         expected.rewind()
         expected.run(training.u[:2000], training.y[:2000])
-    np.testing.assert_array_equal(estimator.belief.mean, expected.belief.mean)
+    assert estimator.belief == expected.belief
     assert seconds == 4.0 / (passes * 2000)
 
 
 def test_a_simulation_knows_no_more_than_the_first_outputs(simulated):
     training, test = simulated
-    estimator, _, _ = module.identify(Setting(DuffingODE("spline")), training, 2500)
+    estimator, _, _ = module.identify(SETTINGS["ODE spline"], training, 2500)
     error = module.simulation_error(estimator, test)
     unknown = test.y.copy()
     unknown[GIVEN:] = 7.0
@@ -142,10 +142,10 @@ def test_a_simulation_knows_no_more_than_the_first_outputs(simulated):
     assert 2.5e-4 < module.rmse(error) < 1e-3
 
 
-@pytest.mark.parametrize("model", [DuffingODE(), DuffingODE("look_ahead"), NLARX(regressors="three-tap")], ids=str)
-def test_coverage_compares_each_output_with_its_own_forecast(simulated, model):
+@pytest.mark.parametrize("name", ["ODE linear", "ODE look-ahead", "NLARX three-tap"])
+def test_coverage_compares_each_output_with_its_own_forecast(simulated, name):
     training, test = simulated
-    estimator, _, _ = module.identify(Setting(model), training, 2500)
+    estimator, _, _ = module.identify(SETTINGS[name], training, 2500)
     before = {name: array.copy() for name, array in estimator.arrays().items()}
     # 1,500 outputs: 90 % within 4 standard deviations. Off by one sample, hardly any would be within.
     assert module.coverage(estimator, training, test) == pytest.approx(0.9, abs=0.035)
@@ -161,12 +161,13 @@ def test_mean_field_has_no_coverage(simulated):
     assert math.isnan(module.coverage(estimator, training, test))
 
 
-def test_settings_without_feedthrough_know_that_it_is_zero():
+def test_settings_without_feedthrough_have_none():
     belief = SETTINGS["ODE spline, d = 0"].estimator().belief
-    assert belief.parameters()["feedthrough"] == (0.0, 0.0, "1")
-    assert belief.parameters()["output_offset"][1] > 0
+    assert "d" not in belief.parameters()
+    assert belief.parameters()["y0"][1] > 0
 
 
+@pytest.mark.slow  # seconds of compilation
 def test_selection_uses_the_training_section_only(record, monkeypatch, capsys):
     u, y = (np.full(131_072, np.nan) for _ in range(2))
     training = slice(40_650, 40_650 + 65_062)
@@ -249,8 +250,9 @@ def test_results_are_written_whole(results):
     ]
     assert list((folder / "new").iterdir()) == [folder / "new" / "results.json"]
     assert list(found["rows"]) == list(FEW)
-    assert found["rows"]["ODE linear"]["parameters"]["stiffness"]["mean"] == pytest.approx(1.843e5, rel=1e-3)
-    assert found["rows"]["ODE linear"]["options"]["interpolation"] == "linear"
+    parameters = found["rows"]["ODE linear"]["parameters"]
+    assert parameters["a"]["mean"] / parameters["m"]["mean"] == pytest.approx(1.843e5, rel=1e-3)
+    assert found["rows"]["ODE linear"]["interpolation"] == "linear"
 
 
 def test_figures_show_something(results):

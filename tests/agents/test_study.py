@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from agents import study
-from agents.evaluation import evaluate
-from agents.study import MEASURES, RECIPES, Config, learn, main
+from agents.evaluation.rollout import evaluate
+from agents.studies import rewards as study
+from agents.studies.rewards import MEASURES, RECIPES, Config, learn, main
 from agents.training import train
 
 UPDATE = 32_768  # samples between two updates of PPO

@@ -15,8 +15,8 @@ from safetensors.numpy import load_file
 
 import agents.vec_env
 from agents import make_policy
-from agents.evaluation import evaluate
-from agents.leaderboard import summarise
+from agents.evaluation.leaderboard import summarise
+from agents.evaluation.rollout import evaluate
 from agents.training import PPOSettings, TrainConfig, train
 from agents.training.hyperparameters import settings_of
 

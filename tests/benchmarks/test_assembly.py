@@ -2,7 +2,7 @@ import pytest
 from targets import has_fused_multiply_add
 
 from benchmarks.assembly import NotCounted, Operations, count, count_text
-from benchmarks.roofline import divide, move, multiply_add, take_root
+from benchmarks.roofline import divide, move, multiply_add, pieces, take_root
 from estimator.lanes import lanewise, rows
 
 on_x86 = pytest.mark.skipif(not has_fused_multiply_add(), reason="counts x86-64 assembly with AVX and FMA")
@@ -38,6 +38,16 @@ def test_scalar_code_is_not_taken_for_vectors() -> None:
         count_text("\tvmulsd\t(%rdi), %xmm0, %xmm0\n\tvmovsd\t%xmm0, 8(%rdi)\n", outputs=1)
 
 
+def test_what_is_the_same_in_all_lanes_may_be_computed_once_before_the_loop() -> None:
+    once = "\tvmulsd\t%xmm1, %xmm1, %xmm1\n"
+    loop = f"\tje\t.LBB0_3\n.LBB0_1:\n{UNROLLED_TWICE}.LBB0_3:\n"
+    assert count_text(once + loop, outputs=1) == count_text(UNROLLED_TWICE, outputs=1)
+    with pytest.raises(NotCounted, match="not vectorised"):
+        count_text(loop.replace(".LBB0_1:\n", f".LBB0_1:\n{once}"), outputs=1)
+    with pytest.raises(NotCounted, match="not vectorised"):
+        count_text(once + UNROLLED_TWICE, outputs=1)
+
+
 def test_text_without_stores_is_refused() -> None:
     with pytest.raises(NotCounted, match="passes are not clear"):
         count_text("\tvmulpd\t%zmm0, %zmm0, %zmm0\n", outputs=1)
@@ -54,6 +64,13 @@ def test_a_function_has_the_operations_that_one_counts_by_hand() -> None:
     assert (counted.simple, counted.fused, counted.divisions, counted.roots) == (2, 1, 1, 0)
     assert counted.flops == 5
     assert (counted.loads, counted.stores) == (2, 2)
+
+
+@on_x86
+@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
+def test_every_piece_of_a_step_is_counted(factorisation: str) -> None:
+    for name, functions in pieces(factorisation).items():
+        assert sum((count(function) * times for function, times in functions.items()), Operations()).flops > 10, name
 
 
 @on_x86

@@ -8,8 +8,7 @@ from scipy.stats import binom, chi2
 
 from benchmarks import coverage_continuous
 from benchmarks.coverage import LENGTHS, LEVEL, NOISES
-from benchmarks.coverage_continuous import PHYSICAL, Config, evaluate
-from estimator.continuous import COEFFICIENTS
+from benchmarks.coverage_continuous import COEFFICIENTS, PHYSICAL, Config, evaluate
 
 TAIL = 1e-4  # chance that a calibrated posterior misses one bound of one check
 

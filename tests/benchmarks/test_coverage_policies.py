@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from agents.evaluation import evaluate
+from agents.evaluation.rollout import evaluate
 from benchmarks.coverage_policies import TRACKS, Config, main, measure, run
 
 

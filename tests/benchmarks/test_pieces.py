@@ -5,32 +5,30 @@ import numpy as np
 import pytest
 
 from benchmarks.environments import TRACK, vector_steps
-from benchmarks.pieces import NOISE, SAMPLES, EstimatorOnly, play
-from estimator import NLARX, SILVERBOX_TWIN, OnlineEstimator, Prior, to_coefficients
+from benchmarks.pieces import NOISE, SAMPLES, EstimatorOnly, experiment_of, play
+from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, coefficients_of, difference
 from estimator.lanes import LANES
-from estimator.record import RECORD_SIZE
 
 
 @pytest.mark.parametrize(("factorisation", "iterations"), [("structured", 3), ("mean_field", 10)])
 def test_the_estimator_alone_is_the_estimator(factorisation: str, iterations: int) -> None:
     data = play(LANES + 1)
-    alone = EstimatorOnly(data, factorisation == "structured", iterations)
+    alone = EstimatorOnly(data, factorisation, iterations)
     for t in range(SAMPLES):
         alone.step(t)
-    lane, row = 5, LANES + 5
-    reference = OnlineEstimator(NLARX(input_delay=0), Prior.silverbox_twin(), factorisation)
+    row, experiment = LANES + 5, experiment_of(factorisation)
+    reference = OnlineEstimator(experiment.model, experiment.believed, Rig(), factorisation=factorisation)
     reference.run(data.inputs[:, row], data.outputs[:, row])
-    record = alone._blocks[1].reshape(-1, LANES)[:RECORD_SIZE, lane]
-    np.testing.assert_allclose(record, reference.belief.record, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(alone.records()[row], reference.belief.record, rtol=1e-9, atol=1e-15)
 
 
 def test_the_plant_alone_is_the_twin() -> None:
     data = play(1)
-    truth = to_coefficients(SILVERBOX_TWIN)
+    theta1, theta2, theta3, eta = coefficients_of(difference(), SILVERBOX_TWIN)
     x, last, u = data.outputs[1:-1], data.outputs[:-2], data.inputs[2:]
-    residual = data.outputs[2:] - (truth.theta1 * x + truth.theta2 * x**3 + truth.theta3 * last + truth.eta * u)
+    residual = data.outputs[2:] - (theta1 * x + theta2 * x**3 + theta3 * last + eta * u)
     # The process noise, and three measurement noises with their weights.
-    expected = NOISE * np.sqrt(1 + 1 + truth.theta1**2 + truth.theta3**2)
+    expected = NOISE * np.sqrt(1 + 1 + theta1**2 + theta3**2)
     assert np.std(residual) == pytest.approx(expected, rel=0.1)
 
 

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment, make_experiment
-from duffing_env.layout import SETTINGS
+from duffing_env.layout import pack, unpacker
 from duffing_env.replay import ReplayExperiment
-from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Belief, ContinuousBelief, Prior, continuous_prior
+from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.priors import log_uniform_moments, published_run_prior, weak_prior
 
 BAD = [
     ("factorisation", ["meanfield", None, [], 1]),
@@ -38,8 +41,12 @@ BAD_REPLAY = [
 ]
 
 
-def told(experiment):
-    return dict(zip(SETTINGS, experiment.settings, strict=True))
+def prior_of(
+    model, twin, spread=0.3, process_noise=5e-4, measurement_noise=5e-4, noise_shape=2.0, factorisation="structured"
+):
+    """The weak prior that fits oscillators about a twin."""
+    moments = log_uniform_moments(model, {name: getattr(twin, name) for name in "mcab"}, spread)
+    return weak_prior(model, *moments, process_noise, measurement_noise, noise_shape).factorised(factorisation)
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in BAD for value in values])
@@ -76,55 +83,67 @@ def test_settings_are_the_options():
         factorisation="mean_field", iterations=4, reward="free_energy", max_input=0.1, max_output=0.5, horizon=9,
         process_noise=1e-3, measurement_noise=2e-3, spread=0.2, noise_shape=3.0, plant_spread=0.1,
     )  # fmt: skip
-    settings = told(experiment)
-    assert (experiment.plant_kind, experiment.estimator_kind) == ("difference", "mean_field")
+    kind, setup = experiment.kind, experiment.setup
+    assert (kind.belief, kind.plant, kind.factorisation) == (difference(), difference(), "mean_field")
+    assert (kind.iterations, kind.work) == (0, "free_energy")
     expected = {
-        "iterations": 4, "reward": 3, "max_input": 0.1, "max_output": 0.5,
-        "horizon": 9, "process_noise": 1e-3, "measurement_noise": 2e-3, "spread": 0.1, "nonlinear": 1,
-        "delay": 0, "as_published": 0, "step": SAMPLING_STEP,
-        "center_m": SILVERBOX_TWIN.m, "center_c": SILVERBOX_TWIN.c, "center_a": SILVERBOX_TWIN.a,
-        "center_b": SILVERBOX_TWIN.b,
+        "iterations": 4, "drifts": False, "jump": 0.0, "terminal": False, "forfeits": False,
+        "max_input": 0.1, "max_output": 0.5, "horizon": 9.0, "process_noise": 1e-3, "spread": 0.1, "hold": 1,
+        "delay": 0, "as_published": False, "step": SAMPLING_STEP, "budget": np.inf, "max_slew": np.inf,
     }  # fmt: skip
-    assert {name: settings[name] for name in expected} == expected
-    np.testing.assert_allclose(settings["prior_log_gamma"], -2 * np.log(1e-3), rtol=1e-14)
-    np.testing.assert_allclose(settings["prior_log_xi"], -2 * np.log(2e-3), rtol=1e-14)
+    assert {name: getattr(setup, name) for name in expected} == expected
+    assert setup.measurement_noise.tolist() == [2e-3]
+    assert setup.width.tolist() == [0.0] * 4
+    assert setup.weights.tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert setup.center.tolist() == [getattr(SILVERBOX_TWIN, name) for name in "mcab"]
+    np.testing.assert_allclose(setup.log_precisions, [-2 * np.log(1e-3), -2 * np.log(2e-3)], rtol=1e-14)
+
+
+def test_what_the_kernel_gets_is_the_setup():
+    experiment = SimulatedExperiment(max_rms=0.03, jump=0.2, drift=0.01, terminated_return=-3.0)
+    setup = experiment.setup._replace(hold=4)
+    unpack = unpacker(experiment.kind)
+    again = unpack.py_func(pack(setup))
+    assert again._fields == setup._fields
+    for name, value in setup._asdict().items():
+        np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
+    assert type(again.hold) is type(again.delay) is int
+    assert type(again.terminal) is type(again.forfeits) is type(again.as_published) is np.bool_
 
 
 def test_defaults_are_those_of_the_documentation():
-    settings = told(SimulatedExperiment())
-    assert SimulatedExperiment().estimator_kind == "structured"
-    assert (settings["iterations"], settings["reward"]) == (3, 0)
-    assert told(SimulatedExperiment(factorisation="mean_field"))["iterations"] == 10
-    assert (settings["max_input"], settings["max_output"], settings["horizon"]) == (0.15, 0.6, 256)
-    assert (settings["process_noise"], settings["measurement_noise"], settings["spread"]) == (5e-4, 5e-4, 0.3)
+    experiment = SimulatedExperiment()
+    kind, setup = experiment.kind, experiment.setup
+    assert (kind.factorisation, kind.iterations, kind.work) == ("structured", 3, "")
+    assert setup.weights.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert SimulatedExperiment(factorisation="mean_field").setup.iterations == 10
+    assert (setup.max_input, setup.max_output, setup.horizon) == (0.15, 0.6, 256)
+    assert (setup.process_noise, setup.measurement_noise.tolist(), setup.spread) == (5e-4, [5e-4], 0.3)
 
 
 @pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
 def test_the_first_belief_is_the_prior(factorisation):
-    experiment = SimulatedExperiment(factorisation=factorisation, spread=0.2, process_noise=1e-3, noise_shape=5.0)
-    prior = Prior.silverbox_twin(0.2, 1e-3, 5e-4, 5.0)
-    np.testing.assert_array_equal(experiment.prior_record, prior.to_record(factorisation=factorisation))
-    settings = told(experiment)
-    assert (settings["prior_t1"], settings["prior_e"]) == (prior.theta_mean[0], prior.eta_mean)
-    np.testing.assert_allclose(settings["scale_t3"], prior.theta_cov[2, 2] ** -0.5, rtol=1e-14)
+    options = {"spread": 0.2, "process_noise": 1e-3, "noise_shape": 5.0}
+    experiment = SimulatedExperiment(factorisation=factorisation, **options)
+    prior = prior_of(difference(), SILVERBOX_TWIN, **options, factorisation=factorisation)
+    assert experiment.believed == prior
+    setup = experiment.setup
+    np.testing.assert_array_equal(setup.prior, prior.record)
+    np.testing.assert_allclose(setup.inverse_std, np.diag(prior.coefficients_cov) ** -0.5, rtol=1e-14)
 
 
 def test_a_continuous_experiment_is_told_of_its_estimator():
     options = {"spread": 0.2, "process_noise": 1e-3, "measurement_noise": 2e-3, "noise_shape": 5.0}
     ode = ContinuousExperiment(**options)
-    settings = told(ode)
-    assert (ode.plant_kind, ode.estimator_kind) == ("sde", "ode")
-    assert (settings["center_m"], settings["center_b"]) == (CONTINUOUS_TWIN.m, CONTINUOUS_TWIN.b)
-    prior = continuous_prior(CONTINUOUS_TWIN, 0.2, 1e-3, 2e-3, 5.0)
-    assert ode.to_belief(ode.prior_record) == prior
-    assert isinstance(ode.to_belief(ode.prior_record), ContinuousBelief)
-    assert settings["prior_t2"] == prior.coefficients_mean[1]
+    assert (ode.kind.plant, ode.kind.belief, ode.kind.degree) == (duffing(), duffing(), 1)
+    assert ode.setup.center.tolist() == [getattr(CONTINUOUS_TWIN, name) for name in "mcab"]
+    assert ode.believed == prior_of(duffing(), CONTINUOUS_TWIN, **options)
     for factorisation in ("structured", "mean_field"):
         nlarx = ContinuousExperiment(estimator="nlarx", factorisation=factorisation, **options)
-        assert (nlarx.plant_kind, nlarx.estimator_kind) == ("sde", factorisation)
-        expected = Prior.silverbox_twin(0.2, 1e-3, 2e-3, 5.0, center=CONTINUOUS_TWIN)
-        np.testing.assert_array_equal(nlarx.prior_record, expected.to_record(factorisation=factorisation))
-        assert isinstance(nlarx.to_belief(nlarx.prior_record), Belief)
+        assert (nlarx.kind.plant, nlarx.kind.belief) == (duffing(), difference())
+        assert nlarx.kind.factorisation == factorisation
+        # Oscillators are drawn about the continuous twin, and so is what the difference equation expects.
+        assert nlarx.believed == prior_of(difference(), CONTINUOUS_TWIN, **options, factorisation=factorisation)
 
 
 @pytest.mark.parametrize("value", ["ODE", None, [], 1])
@@ -140,13 +159,11 @@ def test_mean_field_is_for_the_difference_equation():
 
 def test_a_replay_is_told_of_the_record(record):
     experiment = ReplayExperiment(input_delay=1, nonlinear=False, prior="published_run")
-    settings = told(experiment)
-    assert (experiment.plant_kind, settings["delay"]) == ("replay", 1)
-    assert (settings["nonlinear"], settings["spread"]) == (0, 0)
-    assert settings["scale_t2"] == 0.0
-    assert settings["horizon"] == experiment.samples == len(record.multisine.u) - 1
+    kind, setup = experiment.kind, experiment.setup
+    assert (kind.plant, kind.belief) == (None, difference("linear"))
+    assert (setup.delay, setup.spread) == (1, 0)
+    assert setup.horizon == experiment.samples == len(record.multisine.u) - 1
     assert ReplayExperiment(input_delay=0, regime="arrow").samples == len(record.arrow.u)
     np.testing.assert_array_equal(experiment.recorded, (record.multisine.u, record.multisine.y))
-    expected = Prior.published_run().to_record(nonlinear=False)
-    np.testing.assert_array_equal(experiment.prior_record, expected)
-    assert told(ReplayExperiment(factorisation="mean_field", as_published=True))["as_published"] == 1
+    assert experiment.believed == published_run_prior(model=difference("linear"))
+    assert ReplayExperiment(factorisation="mean_field", as_published=True).setup.as_published

@@ -125,14 +125,14 @@ def test_limits_hold_for_every_sample():
     envs.reset(seed=0)
     single.reset(seed=0)
     inputs, apply = [], single._apply
-    single._apply = lambda action: (apply(action), inputs.append(single._batch.quantity("u")[0]))
+    single._apply = lambda action: (apply(action), inputs.append(single._batch.quantity("INPUT")[0]))
     for _ in range(8):
         envs.step(np.ones((3, 1), dtype=np.float32))
         single.step([1.0])
     np.testing.assert_allclose(np.diff([0.0, *inputs[:5]]), 0.02, rtol=1e-12)
     assert np.abs(np.diff(inputs)).max() <= 0.15
     assert np.sum(np.square(inputs)) <= 64 * 0.05**2 * (1 + 1e-12)
-    np.testing.assert_array_equal(envs._batch.quantity("spent"), single._batch.quantity("spent")[0])
+    np.testing.assert_array_equal(envs._batch.quantity("SPENT"), single._batch.quantity("SPENT")[0])
 
 
 def test_every_sample_is_drawn():

@@ -1,5 +1,7 @@
 """The compiled step against its plain NumPy twin, over whole episodes."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from rounding import U64
@@ -7,12 +9,17 @@ from scipy import stats
 from twin import PAIRS, PARAMETERS, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
-from duffing_env.env import DuffingEnv
+from duffing_env.env import DuffingEnv, observation_space
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
-from duffing_env.layout import OBSERVATION
-from estimator import SILVERBOX_TWIN, PhysicalParameters, to_coefficients
+from duffing_env.layout import observation_bounds
+from estimator import SILVERBOX_TWIN
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.models.pendulum import PENDULUM
+from estimator.physical import coefficients_of
 
+COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
 
 
@@ -32,7 +39,7 @@ def test_env_follows_its_twin(factorisation, reward):
         {"horizon": 7, "iterations": 1},
         {"max_output": 0.2, "horizon": 40},
         {"max_input": 0.03, "process_noise": 2e-3, "measurement_noise": 1e-5, "horizon": 40},
-        {"spread": 0.8, "iterations": 5, "horizon": 40},
+        {"spread": 0.8, "horizon": 40},
         {"max_rms": 0.03, "horizon": 40},
         {"max_slew": 0.05, "input_cost": 0.3, "horizon": 40},
         {"jump": 0.5, "drift": 0.01, "horizon": 40},
@@ -52,9 +59,19 @@ def test_env_follows_its_twin_with_other_options(factorisation, options):
 
 
 def test_observation_names_its_entries_in_the_order_of_the_documentation():
-    names = "mean_t1 mean_t2 mean_t3 mean_e log_std_t1 log_std_t2 log_std_t3 log_std_e"
-    names += " corr_12 corr_13 corr_1e corr_23 corr_2e corr_3e log_gamma log_xi state_x0 state_x1"
-    assert list(OBSERVATION) == f"{names} last_input last_output time_left budget_left".split()
+    coefficients = ("theta1", "theta2", "theta3", "eta")
+    names = [f"mean_{c}" for c in coefficients] + [f"log_std_{c}" for c in coefficients]
+    names += [f"corr_{c}_{d}" for c, d in combinations(coefficients, 2)]
+    names += ["log_gamma", "log_xi_y", "state_x1", "state_x2", "last_input", "last_y", "time_left", "budget_left"]
+    assert list(observation_bounds(difference())) == names
+
+
+@pytest.mark.parametrize("model", [difference(), difference("linear"), difference("cubic"), duffing(), PENDULUM])
+def test_the_length_of_an_observation_follows_from_the_model(model):
+    k = model.n_coefficients
+    expected = 2 * k + k * (k - 1) // 2 + model.n_states + 2 * model.n_outputs + 4
+    assert len(observation_bounds(model)) == expected
+    assert observation_space(model).shape == (expected,)
 
 
 @pytest.mark.parametrize("spread", [0.3, 0.9])
@@ -64,7 +81,7 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
     for row, seed in enumerate(spawn_seeds(0, size)):
         batch.seed(row, np.random.default_rng(seed))
     batch.reset(np.ones(size, dtype=np.bool_))
-    drawn = np.stack([batch.quantity(name) for name in PARAMETERS])
+    drawn = np.stack([batch.quantity(f"PARAM_{name}") for name in PARAMETERS])
     low, high = np.log(1 - spread), np.log(1 + spread)
     quantiles = (np.log(drawn / CENTER[:, None]) - low) / (high - low)
     assert quantiles.min() > 0
@@ -73,13 +90,12 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
         assert stats.kstest(row, "uniform").pvalue > 0.01
     assert np.abs(np.corrcoef(quantiles)[np.triu_indices(4, 1)]).max() < 4 / np.sqrt(size)
 
-    expected = to_coefficients(PhysicalParameters(*drawn))
+    expected = coefficients_of(difference(), dict(zip(PARAMETERS, drawn, strict=True))).T
     # θ₁ = 1 + m / (m + c h) - a η cancels; the others are products. None takes more than eight operations on a side.
-    values = np.stack([expected.theta1, expected.theta2, expected.theta3, expected.eta])
-    sizes = np.abs(values)
-    sizes[0] = 1 - expected.theta3 + drawn[2] * expected.eta
-    told = np.stack([batch.quantity(f"true_{name}") for name in ("t1", "t2", "t3", "e")])
-    assert (np.abs(told - values) <= 16 * U64 * sizes).all()
+    sizes = np.abs(expected)
+    sizes[0] = 1 - expected[2] + drawn[2] * expected[3]
+    told = np.stack([batch.quantity(f"TRUE_{name}") for name in COEFFICIENTS])
+    assert (np.abs(told - expected) <= 16 * U64 * sizes).all()
 
 
 def test_prior_has_the_moments_of_the_oscillators():
@@ -90,7 +106,7 @@ def test_prior_has_the_moments_of_the_oscillators():
         batch.seed(row, np.random.default_rng(seed))
     batch.reset(np.ones(size, dtype=np.bool_))
     prior = batch.belief(0)
-    drawn = np.stack([batch.quantity(f"true_{name}") for name in ("t1", "t2", "t3", "e")], axis=1)
+    drawn = np.stack([batch.quantity(f"TRUE_{name}") for name in COEFFICIENTS], axis=1)
     whitened = np.linalg.solve(np.linalg.cholesky(prior.coefficients_cov), (drawn - prior.coefficients_mean).T)
     assert np.abs(whitened.mean(axis=1)).max() < 4 / np.sqrt(size)
     np.testing.assert_allclose(np.cov(whitened), np.eye(4), rtol=0, atol=0.1)
@@ -109,7 +125,7 @@ def test_lanes_beyond_the_last_environment_keep_within_bounds(mode):
     batch = Batch(SimulatedExperiment(horizon=50), 1, mode)
     batch.seed(0, np.random.default_rng(0))
     for _ in range(2000):
-        if mode == RESET_BY_HAND and batch.quantity("truncated")[0]:
+        if mode == RESET_BY_HAND and batch.quantity("TRUNCATED")[0]:
             batch.reset(np.ones(1, dtype=np.bool_))
         batch.step(np.zeros(1))
     assert np.isfinite(batch._observations).all()

@@ -8,11 +8,8 @@ from scipy import stats
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_NEXT_STEP
-from duffing_env.layout import LAYOUT
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, stream_words, to_unit
 from estimator.lanes import LANES
-
-STREAM = slice(LAYOUT["stream_a"], LAYOUT["stream_d"] + 1)
 
 
 def numpy_stream(words):
@@ -25,7 +22,8 @@ def numpy_stream(words):
 
 def words_of(batch, row):
     """The four words of a row's stream."""
-    return batch._blocks[row // LANES, STREAM, row % LANES].copy().view(np.uint64)
+    first = batch._place["STREAM_a"]
+    return batch._blocks[row // LANES, first : first + 4, row % LANES].copy().view(np.uint64)
 
 
 def make_batch(size, seed=0):
@@ -43,8 +41,8 @@ def normals():
     noise = np.empty((2, 250, 500))
     for t in range(noise.shape[1]):
         batch.step(np.zeros(500))
-        noise[:, t] = batch.quantity("noise_w"), batch.quantity("noise_v")
-    assert not batch.quantity("waiting").any()
+        noise[:, t] = batch.quantity("NOISE_w"), batch.quantity("NOISE_v")
+    assert not batch.quantity("WAITING").any()
     return noise
 
 

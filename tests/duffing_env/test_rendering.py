@@ -19,20 +19,19 @@ from scipy import stats
 import duffing_env  # noqa: F401  registers the environments
 from duffing_env import rendering
 from duffing_env.rendering import HEIGHT, SPAN, WIDTH, Screen
-from estimator.belief import Belief
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, propagate_to_physical
-from estimator.prior import Prior
-from estimator.record import RECORD
+from estimator.engine.rows import belief_names
+from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN
+from estimator.priors import silverbox_prior
 
-PRIOR = Belief(Prior.silverbox_twin().to_record())
+PRIOR = silverbox_prior()
 
 
 def changed(**entries):
     """The prior with other numbers in its record."""
     record = PRIOR.record.copy()
     for name, value in entries.items():
-        record[RECORD.index(name)] = value
-    return Belief(record)
+        record[belief_names(PRIOR.model).index(name)] = value
+    return PRIOR.with_records([record])[0]  # past the checks, as those of an environment
 
 
 def started(horizon=100, truth=SILVERBOX_TWIN, belief=PRIOR):
@@ -44,7 +43,7 @@ def started(horizon=100, truth=SILVERBOX_TWIN, belief=PRIOR):
 def with_samples(count, **options):
     screen = started(**options)
     for k in range(count):
-        screen.add(0.1 * np.sin(k), 0.3 * np.cos(k), changed(e=0.4 + 0.01 * np.sin(k), P_e_e=1e-3 / (k + 1)))
+        screen.add(0.1 * np.sin(k), 0.3 * np.cos(k), changed(eta=0.4 + 0.01 * np.sin(k), P_eta_eta=1e-3 / (k + 1)))
     return screen
 
 
@@ -127,10 +126,16 @@ def test_curves_and_numbers_are_those_of_the_episode():
 
 
 def test_moments_are_those_of_each_belief():
-    beliefs = [changed(e=0.3, t1=1.5), PRIOR, changed(e=0.0), changed(t2=np.nan), changed(P_t1_t1=np.inf)]
+    beliefs = [
+        changed(eta=0.3, theta1=1.5),
+        PRIOR,
+        changed(eta=0.0),
+        changed(theta2=np.nan),
+        changed(P_theta1_theta1=np.inf),
+    ]
     means, stds = rendering._physical_moments(beliefs)
     for k, belief in enumerate(beliefs[:2]):
-        mean, cov = propagate_to_physical(belief.coefficients_mean, belief.coefficients_cov)
+        mean, cov = belief.physical()
         np.testing.assert_allclose(means[:, k], mean)
         np.testing.assert_allclose(stds[:, k], np.sqrt(np.diag(cov)))
     assert np.isnan(means[:, 2:]).all()
@@ -140,9 +145,9 @@ def test_moments_are_those_of_each_belief():
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e300, 1e300])
 def test_numbers_without_bounds_are_drawn_within_the_axes(value):
     screen = started()
-    screen.add(0.1, value, changed(t1=value, P_t2_t2=abs(value)))
-    screen.add(value, 0.1, changed(t2=value))
-    screen.add(0.1, 0.1, changed(e=1e-5))
+    screen.add(0.1, value, changed(theta1=value, P_theta2_theta2=abs(value)))
+    screen.add(value, 0.1, changed(theta2=value))
+    screen.add(0.1, 0.1, changed(eta=1e-5))
     panel = panel_of(screen, 3)
     drawn = panel.mean.get_ydata()
     assert np.nanmax(np.abs(drawn)) <= 150
@@ -152,7 +157,7 @@ def test_numbers_without_bounds_are_drawn_within_the_axes(value):
 
 
 def test_an_episode_without_a_usable_belief_is_drawn():
-    screen = started(belief=changed(e=0.0))
+    screen = started(belief=changed(eta=0.0))
     assert [panel_of(screen, row)._estimate.get_text() for row in range(4)] == ["not known yet"] * 4
 
 

@@ -22,7 +22,7 @@ from rounding import U32
 from duffing_env.batch import spawn_seeds
 from duffing_env.env import DuffingEnv
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator import Belief
+from estimator.belief import Belief
 
 TRACK = "duffing_env/Amplitude-v0"
 # Random inputs end about half of such episodes at the limit, the others at the horizon.
@@ -157,7 +157,8 @@ def test_an_episode_ends_with_its_own_belief_and_truth(mode):
         for name in PARAMETERS:
             assert getattr(endings["truth"][row], name) == getattr(truth, name)[row]
         belief = endings["belief"][row]
-        np.testing.assert_allclose(final[row][7], 0.5 * np.log(belief.eta_var / prior.eta_var), rtol=1e-6)
+        variances = [b.coefficients_cov[3, 3] for b in (belief, prior)]
+        np.testing.assert_allclose(final[row][7], 0.5 * np.log(variances[0] / variances[1]), rtol=1e-6)
         assert belief.entropy() < prior.entropy()
         assert final[row][20] == 0.0
     assert (envs.truth.m == truth.m).all() != same_step

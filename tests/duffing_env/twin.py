@@ -1,33 +1,22 @@
 """Plain NumPy twins of `DuffingEnv` and `ContinuousEnv`: steps written from the paper and the docstrings.
 
-They share no code with the kernel but the estimators, which have twins of its own under tests/estimator.
+They share no code with the kernel, and know nothing of the engine that generates it: of the package they use the
+priors and the twins of the circuit.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from rounding import U32
+from scipy.special import digamma, gammaln
 
 from duffing_env.rewards import REWARDS
-from estimator import (
-    CONTINUOUS_TWIN,
-    NLARX,
-    SAMPLING_STEP,
-    SILVERBOX_TWIN,
-    ContinuousBelief,
-    OnlineEstimator,
-    PhysicalParameters,
-    Prior,
-    continuous_prior,
-    to_coefficients,
-)
-from estimator.inference import continuous, free_energy
-from estimator.lanes import LANES
-from estimator.record import LAYOUT, N_ROWS, RECORD
+from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Parameters
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.priors import log_uniform_moments, weak_prior
 
-PARAMETERS = ("m", "c", "a", "b")
-JOINT = ("x0", "x1", "t1", "t2", "t3", "e")
 #: An observation is rounded to float32; what is rounded agrees to 1e-9 of a belief's units, see `assert_beliefs_agree`.
 ROUNDED = {"rtol": 2 * U32, "atol": 1e-8}
 #: Every factorisation beside every reward. Three rewards read of a mean-field belief what they read of another: their
@@ -43,6 +32,236 @@ PAIRS = [
     for reward in REWARDS
 ]
 
+PARAMETERS = ("m", "c", "a", "b")
+ITERATIONS = {"structured": 3, "mean_field": 10}
+TIE = 1e12  # precision of the identity between the second component of z_t and the first of z_{t-1}
+LOG_2PI = np.log(2 * np.pi)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """A belief: Gaussian over two states and four coefficients, and Gamma (shape, rate) of γ and of ξ."""
+
+    mean: np.ndarray  # (6,)
+    cov: np.ndarray  # (6, 6)
+    gamma: tuple[float, float]
+    xi: tuple[float, float]
+
+    @classmethod
+    def of(cls, belief):
+        return cls(belief.mean, belief.cov, tuple(belief.noises[:2]), tuple(belief.noises[2:]))
+
+    @property
+    def coefficients(self):
+        """Mean (4,) and covariance (4, 4)."""
+        return self.mean[2:], self.cov[2:, 2:]
+
+    def entropy(self):
+        """Of the coefficients [nats]."""
+        return entropy(self.cov[2:, 2:])
+
+    def log_prob(self, coefficients):
+        """Log density of the coefficients [nats]."""
+        mean, cov = self.coefficients
+        return log_normal(coefficients - mean, cov)
+
+
+def to_coefficients(truth):
+    """(4,) θ1, θ2, θ3 and η of an oscillator, Eqs. (3) and (4)."""
+    m, c, a, b = (getattr(truth, name) for name in PARAMETERS)
+    d = SAMPLING_STEP
+    return np.array([2 * m + c * d - a * d**2, -b * d**2, -m, d**2]) / (m + c * d)
+
+
+def to_parameters(coefficients):
+    """(4,) m, c, a and b of them."""
+    t1, t2, t3, e = coefficients
+    return np.array([-t3 * SAMPLING_STEP**2, (1 + t3) * SAMPLING_STEP, 1 - t1 - t3, -t2]) / e
+
+
+def to_rates(truth):
+    """(4,) stiffness, cubic, damping and gain of an oscillator, with time counted in samples."""
+    m, c, a, b = (getattr(truth, name) for name in PARAMETERS)
+    return np.array([a, b, c / SAMPLING_STEP, 1.0]) * SAMPLING_STEP**2 / m
+
+
+def from_rates(coefficients):
+    """(4,) m, c, a and b of them."""
+    stiffness, cubic, damping, gain = coefficients
+    return np.array([SAMPLING_STEP**2, SAMPLING_STEP * damping, stiffness, cubic]) / gain
+
+
+def difference_step(mean, u):
+    """Eq. (2) at the mean (6,) of (x_t, x_{t-1}, θ, η): the states after it, derivatives (6, 6), and noise (2, 2)."""
+    x, last_x, t1, t2, t3, e = mean
+    jacobian = np.eye(6)
+    jacobian[0] = [t1 + 3 * t2 * x**2, t3, x, x**3, last_x, u]
+    jacobian[1] = [1, 0, 0, 0, 0, 0]
+    return np.array([t1 * x + t2 * x**3 + t3 * last_x + e * u, x]), jacobian, np.diag([1.0, 0.0])
+
+
+def runge_kutta(slope, whole, substeps=8):
+    """A sample of Runge and Kutta's method of order 4, of the rate of change ``slope(tau, whole)``."""
+    h = 1 / substeps
+    for n in range(substeps):
+        k1 = slope(n * h, whole)
+        k2 = slope((n + 0.5) * h, whole + h / 2 * k1)
+        k3 = slope((n + 0.5) * h, whole + h / 2 * k2)
+        k4 = slope((n + 1) * h, whole + h * k3)
+        whole = whole + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return whole
+
+
+def oscillate(state, coefficients, last_u, u):
+    """(x, x') after a sample of x'' = g u - c x' - k x - b x³; the input goes linearly. Also of complex numbers."""
+    k, b, c, g = coefficients
+
+    def slope(tau, state):
+        x, v = state
+        return np.array([v, g * (last_u + tau * (u - last_u)) - c * v - k * x - b * x**3])
+
+    return runge_kutta(slope, np.asarray(state))
+
+
+def continuous_step(mean, last_u, u):
+    """Eq. (1) at the mean (6,) of (x, x', k, b, c, g), as `difference_step`.
+
+    The derivatives are the imaginary parts of complex steps, exact to rounding. The noise is N of N' = A N + N Aᵀ +
+    diag(0, 3), with A the Jacobian of the right-hand side on the way.
+    """
+    nudged = mean[:, None] + 1e-30j * np.eye(6)
+    moved = oscillate(nudged[:2], nudged[2:], last_u, u)
+    k, b, c, g = mean[2:]
+
+    def slope(tau, whole):
+        (x, v), N = whole[0], whole[1:]
+        A = np.array([[0.0, 1.0], [-k - 3 * b * x**2, -c]])
+        acceleration = g * (last_u + tau * (u - last_u)) - c * v - k * x - b * x**3
+        return np.vstack([[v, acceleration], A @ N + N @ A.T + np.diag([0.0, 3.0])])
+
+    whole = runge_kutta(slope, np.vstack([mean[:2], np.zeros((2, 2))]))
+    return whole[0], np.vstack([moved.imag / 1e-30, np.eye(6)[2:]]), whole[1:]
+
+
+def structured_update(prior, step, y, iterations):
+    """A Kalman step on the joint Gaussian of states, coefficients and the sample's noise, in turn with q(γ) and q(ξ).
+
+    Args:
+        prior: the belief before.
+        step: where its mean moves, its derivatives, and the noise of unit strength, as `difference_step` gives them.
+        y: the output, which shows the first state.
+        iterations: how often.
+
+    Returns:
+        The posterior, and the sample's free energy [nats].
+    """
+    moved, jacobian, noise = step
+    d = len(prior.mean)
+    T = np.hstack([jacobian, np.eye(d)[:, :2]])  # from (states and coefficients before, w, w') to those after
+    gamma, xi = prior.gamma, prior.xi
+    for _ in range(iterations):
+        q, r = gamma[1] / gamma[0], xi[1] / xi[0]
+        P = np.zeros((d + 2, d + 2))
+        P[:d, :d], P[d:, d:] = prior.cov, q * noise
+        S = T[0] @ P @ T[0] + r
+        gain = P @ T[0] / S
+        deviation = gain * (y - moved[0])
+        posterior = P - np.outer(gain, T[0] @ P)
+        w_power = (deviation[d] ** 2 + posterior[d, d]) / noise[0, 0]
+        v_power = (y - moved[0] - T[0] @ deviation) ** 2 + T[0] @ posterior @ T[0]
+        gamma = prior.gamma[0] + 0.5, prior.gamma[1] + w_power / 2
+        xi = prior.xi[0] + 0.5, prior.xi[1] + v_power / 2
+    # w' given w is as before the sample, and falls out.
+    told = -entropy(posterior[: d + 1, : d + 1])
+    told -= expected_log_gaussian((deviation[:d], posterior[:d, :d]), P[:d, :d])
+    told += 0.5 * np.log(noise[0, 0]) - expected_log_normal(w_power, gamma) - expected_log_normal(v_power, xi)
+    told += gamma_divergence(gamma, prior.gamma) + gamma_divergence(xi, prior.xi)
+    mean = np.concatenate([moved, prior.mean[2:]]) + T @ deviation
+    cov = T @ posterior @ T.T
+    return Moments(mean, (cov + cov.T) / 2, gamma, xi), told
+
+
+def mean_field_update(prior, u, y, iterations, as_published=False):
+    """The six updates of the paper, ``iterations`` times: the posterior, and the sample's free energy [nats].
+
+    ``as_published``: without the offset of the linearisation, and with E[x_{t-1}]²/2 more in the rate of γ.
+    """
+    S, s = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0])
+    z, theta, eta = slice(0, 2), slice(2, 5), 5
+    prior_z, P_z, prior_theta, P_theta = prior.mean[z], prior.cov[z, z], prior.mean[theta], prior.cov[theta, theta]
+    prior_eta, P_eta = prior.mean[eta], prior.cov[eta, eta]
+    W_z = np.linalg.inv(P_z)
+    gamma, xi, m_theta, m_last, m_z = prior.gamma, prior.xi, prior_theta, prior_z, prior_z
+
+    def features(z):
+        return np.array([z[0], z[0] ** 3, z[1]])
+
+    for _ in range(iterations):
+        E_gamma, E_xi = gamma[0] / gamma[1], xi[0] / xi[1]
+        W = np.diag([E_gamma, TIE])
+        V_eta = 1 / (1 / P_eta + E_gamma * u**2)
+        m_eta = V_eta * (prior_eta / P_eta + E_gamma * u * (m_z[0] - m_theta @ features(m_last)))
+        J_theta = features(m_last)
+        gain = P_theta @ J_theta / (1 / E_gamma + J_theta @ P_theta @ J_theta)
+        V_theta = P_theta - np.outer(gain, P_theta @ J_theta)
+        m_theta = prior_theta + gain * (m_z[0] - m_eta * u - J_theta @ prior_theta)
+        V_z = np.diag([1 / (E_gamma + E_xi), 1 / TIE])
+        m_z = np.array([V_z[0, 0] * (E_gamma * (m_theta @ J_theta + m_eta * u) + E_xi * y), m_last[0]])
+        J_x = np.array([m_theta[0] + 3 * m_theta[1] * m_last[0] ** 2, m_theta[2]])
+        A = S + np.outer(s, J_x)
+        offset = 0.0 if as_published else m_theta @ features(m_last) - J_x @ m_last
+        V_last = np.linalg.inv(W_z + A.T @ W @ A)
+        m_last = V_last @ (W_z @ prior_z + A.T @ W @ (m_z - s * (m_eta * u + offset)))
+        J_theta, J_x = features(m_last), np.array([m_theta[0] + 3 * m_theta[1] * m_last[0] ** 2, m_theta[2]])
+        w_power = (m_z[0] - m_theta @ J_theta - m_eta * u) ** 2 + V_z[0, 0]
+        w_power += J_x @ V_last @ J_x + J_theta @ V_theta @ J_theta + u**2 * V_eta
+        v_power = (y - m_z[0]) ** 2 + V_z[0, 0]
+        gamma = prior.gamma[0] + 0.5, prior.gamma[1] + (w_power + as_published * m_last[0] ** 2) / 2
+        xi = prior.xi[0] + 0.5, prior.xi[1] + v_power / 2
+    told = -entropy(V_theta) - expected_log_gaussian((m_theta - prior_theta, V_theta), P_theta)
+    told += 0.5 * (np.log(P_eta / V_eta) + V_eta / P_eta - 1 + (m_eta - prior_eta) ** 2 / P_eta)
+    told += -entropy(V_last) - expected_log_gaussian((m_last - prior_z, V_last), P_z) - entropy(V_z)
+    told += gamma_divergence(gamma, prior.gamma) + gamma_divergence(xi, prior.xi)
+    tie = (m_z[1] - m_last[0]) ** 2 + V_z[1, 1] + V_last[0, 0]
+    told -= expected_log_normal(w_power, gamma) + 0.5 * (np.log(TIE) - LOG_2PI - TIE * tie)
+    told -= expected_log_normal(v_power, xi)
+    mean, cov = np.concatenate([m_z, m_theta, [m_eta]]), np.zeros((6, 6))
+    cov[z, z], cov[theta, theta], cov[eta, eta] = V_z, V_theta, V_eta
+    return Moments(mean, cov, gamma, xi), told
+
+
+def log_det(cov):
+    """log det of a covariance, from that of its correlations, which are better conditioned."""
+    std = np.sqrt(np.diag(cov))
+    return np.linalg.slogdet(cov / np.outer(std, std))[1] + 2 * np.log(std).sum()
+
+
+def entropy(cov):
+    """Of a Gaussian [nats]."""
+    return 0.5 * (len(cov) * (LOG_2PI + 1) + log_det(cov))
+
+
+def log_normal(deviation, cov):
+    """Log density of a Gaussian."""
+    return -0.5 * (len(cov) * LOG_2PI + log_det(cov) + deviation @ np.linalg.solve(cov, deviation))
+
+
+def expected_log_gaussian(q, cov):
+    """E_q log N(0, cov) of a Gaussian q (mean, covariance)."""
+    return log_normal(q[0], cov) - 0.5 * np.trace(np.linalg.solve(cov, q[1]))
+
+
+def gamma_divergence(q, p):
+    """KL[q || p] of two Gammas (shape, rate)."""
+    (a, b), (a0, b0) = q, p
+    return (a - a0) * digamma(a) - gammaln(a) + gammaln(a0) + a0 * (np.log(b) - np.log(b0)) + a * (b0 - b) / b
+
+
+def expected_log_normal(power, precision):
+    """E log N(e | 0, 1/p) where E[e²] is ``power`` and p ~ Gamma ``precision`` = (shape, rate)."""
+    shape, rate = precision
+    return 0.5 * (digamma(shape) - np.log(rate) - LOG_2PI - shape / rate * power)
+
 
 def multisine():
     """The input of a free run in parts of the largest: 20 harmonics over 64 samples, Schroeder's phases, peak ½."""
@@ -57,13 +276,6 @@ def misfit(believed, true):
     with np.errstate(all="ignore"):
         error = np.sqrt(((believed - true) ** 2).sum() / (true**2).sum())
     return error if error < 1.0 else 1.0
-
-
-def joint_moments(belief):
-    """Means (6,) and covariance (6, 6) of x_t, x_{t-1}, θ, η from the record."""
-    told = dict(zip(RECORD, belief.record, strict=True))
-    cov = [[told.get(f"P_{a}_{b}", told.get(f"P_{b}_{a}")) for b in JOINT] for a in JOINT]
-    return np.array([told[name] for name in JOINT]), np.array(cov)
 
 
 class Stream:
@@ -87,6 +299,9 @@ class Stream:
 class TwinEnv:
     """One experiment. `reset` and `step` follow Gymnasium, but a step returns every reward by its name."""
 
+    center, model = SILVERBOX_TWIN, difference()
+    to_coefficients, to_parameters = staticmethod(to_coefficients), staticmethod(to_parameters)
+
     def __init__(
         self,
         seed,
@@ -106,59 +321,49 @@ class TwinEnv:
         drift=0.0,
     ):
         self.stream = Stream(seed)
-        self.factorisation, self.iterations = factorisation, iterations
+        self.factorisation, self.iterations = factorisation, iterations or ITERATIONS[factorisation]
         self.horizon, self.max_input, self.max_output = horizon, max_input, max_output
         self.process_noise, self.measurement_noise, self.spread = process_noise, measurement_noise, spread
         self.budget, self.max_slew, self.input_cost = horizon * max_rms**2, max_slew, input_cost
         self.jump, self.drift = jump, drift
-        self.prior = Prior.silverbox_twin(spread, process_noise, measurement_noise)
-        self.center = SILVERBOX_TWIN
+        center = {name: getattr(self.center, name) for name in PARAMETERS}
+        moments = log_uniform_moments(self.model, center, spread)
+        prior = weak_prior(self.model, *moments, process_noise, measurement_noise).factorised(factorisation)
+        self.first_belief = Moments.of(prior)
 
     def reset(self):
         """Draw an oscillator, put it at rest, and return the first observation."""
         low, high = 1.0 - self.spread, 1.0 + self.spread
         factors = [low * (high / low) ** self.stream.uniform() for _ in PARAMETERS]
         drawn = [getattr(self.center, name) * f for name, f in zip(PARAMETERS, factors, strict=True)]
-        self.truth = PhysicalParameters(*drawn)
-        self.x = self.last_x = self.u = self.y = self.spent = 0.0
+        self.truth = Parameters(zip(PARAMETERS, drawn, strict=True))
+        self.state = np.zeros(2)
+        self.u = self.last_u = self.y = self.spent = 0.0
         self.elapsed = 0
         if self.jump:
             self.jump_at = int(self.horizon * (0.25 + 0.5 * self.stream.uniform()))
             self.jump_factor = (1.0 - self.jump) * ((1.0 + self.jump) / (1.0 - self.jump)) ** self.stream.uniform()
-        self._start()
-        self.first_belief = self.belief
-        self.ideal_cov = np.zeros((6, 6))  # of (x_t, x_{t-1}, θ, η), for one who knows the truth
-        self.ideal_cov[:2, :2] = self.first_belief.state_cov[:2, :2]
-        self.ideal_cov[2:, 2:] = self.first_belief.coefficients_cov
+        self.belief = self.first_belief
+        self.ideal_cov = self.first_belief.cov  # for one who knows the truth
         self._worth = self._appraise()
         return self.observation()
-
-    def _start(self):
-        self._know()
-        self.estimator = OnlineEstimator(
-            NLARX(input_delay=0), self.prior, self.factorisation, self.iterations, drift=self.drift
-        )
-
-    def _know(self):
-        self.coefficients = to_coefficients(self.truth)
-
-    @property
-    def belief(self):
-        return self.estimator.belief
 
     def step(self, action):
         """Apply one action (1,): the observation, all rewards, and the two flags."""
         asked = self.max_input * float(np.clip(np.float32(action[0]), -1.0, 1.0))
+        self.last_u = self.u
         self.u += np.clip(asked - self.u, -self.max_slew, self.max_slew)
         left = np.sqrt(max(self.budget - self.spent, 0.0))
         self.u = float(np.clip(self.u, -left, left))
         self.spent += self.u**2
         if self.jump and self.elapsed == self.jump_at:
-            self.truth = replace(self.truth, m=self.truth.m * self.jump_factor)
-            self._know()
+            self.truth = Parameters({**self.truth, "m": self.truth.m * self.jump_factor})
             self._worth = self._appraise()
-        fisher, expected = self._fisher_gain(), self._expected_gain()
+        fisher = self._fisher_gain()
         self._move()
+        walk = (self.drift * np.sqrt(np.diag(self.first_belief.cov))) ** 2 * [0, 0, 1, 1, 1, 1]
+        self.belief = replace(self.belief, cov=self.belief.cov + np.diag(walk))
+        expected = self._expected_gain()
         self._update()
         self.elapsed += 1
         before, self._worth = self._worth, self._appraise()
@@ -174,82 +379,79 @@ class TwinEnv:
 
     def _move(self):
         w, v = self.stream.normal_pair()
-        psi = self.coefficients
-        moved = psi.theta1 * self.x + psi.theta2 * self.x**3 + psi.theta3 * self.last_x + psi.eta * self.u
-        self.x, self.last_x = moved + self.process_noise * w, self.x
-        self.y = self.x + self.measurement_noise * v
+        moved, _, _ = difference_step([*self.state, *to_coefficients(self.truth)], self.u)
+        self.state = moved + self.process_noise * np.array([w, 0.0])
+        self.y = self.state[0] + self.measurement_noise * v
+
+    def _model_step(self, mean):
+        """The model's step from a mean, under the input of this sample."""
+        return difference_step(mean, self.u)
 
     def _update(self):
-        self.estimator.update(self.u, self.y)
-        self.free_energy = self.estimator.free_energy
-
-    def _fisher_gain(self):
-        """Increase of ½ log det(Λ0 + F): a Kalman filter for states and coefficients, linearised at the truth."""
-        psi, x, last_x = self.coefficients, self.x, self.last_x
-        jacobian = np.eye(6)
-        jacobian[0] = [psi.theta1 + 3 * psi.theta2 * x**2, psi.theta3, x, x**3, last_x, self.u]
-        jacobian[1] = [1, 0, 0, 0, 0, 0]
-        cov = jacobian @ self.ideal_cov @ jacobian.T
-        cov[0, 0] += self.process_noise**2
-        gain = cov[:, 0] / (cov[0, 0] + self.measurement_noise**2)
-        before, self.ideal_cov = self.ideal_cov, cov - np.outer(gain, cov[0])
-        return 0.5 * (np.linalg.slogdet(before[2:, 2:])[1] - np.linalg.slogdet(self.ideal_cov[2:, 2:])[1])
-
-    def _expected_gain(self):
-        """½ log det C less that after an output, whatever it is: a Kalman step with the noises as believed."""
-        belief = self.belief
-        (x, last_x, t1, t2, t3, _), cov = joint_moments(belief)
-        first_std = np.sqrt(np.diag(self.first_belief.coefficients_cov))
-        cov[2:, 2:] += np.diag((self.drift * first_std) ** 2)
-        direction = np.array([t1 + 3 * t2 * x**2, t3, x, x**3, last_x, self._input_of_the_model()])
-        c = cov @ direction
-        variance = direction @ c + 1 / belief.gamma_mean + 1 / belief.xi_mean
-        before, after = cov[2:, 2:], cov[2:, 2:] - np.outer(c[2:], c[2:]) / variance
-        scale = np.sqrt(np.outer(np.diag(before), np.diag(before)))
-        return 0.5 * (np.linalg.slogdet(before / scale)[1] - np.linalg.slogdet(after / scale)[1])
+        if self.factorisation == "mean_field":
+            self.belief, self.free_energy = mean_field_update(
+                self.belief, self._input_of_the_model(), self.y, self.iterations
+            )
+        else:
+            step = self._model_step(self.belief.mean)
+            self.belief, self.free_energy = structured_update(self.belief, step, self.y, self.iterations)
 
     def _input_of_the_model(self):
         return self.u
 
-    def _free_run(self, coefficients):
-        """x (64,) of the difference equation from rest under the test input."""
-        t1, t2, t3, e = np.float64(coefficients)
-        x, last_x, told = np.zeros(1), np.zeros(1), []
+    def _fisher_gain(self):
+        """Increase of ½ log det(Λ0 + F): a Kalman filter for states and coefficients, linearised at the truth."""
+        _, jacobian, noise = self._model_step(np.array([*self.state, *self.to_coefficients(self.truth)]))
+        cov = jacobian @ self.ideal_cov @ jacobian.T
+        cov[:2, :2] += self.process_noise**2 * noise
+        gain = cov[:, 0] / (cov[0, 0] + self.measurement_noise**2)
+        before, self.ideal_cov = self.ideal_cov, cov - np.outer(gain, cov[0])
+        return 0.5 * (log_det(before[2:, 2:]) - log_det(self.ideal_cov[2:, 2:]))
+
+    def _expected_gain(self):
+        """½ log det C less that after an output, whatever it is: a Kalman step with the noises as believed."""
+        belief = self.belief
+        _, jacobian, noise = self._model_step(belief.mean)
+        cov = jacobian @ belief.cov @ jacobian.T
+        cov[:2, :2] += belief.gamma[1] / belief.gamma[0] * noise
+        c = cov[:, 0]
+        after = cov - np.outer(c, c) / (c[0] + belief.xi[1] / belief.xi[0])
+        return 0.5 * (log_det(cov[2:, 2:]) - log_det(after[2:, 2:]))
+
+    def free_run(self, coefficients):
+        """x (64,) of the model alone, from rest under the test input."""
+        state, told = np.zeros(2), []
         with np.errstate(all="ignore"):  # one that runs away
             for u in self.max_input * multisine():
-                x, last_x = t1 * x + t2 * x**3 + t3 * last_x + e * u, x
-                told.append(x)
-        return np.concatenate(told)
-
-    def _true_coefficients(self):
-        psi = self.coefficients
-        return [psi.theta1, psi.theta2, psi.theta3, psi.eta]
+                state, _, _ = difference_step([*state, *np.float64(coefficients)], u)
+                told.append(state[0])
+        return np.array(told)
 
     def _appraise(self):
         """What the belief is worth by each reward that is a difference: a step's reward is its increase."""
-        mean, _ = self.belief.physical()
+        mean, true = self.belief.mean[2:], self.to_coefficients(self.truth)
         truth = np.array([getattr(self.truth, name) for name in PARAMETERS])
         return {
             "information_gain": -self.belief.entropy(),
-            "log_posterior": self.belief.log_prob(self.coefficients),
-            "parameter_error": -np.minimum(np.abs(mean / truth - 1.0), 1.0).mean(),
-            "simulation_error": -misfit(
-                self._free_run(self.belief.coefficients_mean), self._free_run(self._true_coefficients())
-            ),
+            "log_posterior": self.belief.log_prob(true),
+            "parameter_error": -np.minimum(np.abs(self.to_parameters(mean) / truth - 1.0), 1.0).mean(),
+            "simulation_error": -misfit(self.free_run(mean), self.free_run(true)),
         }
 
     def observation(self):
         """The table of the environment's docstring, row by row."""
         belief, first = self.belief, self.first_belief
-        std, first_std = (np.sqrt(np.diag(b.coefficients_cov)) for b in (belief, first))
-        correlations = (belief.coefficients_cov / np.outer(std, std))[np.triu_indices(4, k=1)]
+        (mean, cov), (first_mean, first_cov) = belief.coefficients, first.coefficients
+        std, first_std = np.sqrt(np.diag(cov)), np.sqrt(np.diag(first_cov))
+        correlations = (cov / np.outer(std, std))[np.triu_indices(4, k=1)]
+        precisions = [b.gamma[0] / b.gamma[1] for b in (belief, first)], [b.xi[0] / b.xi[1] for b in (belief, first)]
         return np.concatenate(
             [
-                np.clip((belief.coefficients_mean - first.coefficients_mean) / first_std, -10, 10),
+                np.clip((mean - first_mean) / first_std, -10, 10),
                 np.clip(np.log(std / first_std), -20, 5),
                 correlations,
-                np.log([belief.gamma_mean / first.gamma_mean, belief.xi_mean / first.xi_mean]),
-                np.clip(belief.state_mean[:2] / self.max_output, -2, 2),
+                np.log([now / then for now, then in precisions]),
+                np.clip(belief.mean[:2] / self.max_output, -2, 2),
                 [self.u / self.max_input, np.clip(self.y / self.max_output, -2, 2)],
                 [1.0 - self.elapsed / self.horizon, 1.0 - self.spent / self.budget],
             ]
@@ -259,122 +461,65 @@ class TwinEnv:
 class TwinContinuousEnv(TwinEnv):
     """One experiment on the differential equation, from the docstring of `ContinuousEnv`."""
 
+    center = CONTINUOUS_TWIN
+
     def __init__(self, seed, *, estimator="ode", **options):
-        super().__init__(seed, **options)
-        self.kind = estimator
-        noises = self.process_noise, self.measurement_noise
+        self.estimator = estimator
         if estimator == "ode":
-            self.prior = continuous_prior(CONTINUOUS_TWIN, self.spread, *noises)
-        else:
-            self.prior = Prior.silverbox_twin(self.spread, *noises, center=CONTINUOUS_TWIN)
-        self.center = CONTINUOUS_TWIN
-
-    def _start(self):
-        self.velocity = self.last_u = 0.0
-        if self.kind != "ode":
-            super()._start()
-            return
-        self._know()
-        self.block = np.zeros((N_ROWS, LANES))
-        self.block[: len(self.prior.record)] = self.prior.record[:, None]
-
-    def _know(self):
-        super()._know()
-        if self.kind == "ode":
-            m, c, a, b = (getattr(self.truth, name) for name in PARAMETERS)
-            # Time in samples.
-            self.coefficients = np.array([a, b, c / SAMPLING_STEP, 1.0]) * SAMPLING_STEP**2 / m
-
-    def _fisher_gain(self):
-        return np.nan  # refused on this plant
+            self.model, self.to_coefficients, self.to_parameters = duffing(), to_rates, from_rates
+        super().__init__(seed, **options)
 
     def _input_of_the_model(self):
-        return self.last_u
+        return self.last_u  # the input at x_t, as in Eq. (2)
 
-    def _expected_gain(self):
-        if self.kind != "ode":
-            return super()._expected_gain()
-        # Where the noises are known, what an update gives does not depend on the output.
-        block, before = self.block.copy(), self.belief.entropy()
-        for name in ("g_shape", "g_rate", "n_shape", "n_rate"):
-            block[LAYOUT[name]] *= 1e12
-        for name, value in (("last_u", self.last_u), ("u", self.u), ("y", 0.0)):
-            block[LAYOUT[name]] = value
-        continuous.update(block.reshape(-1), 1, continuous.SUBSTEPS)
-        return before - ContinuousBelief(block[: len(self.prior.record), 0]).entropy()
+    def _model_step(self, mean):
+        if self.estimator == "ode":
+            return continuous_step(mean, self.last_u, self.u)
+        return difference_step(mean, self.last_u)
 
-    def _free_run(self, coefficients):
-        if self.kind != "ode":
-            return super()._free_run(coefficients)
-        stiffness, cubic, damping, gain = coefficients
-        state, told, last_u, h = np.zeros(2), [], 0.0, 0.5
-        for u in self.max_input * multisine():
+    def _fisher_gain(self):
+        # Refused where the estimator has another equation than the plant.
+        return super()._fisher_gain() if self.estimator == "ode" else np.nan
 
-            def slope(tau, state, begin=last_u, end=u):
-                x, v = state
-                return np.array([v, gain * (begin + tau * (end - begin)) - stiffness * x - cubic * x**3 - damping * v])
-
-            for tau in (0.0, h):
-                k1 = slope(tau, state)
-                k2 = slope(tau + h / 2, state + h / 2 * k1)
-                k3 = slope(tau + h / 2, state + h / 2 * k2)
-                k4 = slope(tau + h, state + h * k3)
-                state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    def free_run(self, coefficients):
+        """x (64,) of the model alone, from rest under the test input."""
+        if self.estimator != "ode":
+            return super().free_run(coefficients)
+        state, told, last_u = np.zeros(2), [], 0.0
+        with np.errstate(all="ignore"):
+            for u in self.max_input * multisine():
+                state, last_u = oscillate(state, coefficients, last_u, u), u
                 told.append(state[0])
-            last_u = u
         return np.array(told)
-
-    def _true_coefficients(self):
-        return self.coefficients if self.kind == "ode" else super()._true_coefficients()
-
-    @property
-    def belief(self):
-        return ContinuousBelief(self.block[: len(self.prior.record), 0]) if self.kind == "ode" else super().belief
 
     def _move(self):
         # A pair of numbers for each of eight sub-steps, and one for the sensor.
-        m, c, a, b = (getattr(self.truth, name) for name in PARAMETERS)
         h = 1 / 8
-
-        def slope(tau, state):
-            force = self.last_u + tau * (self.u - self.last_u) - a * state[0] - b * state[0] ** 3
-            force -= c * state[1] / SAMPLING_STEP
-            return np.array([state[1], force * SAMPLING_STEP**2 / m])
-
-        state = np.array([self.x, self.velocity])
+        k, b, c, g = to_rates(self.truth)
+        state = self.state
         # Increments of a Wiener process and of its integral, which moves x by `process_noise` in a sample.
         spread = np.linalg.cholesky(np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]]))
         for s in range(8):
-            k1 = slope(s * h, state)
-            k2 = slope((s + 0.5) * h, state + h / 2 * k1)
-            k3 = slope((s + 0.5) * h, state + h / 2 * k2)
-            k4 = slope((s + 1) * h, state + h * k3)
-            increments = np.sqrt(3) * self.process_noise * spread @ self.stream.normal_pair()
-            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4) + increments[::-1]
-        self.x, self.velocity = state
-        self.y = self.x + self.measurement_noise * self.stream.normal_pair()[1]
 
-    def _update(self):
-        if self.kind == "ode":
-            for name, value in (("last_u", self.last_u), ("u", self.u), ("y", self.y)):
-                self.block[LAYOUT[name]] = value
-            continuous.update(self.block.reshape(-1), self.iterations or 3, continuous.SUBSTEPS)
-            self.free_energy = free_energy(self.block.reshape(-1), 0, True)
-        else:
-            self.estimator.update(self.last_u, self.y)  # the input at x_t, as in Eq. (2)
-            self.free_energy = self.estimator.free_energy
-        self.last_u = self.u
+            def slope(tau, state, begin=s * h):
+                u = self.last_u + (begin + h * tau) * (self.u - self.last_u)
+                return h * np.array([state[1], g * u - c * state[1] - k * state[0] - b * state[0] ** 3])
+
+            increments = np.sqrt(3) * self.process_noise * spread @ self.stream.normal_pair()
+            state = runge_kutta(slope, state, 1) + increments[::-1]
+        self.state = state
+        self.y = self.state[0] + self.measurement_noise * self.stream.normal_pair()[1]
 
 
 def assert_beliefs_agree(actual, expected):
     """To rounding: the coefficients beside their standard deviations, the state beside a volt."""
-    std = np.sqrt(np.diag(expected.coefficients_cov))
-    np.testing.assert_allclose(actual.coefficients_mean / std, expected.coefficients_mean / std, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(actual.state_mean, expected.state_mean, rtol=0, atol=1e-10)
+    mean, cov = expected.coefficients
+    std = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose(actual.coefficients_mean / std, mean / std, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(actual.state_mean, expected.mean[:2], rtol=0, atol=1e-10)
     scale = np.outer(std, std)
-    np.testing.assert_allclose(actual.coefficients_cov / scale, expected.coefficients_cov / scale, rtol=0, atol=1e-10)
-    for name in ("gamma_shape", "gamma_rate", "xi_shape", "xi_rate"):
-        np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), rtol=1e-10)
+    np.testing.assert_allclose(actual.coefficients_cov / scale, cov / scale, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(actual.noises, [*expected.gamma, *expected.xi], rtol=1e-9)
 
 
 def assert_env_follows_twin(env, twin, reward, seed, episodes=2):

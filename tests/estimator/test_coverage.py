@@ -12,10 +12,9 @@ from scipy.stats import binom, chi2
 
 from benchmarks import coverage
 from benchmarks.coverage import HYPOTHESES, LEVEL, Case, Config, evaluate, tables, wilson
-from benchmarks.systems import MAX_INPUT, MODELS, draw, make_prior, move, simulate
-from estimator import SAMPLING_STEP, SILVERBOX_TWIN, DuffingODE, JointBelief, to_coefficients
-from estimator.models.ode import N_JOINT, to_coordinates
-from estimator.models.regressors import Term
+from benchmarks.systems import MAX_INPUT, MODELS, ODE, draw, make_prior, simulate, simulate_ode
+from estimator import SILVERBOX_TWIN, coefficients_of, difference, recorded_prior
+from estimator.models.difference import Term
 
 TAIL = 1e-4  # chance that a calibrated posterior misses one bound of one check
 PHYSICAL = {"m", "c", "a", "b"}
@@ -80,8 +79,8 @@ def test_an_ensemble_mends_wrong_noise_priors(case):
 
 
 def test_systems_that_leave_the_range_are_left_out():
-    psi = to_coefficients(SILVERBOX_TWIN)
-    one = np.array([psi.theta1, psi.theta2, psi.theta3, psi.eta])
+    one = coefficients_of(difference(), SILVERBOX_TWIN)
+    theta1, theta2, theta3, eta = one
     both = np.array([one, one * [1, 1, 1, 50]])
     terms = (Term(1), Term(3), Term(0, 1), Term(tap=0))
     u, y, stayed = simulate(terms, both, 1e-4, 1e-4, 500, np.random.default_rng(0))
@@ -89,7 +88,7 @@ def test_systems_that_leave_the_range_are_left_out():
     assert np.isfinite(y).all()
     x = x_last = 0.0
     for t in range(500):
-        x, x_last = psi.theta1 * x + psi.theta2 * x**3 + psi.theta3 * x_last + psi.eta * u[0, t], x
+        x, x_last = theta1 * x + theta2 * x**3 + theta3 * x_last + eta * u[0, t], x
         assert abs(y[0, t] - x) < 0.02  # but for the noises
     assert np.abs(u).max() <= MAX_INPUT
 
@@ -109,48 +108,28 @@ def test_taps_reach_back_from_their_own_sample():
 def test_the_prior_has_the_moments_of_the_draw(model):
     systems = 4000
     prior = make_prior(model, 1e-3, 1e-3, 2.0)
-    known = {}
-    if isinstance(prior, JointBelief):
-        mean, cov = prior.coefficients_mean, prior.coefficients_cov
-        known = {DuffingODE.names.index("cubic_damping")} if model == "ode" else known
-    else:
-        mean, cov = np.append(prior.theta_mean, prior.eta_mean), prior.coefficients_cov
+    mean, cov = prior.coefficients_mean, prior.coefficients_cov
     drawn = draw(model, systems, 1e-3, 1e-3, 3, np.random.default_rng(0)).truth[:, : len(mean)]
-    free = [i for i in range(len(mean)) if i not in known]
-    std = np.sqrt(np.diag(cov))[free]
-    np.testing.assert_allclose((drawn.mean(0) - mean)[free] / std, 0, atol=5 / np.sqrt(systems))
-    difference = (np.cov(drawn.T) - cov)[np.ix_(free, free)] / np.outer(std, std)
+    std = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose((drawn.mean(0) - mean) / std, 0, atol=5 / np.sqrt(systems))
+    difference = (np.cov(drawn.T) - cov) / np.outer(std, std)
     np.testing.assert_allclose(difference, 0, atol=8 / np.sqrt(systems))
-    assert all((drawn[:, i] == mean[i]).all() for i in known)
 
 
-def test_the_physical_equation_moves_as_its_twin():
-    """`move` against Runge-Kutta steps of the equation itself, in volts and seconds."""
-    rng = np.random.default_rng(0)
-    truth = DuffingODE().prior().coefficients_mean.copy()
-    truth[[4, 6]] = 0.02, -0.03
-    k, c, g, b, u0, _, y0, _ = truth
-    u, w, substeps = rng.uniform(-0.15, 0.15, 60), 1e-3 * rng.standard_normal(60), DuffingODE().substeps
-    start = to_coordinates(np.concatenate([[0.01, -2.0], truth]), np.zeros((N_JOINT, N_JOINT)))[0]
-    z = np.empty(60)
-    move(start[:-1], DuffingODE().pieces(u), w, substeps, z)
+def test_the_physical_equation_moves_as_its_filter_expects():
+    """Without noises, a filter that knows the coefficients forecasts every output."""
+    from estimator import OnlineEstimator, Rig
+    from estimator.belief import Belief
 
-    def rates(state, force):
-        x, v = state
-        return np.array([v, g * (force - u0) - c * v - k * x - b * x**3])
-
-    state, h, expected = np.array([0.01, -2.0]), SAMPLING_STEP / substeps, []
-    for t in range(60):
-        for i in range(substeps if t else 0):
-            start, middle, stop = (u[t - 1] + (u[t] - u[t - 1]) * (i + part) / substeps for part in (0.0, 0.5, 1.0))
-            r1 = rates(state, start)
-            r2 = rates(state + h / 2 * r1, middle)
-            r3 = rates(state + h / 2 * r2, middle)
-            r4 = rates(state + h * r3, stop)
-            state = state + h / 6 * (r1 + 2 * r2 + 2 * r3 + r4)
-        state = state + w[t] * np.array([1.0, 2 / SAMPLING_STEP])
-        expected.append(state[0] + y0)
-    np.testing.assert_allclose(z, expected, atol=1e-12)
+    truth = recorded_prior(ODE).coefficients_mean[None].copy()
+    truth[0, 4:] = 2e-3, -0.03, 0.05  # force, y0, d
+    u, y, _ = simulate_ode(truth, 1e-30, 1e-30, 60, np.random.default_rng(0))
+    cov = np.diag([1e-6, 1e-6] + [0.0] * 7)
+    prior = Belief.of(ODE, [-0.03, 0.0, *truth[0]], cov, (1e15, 1e15 * 1e-20), (1e15, 1e15 * 1e-20))
+    estimator = OnlineEstimator(ODE, prior, Rig.silverbox("linear"))
+    estimator.run(u[0], y[0])
+    # What is left of the unknown first state after two outputs is 1e-10 V and its velocity.
+    np.testing.assert_allclose(estimator.forecasts[4:, 0], y[0, 4:], atol=1e-8)
 
 
 def test_the_command_writes_its_tables(tmp_path, capsys, monkeypatch):
@@ -164,7 +143,7 @@ def test_the_command_writes_its_tables(tmp_path, capsys, monkeypatch):
     row = written["structured"][0]
     assert set(row["hits"]) == {"θ1", "θ2", "θ3", "η"} | PHYSICAL
     assert row["wilson"]["θ1"] == list(wilson(row["hits"]["θ1"], row["kept"]))
-    assert "cubic_damping" not in written["ode"][0]["hits"]
+    assert list(written["ode"][0]["hits"]) == list(ODE.coefficients)
     assert list(tmp_path.iterdir()) == [path]
     printed = capsys.readouterr().out
     assert "| 0.0005  | 0.0005  |" in printed

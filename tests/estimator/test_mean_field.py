@@ -1,9 +1,12 @@
-"""The mean-field update against its plain twin, and against what its free energy must be."""
+"""The mean-field update against its equations with matrices, and against what its free energy must be."""
 
+import re
+
+import numba
 import numpy as np
 import pytest
-from scipy.stats import norm
-from twins import (
+from mean_field_reference import (
+    LAYOUT,
     Moments,
     assert_same_moments,
     block_of,
@@ -12,34 +15,46 @@ from twins import (
     random_prior,
     records_of,
 )
+from scipy.stats import norm
+from targets import has_fused_multiply_add
 
-from estimator.inference import free_energy, update
-from estimator.lanes import LANES
+from estimator.inference import mean_field
 
-NO_TRACE = np.empty(0)
-DRAWS = 20_000
+LANES, DRAWS = mean_field.LANES, 20_000
+PIECES, ONE = mean_field.pieces(LAYOUT), mean_field.pieces(LAYOUT, lanes=1)
 
 
-def samples(rng):
-    return rng.normal(0.0, 0.1, LANES), rng.normal(0.0, 0.2, LANES)
+def samples(rng, count):
+    return rng.normal(0.0, 0.1, count), rng.normal(0.0, 0.2, count)
+
+
+def updated(block, iterations, as_published=False, pieces=PIECES):
+    """Update a block; the free energies of its first lane after every iteration."""
+    trace = []
+    pieces.begin(block)
+    for _ in range(iterations):
+        pieces.iterate(block, as_published)
+        trace.append(pieces.free_energy(block, 0))
+    pieces.end(block)
+    return np.array(trace)
 
 
 @pytest.mark.parametrize("nonlinear", [True, False])
 @pytest.mark.parametrize("as_published", [False, True])
-def test_update_equals_its_twin(as_published, nonlinear):
+def test_update_equals_its_equations(as_published, nonlinear):
     rng = np.random.default_rng(0)
     for iterations in range(1, 11):
-        priors = [random_prior(rng, "mean_field", nonlinear) for _ in range(LANES)]
+        priors = [random_prior(rng, nonlinear) for _ in range(LANES)]
         for _ in range(2):
-            u, y = samples(rng)
-            block, trace = block_of([prior.to_record() for prior in priors], u, y), np.empty(iterations)
-            update(block, False, iterations, as_published, trace)
-            posteriors = [Moments.of_record(record) for record in records_of(block)]
+            u, y = samples(rng, LANES)
+            block = block_of([prior.to_record() for prior in priors], u, y, LANES)
+            trace = updated(block, iterations, as_published)
+            posteriors = [Moments.of_record(record) for record in records_of(block, LANES)]
             for j in range(LANES):
-                twin, free_energies = mean_field_step(priors[j], u[j], y[j], iterations, as_published, nonlinear)
-                assert_same_moments(posteriors[j], twin)
-                # The twin's lnΓ of shapes up to 1e3, and its squares times 1e12, round at 1e-12 nats.
-                assert free_energy(block, j, False) == pytest.approx(free_energies[-1], rel=1e-9, abs=1e-9)
+                expected, free_energies = mean_field_step(priors[j], u[j], y[j], iterations, as_published, nonlinear)
+                assert_same_moments(posteriors[j], expected)
+                # The reference's lnΓ of shapes up to 1e3, and its squares times 1e12, round at 1e-12 nats.
+                assert PIECES.free_energy(block, j) == pytest.approx(free_energies[-1], rel=1e-9, abs=1e-9)
                 if j == 0:
                     np.testing.assert_allclose(trace, free_energies, rtol=1e-9, atol=1e-9)
             priors = posteriors
@@ -50,10 +65,10 @@ def test_free_energy_falls_and_bounds_the_surprise_where_the_first_order_is_exac
     # F >= -log p(y), here by Monte Carlo over η and the noises.
     rng = np.random.default_rng(2)
     for _ in range(20):
-        prior, u = random_prior(rng, "mean_field", nonlinear=False), rng.normal(0.0, 0.1)
-        prior.cov[3:6, 3:6] *= 1e-18
-        theta = prior.mean[[3, 5]]
-        eta = prior.mean[6] + np.sqrt(prior.cov[6, 6]) * rng.standard_normal(DRAWS)
+        prior, u = random_prior(rng, nonlinear=False), rng.normal(0.0, 0.1)
+        prior.cov[2:5, 2:5] *= 1e-18
+        theta = prior.mean[[2, 4]]
+        eta = prior.mean[5] + np.sqrt(prior.cov[5, 5]) * rng.standard_normal(DRAWS)
         std = np.sqrt(
             theta @ prior.cov[:2, :2] @ theta
             + draw_variances(rng, prior.gamma, DRAWS)
@@ -61,8 +76,7 @@ def test_free_energy_falls_and_bounds_the_surprise_where_the_first_order_is_exac
         )
         prediction = theta @ prior.mean[:2] + eta * u
         y = rng.normal(prediction[0], std[0])
-        block, trace = block_of([prior.to_record()] * LANES, u, y), np.empty(10)
-        update(block, False, 10, False, trace)
+        trace = updated(block_of([prior.to_record()], u, y, 1), 10, pieces=ONE)
         assert np.diff(trace).max() <= 1e-12  # some twenty terms, each of them to 5e-14 as `test_elementary` has it
         density = norm.pdf(y, prediction, std)
         evidence, error = density.mean(), density.std() / np.sqrt(DRAWS)
@@ -72,13 +86,25 @@ def test_free_energy_falls_and_bounds_the_surprise_where_the_first_order_is_exac
 @pytest.mark.parametrize("as_published", [False, True])
 def test_lanes_are_independent(as_published):
     rng = np.random.default_rng(3)
-    priors = np.array([random_prior(rng, "mean_field").to_record() for _ in range(LANES)])
-    u, y = samples(rng)
-    mixed = block_of(priors, u, y)
-    update(mixed, False, 10, as_published, NO_TRACE)
+    priors = np.array([random_prior(rng).to_record() for _ in range(LANES)])
+    u, y = samples(rng, LANES)
+    mixed = block_of(priors, u, y, LANES)
+    updated(mixed, 10, as_published)
     for j in range(LANES):
-        uniform = block_of([priors[j]] * LANES, u[j], y[j])
-        update(uniform, False, 10, as_published, NO_TRACE)
-        np.testing.assert_array_equal(
-            records_of(uniform), np.broadcast_to(records_of(mixed)[j], (LANES, len(priors[j])))
-        )
+        uniform = block_of([priors[j]] * LANES, u[j], y[j], LANES)
+        updated(uniform, 10, as_published)
+        expected = np.broadcast_to(records_of(mixed, LANES)[j], (LANES, len(priors[j])))
+        np.testing.assert_array_equal(records_of(uniform, LANES), expected)
+
+
+def test_the_loop_holds_packed_vector_instructions():
+    if not has_fused_multiply_add():
+        pytest.skip("Numba compiles for a processor without AVX2, so there are no 256-bit registers to look for")
+    signature = (numba.float64[::1], numba.boolean)
+    PIECES.iterate.compile(signature)
+    assembly = PIECES.iterate.inspect_asm(signature)
+    packed = re.findall(r"^\s+(?:vmulpd|vfn?m(?:add|sub)\d+pd)\s.*%[yz]mm", assembly, flags=re.MULTILINE)
+    scalar = re.findall(r"^\s+(?:vmulsd|vfn?m(?:add|sub)\d+sd)\s", assembly, flags=re.MULTILINE)
+    # Scalar code has none of the first kind; of the second, a uniform argument may bring a few.
+    assert len(packed) > 20
+    assert len(scalar) < len(packed) / 10

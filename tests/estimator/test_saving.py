@@ -1,76 +1,155 @@
-"""Estimators in files: they continue bit by bit, and nothing but our own files is read."""
+"""Estimators in files: they continue bit by bit, and nothing but our own whole files is read."""
 
+import io
 import json
+import os
+import re
 
 import numpy as np
 import pytest
+from estimators import KINDS, assert_same, record
 
-from estimator import NLARX, DuffingODE, OnlineEstimator, load_estimator, save_estimator
-from estimator.models.regressors import Term
+from estimator import OnlineEstimator, load_estimator, save_estimator
 
-ESTIMATORS = {
-    "structured": lambda: OnlineEstimator(NLARX()),
-    "mean field": lambda: OnlineEstimator(NLARX(input_delay=0), factorisation="mean_field", iterations=4),
-    "linear": lambda: OnlineEstimator(NLARX(nonlinear=False)),
-    "three-tap": lambda: OnlineEstimator(NLARX(regressors="three-tap")),
-    "own terms": lambda: OnlineEstimator(NLARX(regressors=(Term(1), Term(0, 1), Term(tap=2), Term(1, 1)))),
-    "ode": lambda: OnlineEstimator(DuffingODE(cubic_damping=True)),
-    "ode, look-ahead": lambda: OnlineEstimator(DuffingODE("look_ahead", substeps=3)),
-    "ode, sigma points": lambda: OnlineEstimator(DuffingODE("look_ahead"), expectations="sigma_points", drift=1e-3),
-    "three-tap, sigma points": lambda: OnlineEstimator(NLARX(regressors="three-tap"), expectations="sigma_points"),
-    "ensemble": lambda: OnlineEstimator(NLARX(), noise_hypotheses=3),
-    "ode ensemble": lambda: OnlineEstimator(DuffingODE("look_ahead", substeps=3), noise_hypotheses=3),
-}
+FEW = ("paper", "mean field", "own terms, drift", "ode, look-ahead", "ensemble")
 
 
-def some_record(samples=300):
-    rng = np.random.default_rng(3)
-    u = rng.uniform(-0.1, 0.1, samples)
-    y = np.zeros(samples)
-    for t in range(2, samples):
-        y[t] = 1.48 * y[t - 1] - 1.5 * y[t - 1] ** 3 - 0.94 * y[t - 2] + 0.39 * u[t - 1]
-    return u, y + 5e-4 * rng.standard_normal(samples)
-
-
-@pytest.mark.parametrize("kind", ESTIMATORS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_saved_estimator_continues_bit_by_bit(kind, tmp_path):
-    u, y = some_record()
-    original = ESTIMATORS[kind]()
+    u, y = record()
+    original = KINDS[kind]()
     original.run(u[:200], y[:200])
     save_estimator(original, tmp_path / "estimator.npz")
     resumed = load_estimator(tmp_path / "estimator.npz")
-    expected = original.run(u[200:], y[200:])
-    np.testing.assert_array_equal(resumed.run(u[200:], y[200:]), expected)
-    for name, array in original.arrays().items():
-        np.testing.assert_array_equal(resumed.arrays()[name], array, err_msg=name)
+    assert (resumed.model, resumed.rig, resumed.settings) == (original.model, original.rig, original.settings)
+    np.testing.assert_array_equal(resumed.run(u[200:], y[200:]), original.run(u[200:], y[200:]))
+    assert_same(original, resumed)
     original.rewind()
     resumed.rewind()
     np.testing.assert_array_equal(resumed.run(u, y), original.run(u, y))
 
 
-def test_settings_come_back(tmp_path):
-    original = ESTIMATORS["own terms"]()
-    save_estimator(original, tmp_path / "estimator.npz")
-    resumed = load_estimator(tmp_path / "estimator.npz")
-    assert resumed.model == original.model
-    assert (resumed.iterations, resumed.factorisation) == (original.iterations, original.factorisation)
+# --- Files that are none -------------------------------------------------------------------------------------------
 
 
-def test_a_file_of_another_kind_is_refused(tmp_path):
-    (tmp_path / "text.npz").write_text("not an archive")
-    np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    np.savez(tmp_path / "future.npz", description=np.array(json.dumps({"format": 99})))
-    np.savez(tmp_path / "objects.npz", description=np.array([{"format": 1}], dtype=object))
-    for name, message in (("text", "not one"), ("other", "not one"), ("future", "of 99"), ("objects", "not one")):
-        with pytest.raises(ValueError, match=message):
-            load_estimator(tmp_path / f"{name}.npz")
-    with pytest.raises(FileNotFoundError):
+@pytest.fixture
+def written(tmp_path):
+    """The place of a file of an estimator that has a sample waiting, and its arrays."""
+    path = tmp_path / "estimator.npz"
+    estimator = KINDS["ode, look-ahead"]()
+    estimator.run(*record(12))
+    save_estimator(estimator, path)
+    with np.load(path) as archive:
+        return path, {name: archive[name] for name in archive.files}
+
+
+def described(arrays, **changes):
+    """The arrays with another description."""
+    described = {**json.loads(arrays["description"].tobytes()), **changes}
+    return {**arrays, "description": np.frombuffer(json.dumps(described).encode(), dtype=np.uint8)}
+
+
+REFUSED = {
+    "no description": lambda a: {name: array for name, array in a.items() if name != "description"},
+    "another version": lambda a: described(a, format=1),
+    "a model that is none": lambda a: described(a, model={"name": "x"}),
+    "a model that runs code": lambda a: described(
+        a, model={**json.loads(a["description"].tobytes())["model"], "rates": ["v", "().__class__"]}
+    ),
+    "a rig that is none": lambda a: described(a, rig={"step": -1.0, "interpolation": "linear", "delay": 0}),
+    "settings that are none": lambda a: described(a, settings={"iterations": 2**31}),
+    "an array too many": lambda a: {**a, "more": np.zeros(3)},
+    "an array too few": lambda a: {name: array for name, array in a.items() if name != "walk"},
+    "too many waiting": lambda a: {**a, "outputs": np.ones((50, 1))},
+    "too many inputs": lambda a: {**a, "inputs": np.ones(50)},
+    "numbers of another kind": lambda a: {**a, "records": a["records"].astype(np.float32)},
+    "objects": lambda a: {**a, "records": np.array([{"a": 1}], dtype=object)},
+    "inputs that are not finite": lambda a: {**a, "inputs": a["inputs"] * np.nan},
+    "a belief that is not finite": lambda a: {**a, "records": a["records"] * np.nan},
+    "a negative covariance": lambda a: {**a, "records": a["records"] * np.where(np.arange(len(a["first"])) > 8, -1, 1)},
+    "a prior with a negative covariance": lambda a: {**a, "first": a["first"] * np.where(a["first"] > 0, -1, 1)},
+    "a negative walk": lambda a: {**a, "walk": a["walk"] - 1.0},
+    "weights that are none": lambda a: {**a, "weights": a["weights"] * 2},
+    "half begun": lambda a: {**a, "begun": a["begun"] * 0.5},
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_a_file_with_wrong_content_is_refused(what, written):
+    path, arrays = written
+    np.savez(path, **REFUSED[what](arrays))
+    with pytest.raises(
+        ValueError, match=f"path must be a whole file of save_estimator, but {re.escape(str(path))} is not"
+    ):
+        load_estimator(path)
+
+
+def test_a_damaged_file_is_refused(written):
+    path, _ = written
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    pieces = [whole[:n] for n in (0, 1, 100, len(whole) // 2, len(whole) - 1)]
+    changed = [bytearray(whole) for _ in range(60)]
+    for piece in changed:
+        for place in rng.integers(len(whole), size=20):
+            piece[place] ^= 1 << rng.integers(8)
+    for content in (*pieces, *changed, b"not an archive", b"PK\x03\x04"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="path must be a whole file of save_estimator"):
+            load_estimator(path)
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "fifo")  # reading it would wait for a writer
+    for place in (tmp_path, tmp_path / "fifo"):
+        with pytest.raises(ValueError, match="is none; name the file itself"):
+            load_estimator(place)
+    with pytest.raises(FileNotFoundError, match="there is no"):
         load_estimator(tmp_path / "missing.npz")
+    huge = io.BytesIO()
+    np.savez_compressed(huge, description=np.zeros(10**8, dtype=np.uint8))
+    (tmp_path / "bomb.npz").write_bytes(huge.getvalue())
+    with pytest.raises(ValueError, match="it unpacks to 100000"):
+        load_estimator(tmp_path / "bomb.npz")
+
+
+# --- Arrays --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", FEW)
+def test_restore_is_all_or_nothing(kind):
+    estimator, other, untouched = (KINDS[kind]() for _ in range(3))
+    other.run(*record())
+    arrays = other.arrays()
+    for name, array in arrays.items():
+        others = {key: value for key, value in arrays.items() if key != name}
+        for wrong in (others, {**others, name: array[None]}, {**others, name: array.astype(np.float32)}):
+            with pytest.raises(ValueError, match=r"use arrays\(\) of an estimator"):
+                estimator.restore(wrong)
+            assert_same(estimator, untouched)
+    estimator.restore(arrays)
+    for array in arrays.values():
+        array[...] = 0.0
+    np.testing.assert_array_equal(estimator.belief.record, other.belief.record)
+
+
+def test_an_ensemble_without_some_members_comes_back(tmp_path):
+    estimator = KINDS["ensemble"]()
+    estimator.run(*record())
+    arrays = estimator.arrays()
+    arrays["records"][0], arrays["weights"][0] = np.nan, 0.0
+    arrays["weights"] /= arrays["weights"].sum()
+    estimator.restore(arrays)
+    save_estimator(estimator, tmp_path / "estimator.npz")
+    resumed = load_estimator(tmp_path / "estimator.npz")
+    for name, array in estimator.arrays().items():
+        np.testing.assert_array_equal(resumed.arrays()[name], array, err_msg=name)
+    assert resumed.belief == estimator.belief
 
 
 def test_nothing_is_half_written(tmp_path, monkeypatch):
     path = tmp_path / "estimator.npz"
-    save_estimator(ESTIMATORS["structured"](), path)
+    save_estimator(OnlineEstimator(), path)
     before = path.read_bytes()
 
     def fail(*_):
@@ -78,6 +157,6 @@ def test_nothing_is_half_written(tmp_path, monkeypatch):
 
     monkeypatch.setattr("estimator.files.os.replace", fail)
     with pytest.raises(OSError, match="disk full"):
-        save_estimator(ESTIMATORS["ode"](), path)
+        save_estimator(KINDS["ode"](), path)
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["estimator.npz"]

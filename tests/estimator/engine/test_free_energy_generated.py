@@ -1,20 +1,22 @@
 """The free energy of the generated update, from what it leaves in its trace."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from engine_cases import CASES, random_belief
+from engine_cases import CASES, get_belief, random_belief
 from engine_reference import EPS, update
+from scipy.stats import norm
 from test_structured_generated import LANES, some_samples, updated
 
 from estimator.engine import tasks
 from estimator.engine.free_energy import free_energies
-from estimator.inference.noise import sample_free_energy
 
 ITERATIONS = 3
 
 
 @pytest.mark.slow  # seconds of compilation
-@pytest.mark.parametrize("name", ["duffing", "pendulum"])
+@pytest.mark.parametrize("name", ["duffing", "paper", "pendulum"])
 def test_free_energies_equal_their_definition(name):
     """Over one and over two sensors, of which only the first tells of the process noise."""
     case = CASES[name]
@@ -34,20 +36,75 @@ def test_free_energies_equal_their_definition(name):
         np.testing.assert_allclose(out, total, rtol=tolerance, atol=tolerance * (1 + np.abs(total).max()))
 
 
-def test_a_single_sensor_has_the_free_energy_of_a_sample():
+def traced(iterations):
+    """The update of the paper's equation, its free energies, and belief and sample after sample for it."""
     case = CASES["paper"]
-    task = tasks.structured(case.model, iterations=ITERATIONS, lanes=LANES, trace=True)
-    free_energy = free_energies(case.model, ITERATIONS, LANES, task.layout)
-    belief = random_belief(case, np.random.default_rng(5))
-    W = updated(case, task, [(belief, [0.3], [0.2])] * LANES)
-    row = lambda name: W[task.layout[name] * LANES + LANES - 1]  # noqa: E731
-    out = np.empty(ITERATIONS)
-    free_energy(W, LANES - 1, out)
-    (g_shape, g_rate), (n_shape, n_rate) = belief.gamma, belief.xi[0]
-    for i in range(ITERATIONS):
-        q, r = row(f"TRACE_0_q_{i}"), row(f"TRACE_0_r_{i}")
-        expected = sample_free_energy(
-            row("TRACE_0_innovation"), row("TRACE_0_variance"), q, r, g_shape + 0.5, g_rate, n_shape + 0.5, n_rate
-        )  # fmt: skip
-        # The rates before the sample come back from variances and shapes, by two roundings.
-        assert out[i] == pytest.approx(expected, rel=1e-13, abs=1e-13)
+    task = tasks.structured(case.model, iterations=iterations, lanes=LANES, trace=True)
+    return case, task, free_energies(case.model, iterations, LANES, task.layout)
+
+
+def predicted(belief, u):
+    """Mean and variance of the next displacement without its noise, to first order."""
+    x, last, theta1, theta2, theta3, eta = belief.mean
+    slope = np.array([theta1 + 3 * theta2 * x**2, theta3, x, x**3, last, u])
+    return theta1 * x + theta2 * x**3 + theta3 * last + eta * u, slope @ belief.cov @ slope
+
+
+def noise_variances(rng, precision, draws):
+    """Variances (draws,) of a noise whose precision is Gamma (shape, rate)."""
+    shape, rate = precision
+    return 1 / rng.gamma(shape, 1 / rate, draws)
+
+
+def test_known_noises_make_it_the_surprise_of_a_kalman_filter():
+    """With shapes of 1e12 the noises stay where they are; then F is -log N(y | prediction, S), which is exact."""
+    case, task, free_energy = traced(ITERATIONS)
+    q, r, shape, out, rng = 0.01**2, 0.02**2, 1e12, np.empty(ITERATIONS), np.random.default_rng(4)
+    samples, surprises = [], []
+    for belief, inputs, _ in some_samples(case, 4):
+        mean, variance = predicted(belief, inputs[0])
+        std = np.sqrt(variance + q + r)
+        y = mean + std * rng.standard_normal()
+        samples.append((replace(belief, gamma=(shape, shape * q), xi=[(shape, shape * r)]), inputs, [y]))
+        surprises.append(-norm.logpdf(y, mean, std))
+    W = updated(case, task, samples)
+    for lane, surprise in enumerate(surprises):
+        free_energy(W, lane, out)
+        # Both KL[q(γ)] and KL[q(ξ)] are below (ν²/r)² / shape, which is 1e-8 nats here.
+        assert out[-1] == pytest.approx(surprise, abs=1e-7)
+
+
+def test_it_never_rises_and_bounds_the_surprise():
+    """The iterations are coordinate descent on F of the linearised model, and F >= -log p(y) for any noise prior."""
+    case, task, free_energy = traced(10)
+    rng, draws, out = np.random.default_rng(5), 20_000, np.empty(10)
+    samples, densities = [], []
+    for belief, inputs, _ in some_samples(case, 5):
+        mean, variance = predicted(belief, inputs[0])
+        noises = noise_variances(rng, belief.gamma, draws) + noise_variances(rng, belief.xi[0], draws)
+        std = np.sqrt(variance + noises)
+        y = rng.normal(mean, std[0])
+        samples.append((belief, inputs, [y]))
+        densities.append(norm.pdf(y, mean, std))
+    W = updated(case, task, samples)
+    for lane, density in enumerate(densities):
+        free_energy(W, lane, out)
+        assert np.diff(out).max() <= 1e-12  # some twenty terms, each of them to 5e-14 as `test_elementary` has it
+        evidence, error = density.mean(), density.std() / np.sqrt(draws)
+        assert out[-1] >= -np.log(evidence) - 5 * error / evidence
+    # With equal priors E[w²] = E[v²] for every sample, so that E[γ] = E[ξ] for ever: docs/coverage.md.
+    W = updated(case, task, [(replace(belief, xi=[belief.gamma]), *rest) for belief, *rest in samples])
+    for lane, (belief, *_) in enumerate(samples):
+        after = get_belief(W, task.layout, LANES, lane, case)
+        assert after.gamma == after.xi[0]
+        assert after.gamma[1] != belief.gamma[1]
+
+
+def test_it_is_finite_far_from_the_prior():
+    """The rate of γ moves to 1e33 with this sample: the prior rate is then lost in the new one."""
+    case, task, free_energy = traced(ITERATIONS)
+    belief, out = random_belief(case, np.random.default_rng(6)), np.empty(ITERATIONS)
+    W = updated(case, task, [(belief, [0.0], [1e20])] * LANES)
+    free_energy(W, 0, out)
+    expected = update(case.plant, case.model.n_states, belief, [0.0], [1e20], ITERATIONS)
+    np.testing.assert_allclose(out, np.sum(expected.free_energies, axis=0), rtol=1e-9)

@@ -5,7 +5,8 @@ import pytest
 from engine_cases import CASES, FIVE, block, interpreted, put, random_inputs
 from engine_reference import EPS, moved, path, spread
 
-from estimator.engine import tasks
+from estimator.engine import gradient, tasks
+from estimator.engine.rows import input_rows
 
 SAMPLES = 12
 #: Variances of unit process noise and of the sensors.
@@ -37,7 +38,7 @@ def start(case, layout, z, V, c, W, lane=0, lanes=1):
 
 
 def feed(case, layout, taps, y, W, lane=0, lanes=1):
-    values = dict(zip(tasks.input_rows(case.model, case.degree), taps, strict=True))
+    values = dict(zip(input_rows(case.model, case.degree), taps, strict=True))
     if y is not None:
         values |= dict(zip((f"Y_{s}" for s in case.model.outputs), y, strict=True))
     put(W, layout, lanes, lane, values)
@@ -156,72 +157,44 @@ def test_the_information_is_that_of_the_responses_slopes(name, monkeypatch):
 def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
     """Of a weighted sum of all that the path leaves, with process noise and an uncertain start."""
     interpreted(monkeypatch)
+    monkeypatch.setattr(gradient, "NAMES", tasks.NAMES)
+    monkeypatch.setattr(gradient, "inlined", lambda function: function)
     case = CASES[name]
-    task = tasks.path.__wrapped__(case.model, case.degree, observed=False, lanes=1, gradient=True)
-    assert_gradient(case, task)
+    code = gradient.pieces.__wrapped__(case.model, case.degree)
+    z, V, c, _, R, _ = some_walk(case, 3)
+    rng, n = np.random.default_rng(4), case.model.n_states
+    begun = np.zeros(code.n_path)
+    begun[:n] = z
+    begun[n : n + n * (n + 1) // 2] = V[np.triu_indices(n)]
+    inputs, C, N = 0.1 * rng.standard_normal(SAMPLES), code.coefficients(c), code.noises([NOISE, *R])
 
+    def forward(u, tape):
+        """What the path leaves, its information, and what the first sensor shows."""
+        (P, F), seen = code.begin(begun), []
+        for t in range(SAMPLES):
+            P, F, shown, _ = code.step(P, F, C, laid(u, t), N, tape, t)
+            seen.append(shown)
+        return np.array(P), np.array(F), np.array(seen)
 
-def test_the_compiled_gradient_equals_differences():
-    case = CASES["paper"]
-    assert_gradient(case, tasks.path(case.model, case.degree, observed=False, lanes=1, gradient=True))
+    def laid(u, t):
+        return code.lay(*(u[t - k] if t >= k else 0.0 for k in range(3)))
 
-
-def assert_gradient(case, task):
-    z, V, c, inputs, R, _ = some_walk(case, 3)
-    layout, noises, continuous = task.layout, (NOISE, *R), case.model.is_continuous
-    names = tasks.input_rows(case.model, case.degree)
-    states, rng = list(case.model.states), np.random.default_rng(4)
-    rows = [r for r in layout if r[:2] in ("F_", "Z_", "V_") or r in states]
-    shown = [f"SHOWN_{s}" for s in case.model.outputs]
-
-    def forward(flat, keep=None):
-        """The path of inputs; the block before every piece goes to ``keep``."""
-        W, seen = block(layout, 1), []
-        start(case, layout, z, V, c, W)
-        for taps in flat.reshape(SAMPLES, -1):
-            feed(case, layout, taps, None, W)
-            if continuous:
-                task.pieces.begin(W)
-                for s in range(case.model.substeps):
-                    if keep is not None:
-                        keep.append(W.copy())
-                    task.pieces.move(W, s / case.model.substeps)
-            if keep is not None:
-                keep.append(W.copy())
-            task.pieces.finish(W, *noises)
-            seen.append([W[layout[r]] for r in shown])
-        return W, np.array(seen)
-
-    flat, kept = np.concatenate(inputs), []
-    end, seen = forward(flat, kept)
+    tape = np.empty((SAMPLES, code.n_tape))
+    ends = forward(inputs, tape)
     # Weights of a size that lets everything count alike.
-    weights = {r: rng.standard_normal() / max(abs(end[layout[r]]), 1e-3) for r in rows}
-    seen_weights = rng.standard_normal(seen.shape)
+    weights = [rng.standard_normal(end.shape) / np.maximum(np.abs(end), 1e-3) for end in ends[:2]]
+    weights.append(rng.standard_normal(SAMPLES))
 
-    def value(flat):
-        W, seen = forward(flat)
-        return np.array([sum(w * W[layout[r]] for r, w in weights.items()) + (seen_weights * seen).sum()])
+    def value(u):
+        return np.array([sum((w * end).sum() for w, end in zip(weights, forward(u, tape.copy()), strict=True))])
 
-    A = block(layout, 1)
-    for r, w in weights.items():
-        A[layout[r]] = w
-    gradient = np.zeros((SAMPLES, len(names)))
+    G, found = tuple(weights[0]), np.zeros(SAMPLES + 2)
     for t in reversed(range(SAMPLES)):
-        for r, w in zip(shown, seen_weights[t], strict=True):
-            A[layout[r]] = w
-        for r in names:
-            A[layout[r]] = 0.0
-        task.pieces.finish_back(kept.pop(), A, *noises)
-        if continuous:
-            for s in reversed(range(case.model.substeps)):
-                task.pieces.move_back(kept.pop(), A, s / case.model.substeps)
-            for i in states:  # the sample began at the state
-                A[layout[i]] = A[layout[f"M_{i}"]]
-        gradient[t] = [A[layout[r]] for r in names]
-    assert not kept
-    expected = central(value, flat, 1e-3)[0]
+        G, *slopes = code.back(G, tuple(weights[1]), C, laid(inputs, t), N, weights[2][t], tape, t)
+        found[t : t + 3] += slopes[::-1]  # of the inputs two samples before, one before, and now
+    expected = central(value, inputs, 1e-3)[0]
     assert np.abs(expected).max() > 1.0
-    np.testing.assert_allclose(gradient.ravel(), expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(found[2:], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
 def test_a_lane_that_is_over_counts_nothing(monkeypatch):
@@ -236,12 +209,6 @@ def test_a_lane_that_is_over_counts_nothing(monkeypatch):
     task.sample(W, NOISE, *R)
     totals = [W[place] for row, place in task.layout.items() if row == "LOSS" or row[:2] == "F_" or row[:5] == "SLOPE"]
     np.testing.assert_array_equal(totals, 0.0)
-
-
-def test_a_gradient_is_of_one_response_without_noise():
-    for options in ({"observed": True, "lanes": 1}, {"observed": False, "lanes": 4}):
-        with pytest.raises(ValueError, match="gradient is for the response without noise of one system"):
-            tasks.path(CASES["paper"].model, gradient=True, **options)
 
 
 def test_the_noise_of_a_linear_oscillator_is_the_integral_of_its_response():

@@ -10,7 +10,8 @@ from test_structured_generated import LANES, some_samples, updated
 
 from estimator.engine import tasks
 from estimator.engine.free_energy import free_energies
-from estimator.inference.sigma_points import ROUNDING
+from estimator.engine.points import ROUNDING
+from estimator.engine.rows import input_rows
 from estimator.models.model import Model
 
 NAMES = ["duffing", "duffing, all terms", "cubic", "pendulum", "wiener-hammerstein", "van der pol"]
@@ -131,7 +132,7 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
             put_belief(W, task.layout, LANES, lane, case, precise)
         table = W.reshape(-1, LANES)
         for _ in range(60):
-            for row in tasks.input_rows(case.model, case.degree):
+            for row in input_rows(case.model, case.degree):
                 table[task.layout[row]] = width * rng.standard_normal(LANES)
             table[task.layout["Y_y"]] = width * rng.standard_normal(LANES)
             task.update(W)

@@ -19,6 +19,7 @@ from engine_cases import (
 from engine_reference import EPS, Plant, update
 
 from estimator.engine import tasks
+from estimator.engine.rows import input_rows
 from estimator.models.model import Model
 
 LANES = 8
@@ -39,7 +40,7 @@ def updated(case, task, samples):
     W = block(task.layout, LANES)
     for lane, (belief, inputs, y) in enumerate(samples):
         put_belief(W, task.layout, LANES, lane, case, belief)
-        rows = tasks.input_rows(case.model, case.degree)
+        rows = input_rows(case.model, case.degree)
         put(W, task.layout, LANES, lane, dict(zip(rows, inputs, strict=True)))
         put(W, task.layout, LANES, lane, dict(zip((f"Y_{s}" for s in case.model.outputs), y, strict=True)))
     task.update(W)

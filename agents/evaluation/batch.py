@@ -1,0 +1,16 @@
+"""The systems of a track, as a batch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+
+from duffing_env.vector_env import DuffingVectorEnv
+
+
+def make(env_id: str, systems: int, options: dict[str, Any] | None = None) -> DuffingVectorEnv:
+    """A batch of a track."""
+    envs = gym.make_vec(env_id, num_envs=systems, vectorization_mode="vector_entry_point", **(options or {}))
+    assert isinstance(envs, DuffingVectorEnv)
+    return envs

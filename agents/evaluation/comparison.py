@@ -1,0 +1,51 @@
+"""Policies compared: evaluated on the same systems, in a table, a file, and figures or a report."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation.leaderboard import print_estimators, print_table, write_json
+from agents.evaluation.rollout import Evaluation, evaluate
+
+
+def compare(
+    policies: Sequence[str],
+    env_id: str,
+    systems: int,
+    options: dict[str, Any],
+    folder: Path,
+    *,
+    seed: int = 0,
+    report: bool = False,
+) -> list[Evaluation]:
+    """Evaluate policies; print the tables, and write ``evaluation.json`` and the figures or the report."""
+    from rich.console import Console
+
+    console = Console()
+    with console.status("Evaluating") as status:
+        evaluations = evaluate(
+            policies, env_id, systems, seed, options, lambda name: status.update(f"Evaluating {name}")
+        )
+    title = f"{env_id}, {systems} systems"
+    print_table(evaluations, title)
+    print_estimators(evaluations)
+    settings = {"env": env_id, "systems": systems, "seed": seed, "options": options}
+    write_json(folder / "evaluation.json", evaluations, settings)
+    written = ["evaluation.json"]
+    if report:
+        from agents.evaluation.report import write_report
+
+        write_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
+        written += ["report.html"]
+    else:
+        from agents.evaluation.figures import draw_contraction, draw_excitations
+
+        draw_contraction(folder / "contraction.png", evaluations, title)
+        draw_excitations(folder / "excitations.png", evaluations)
+        written += ["contraction.png", "excitations.png"]
+    for name in written:
+        print(folder / name)
+    return evaluations

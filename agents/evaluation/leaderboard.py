@@ -1,0 +1,218 @@
+"""The leaderboard: policies side by side, every figure with its interval; as a table, JSON and figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from agents.evaluation.rollout import Evaluation
+from estimator.files import write_atomically
+
+FloatArray = npt.NDArray[np.float64]
+
+#: What a new policy is compared with: the paper's regimes, and two classical excitations.
+BASELINES = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")
+
+_RESAMPLES = 2000
+
+
+Statistic = tuple[str, Callable[..., Any]]
+
+MEAN: Statistic = ("mean", np.mean)
+MEDIAN: Statistic = ("median", np.median)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A column of the table.
+
+    Attributes:
+        title: with its unit.
+        digits: decimals that are printed.
+        scale: from the stored to the printed unit.
+        center: the statistic over systems, and its name.
+        center_of_seeds: the same over systems and training seeds, by default the interquartile mean. Of shares it is
+            the mean: the middle half of an event that is rare never sees it.
+    """
+
+    title: str
+    digits: int
+    scale: float = 1.0
+    center: Statistic = MEAN
+    center_of_seeds: Statistic = ("iqm", partial(stats.trim_mean, proportiontocut=0.25))
+
+
+_share = partial(Metric, center_of_seeds=MEAN)
+
+METRICS = {
+    "information_gain": Metric("information gained / nat", 2),
+    "log_posterior_gain": Metric("log posterior gain / nat", 2),
+    "error_m": Metric("error of m / %", 3, 100, MEDIAN),
+    "error_c": Metric("error of c / %", 2, 100, MEDIAN),
+    "error_a": Metric("error of a / %", 3, 100, MEDIAN),
+    "error_b": Metric("error of b / %", 2, 100, MEDIAN),
+    "coverage_50": _share("50 % intervals that cover / %", 1, 100),
+    "coverage": _share("90 % intervals that cover / %", 1, 100),
+    "coverage_95": _share("95 % intervals that cover / %", 1, 100),
+    "nees": _share("NEES per coefficient", 2),
+    "ended_early": _share("episodes ended early / %", 1, 100),
+    "input_power": Metric("input power / mV²", 0, 1e6),
+    "input_peak": Metric("input peak / mV", 1, 1e3),
+    "crest_factor": Metric("crest factor", 2),
+    "decision_time": Metric("time per decision / µs", 2, 1e6),
+    "fisher_gain": Metric("Fisher information / nat", 2),
+    "efficiency": Metric("D-efficiency / %", 1, 100),
+    # Infinite where the whole regime tells less, so only a median says something of many.
+    "silverbox_equivalent": Metric("Silverbox equivalent / samples", 0, 1.0, MEDIAN, MEDIAN),
+    "simulation_rmse": Metric("RMSE on the twin's arrow / mV", 3, 1e3, MEDIAN),
+    "arrow_rmse": Metric("RMSE on the real arrow / mV", 2, 1e3, MEDIAN),
+}
+
+#: What the table of estimators shows.
+ESTIMATOR_METRICS = ("error_m", "error_c", "error_a", "error_b", "coverage", "nees")
+
+
+def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, Any]]:
+    """The centre of each metric over systems, with its 95 % interval: `center_and_interval` by name."""
+    return {
+        name: center_and_interval(values.reshape(evaluation.seeds, -1), METRICS[name], seed)
+        for name, values in evaluation.metrics.items()
+    }
+
+
+def center_and_interval(values: FloatArray, metric: Metric, seed: int = 0) -> dict[str, Any]:
+    """The centre of values (seeds, systems), with a 95 % bootstrap interval (percentile, 2000 resamples).
+
+    Over several training seeds the bootstrap is stratified: in every resample each seed has as many systems as it was
+    evaluated on. They are the same for all seeds, as the seeds were evaluated on the same ones, which are not
+    independent of each other. So the interval is that of these policies over systems; what another training would
+    give is in the spread of ``seeds``.
+
+    Returns:
+        The centre by its name, ``low`` and ``high``; of several seeds also ``seeds``, the metric's centre for each, and
+        ``median_of_seeds``.
+    """
+    kind, statistic = metric.center if len(values) == 1 else metric.center_of_seeds
+
+    def resampled(rows: Any, axis: int = -1) -> Any:
+        drawn = values[:, np.asarray(rows, dtype=np.intp)]  # (seeds, ..., systems)
+        return statistic(np.concatenate(drawn, axis=axis), axis=axis)
+
+    entry: dict[str, Any] = {kind: float(resampled(np.arange(values.shape[1])))}
+    if (values == values.flat[0]).all():  # SciPy warns of samples without spread
+        entry |= dict.fromkeys(("low", "high"), entry[kind])
+    else:
+        with np.errstate(invalid="ignore"):  # values may be infinite, and SciPy takes their standard deviation
+            interval = stats.bootstrap(
+                (np.arange(values.shape[1]),), resampled, n_resamples=_RESAMPLES, method="percentile", vectorized=True,
+                rng=np.random.default_rng(seed),
+            ).confidence_interval  # fmt: skip
+        entry |= {"low": float(interval.low), "high": float(interval.high)}
+    if len(values) > 1:
+        each = [float(metric.center[1](row)) for row in values]
+        entry |= {"median_of_seeds": float(np.median(each)), "seeds": each}
+    return entry
+
+
+def write_json(path: Path, evaluations: list[Evaluation], settings: dict[str, Any]) -> None:
+    """Write summaries and the settings that they were made with; a number that is not finite, as null."""
+    results = {
+        evaluation.policy: {
+            **finite(summarise(evaluation)),
+            "estimators": {
+                estimator: finite(summarise(replace(evaluation, metrics=values)))
+                for estimator, values in evaluation.estimators.items()
+            },
+        }
+        for evaluation in evaluations
+    }
+    write_atomically(path, json.dumps({"settings": settings, "policies": results}, indent=2, allow_nan=False))
+
+
+def finite(summary: Any) -> Any:
+    """What JSON can hold: a number that is not finite becomes null."""
+    if isinstance(summary, dict):
+        return {key: finite(value) for key, value in summary.items()}
+    if isinstance(summary, list):
+        return [finite(value) for value in summary]
+    return None if isinstance(summary, float) and not np.isfinite(summary) else summary
+
+
+def print_table(evaluations: list[Evaluation], title: str) -> None:
+    """Print the leaderboard: a column for each policy, the best log posterior gain first; intervals below."""
+    from rich.console import Console
+    from rich.table import Table
+
+    summaries = {evaluation.title: summarise(evaluation) for evaluation in evaluations}
+    order = [evaluation.title for evaluation in in_order(evaluations)]
+    table = Table(title=title, caption=caption_of(evaluations))
+    table.add_column("", no_wrap=True)
+    for policy in order:
+        table.add_column(policy, justify="right", overflow="fold")
+    for name, metric in METRICS.items():
+        if any(name in summary for summary in summaries.values()):
+            table.add_row(metric.title, *(cell_of(metric, summaries[policy].get(name)) for policy in order))
+    console = Console(markup=False)  # the brackets of the intervals are no markup
+    console.width = max(console.width, 36 + 20 * len(order))
+    console.print(table)
+
+
+def print_estimators(evaluations: list[Evaluation]) -> None:
+    """Print the two-way table, policies by estimators: who identified what from the same inputs and outputs."""
+    from rich.console import Console
+    from rich.table import Table
+
+    titles = [METRICS[name].title for name in ESTIMATOR_METRICS]
+    table = Table(title="the same inputs and outputs in other hands")
+    for name in ("policy", "estimator"):
+        table.add_column(name, no_wrap=True)
+    for text in titles:
+        table.add_column(text)
+    for evaluation in evaluations:
+        for estimator, values in evaluation.estimators.items():
+            cells = []
+            for name in ESTIMATOR_METRICS:
+                metric = METRICS[name]
+                cells.append(f"{metric.scale * float(metric.center[1](values[name])):.{metric.digits}f}")
+            table.add_row(evaluation.title, estimator.replace("_", " "), *cells)
+        table.add_section()
+    if table.rows:
+        console = Console(markup=False)
+        console.width = max(console.width, 130)
+        console.print(table)
+
+
+def in_order(evaluations: list[Evaluation]) -> list[Evaluation]:
+    """The best log posterior gain first."""
+    return sorted(evaluations, key=lambda evaluation: -float(evaluation.metrics["log_posterior_gain"].mean()))
+
+
+def caption_of(evaluations: list[Evaluation]) -> str:
+    """What the figures of a table are."""
+    several = any(evaluation.seeds > 1 for evaluation in evaluations)
+    over = "of several seeds interquartile means, shares as means, and the median seed; " if several else ""
+    return f"means, errors as medians; {over}[95 % bootstrap intervals over systems]"
+
+
+def cell_of(metric: Metric, entry: dict[str, Any] | None) -> str:
+    """What a table says of a metric: its centre, its interval on the next line, then the median of seeds, of several.
+
+    A dash where there is none.
+    """
+    if entry is None:
+        return "-"
+
+    def text(value: float) -> str:
+        return f"{metric.scale * value:.{metric.digits}f}"
+
+    center = next(value for key, value in entry.items() if key in ("mean", "median", "iqm"))
+    cell = f"{text(center)}\n[{text(entry['low'])}, {text(entry['high'])}]"
+    return f"{cell}\nmedian seed {text(entry['median_of_seeds'])}" if "seeds" in entry else cell

@@ -1,0 +1,157 @@
+"""What an experiment was worth, system by system: errors, calibration, information, and what the input was like."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from agents.planner.plants import plant_of
+from duffing_env.layout import parameter_names
+from duffing_env.silverbox import load_record, regime_input
+from estimator.free_run import free_run
+from estimator.information import fisher_information
+from estimator.models.difference import difference
+from estimator.models.model import Model
+from estimator.physical import coefficients_of, to_physical
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Nominal levels of the intervals whose coverage is reported, by their metric.
+LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}
+
+_TWIN_ARROW_SAMPLES = 8_192
+
+
+def estimate_metrics(
+    means: FloatArray, covs: FloatArray, truth: Any, model: Model, step: float
+) -> dict[str, FloatArray]:
+    """Posteriors of coefficients beside the truth.
+
+    Args:
+        means: (n, K).
+        covs: (n, K, K).
+        truth: the systems.
+        model: whose coefficients they are.
+        step: sampling step [s].
+
+    Returns:
+        Relative errors ``error_<parameter>``; the share of the coefficients that their intervals hold, at each of
+        `LEVELS`; ``nees``, the normalised estimation error squared dᵀ C⁻¹ d per coefficient, whose mean is 1 where the
+        posterior is calibrated.
+    """
+    true = {name: truth[name] for name in parameter_names(model)}
+    errors = np.abs(to_physical(model, means, step) / np.stack(list(true.values()), axis=-1) - 1)
+    free = np.flatnonzero(np.diagonal(covs, axis1=1, axis2=2).all(axis=0))  # without those that are known, as θ2 = 0
+    deviations, covs = (means - coefficients_of(model, true, step))[:, free], covs[:, free][:, :, free]
+    stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
+    units = covs / (stds[:, :, None] * stds[:, None, :])  # better conditioned than the covariances themselves
+    scaled = deviations / stds
+    nees = np.einsum("ni,ni->n", scaled, np.linalg.solve(units, scaled[:, :, None])[:, :, 0]) / len(free)
+    return {
+        **{f"error_{name}": errors[:, i] for i, name in enumerate(true)},
+        **{
+            name: (np.abs(scaled) <= stats.norm.ppf(0.5 + level / 2)).mean(axis=1) for name, level in LEVELS.items()
+        },
+        "nees": nees,
+    }  # fmt: skip
+
+
+def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
+    """Mean square [V²], largest value [V] and crest factor (that over the RMS) of inputs (T, n), NaN where ended."""
+    power, peak = np.nanmean(inputs**2, axis=0), np.nanmax(np.abs(inputs), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crest = np.where(power > 0, peak / np.sqrt(power), np.nan)
+    return {"input_power": power, "input_peak": peak, "crest_factor": crest}
+
+
+def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatArray | None = None) -> FloatArray:
+    """(n,) ½ log det(Λ0 + F) - ½ log det Λ0 [nats] of inputs (T, n): what an efficient estimator gains from them.
+
+    F is the Fisher information at the true coefficients of the plant's equation, along the outputs (T, n) that were
+    seen, or along the response without noise; Λ0 is the inverse covariance of the prior of plants so drawn.
+    """
+    noises = experiment.process_noise, experiment.measurement_noise
+    plant = plant_of(experiment)
+    F = fisher_information(
+        plant.model, plant.coefficients_of(truth), inputs.T, *noises, interpolation=plant.interpolation,
+        y=None if outputs is None else outputs.T,
+    )  # fmt: skip
+    cov = plant.prior.coefficients_cov
+    std = np.sqrt(np.diag(cov))
+    prior = np.linalg.inv(cov / np.outer(std, std))
+    return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])
+
+
+def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatArray | None:
+    """(n,) D-efficiency of the systems that the track's stored `Oracle` has; None without one."""
+    from agents.evaluation.oracle import Oracle
+    from agents.evaluation.oracle_task import Systems
+
+    try:
+        oracle = Oracle.of(Systems.of(env_id, evaluation.inputs.shape[1], options))
+    except FileNotFoundError:
+        return None
+    n = len(oracle.values)
+    return oracle.efficiency(evaluation.inputs.T[:n], evaluation.outputs.T[:n])
+
+
+def silverbox_equivalents(gains: FloatArray, truth: Any, experiment: Any, seed: int) -> FloatArray:
+    """(n,) samples of the Silverbox multisine regime that tell as much as ``gains`` (n,) of `information`.
+
+    Each system is given a stretch of the regime as recorded, at its own power (`regime_information`). Interpolated
+    between powers of √2; inf where even the longest stretch, 46,340 samples, tells less.
+    """
+    return equal_information(gains, *regime_information(truth, experiment, seed))
+
+
+def regime_information(
+    truth: Any, experiment: Any, seed: int, scale: float = 1.0, longest: float = 15.5
+) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    """What stretches of the Silverbox multisine regime, times ``scale``, tell of each system.
+
+    They start anywhere in the regime and go on at its begin where it ends, so that every part of it counts alike: rare
+    peaks of the displacement tell most of what is known of b, and some parts have more of them.
+
+    Returns:
+        Their lengths (k,) up to 2**longest samples, and (k, n) the `information` in them [nats].
+    """
+    lengths = np.unique(np.round(2 ** np.arange(4, longest + 0.1, 0.5)).astype(int))
+    rng = np.random.default_rng(seed)
+    regime = regime_input("multisine", rng)
+    starts = rng.integers(len(regime), size=np.size(truth.m))
+    inputs = scale * np.take(regime, np.arange(lengths[-1])[:, None] + starts, mode="wrap")
+    return lengths, np.array([information(inputs[:length], truth, experiment) for length in lengths])
+
+
+def equal_information(gains: FloatArray, lengths: npt.NDArray[np.int64], told: FloatArray) -> FloatArray:
+    """(n,) the lengths at which ``told`` (k, n) reaches ``gains`` (n,); inf where it does not."""
+    equivalents = np.empty(len(gains))
+    for i, gain in enumerate(gains):
+        curve = np.maximum.accumulate(told[:, i])
+        equivalents[i] = np.exp(np.interp(gain, curve, np.log(lengths))) if gain <= curve[-1] else np.inf
+    return equivalents
+
+
+def simulation_errors(means: FloatArray, truth: Any) -> FloatArray:
+    """(n,) RMSE [V] of free runs of Eq. (2) with estimated coefficients beside the true ones, for the arrow input."""
+    u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:][1:-1]
+    true = coefficients_of(difference(), truth)
+    runs = [[free_run(difference(), c, u) for c in pair] for pair in zip(means, true, strict=True)]
+    at_rest = np.zeros(2)  # as a record's first two outputs, which are given
+    return np.array([_rmse(np.append(at_rest, believed), np.append(at_rest, exact)) for believed, exact in runs])
+
+
+def arrow_errors(means: FloatArray) -> FloatArray:
+    """(n,) RMSE [V] of free runs over the real arrow record; inf where a run diverges."""
+    arrow = load_record().arrow
+    start = arrow.y[1::-1]
+    return np.array([_rmse(free_run(difference(), mean, arrow.u[1:-1], start), arrow.y[2:]) for mean in means])
+
+
+def _rmse(simulated: FloatArray, output: FloatArray) -> float:
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = float(np.sqrt(np.mean((simulated - output) ** 2)))
+    return error if np.isfinite(error) else np.inf

@@ -1,0 +1,105 @@
+"""The oracle: D-optimal inputs at the true parameters, stored, and the D-efficiency of other inputs against them.
+
+`agents.evaluation.oracle_search` finds them. The worth of inputs has many summits, and the best one found is only a
+lower bound of the highest. So whoever finds a better input puts it in its place.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from agents.evaluation.oracle_task import Systems
+from estimator.files import write_atomically
+from estimator.information import fisher_information
+from estimator.parameters import FloatArray
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """The best inputs found so far.
+
+    Attributes:
+        systems: that they are for.
+        inputs: (n, samples) [V].
+        values: (n,) their worth [nats].
+    """
+
+    systems: Systems
+    inputs: FloatArray
+    values: FloatArray
+
+    @classmethod
+    def of(cls, systems: Systems) -> Oracle:
+        """The stored oracle, of as many of the systems as it has.
+
+        Raises:
+            FileNotFoundError: if none is stored for this task, saying which command makes one.
+            ValueError: if it is for other systems.
+        """
+        path = systems.task.path
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"no oracle is stored for {systems.task}; run python -m agents.evaluation.oracle_search --env ..."
+            )
+        with np.load(path, allow_pickle=False) as stored:
+            scaled, theta = stored["inputs"], stored["theta"]
+        n = min(len(theta), len(systems.theta))
+        if not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
+            raise ValueError(f"oracle must be for the systems at hand, but {path.name} is not; make it anew")
+        chosen = Systems(systems.task, systems.theta[:n], systems.precision)
+        inputs = systems.task.max_input * scaled[:n].astype(np.float64)
+        return cls(chosen, inputs, chosen.worth(inputs)[0])
+
+    def save(self) -> Path:
+        """Store it in the package, in one piece."""
+        content = BytesIO()
+        np.savez_compressed(
+            content,
+            inputs=as_stored(self.inputs / self.systems.task.max_input),
+            theta=self.systems.theta,
+            values=self.values,
+            task=np.array(json.dumps(self.systems.task.description)),
+        )
+        write_atomically(self.systems.task.path, content.getvalue())
+        return self.systems.task.path
+
+    def efficiency(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike) -> FloatArray:
+        """D-efficiency (n,) of an episode: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / K] for K coefficients.
+
+        F is taken at the true coefficients along the outputs that were seen, because feedback keeps these within
+        their limit, and not the response without noise to the same inputs, which drifts away from them. 0.5 means that
+        about twice the samples would be needed. Above 1 says that there is a better input than the stored one, or that
+        the noise was kind.
+
+        Args:
+            inputs: (n, samples) [V]; NaN from the end of an episode on.
+            outputs: (n, samples) [V] that followed them.
+
+        Raises:
+            ValueError: for more rows than the oracle has systems, or as `estimator.fisher_information`.
+        """
+        u = np.asarray(inputs, dtype=np.float64)
+        if u.ndim != 2 or len(u) > len(self.values):
+            raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
+        task = self.systems.task
+        information = fisher_information(
+            task.model, self.systems.theta[: len(u)], u, task.process_noise, task.measurement_noise, y=outputs,
+            interpolation=task.interpolation,
+        )  # fmt: skip
+        values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]
+        efficiency: FloatArray = np.exp(2 * (values - self.values[: len(u)]) / task.model.n_coefficients)
+        return efficiency
+
+
+def as_stored(scaled: FloatArray) -> npt.NDArray[np.float16]:
+    """Inputs in parts of the largest as they are stored, never larger than they were; what was stored stays so."""
+    stored = scaled.astype(np.float16)
+    # A little larger is no larger: volts and back again are not exact.
+    larger = np.abs(stored.astype(np.float64)) > np.abs(scaled) * (1 + 1e-12)
+    return np.where(larger, np.nextafter(stored, np.float16(0)), stored)

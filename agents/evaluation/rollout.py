@@ -1,0 +1,266 @@
+"""What policies are worth: any number of them, on the same systems and the same noise."""
+
+from __future__ import annotations
+
+import glob
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from agents.evaluation import metrics
+from agents.evaluation.batch import make
+from agents.policies import make_policy
+from duffing_env.experiment import Experiment, SimulatedExperiment
+from duffing_env.layout import observation_bounds, parameter_names
+from duffing_env.silverbox import record_available
+from estimator.belief import Belief
+from estimator.identify import identify
+from estimator.maximum_a_posteriori import maximum_a_posteriori
+from estimator.models.difference import difference
+from estimator.parameters import Parameters
+from estimator.physical import coefficients_of
+from estimator.rig import Rig
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Who else identifies the systems from what a policy left behind, beside the environment's own estimator.
+AUDITOR = "auditor"
+FACTORISATIONS = ("structured", "mean_field")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What happened under one policy, system by system; or under several of one recipe, which differ by their seeds.
+
+    Arrays over systems hold those of the first seed, then those of the second, and so on: the same systems again.
+
+    Attributes:
+        policy: its name, or that of the recipe.
+        metrics: name of a metric to its value for each system (systems,); see `agents.evaluation.leaderboard.METRICS`.
+        curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats]; what a jump of the
+            truth takes away is in it.
+        inputs: (horizon, systems) inputs that the plant was given [V], NaN after the end of an episode.
+        outputs: (horizon, systems) outputs [V], likewise.
+        estimators: what others make of the same inputs and outputs: name of an estimator to its `metrics`.
+        seeds: number of policies.
+    """
+
+    policy: str
+    metrics: dict[str, FloatArray]
+    curve: FloatArray
+    inputs: FloatArray
+    outputs: FloatArray
+    estimators: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
+    seeds: int = 1
+
+    @property
+    def title(self) -> str:
+        """The name, and of several the number of seeds."""
+        return self.policy if self.seeds == 1 else f"{self.policy} ({self.seeds} seeds)"
+
+
+def evaluate(
+    policies: Sequence[str],
+    env_id: str = "duffing_env/Amplitude-v0",
+    systems: int = 256,
+    seed: int = 0,
+    options: dict[str, Any] | None = None,
+    on_policy: Callable[[str], None] | None = None,
+) -> list[Evaluation]:
+    """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
+
+    Learned policies act by their mean. With ``hold`` in the options, inputs, outputs and what is made of them are those
+    of every sample; a stored oracle is that of the track without it. An episode that a limit ends is never dropped: it
+    counts with what was known by then. Information at the truth, what other estimators make of the inputs and
+    outputs, and the arrow error need a simulated plant whose truth stays as it is; what is measured by free runs or
+    in samples of the Silverbox regime, the difference equation. The arrow error is that of the difference equation
+    identified on the track's twin (``plant_spread=0``) in a free run over the real arrow record; it is left out
+    without the record, and for the differential equation: the simulated plant has no offsets, and those of the
+    circuit, 8 mV at the input, would be nearly all of its error (5.3 mV for the twin itself).
+
+    Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the
+    entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.
+
+    Args:
+        policies: names or run folders, see `agents.policies.make_policy`, or patterns as above; at least one.
+        env_id: a registered track.
+        systems: number of systems, at least 2.
+        seed: of systems and noise; and of the policies' own randomness.
+        options: of the environment.
+        on_policy: called with each policy's name before its turn.
+
+    Raises:
+        ValueError: for no policies, an unknown one, a pattern that less than two policies match, fewer than two
+            systems, or options that the track does not take.
+    """
+    if not policies:
+        raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
+    if systems < 2:
+        raise ValueError(f"systems must be at least 2, but is {systems}; intervals need more than one")
+    evaluations = []
+    for name in policies:
+        title, members = _members(name)
+        each = []
+        for member in members:
+            if on_policy is not None:
+                on_policy(member)
+            each.append(_evaluate(member, env_id, systems, seed, dict(options or {})))
+        evaluations.append(each[0] if title is None else pooled(title, each))
+    return evaluations
+
+
+def _members(name: str) -> tuple[str | None, list[str]]:
+    """The title of a group and the policies in it; without a title, the one policy of this name."""
+    title, equals, pattern = name.partition("=")
+    if not equals or Path(name).exists():
+        return None, [name]
+    found = sorted(path for path in glob.glob(pattern) if (Path(path) / "policy.json").is_file())
+    if not title or len(found) < 2:
+        raise ValueError(
+            f"policies must name a group as TITLE=PATTERN, whose pattern two policy folders or more match, but "
+            f"{name!r} matches {found}; write e.g. 'ppo=runs/ppo-amplitude-v0-*'"
+        )
+    return title, found
+
+
+def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Policies of one recipe as one entry; they must have been evaluated on the same systems."""
+
+    def join(tables: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+        return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+    return Evaluation(
+        title,
+        join([e.metrics for e in evaluations]),
+        np.concatenate([e.curve for e in evaluations], axis=1),
+        np.concatenate([e.inputs for e in evaluations], axis=1),
+        np.concatenate([e.outputs for e in evaluations], axis=1),
+        {name: join([e.estimators[name] for e in evaluations]) for name in evaluations[0].estimators},
+        sum(e.seeds for e in evaluations),
+    )
+
+
+def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]) -> Evaluation:
+    """One policy."""
+    evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
+    if not isinstance(experiment, SimulatedExperiment):
+        return evaluation
+    found, stays = evaluation.metrics, experiment.jump == 0
+    is_difference = experiment.plant == difference()
+    if stays:
+        gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
+        found["fisher_gain"] = gains
+        evaluation.estimators.update(_audit(evaluation, truth, experiment))
+        efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
+        if efficiency is not None:  # an oracle is stored, of the systems of seed 0
+            found["efficiency"] = efficiency
+    if stays and is_difference:
+        found["silverbox_equivalent"] = metrics.silverbox_equivalents(gains, truth, experiment, seed)
+    if is_difference:
+        means = np.array([belief.coefficients_mean for belief in beliefs])
+        found["simulation_rmse"] = metrics.simulation_errors(means, truth)
+    if stays and is_difference and record_available():
+        _, twins, _, _ = roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
+        found["arrow_rmse"] = metrics.arrow_errors(np.array([twin.coefficients_mean for twin in twins]))
+    return evaluation
+
+
+def roll_out(
+    name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]
+) -> tuple[Evaluation, list[Belief], Any, Experiment]:
+    """One episode of every system; the beliefs it ended with, the truth and the experiment."""
+    envs = make(env_id, systems, options)
+    policy = make_policy(name, envs, seed=seed)
+    hold = envs.experiment.hold
+    if hold > 1:  # applied sample by sample instead, which is the same, so that every sample is seen
+        envs = make(env_id, systems, {**options, "hold": 1})
+    entries = list(observation_bounds(envs.experiment.model))
+    last_input, last_output = entries.index("last_input"), entries.index("last_input") + 1
+    first = parameter_names(envs.experiment.truth_model)[0]
+    observations, _ = envs.reset(seed=seed)
+    prior, horizon = envs.belief(0), envs.horizon
+    began, curve = envs.truth, np.zeros((horizon + 1, systems))
+    inputs, outputs = np.full((2, horizon, systems), np.nan)
+    beliefs: list[Belief] = [prior] * systems
+    truths = [began] * systems
+    ended_early, jumped_at = np.zeros(systems), np.full(systems, horizon)
+    running = np.ones(systems, dtype=np.bool_)
+    state, episode_start = None, np.ones(systems, dtype=np.bool_)
+    deciding: list[float] = []
+    for t in range(horizon):
+        if t % hold == 0:
+            started = time.process_time()
+            actions, state = policy.predict(observations, state, episode_start, deterministic=True)
+            deciding.append(time.process_time() - started)
+            episode_start = np.zeros(systems, dtype=np.bool_)
+        observations, _, terminated, truncated, infos = envs.step(actions)
+        curve[t + 1] = curve[t] + np.where(running, infos["log_posterior_gain"], 0.0)
+        jumped_at[running & (jumped_at == horizon) & (getattr(envs.truth, first) != getattr(began, first))] = t
+        inputs[t, running] = envs.max_input * observations[running, last_input]
+        outputs[t, running] = envs.experiment.max_output * observations[running, last_output]
+        finished = running & (terminated | truncated)
+        for row in np.flatnonzero(finished):
+            beliefs[row], truths[row] = infos["belief"][row], infos["truth"][row]
+        ended_early[finished & terminated] = 1.0
+        running &= ~finished
+        episode_start |= terminated | truncated
+        if not running.any():
+            curve[t + 2 :] = curve[t + 1]
+            break
+    envs.close()
+    names = parameter_names(envs.experiment.truth_model)
+    truth = Parameters({p: np.array([getattr(t, p) for t in truths]) for p in names})
+    means = np.array([belief.coefficients_mean for belief in beliefs])
+    covs = np.array([belief.coefficients_cov for belief in beliefs])
+    # The environment does not count what a jump of the truth takes away: what lacks at the end was lost there.
+    jumped = np.flatnonzero(jumped_at < horizon)
+    if len(jumped):
+        model, step = prior.model, prior.step
+        before, after = (coefficients_of(model, t, step) for t in (began, truth))
+        for row in jumped:
+            gain = beliefs[row].log_prob(after[row]) - prior.log_prob(before[row])
+            curve[jumped_at[row] + 1 :, row] += gain - curve[-1, row]
+    values = {
+        "information_gain": np.array([prior.entropy() - belief.entropy() for belief in beliefs]),
+        "log_posterior_gain": curve[-1],
+        **metrics.estimate_metrics(means, covs, truth, prior.model, prior.step),
+        "ended_early": ended_early,
+        **metrics.input_metrics(inputs),
+        # Processor time. The first call may compile, and counts where there is no other.
+        "decision_time": np.full(systems, np.mean(deciding[1:] or deciding) / systems),
+    }
+    return Evaluation(name, values, curve, inputs, outputs), beliefs, truth, envs.experiment
+
+
+def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:
+    """What every estimator of the plant, and the auditor, make of the inputs and outputs of a policy.
+
+    The auditor fits the plant's own equation. That of the paper, on another plant whose input goes linearly from one
+    action to the next, takes as an environment does the input at the sample before.
+    """
+    u, y, plant, step = evaluation.inputs.T, evaluation.outputs.T, experiment.plant, experiment.step
+    interpolation = "linear" if plant.is_continuous and experiment.degree else "zero_order"
+    rig = Rig(step, interpolation=interpolation)
+    hands: dict[str, tuple[Belief, FloatArray]] = {}
+    if plant == difference():
+        hands = {name: (experiment.prior_of(plant, name), u) for name in FACTORISATIONS}
+    else:
+        hands["ode" if plant.is_continuous else "structured"] = experiment.prior_of(plant), u
+        if set(parameter_names(plant)) == set(parameter_names(difference())):
+            earlier = u if not experiment.degree else np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
+            hands |= {f"nlarx_{name}": (experiment.prior_of(difference(), name), earlier) for name in FACTORISATIONS}
+    found: dict[str, dict[str, FloatArray]] = {}
+    for name, (prior, acting) in hands.items():
+        beliefs = identify(acting, y, prior, rig if prior.model.is_continuous else None)
+        means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
+        found[name] = metrics.estimate_metrics(means, covs, truth, prior.model, step)
+    fit = maximum_a_posteriori(
+        plant, u, y, experiment.prior_of(plant), experiment.process_noise, experiment.measurement_noise, interpolation
+    )
+    found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, plant, step)
+    return found

@@ -1,0 +1,1 @@
+"""Inputs that are planned: on the belief, by search, or at known parameters, by gradient."""

@@ -1,0 +1,154 @@
+"""What a plan would teach and cost, imagined on a belief of any model, compiled across lanes.
+
+What it teaches is `estimator.engine.imagination`'s: belief propagation along the plan's trajectory. Here stands what a
+plan is judged by besides. Plans lie in the lanes of a block, so that the compiler imagines several at a time.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.planner.design import half_log_det, invert
+from estimator.engine.imagination import LOST, imagination
+from estimator.engine.rows import belief_names
+from estimator.lanes import LANES, lanewise, part
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+
+#: Nats that an output beyond its limit costs, per limit that it is beyond: more than any plan can teach.
+_BEYOND = 1e4
+
+
+class Terms(NamedTuple):
+    """What a plan is judged by besides the belief, and what bounds its inputs.
+
+    Attributes:
+        amplitude: largest input.
+        slew: largest change of the input from sample to sample; inf where there is none.
+        limit: of the first sensor.
+        margin: predictive standard deviations that a plan keeps from it.
+        walk: (K,) variances of the coefficients' random walk in a sample; zeros for constants.
+        scales: (n,) sizes of the states when the first sensor is at its limit.
+        price: nats for the square of an input.
+        goal: mean of the goal prior of what the first sensor shows.
+        goal_weight: half its precision; 0 for no goal.
+    """
+
+    amplitude: float
+    slew: float
+    limit: float
+    margin: float
+    walk: FloatArray
+    scales: FloatArray
+    price: float = 0.0
+    goal: float = 0.0
+    goal_weight: float = 0.0
+
+
+class Mind(NamedTuple):
+    """Compiled functions of one model, on a block ``W`` of `LANES` plans.
+
+    Attributes:
+        size: numbers in a block.
+        kept: of these, from the first on, that stand for a plan between two samples.
+        u: where the row of the newest input begins; before a sample, the input to apply.
+        score: where the row of the scores begins.
+        fill: ``fill(W, record, lasts)``: put a belief into every lane, and the last inputs, newest first (2,).
+        collect: ``collect(W, record)``: take the belief of the first lane.
+        advance: ``advance(W, record, terms)``: one expected sample in every lane, and its cost; coefficients and noises
+            are those of a record.
+        appraise: ``appraise(W, M, scale)``: the scores, minus the expected free energy up to a constant, with (scale M)
+            (scale M)ᵀ (K, K) of information still to come.
+        precision: ``precision(W, inverse)``: inverse (K, K) of the coefficients' covariance in the first lane.
+    """
+
+    size: int
+    kept: int
+    u: int
+    score: int
+    fill: Any
+    collect: Any
+    advance: Any
+    appraise: Any
+    precision: Any
+
+
+def _charge(INPUT, SHOWN, SPREAD, COST, noise, limit, margin, price, goal, goal_weight):
+    """What a sample costs; of the output's variance ``noise`` is the sensor's own."""
+    over = abs(SHOWN) + margin * np.sqrt(SPREAD) - limit
+    over = over if over > 0.0 else 0.0
+    off = SHOWN - goal
+    return COST + _BEYOND / limit * over + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise)
+
+
+def _weigh(KNOWN, COST):
+    """What is known, less the cost; also of a plan whose numbers are none any more."""
+    score = KNOWN - COST
+    return score if score > LOST else LOST
+
+
+@cache
+def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
+    """The imagination of a model; arguments as `estimator.engine.imagination.imagination`."""
+    imagined = imagination(model, degree, lag)
+    place, names = imagined.layout, belief_names(model)
+    size, kept = len(place) * LANES, imagined.kept * LANES
+    k, n_record = model.n_coefficients, model.n_states + model.n_coefficients
+    n_states = model.n_states
+    # A block holds a record's states and covariances, and not the means of the coefficients, which are the same in all.
+    n_loaded = n_states + sum(name.startswith("P_") for name in names)
+    inputs = tuple(place[name] * LANES for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT") if name in place)
+    u, cost, score = inputs[0], place["COST"] * LANES, place["SCORE"] * LANES
+    first = next(iter(model.coefficients))
+    covariance = place[f"P_{first}_{first}"] * LANES
+    noise = names.index("GAMMA_SHAPE") + 2
+    advance_belief, judge = imagined.advance, imagined.judge
+    uniform = "noise limit margin price goal goal_weight"
+    charge = lanewise(place, "COST", uniform=uniform)(_charge)
+    weigh = lanewise(place, "SCORE")(_weigh)
+    inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
+
+    @inner
+    def fill(W, record, lasts):
+        for row in range(n_loaded):
+            value = record[row if row < n_states else row - n_states + n_record]
+            for j in range(LANES):
+                W[row * LANES + j] = value
+        for row in range(len(inputs)):
+            value = lasts[max(0, row - 1)]
+            for j in range(LANES):
+                W[inputs[row] + j] = value
+        for j in range(LANES):
+            W[cost + j] = 0.0
+
+    @inner
+    def collect(W, record):
+        for row in range(n_loaded):
+            record[row if row < n_states else row - n_states + n_record] = W[row * LANES]
+
+    @inner
+    def advance(W, record, terms):
+        advance_belief(W, record, terms.walk)
+        r = record[noise + 1] / record[noise]
+        charge(W, r, terms.limit, terms.margin, terms.price, terms.goal, terms.goal_weight)
+
+    @inner
+    def appraise(W, M, scale):
+        judge(W, scale * M)
+        weigh(W)
+
+    @inner
+    def precision(W, inverse):
+        work = np.empty((k, k))
+        place = covariance
+        for j in range(k):
+            for i in range(j, k):
+                work[i, j] = W[place]
+                place += LANES
+        half_log_det(work)
+        invert(work, inverse)
+
+    return Mind(size, kept, u, score, fill, collect, advance, appraise, precision)

@@ -1,0 +1,218 @@
+"""What policies read off an observation, of any model: coefficients and states, resonance, velocity, sizes of states.
+
+Time is counted in samples: a frequency is in cycles per sample, a velocity in what the first sensor changes by in one.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from duffing_env.layout import observation_bounds
+from estimator.engine.motion import motion
+from estimator.lanes import kernel
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+
+
+class View(NamedTuple):
+    """How a policy takes the model of an experiment.
+
+    Attributes:
+        model: that is believed.
+        degree: of the input over a sample of a differential equation.
+        lag: 1 where a difference equation takes every input a sample later.
+    """
+
+    model: Model
+    degree: int = 0
+    lag: int = 0
+
+    @classmethod
+    def of(cls, experiment: Any) -> View:
+        """That of an experiment of duffing_env.
+
+        On a plant whose input goes linearly from one action to the next, a difference equation takes the input at the
+        begin of a sample, as the environment feeds it (`duffing_env.sources`).
+        """
+        model = experiment.model
+        if model.is_continuous:
+            return cls(model, experiment.degree)
+        return cls(model, 0, int(experiment.truth_model.is_continuous and experiment.degree == 1))
+
+
+class Places(NamedTuple):
+    """Where the entries of an observation begin.
+
+    Attributes:
+        mean: of the coefficients' means.
+        log_std: of the logarithms of their standard deviations.
+        correlation: of their correlations.
+        state: of the states.
+        last_input: of the last input.
+        last_output: of the last outputs.
+        time_left: of the time left.
+        budget_left: of the energy left.
+        size: entries.
+    """
+
+    mean: int
+    log_std: int
+    correlation: int
+    state: int
+    last_input: int
+    last_output: int
+    time_left: int
+    budget_left: int
+    size: int
+
+
+@cache
+def places(model: Model) -> Places:
+    """Where the entries of a model's observation begin."""
+    at = {name: i for i, name in enumerate(observation_bounds(model))}
+    k, state, sensor = model.n_coefficients, next(iter(model.states)), next(iter(model.outputs))
+    return Places(
+        0, k, 2 * k, at[f"state_{state}"], at["last_input"], at[f"last_{sensor}"], at["time_left"], at["budget_left"],
+        len(at),
+    )  # fmt: skip
+
+
+@cache
+def _surveyor(model: Model) -> Any:
+    """``survey(means, states, shown, velocities, slopes)`` fills in what n systems show, and their linear parts."""
+    found = motion(model)
+    at, sense, linearise = found.layout, found.sense, found.linearise
+    n, k, size, first = model.n_states, model.n_coefficients, len(at), at["INPUT"]
+    now, velocity = at["NOW"], at["VELOCITY"]
+    state = next(iter(model.states))
+    linear = at[f"A_{state}_{state}"]
+
+    @kernel(kind=f"{model.name}_{model.digest}")
+    def survey(means, states, shown, velocities, slopes):
+        W = np.zeros(size)
+        for i in range(len(means)):
+            W[:n] = states[i]
+            W[n : n + k] = means[i]
+            sense(W)
+            linearise(W)
+            shown[i], velocities[i] = W[now], W[velocity]
+            for a in range(n):
+                for b in range(n):
+                    slopes[i, a, b] = W[linear + a * n + b]
+
+    assert first == n + k
+    return survey
+
+
+def survey(model: Model, means: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What systems do by themselves.
+
+    Args:
+        model: of all.
+        means: (n, K) their coefficients.
+        states: (n, states) where they are.
+
+    Returns:
+        What the first sensor shows (n,), its velocity (n,), and the frequency (n,) in cycles per sample at which the
+        linear part rings: the highest, or 0 where it does not ring.
+    """
+    count, size = len(means), model.n_states
+    shown, velocities, slopes = np.empty(count), np.empty(count), np.empty((count, size, size))
+    _surveyor(model)(np.ascontiguousarray(means), np.ascontiguousarray(states), shown, velocities, slopes)
+    poles = np.linalg.eigvals(slopes)
+    angles = np.abs(poles.imag if model.is_continuous else np.where(poles.imag != 0, np.angle(poles), 0.0))
+    return shown, velocities, angles.max(axis=-1) / (2.0 * np.pi)
+
+
+#: Samples of the motion by which states are measured, and where it turns, in parts of the limit.
+_SAMPLES, _TURN = 128, 0.95
+
+
+@cache
+def _swinger(view: View) -> Any:
+    """``swing(means, max_input, limit, peaks)``: the peaks of states and sensor of a system that is pumped up."""
+    found = motion(*view)
+    at, sense, glance, step = found.layout, found.sense, found.glance, found.step
+    n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
+    u, shown, velocity = at["INPUT"], at["SHOWN"], at["VELOCITY"]
+
+    @kernel(kind=f"{view.model.name}_{view.model.digest}_{view.degree}_{view.lag}")
+    def swing(means, max_input, limit, peaks):
+        W = np.zeros(size)
+        W[n : n + k] = means
+        peaks[:] = 0.0
+        for _ in range(_SAMPLES):
+            sense(W)
+            W[u] = max_input if W[velocity] >= 0.0 else -max_input
+            glance(W)
+            if abs(W[shown]) > _TURN * limit:
+                W[u] = -W[u]
+            step(W)
+            if not abs(W[shown]) < 2.0 * limit:
+                break
+            for i in range(n):
+                peaks[i] = max(peaks[i], abs(W[i]))
+            peaks[n] = max(peaks[n], abs(W[shown]))
+
+    return swing
+
+
+def scales(view: View, prior_means: npt.ArrayLike, max_input: float, limit: float) -> FloatArray:
+    """Sizes of the states when the first sensor is at its limit.
+
+    The sensor's own state, and one that keeps its last value, have the limit itself. Others, such as a velocity, are
+    measured by the motion of the prior's means, pumped up along the velocity and turned before the limit: a state's
+    scale is the limit times the ratio of its peak to the sensor's. So it has no unit of its own to go wrong by, and is
+    right where the limit is out of reach, too.
+
+    Args:
+        view: of the model.
+        prior_means: (K,) of the coefficients.
+        max_input: amplitude limit.
+        limit: of the first sensor.
+    """
+    model = view.model
+    peaks = np.empty(model.n_states + 1)
+    _swinger(view)(np.asarray(prior_means, dtype=np.float64), float(max_input), float(limit), peaks)
+    sensor = next(iter(model.outputs.values()))
+    moves = zip(model.states, model.moves, strict=True)
+    keeps = np.array([x == sensor or (not model.is_continuous and move == sensor) for x, move in moves])
+    keeps |= (peaks[:-1] <= 0) | (peaks[-1] <= 0)
+    return limit * np.divide(peaks[:-1], peaks[-1], out=np.ones(model.n_states), where=~keeps)
+
+
+@cache
+def _describer(model: Model) -> Any:
+    """``describe(means, states, u, made)``: fills in the regressors, and gives the gain."""
+    found = motion(model)
+    at, sense, regress = found.layout, found.sense, found.regress
+    n, k, size, gain = model.n_states, model.n_coefficients, len(at), at["GAIN"]
+    first, u = at[f"E_{next(iter(model.coefficients))}"], at["INPUT"]
+
+    @kernel(kind=f"{model.name}_{model.digest}")
+    def describe(means, states, u_now, made):
+        W = np.zeros(size)
+        W[:n], W[n : n + k], W[u] = states, means, u_now
+        sense(W)
+        regress(W)
+        made[:] = W[first : first + k]
+        return W[gain]
+
+    return describe
+
+
+def regressors(model: Model, means: FloatArray, states: FloatArray, u: float) -> FloatArray:
+    """(K,) derivatives of a sample's moves by the coefficients, at states (n,) and an input that is on."""
+    made = np.empty(model.n_coefficients)
+    _describer(model)(means, states, float(u), made)
+    return made
+
+
+def typical_gain(model: Model, means: FloatArray) -> float:
+    """The gain (`estimator.engine.motion`) at rest, without its sign."""
+    made = np.empty(model.n_coefficients)
+    return abs(float(_describer(model)(means, np.zeros(model.n_states), 0.0, made)))

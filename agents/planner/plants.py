@@ -1,0 +1,42 @@
+"""The model that an environment's plant obeys, and what is believed of it before the first sample."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from estimator.belief import Belief
+from estimator.models.model import Model
+from estimator.parameters import FloatArray, Parameters
+from estimator.physical import coefficients_of
+
+
+class Plant(NamedTuple):
+    """A plant.
+
+    Attributes:
+        model: its equation.
+        interpolation: of the input between samples.
+        prior: of its coefficients.
+    """
+
+    model: Model
+    interpolation: str
+    prior: Belief
+
+    def coefficients_of(self, truth: Parameters) -> FloatArray:
+        """(..., K) the coefficients of one plant or a batch."""
+        return coefficients_of(self.model, truth, self.prior.step)
+
+
+def plant_of(experiment: Any) -> Plant:
+    """The plant of an experiment that simulates one."""
+    return Plant(experiment.plant, _interpolation(experiment, experiment.plant), experiment.prior_of(experiment.plant))
+
+
+def believed_of(experiment: Any) -> tuple[Model, str]:
+    """The model whose coefficients an experiment's estimator believes in, and the interpolation of the input."""
+    return experiment.model, _interpolation(experiment, experiment.model)
+
+
+def _interpolation(experiment: Any, model: Model) -> str:
+    return "linear" if experiment.degree and model.is_continuous else "zero_order"

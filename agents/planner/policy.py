@@ -1,0 +1,196 @@
+"""The expected free energy planner: it imagines what candidate inputs would teach, and applies the best one's first.
+
+Of a sequence of inputs u over the next H samples the expected free energy is, in nats,
+
+    G(u) = -[½ log det C_0 - ½ log det (C_H(u)⁻¹ + J)⁻¹]              what it teaches (epistemic)
+           + Σ_h E[(x_h - goal)²] / (2 goal_std²)                       how far it is from a goal (pragmatic, optional)
+           + input_cost Σ_h u_h²                                        what it costs (optional)
+
+with C_0 the covariance of the coefficients now and C_H the one after the H outputs that are expected, by belief
+propagation: the joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample
+teaches is not counted again by the next. The teaching part then telescopes: a plan of the whole episode would be
+Bayesian D-optimal. J is the information that the rest of the episode after H will bring anyway, at the rate of the last
+plans; so a plan looks for what will be lacking at the end. Where the coefficients walk (``drift``) J is 0, and the walk
+is imagined too.
+
+What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then
+predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
+exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes
+true. Where an input comes to act in full only a sample later, because it goes linearly from the last one to the new,
+the noise of the sample between moves the next output about as much again, and no input makes up for it: the margin is
+then twice as wide.
+
+The search (`agents.planner.search`) builds a plan sample by sample, by the best ways through the plane of the
+model's first two states, and improves it by small changes. Horizon 1 is myopic.
+
+Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
+climbs by gradient (`agents.planner.pursuit`): then the question is when to spend, which no short horizon can answer.
+That search knows neither ``max_slew`` nor ``drift``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtri
+
+from agents.planner.imagination import Terms
+from agents.planner.motion import View, places, scales
+from agents.planner.plants import believed_of
+from agents.planner.pursuit import Rule, pursuit
+from agents.planner.search import search
+from estimator.engine.feeding import input_degree
+from estimator.parameters import FloatArray
+
+#: The last plans (n, horizon) in V, what plans taught per sample (n, K, K), the streams of random numbers (n, 4), and
+#: the last input (n,) in V.
+PlannerState = tuple[FloatArray, FloatArray, npt.NDArray[np.uint64], FloatArray]
+
+#: Samples to plan for under an amplitude limit: some periods of the oscillator.
+_HORIZON = 24
+
+
+class Planner:
+    """Expected free energy planning on the beliefs of an environment.
+
+    Environment i searches with a stream of random numbers of its own, the i-th child of the seed, so that its inputs
+    do not depend on the size of the batch.
+
+    Args:
+        env: the unwrapped environment, single or vector, whose beliefs it reads: `predict` must be called between
+            its steps, with its observations.
+        seed: of the search.
+        horizon: samples to plan for; by default 24, and the whole episode where the energy is limited. No more than 20
+            of the last 48 of an episode.
+        rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 samples; of no
+            effect on a plan of the whole episode.
+        risk: upper bound of the probability that an episode ends early, in (0, 1), where the belief is right.
+        goal: mean of the goal prior of the displacement [V].
+        goal_std: its standard deviation [V]; no goal where it is None.
+        input_cost: nats for a V² of input energy.
+
+    Raises:
+        ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
+            samples, a number is out of range, or a plan of the whole episode is asked to have a goal or cost, or to be
+            of another model than Eq. (2).
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        seed: int = 0,
+        *,
+        horizon: int | None = None,
+        rounds: int = 4,
+        risk: float = 0.05,
+        goal: float = 0.0,
+        goal_std: float | None = None,
+        input_cost: float = 0.0,
+    ) -> None:
+        if not hasattr(env, "records") or hasattr(env, "recorded_input"):
+            raise ValueError(
+                f"env must be an environment of duffing_env that simulates a plant, but is {type(env).__name__}; "
+                "the planner needs its beliefs: pass it to make_policy"
+            )
+        for name, count in (("horizon", 1 if horizon is None else horizon), ("rounds", rounds)):
+            if not isinstance(count, int | np.integer) or count < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, but is {count!r}")
+        if not 0 < risk < 1:
+            raise ValueError(f"risk must be a probability between 0 and 1, but is {risk!r}")
+        if not 0 <= input_cost < np.inf:
+            raise ValueError(f"input_cost must be 0 or more and finite, but is {input_cost!r}")
+        if goal_std is not None and not 0 < goal_std < np.inf:
+            raise ValueError(f"goal_std must be positive and finite, but is {goal_std!r}; None is no goal")
+        experiment = env.experiment
+        if experiment.hold != 1:
+            raise ValueError(
+                f"env must take an action for every sample, as plans do, but its hold is {experiment.hold}; "
+                "make it with hold=1, or choose a learned policy or a signal"
+            )
+        setup, self._view = experiment.setup, View.of(experiment)
+        whole = bool(np.isfinite(setup.budget)) and horizon is None
+        if whole and (goal_std is not None or input_cost):
+            raise ValueError(
+                "goal_std and input_cost must be left out where the energy is limited, but are "
+                f"{goal_std!r} and {input_cost!r}; pass a horizon to plan with them"
+            )
+        horizon = env.horizon if whole else min(horizon or _HORIZON, env.horizon)
+        self._energy = setup.budget if whole else None
+        if whole:
+            model, interpolation = believed_of(experiment)
+            self._pursue = pursuit(model, input_degree(model, interpolation)).pursue
+        self._env = env
+        self.seed = seed
+        self.horizon, self.rounds = int(horizon), int(rounds)
+        means = experiment.believed.coefficients_mean
+        self._terms = Terms(
+            amplitude=setup.max_input,
+            slew=setup.max_slew,
+            limit=setup.max_output,
+            margin=float(-ndtri(risk / env.horizon)) * (1 + max(self._view.degree, self._view.lag)),
+            walk=setup.walk.copy(),
+            scales=scales(self._view, means, setup.max_input, setup.max_output),
+            price=float(input_cost),
+            goal=float(goal),
+            goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
+        )
+
+    def predict(
+        self,
+        observation: npt.ArrayLike,
+        state: PlannerState | None = None,
+        episode_start: npt.ArrayLike | None = None,
+        deterministic: bool = False,
+    ) -> tuple[npt.NDArray[np.float32], PlannerState]:
+        """Plan, and give the first input of each environment's plan.
+
+        Args:
+            observation: (n, features) what the environment showed last, or (features,) of a single one.
+            state: what the last call returned; None begins new plans and streams.
+            episode_start: (n,) which environments begin an episode, and so a new plan.
+            deterministic: without effect: the search is reproducible by its seed.
+
+        Returns:
+            The actions in [-1, 1], float32 (n, 1), or (1,) for a single observation; and the next state.
+
+        Raises:
+            ValueError: if ``observation`` is not for as many environments as ``env`` has.
+        """
+        observed = np.asarray(observation, dtype=np.float64)
+        records = self._env.records
+        if observed.ndim not in (1, 2) or observed.size != len(records) * observed.shape[-1]:
+            raise ValueError(
+                f"observation must be of the planner's own {len(records)} environments, but has shape {observed.shape}"
+            )
+        n = len(records)
+        k, terms = self._view.model.n_coefficients, self._terms
+        if state is None:
+            plans, rates, before = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n)
+            words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
+        else:
+            plans, rates, words, before = state[0].copy(), state[1].copy(), state[2].copy(), state[3].copy()
+        if episode_start is not None:
+            begun = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)
+            plans[begun], rates[begun], before[begun] = 0.0, 0.0, 0.0
+        at, rows = places(self._view.model), observed.reshape(n, -1)
+        left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
+        last = terms.amplitude * rows[:, at.last_input]
+        inputs, scores = np.empty((2, n))
+        if self._energy is not None:
+            energies, rule = rows[:, at.budget_left] * self._energy, Rule(terms.amplitude, terms.limit, terms.margin)
+            self._pursue(records, left, energies, rule, last, plans, words, inputs, scores)
+        else:
+            lasts = np.stack([last, before], axis=1)
+            search(*self._view).plan(
+                records, left, self.horizon, self.rounds, terms, lasts, plans, rates, words, inputs, scores
+            )
+        actions = (inputs / terms.amplitude).astype(np.float32)
+        return actions.reshape(*observed.shape[:-1], 1), (plans, rates, words, last)
+
+
+def _stream(seed: np.random.SeedSequence) -> npt.NDArray[np.uint64]:
+    """The four words of a fresh stream."""
+    state: npt.NDArray[np.uint64] = np.random.SFC64(seed).state["state"]["state"]
+    return state

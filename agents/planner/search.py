@@ -1,0 +1,339 @@
+"""The planner's search, compiled for a model: the best ways through the map of its state, and small changes of them.
+
+The teaching of a plan has many summits, and changing a long plan here and there finds a poor one, even of a system that
+is known. So the plan is built sample by sample, as by dynamic programming: of all ways that lead into the same cell of
+the plane of the first two states only the best is followed, with the highest input, the lowest, and the one nearest to
+zero. A way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of
+the last plans. Without the latter a way would be praised for what every way teaches sooner or later.
+
+The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
+line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.scales`). Other
+states, and older inputs, are followed with their way, and do not tell ways apart.
+
+The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.planner.design import half_log_det
+from agents.planner.imagination import mind
+from duffing_env.noise import draw, to_unit
+from estimator.lanes import LANES, jit, kernel, part
+from estimator.models.model import Model
+
+#: Cells of the map along each axis, from minus a state's scale to plus.
+_CELLS = 24
+
+#: Towards the end of an episode, when so many samples are left, no later plan mends what a plan misses: the map is then
+#: finer, the rounds are more by this factor, and plans look no further than so many samples.
+_LATE, _LATE_CELLS, _LATE_ROUNDS, _LATE_HORIZON = 48, 32, 4, 20
+
+#: Inputs that are tried at every cell.
+_CHOICES = 3
+
+#: A way this much [nats] worse than the best of its length is followed no further.
+_HOPELESS = 1.0
+
+#: Part of what a plan teaches per sample that goes into the running mean.
+_REFRESHED = 0.2
+
+_MOST = _LATE_CELLS * _LATE_CELLS
+_BLOCKS = -(-_MOST // LANES)
+
+
+class Search(NamedTuple):
+    """The search for a model, compiled.
+
+    Attributes:
+        plan: ``plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, scores)`` searches the
+            best next inputs of n environments:
+
+            - ``records`` (n, size): their beliefs;
+            - ``left`` (n,): samples left in their episodes;
+            - ``horizon``: samples to plan for, at most;
+            - ``rounds``: of `LANES` changed copies each;
+            - ``terms``: `agents.planner.imagination.Terms`;
+            - ``lasts`` (n, 2): the inputs that were applied last, newest first;
+            - ``plans`` (n, horizon): the last plans, begun one sample ago; overwritten by the new ones;
+            - ``rates`` (n, K, K): information per sample that plans have brought, a running mean; zeros where there was
+              none yet; overwritten;
+            - ``words`` (n, 4): streams of random numbers; overwritten;
+            - ``actions`` (n,): receives the first input of the best plan;
+            - ``scores`` (n,): receives the best plan's score [nats].
+        play: ``play(record, first, horizon, rounds, terms, u, words)`` plans the inputs u (T,) from sample ``first``
+            on, where the means of the belief are the truth. The inputs before it are followed as they are. Arguments as
+            of ``plan``; ``words`` is (4,), and the record is overwritten.
+    """
+
+    plan: Any
+    play: Any
+
+
+class Memory(NamedTuple):
+    """What a search writes on.
+
+    Attributes:
+        ways: blocks of the ways that are followed.
+        continued: blocks of their continuations.
+        origins: (horizon, ways) of which way each continues.
+        inputs: (horizon, ways) with which input.
+        candidates: (LANES, horizon) plans that compete.
+    """
+
+    ways: Any
+    continued: Any
+    origins: Any
+    inputs: Any
+    candidates: Any
+
+
+class Task(NamedTuple):
+    """What is searched for, of one environment.
+
+    Attributes:
+        record: the belief.
+        left: samples left in the episode.
+        steps: of the plan.
+        terms: `agents.planner.imagination.Terms`.
+        lasts: (2,) the inputs that were applied last, newest first.
+        M: (K, K) factor of the information per sample that is to come.
+    """
+
+    record: Any
+    left: int
+    steps: int
+    terms: Any
+    lasts: Any
+    M: Any
+
+
+@cache
+def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
+    """The search for a model; arguments as `estimator.engine.imagination.imagination`."""
+    size, kept, U, SCORE, fill, collect, advance, appraise, precision = mind(model, degree, lag)
+    k, is_plane = model.n_coefficients, model.n_states > 1
+    kind = f"{model.name}_{model.digest}_{degree}_{lag}"
+    inner, entry = part(kind), kernel(kind=kind)
+
+    @inner
+    def memory(horizon):
+        ways, continued = np.empty((_BLOCKS, size)), np.empty((_CHOICES * _BLOCKS, size))
+        origins, inputs = np.empty((horizon, _MOST), np.int64), np.empty((horizon, _MOST))
+        return Memory(ways, continued, origins, inputs, np.empty((LANES, horizon)))
+
+    @inner
+    def gather(memory, h, best, ends):
+        """Make the best continuations the new ways, and note where they come from; gives their number.
+
+        ``best``, the scores of the cells, becomes that of the ways.
+        """
+        ways, continued = memory.ways, memory.continued
+        enough = np.max(best) - _HOPELESS
+        count = 0
+        for cell in range(len(best)):
+            if best[cell] >= enough and best[cell] > -np.inf:
+                b, j = ends[cell] // LANES, ends[cell] % LANES
+                memory.origins[h, count] = b // _CHOICES * LANES + j
+                memory.inputs[h, count] = continued[b, U + j]
+                best[count] = best[cell]
+                way, lane = ways[count // LANES], count % LANES
+                for row in range(0, kept, LANES):
+                    way[row + lane] = continued[b, row + j]
+                count += 1
+        # Lanes beyond the last way do the same work as the others, so that none of them runs wild.
+        for lane in range(count, -(-count // LANES) * LANES):
+            for row in range(0, kept, LANES):
+                ways[lane // LANES, row + lane % LANES] = ways[lane // LANES, row]
+        return count
+
+    @inner
+    def find_way(memory, task, cells, found, words):
+        """Build a plan by the best ways into the cells of the map, which is laid anew at random every time."""
+        ways, continued, terms = memory.ways, memory.continued, task.terms
+        n_cells = cells * cells if is_plane else cells
+        best, ends = np.empty(n_cells), np.empty(n_cells, np.int64)
+        right, up = uniform(words), uniform(words)
+        fill(ways[0], task.record, task.lasts)
+        count = 1
+        for h in range(task.steps):
+            best[:] = -np.inf
+            for b in range(_CHOICES * (-(-count // LANES))):
+                W = continued[b]
+                W[:kept] = ways[b // _CHOICES, :kept]
+                for j in range(LANES):
+                    W[U + j] = choose(b % _CHOICES, W[U + j], terms)
+                advance(W, task.record, terms)
+                appraise(W, task.M, np.sqrt(task.left - h - 1))
+                for j in range(min(LANES, count - b // _CHOICES * LANES)):
+                    cell = place(W[j], terms.scales[0], cells, right)
+                    if is_plane:
+                        cell = cell * cells + place(W[LANES + j], terms.scales[1], cells, up)
+                    if W[SCORE + j] > best[cell]:
+                        best[cell] = W[SCORE + j]
+                        ends[cell] = b * LANES + j
+            count = gather(memory, h, best, ends)
+        way = np.argmax(best[:count])
+        for h in range(task.steps - 1, -1, -1):
+            found[h] = memory.inputs[h, way]
+            way = memory.origins[h, way]
+
+    @inner
+    def follow(W, task, candidates):
+        """Imagine the candidates (LANES, horizon) from the belief on, or one for all lanes."""
+        fill(W, task.record, task.lasts)
+        for h in range(task.steps):
+            for j in range(LANES):
+                W[U + j] = candidates[j % len(candidates), h]
+            advance(W, task.record, task.terms)
+
+    @inner
+    def refresh(W, task, best, rate):
+        """Let the information per sample of a plan into the running mean; the first one is taken as it is."""
+        before, after = np.empty((k, k)), np.empty((k, k))
+        fill(W, task.record, task.lasts)
+        precision(W, before)
+        follow(W, task, best.reshape(1, -1))
+        precision(W, after)
+        brought = (after - before) / task.steps
+        if np.all(np.isfinite(brought)):
+            rate += (_REFRESHED if rate[0, 0] > 0.0 else 1.0) * (brought - rate)
+
+    @inner
+    def improve(memory, record, left, steps, rounds, terms, lasts, best, rate, words):
+        """Improve the plan ``best`` (horizon,), begun one sample ago, and ``rate``; gives the plan's score [nats]."""
+        candidates, last = memory.candidates, lasts[0]
+        cells = _CELLS
+        if left <= _LATE:
+            cells, steps, rounds = _LATE_CELLS, min(steps, _LATE_HORIZON), _LATE_ROUNDS * rounds
+        M = np.zeros((k, k))
+        factorise(rate, M)
+        task = Task(record, left, steps, terms, lasts, M)
+        turned = -best[0]
+        best[:-1] = best[1:].copy()
+        best[steps - 1] = turned
+        bound(best, steps, last, terms)
+        candidates[0] = best
+        candidates[1] = 0.0
+        bound(candidates[1], steps, last, terms)
+        find_way(memory, task, cells, candidates[2], words)
+        for j in range(3, LANES):
+            candidates[j] = candidates[2 * (j % 2)]
+            change(candidates[j], steps, terms.amplitude, words)
+            bound(candidates[j], steps, last, terms)
+        W = memory.ways[0]
+        score = -np.inf
+        for round_ in range(rounds):
+            for j in range(LANES if round_ > 0 else 0):
+                candidates[j] = best
+                change(candidates[j], steps, terms.amplitude, words)
+                bound(candidates[j], steps, last, terms)
+            follow(W, task, candidates)
+            appraise(W, M, np.sqrt(left - steps))
+            for j in range(LANES):
+                if W[SCORE + j] > score:
+                    score = W[SCORE + j]
+                    best[:] = candidates[j]
+        # Where the coefficients walk, what is learned later does not add to what is learned now.
+        if not np.any(terms.walk):
+            refresh(W, task, best, rate)
+        return score
+
+    @entry
+    def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, scores):
+        kept_memory = memory(horizon)
+        for i in range(len(records)):
+            rest = max(1, left[i])
+            scores[i] = improve(
+                kept_memory, records[i], rest, min(horizon, rest), rounds, terms, lasts[i], plans[i], rates[i], words[i]
+            )  # fmt: skip
+            actions[i] = plans[i, 0]
+
+    @entry
+    def play(record, first, horizon, rounds, terms, u, words):
+        kept_memory = memory(horizon)
+        best, rate, W = np.zeros(horizon), np.zeros((k, k)), np.empty(size)
+        lasts = np.zeros(2)
+        for t in range(len(u)):
+            left = len(u) - t
+            if t >= first:
+                improve(kept_memory, record, left, min(horizon, left), rounds, terms, lasts, best, rate, words)
+                u[t] = best[0]
+            fill(W, record, lasts)
+            W[U : U + LANES] = u[t]
+            advance(W, record, terms)
+            collect(W, record)
+            lasts[1], lasts[0] = lasts[0], u[t]
+
+    return Search(plan, play)
+
+
+@jit
+def choose(choice, last, terms):
+    """The highest input after ``last``, the lowest, or the one nearest to zero."""
+    if choice == 0:
+        return min(terms.amplitude, last + terms.slew)
+    if choice == 1:
+        return max(-terms.amplitude, last - terms.slew)
+    return max(last - terms.slew, min(0.0, last + terms.slew))
+
+
+@jit
+def place(x, scale, cells, offset):
+    """The cell of a state along one axis; the first for one that is no number."""
+    where = (x / scale + 1.0) * 0.5 * (cells - 1) + offset
+    if not where > 0.0:
+        return 0
+    return np.int64(min(where, cells - 1.0))
+
+
+@jit
+def bound(candidate, steps, last, terms):
+    """Cut changes of the input beyond the slew limit, as the environment does."""
+    for h in range(steps):
+        candidate[h] = max(last - terms.slew, min(candidate[h], last + terms.slew))
+        last = candidate[h]
+
+
+@jit
+def factorise(information, M):
+    """The factor M of an information M Mᵀ; zeros where there is none, or it tells nothing of a coefficient."""
+    M[:] = information
+    if half_log_det(M) == -np.inf:
+        M[:] = 0.0
+
+
+@jit
+def uniform(words):
+    """A number in (0, 1) from a stream (4,), which moves on."""
+    value, words[0], words[1], words[2], words[3] = draw(words[0], words[1], words[2], words[3])
+    return to_unit(value)
+
+
+@jit
+def change(candidate, steps, amplitude, words):
+    """Change a candidate a little: turn one, two or a run of inputs over, shift it, or put one anywhere."""
+    kind = uniform(words)
+    h = np.int64(uniform(words) * steps)
+    if kind < 0.35:
+        candidate[h] = -amplitude if candidate[h] > 0.0 else amplitude
+    elif kind < 0.55:
+        other = np.int64(uniform(words) * steps)
+        candidate[h] = -amplitude if candidate[h] > 0.0 else amplitude
+        candidate[other] = -amplitude if candidate[other] > 0.0 else amplitude
+    elif kind < 0.75:
+        stop = min(steps, h + 2 + np.int64(4.0 * uniform(words)))
+        for k in range(h, stop):
+            candidate[k] = -candidate[k]
+    elif kind < 0.85:
+        for k in range(h, steps - 1):
+            candidate[k] = candidate[k + 1]
+    elif kind < 0.92:
+        for k in range(steps - 1, h, -1):
+            candidate[k] = candidate[k - 1]
+    else:
+        candidate[h] = amplitude * (2.0 * uniform(words) - 1.0)

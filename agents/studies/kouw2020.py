@@ -1,0 +1,377 @@
+"""The experiment of Kouw (2020), section 4, repeated on the Silverbox record and set against the published numbers.
+
+Every model is trained on the multisine part of the record, 90,972 samples, and validated on the arrow part, 40,100
+samples, with its parameters fixed: by one-step predictions from the measured outputs, and by a simulation, a free run
+from the first two of them. `reproduce` does it all; ``docs/reproduction.md`` discusses the outcome.
+"""
+
+from __future__ import annotations
+
+import io
+import platform
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from json import dumps
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from agents.cli import progress_bar
+from agents.policies import make_policy
+from duffing_env.silverbox import Regime, SilverboxRecord, load_record
+from estimator import OnlineEstimator, Rig, difference, published_run_prior
+from estimator.belief import Belief
+from estimator.files import write_atomically
+from estimator.offline import PEMNARX
+from estimator.parameters import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PUBLISHED = {
+    "PEM-NARX": {"prediction_mse": 5.830793034083989e-05, "simulation_mse": 1.001367833873263e-03},
+    "FEM-LARX": {"prediction_mse": 5.9446129987526364e-05, "simulation_mse": 1.0204335589997665e-03},
+    "FEM-NLARX": {"prediction_mse": 5.8304968780121563e-05, "simulation_mse": 9.256401174690808e-04},
+}
+"""Mean squared errors [V²] of the published run, from its own files; the paper's text has 1.002e-3 for FEM-LARX."""
+
+MEASURES = ("prediction", "simulation")
+VERSIONED = ("duffing-env", "gymnasium", "matplotlib", "numba", "numpy", "scipy")
+
+EVERY = 80
+"""The figures show one sample of this many, as the paper's do."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to run the experiment. All start from `published_run_prior`, with the default number of iterations.
+
+    Attributes:
+        summary: what it is, for the reader of the table.
+        factorisation: of the online estimator, ``mean_field`` or ``structured``.
+        input_delay: samples between an input and the output it acts on, 0 or 1.
+        as_published: with the published run's two departures from the derived messages.
+        through_environment: every sample is one step of the Gymnasium environment.
+        models: names of the models, in the paper's order.
+    """
+
+    summary: str
+    factorisation: str
+    input_delay: int
+    as_published: bool = False
+    through_environment: bool = False
+    models: tuple[str, ...] = ("FEM-LARX", "FEM-NLARX")
+
+
+SETTINGS = {
+    "as_published": Setting(
+        "mean field, input delay 0, with the two departures",
+        factorisation="mean_field",
+        input_delay=0,
+        as_published=True,
+        models=("PEM-NARX", "FEM-LARX", "FEM-NLARX"),
+    ),
+    "through_environment": Setting(
+        "the same, each sample a step of SilverboxReplay-v0",
+        factorisation="mean_field",
+        input_delay=0,
+        as_published=True,
+        through_environment=True,
+    ),
+    "corrected_messages": Setting(
+        "mean field, input delay 0, messages as derived",
+        factorisation="mean_field",
+        input_delay=0,
+    ),
+    "as_derived": Setting(
+        "mean field, input delay 1, messages as derived",
+        factorisation="mean_field",
+        input_delay=1,
+        models=("PEM-NARX", "FEM-LARX", "FEM-NLARX"),
+    ),
+    "structured": Setting(
+        "states and coefficients jointly Gaussian, input delay 1",
+        factorisation="structured",
+        input_delay=1,
+    ),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A trained model on the validation part.
+
+    Attributes:
+        prediction: (T,) one-step predictions [V]; the first two entries repeat the measured outputs.
+        simulation: (T,) free run [V]; likewise.
+        prediction_mse: see `prediction_mse` [V²].
+        simulation_mse: see `simulation_mse` [V²].
+        seconds: time that the training took, once compiled [s].
+    """
+
+    prediction: FloatArray
+    simulation: FloatArray
+    prediction_mse: float
+    simulation_mse: float
+    seconds: float
+
+
+def reproduce(
+    data: Path | None = None, json: Path | None = None, figures: Path = Path("runs/reproduction")
+) -> dict[str, Any]:
+    """Repeats the experiment in all `SETTINGS`: progress on stderr, a table on stdout, figures and results in files.
+
+    Args:
+        data: File or folder of the record; searched for where it is None (`load_record`).
+        json: File for the results; None writes none.
+        figures: Folder for ``prediction_error.png`` and ``simulation_error.png``, which show ``as_published``.
+
+    Returns:
+        What the JSON file holds: for ``published`` and every name in `SETTINGS`, for each of its models, the two
+        mean squared errors [V²]; and under ``meta`` the settings, seconds of training, sample counts and versions.
+
+    Raises:
+        RecordNotFound: The record is not on this machine; the message says where to get it.
+        RecordDamaged: The file found is not the record.
+        OSError: A result cannot be written; found out before the work begins, where it can be.
+    """
+    record = load_record(data)
+    if json is not None:
+        if json.is_dir():
+            raise IsADirectoryError(f"json must be a file, but is the folder {json}; name a file in it")
+        json.parent.mkdir(parents=True, exist_ok=True)
+    figures.mkdir(parents=True, exist_ok=True)
+
+    runs = run_all(record, data)
+    results = summarise(runs, record)
+    if json is not None:
+        write_atomically(json, dumps(results, indent=2) + "\n")
+    for measure in MEASURES:
+        png = io.BytesIO()
+        draw(runs["as_published"], record.arrow, measure).savefig(png, format="png")
+        write_atomically(figures / f"{measure}_error.png", png.getvalue())
+
+    report(results)
+    return results
+
+
+def run_all(record: SilverboxRecord, data: Path | None) -> dict[str, dict[str, Run]]:
+    """Trains and validates each model of each setting, behind a progress bar on stderr."""
+    runs: dict[str, dict[str, Run]] = {}
+    with progress_bar() as progress:
+        task = progress.add_task("compiling", total=sum(len(setting.models) for setting in SETTINGS.values()))
+        compile_kernels(record, data)
+        for name, setting in SETTINGS.items():
+            runs[name] = {}
+            for model in setting.models:
+                progress.update(task, description=f"{name}, {model}")
+                runs[name][model] = run(setting, model, record, data)
+                progress.advance(task)
+        progress.update(task, description="done")
+    return runs
+
+
+def compile_kernels(record: SilverboxRecord, data: Path | None) -> None:
+    """Compiles what `run` trains with, so that its seconds do not count that.
+
+    Numba compiles anew for the record's arrays, which are read-only, and for the delayed copies of them.
+    """
+    for setting in SETTINGS.values():
+        if setting.through_environment:
+            env = make_environment(setting, True, data)
+            env.reset(seed=0)
+            env.step(np.zeros(1, dtype=np.float32))
+        else:
+            train_online(setting, True, Regime("multisine", record.multisine.u[:2], record.multisine.y[:2]))
+
+
+def run(setting: Setting, model: str, record: SilverboxRecord, data: Path | None) -> Run:
+    """Trains one model on the multisine part and validates it on the arrow part."""
+    training, validation = record.multisine, record.arrow
+    u, y = validation.u, validation.y
+    start = perf_counter()
+    if model == "PEM-NARX":
+        narx = PEMNARX(input_delay=setting.input_delay).fit(training.u, training.y)
+        seconds = perf_counter() - start
+        prediction, simulation = narx.predict(u, y), narx.simulate(u, y[:2])
+    else:
+        nonlinear = model == "FEM-NLARX"
+        if setting.through_environment:
+            coefficients = train_through_environment(setting, nonlinear, data)
+        else:
+            coefficients = train_online(setting, nonlinear, training)
+        seconds = perf_counter() - start
+        trained = estimator_at(coefficients, setting.input_delay)
+        prediction, simulation = trained.predict(u, y), trained.simulate(u, y[:2])
+    return Run(prediction, simulation, prediction_mse(prediction, y), simulation_mse(simulation, y), seconds)
+
+
+def train_online(setting: Setting, nonlinear: bool, training: Regime) -> FloatArray:
+    """Posterior means (4,) of θ1, θ2, θ3, η after the whole training part."""
+    estimator = OnlineEstimator(
+        difference(),
+        published_run_prior(nonlinear),
+        Rig(interpolation="zero_order", delay=setting.input_delay),
+        factorisation=setting.factorisation,
+        as_published=setting.as_published,
+    )
+    estimator.run(training.u, training.y)
+    return estimator.belief.coefficients_mean
+
+
+def estimator_at(coefficients: FloatArray, input_delay: int) -> OnlineEstimator:
+    """An estimator that believes the coefficients (4,): for predictions and free runs with them."""
+    prior = published_run_prior()
+    record = prior.record.copy()
+    record[2:6] = coefficients
+    believed = Belief(difference(), record, prior.step)
+    return OnlineEstimator(difference(), believed, Rig(interpolation="zero_order", delay=input_delay))
+
+
+def train_through_environment(setting: Setting, nonlinear: bool, data: Path | None) -> FloatArray:
+    """The same means, from an episode in which the reference policy plays the recorded input.
+
+    Raises:
+        RuntimeError: The episode ended before the record did.
+    """
+    env = make_environment(setting, nonlinear, data)
+    policy = make_policy("silverbox-multisine", env=env)
+    observation, info = env.reset(seed=0)
+    state, terminated, truncated = None, False, False
+    while not (terminated or truncated):
+        action, state = policy.predict(observation, state)
+        observation, _, terminated, truncated, info = env.step(action)
+    if terminated:
+        raise RuntimeError(f"the episode must reach the end of the record, but was terminated before: {info}")
+    means: FloatArray = info["belief"].coefficients_mean
+    return means if nonlinear else np.insert(means, 1, 0.0)  # without the cubic term θ2 is no coefficient: it is 0
+
+
+def make_environment(setting: Setting, nonlinear: bool, data: Path | None) -> gym.Env:
+    """The environment that replays the training part."""
+    return gym.make(
+        "duffing_env/SilverboxReplay-v0",
+        regime="multisine",
+        prior="published_run",
+        input_delay=setting.input_delay,
+        factorisation=setting.factorisation,
+        as_published=setting.as_published,
+        nonlinear=nonlinear,
+        data=None if data is None else str(data),
+    )
+
+
+def prediction_mse(predicted: FloatArray, y: FloatArray) -> float:
+    """Mean squared one-step prediction error [V²], indexed as in the published run.
+
+    With samples numbered from 1, that run predicts y_4, ..., y_T, and takes the mean over y_3, ..., y_T with the value
+    0 in place of a prediction of y_3.
+
+    Args:
+        predicted: (T,) predictions [V], of which the first three do not count.
+        y: (T,) measured outputs [V], T >= 3.
+    """
+    errors = predicted[2:] - y[2:]
+    errors[0] = 0.0 - y[2]
+    return float(np.mean(errors**2))
+
+
+def simulation_mse(simulated: FloatArray, y: FloatArray) -> float:
+    """Mean squared simulation error [V²] over y_3, ..., y_T: all but the two outputs that were given.
+
+    Args:
+        simulated: (T,) free run [V].
+        y: (T,) measured outputs [V], T >= 3.
+    """
+    return float(np.mean((simulated[2:] - y[2:]) ** 2))
+
+
+def summarise(runs: dict[str, dict[str, Run]], record: SilverboxRecord) -> dict[str, Any]:
+    """The results as `reproduce` returns them: plain dictionaries, fit for JSON."""
+    measured = [f"{measure}_mse" for measure in MEASURES]
+    errors = {
+        name: {model: {measure: getattr(run, measure) for measure in measured} for model, run in models.items()}
+        for name, models in runs.items()
+    }
+    meta = {
+        "prior": "published_run",
+        "settings": {name: asdict(setting) for name, setting in SETTINGS.items()},
+        "seconds": {name: {model: run.seconds for model, run in models.items()} for name, models in runs.items()},
+        "samples": {"training": len(record.multisine.u), "validation": len(record.arrow.u)},
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in VERSIONED},
+    }
+    return {"published": PUBLISHED, **errors, "meta": meta}
+
+
+def report(results: dict[str, Any]) -> None:
+    """Prints the table and what its rows are."""
+    console = Console(highlight=False)
+    console.print(table(results))
+    console.print("\nratio: to the published error of the same model")
+    for name, setting in SETTINGS.items():
+        console.print(f"{name + ':':20} {setting.summary}")
+    for name in ("as_published", "through_environment"):
+        console.print(f"{name} is within {deviation(results[name]):.1e} of the published FEM errors, relative")
+
+
+def table(results: dict[str, Any]) -> Table:
+    """The errors, their ratios to the published errors of the same models, and their roots, in 80 characters."""
+    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=0)
+    shown.add_column("\nrun")
+    shown.add_column("\nmodel")
+    for measure in MEASURES:
+        shown.add_column(f"{measure}\nMSE [V²]", justify="right")
+        shown.add_column("\nratio", justify="right")
+        shown.add_column("RMSE\n\\[mV]", justify="right")  # escaped: rich takes it for a style
+    for name in ("published", *SETTINGS):
+        for model, errors in results[name].items():
+            cells = []
+            for measure in MEASURES:
+                mse = errors[f"{measure}_mse"]
+                ratio = mse / PUBLISHED[model][f"{measure}_mse"]
+                cells += [f"{mse:.4e}", f"{ratio:.4f}", f"{1e3 * np.sqrt(mse):.3f}"]
+            shown.add_row(name, model, *cells)
+        shown.add_section()
+    return shown
+
+
+def deviation(errors: dict[str, dict[str, float]]) -> float:
+    """Largest relative deviation of the four FEM errors from the published ones."""
+    return max(
+        abs(mse / PUBLISHED[model][measure] - 1)
+        for model in ("FEM-LARX", "FEM-NLARX")
+        for measure, mse in errors[model].items()
+    )
+
+
+def draw(runs: dict[str, Run], validation: Regime, measure: str) -> Figure:
+    """One of the paper's two figures of errors: a column for each model, the lower row in log scale.
+
+    Args:
+        runs: The models by name.
+        validation: What they were validated on.
+        measure: ``prediction`` or ``simulation``.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5.2), dpi=100, layout="constrained")
+    axes = figure.subplots(2, len(runs), sharex=True, sharey="row", squeeze=False)
+    samples = np.arange(0, len(validation.y), EVERY)
+    for (upper, lower), (model, run) in zip(axes.T, runs.items(), strict=True):
+        output = getattr(run, measure)[samples]
+        squared_error = (output - validation.y[samples]) ** 2
+        upper.plot(samples, output, color="purple", linewidth=0.8, label=f"{measure} [V]")
+        upper.plot(samples, squared_error, color="black", linewidth=1.0, label="squared error [V²]")
+        upper.set_title(f"{model}: MSE {getattr(run, f'{measure}_mse'):.3e} V²", fontsize=11)
+        lower.semilogy(samples, squared_error, color="black", linewidth=0.6, nonpositive="mask")
+        lower.set_xlabel("sample")
+    axes[0, 0].set_ylabel("output [V], squared error [V²]")
+    axes[1, 0].set_ylabel("squared error [V²]")
+    axes[0, 0].legend(loc="lower left", fontsize=9)
+    return figure

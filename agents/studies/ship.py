@@ -1,0 +1,116 @@
+"""Ship a trained policy: the median of its training seeds, with a card that says what all of them are worth.
+
+    python -m agents.studies.ship --name ppo/amplitude --runs runs/ppo-amplitude-v0-[0-4]
+
+evaluates the runs on the same 256 systems (seed 0), and writes the weights of the median one by D-efficiency, or by
+information gain on a track without an oracle, to `agents/policies/trained/NAME`. The card is that of its run, with the
+track, the version of this package, the reward and the seeds, and with the scores over all seeds: interquartile mean,
+interval, median of seeds and each seed's own.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents import policies
+from agents.cli import run_script
+from agents.evaluation.leaderboard import finite, print_table, summarise
+from agents.evaluation.rollout import evaluate, pooled
+from agents.policies.learned import CARD, WEIGHTS
+from estimator.files import write_atomically
+
+
+@dataclass(frozen=True)
+class Config:
+    """Ship the median of several training seeds."""
+
+    name: str
+    """What it ships as: ALGORITHM/TRACK, such as ppo/amplitude."""
+    runs: tuple[Path, ...]
+    """Run folders of one recipe, which differ by their seeds only."""
+    systems: int = 256
+    """Systems to evaluate on, with seed 0."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[a-z0-9-]+/[a-z0-9-]+", self.name):
+            raise ValueError(f"name must be ALGORITHM/TRACK in small letters, but is {self.name!r}; e.g. ppo/amplitude")
+        if len(self.runs) < 2:
+            raise ValueError(f"runs must be two folders or more, but are {len(self.runs)}; train further seeds")
+
+
+def ship(config: Config) -> Path:
+    """Evaluate, choose and write; the folder that the policy ships in.
+
+    Raises:
+        ValueError: for runs that are no policy folders, are of several recipes, or have a seed in common.
+    """
+    cards = [_card(run) for run in config.runs]
+    env, options, seeds = _recipe(config.runs, cards)
+    evaluations = evaluate([str(run) for run in config.runs], env, config.systems, options=options)
+    together = pooled(config.name, evaluations)
+    scores = summarise(together)
+    by = "efficiency" if "efficiency" in scores else "information_gain"
+    chosen = median_index(scores[by]["seeds"])
+    card = cards[chosen] | {
+        "track": env,
+        "version": version("duffing-env"),
+        "reward": cards[chosen]["config"]["reward"],
+        "seeds": seeds,
+        "shipped": {"seed": seeds[chosen], "median_by": by},
+        "scores": {
+            "settings": {"env": env, "systems": config.systems, "seed": 0, "options": options},
+            # How long a decision took is of the machine, not of the policy.
+            **{name: finite(entry) for name, entry in scores.items() if name != "decision_time"},
+        },
+    }
+    folder = policies.TRAINED / config.name
+    # The weights first: a card without them is none, and a card that is older than they are is mended by a second try.
+    write_atomically(folder / WEIGHTS, (config.runs[chosen] / WEIGHTS).read_bytes())
+    write_atomically(folder / CARD, json.dumps(card, indent=2, allow_nan=False))
+    print_table([together], f"{env}, {config.systems} systems")
+    print(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
+    return folder
+
+
+def median_index(values: list[float]) -> int:
+    """Which value is the median; of an even number the lower one of the two."""
+    return int(np.argsort(values, kind="stable")[(len(values) - 1) // 2])
+
+
+def _card(run: Path) -> dict[str, Any]:
+    if not (run / WEIGHTS).is_file() or not (run / CARD).is_file():
+        raise ValueError(f"runs must hold {WEIGHTS} and {CARD}, but {run} does not; pass finished run folders")
+    card: dict[str, Any] = json.loads((run / CARD).read_text())
+    return card
+
+
+def _recipe(runs: tuple[Path, ...], cards: list[dict[str, Any]]) -> tuple[str, dict[str, Any], list[int]]:
+    """Track, options and seeds of runs that differ by nothing else than their seeds and folders."""
+    recipes = [
+        {"algorithm": card.get("algorithm"), **card["config"]} | {"seed": None, "output": None, "systems": None}
+        for card in cards
+    ]
+    for run, recipe in zip(runs, recipes, strict=True):
+        differing = sorted(name for name in recipes[0] | recipe if recipe.get(name) != recipes[0].get(name))
+        if differing:
+            raise ValueError(f"runs must be of one recipe, but {run} has another {', '.join(differing)} than {runs[0]}")
+    seeds = [int(card["config"]["seed"]) for card in cards]
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"runs must have a seed each, but have {seeds}; leave out what is there twice")
+    return recipes[0]["env"], recipes[0]["options"], seeds
+
+
+def main(config: Config) -> None:
+    """Ship it."""
+    ship(config)
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__ or "")

@@ -1,0 +1,128 @@
+"""Figures of the Silverbox protocol, as PNG. No display is needed."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator import duffing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from agents.studies.silverbox_protocol import Outcome
+
+_COLOURS = {
+    "paper as published": "#000000",
+    "paper, delay 1": "#666666",
+    "NLARX three-tap": "#cc79a7",
+    "ODE linear": "#d55e00",
+    "ODE look-ahead": "#e69f00",
+    "ODE spline": "#56b4e9",
+    "ODE spline +e": "#0072b2",
+}
+_WINDOW = 400
+"""Samples of the running root mean square."""
+
+_NINETY = 1.6448536269514722
+_SHOWN_FROM = 200
+"""The parameters' axes are cut to hold their intervals from this many samples on."""
+
+
+def draw(outcomes: Mapping[str, Outcome], trained: int) -> dict[str, bytes]:
+    """The three figures, by name: ``arrow``, ``learning``, ``parameters``.
+
+    Args:
+        outcomes: By the names of the settings.
+        trained: Samples of the arrow whose amplitude does not exceed the training's.
+    """
+    shown = {name: outcomes[name] for name in _COLOURS if name in outcomes}
+    figures = {
+        "arrow": _draw_arrow(shown, trained),
+        "learning": _draw_learning(shown),
+        "parameters": _draw_parameters(shown),
+    }
+    return {name: _png(figure) for name, figure in figures.items()}
+
+
+def _draw_arrow(outcomes: Mapping[str, Outcome], trained: int) -> Figure:
+    """Simulation error over the arrow: every sample, and its running root mean square."""
+    figure = _figure(9, 5)
+    axes = figure.add_subplot()
+    for name, outcome in outcomes.items():
+        if name in ("ODE look-ahead", "ODE spline"):
+            continue  # they would lie on "ODE linear"
+        error = 1e3 * np.abs(outcome.arrow_error)
+        axes.plot(error, ",", color=_COLOURS[name], alpha=0.4)
+        mean_square = np.convolve(error**2, np.full(_WINDOW, 1 / _WINDOW), mode="valid")
+        middle = np.arange(len(mean_square)) + _WINDOW / 2
+        axes.plot(middle, np.sqrt(mean_square), color=_COLOURS[name], linewidth=1.2, label=name)
+    axes.axvline(trained, color="black", linestyle=":", linewidth=1)
+    axes.set_yscale("log")
+    axes.set_ylim(3e-3, 300)
+    axes.set_xlim(0, len(error))
+    axes.set_xlabel("sample of the arrow; right of the dotted line its amplitude exceeds the training's")
+    axes.set_ylabel("simulation error / mV")
+    axes.set_title(f"points: every sample; lines: root mean square of {_WINDOW}", fontsize=9, loc="left")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper left", ncols=3, fontsize=9)
+    return figure
+
+
+def _draw_learning(outcomes: Mapping[str, Outcome]) -> Figure:
+    """Simulation error on the arrow over the number of training samples."""
+    figure = _figure(7, 4.5)
+    axes = figure.add_subplot()
+    for name, outcome in outcomes.items():
+        samples, errors = np.array(list(outcome.learning.items())).T
+        axes.loglog(samples, 1e3 * errors, "o-", markersize=3, color=_COLOURS[name], label=name)
+    axes.axhline(1.0, color="black", linestyle=":", linewidth=1)
+    axes.set_xlabel("training samples")
+    axes.set_ylabel("simulation error on the arrow / mV")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.27), fontsize=9)
+    return figure
+
+
+def _draw_parameters(outcomes: Mapping[str, Outcome]) -> Figure:
+    """Posterior means and 90 % intervals of the physical parameters over the number of training samples."""
+    figure = _figure(11, 5.5)
+    units = duffing(offsets=True, cubic_damping=True, feedthrough=True).physical_units
+    panels = dict(zip(units, figure.subplots(2, 4, sharex=True).flat, strict=True))
+    limits: dict[str, list[float]] = {parameter: [] for parameter in panels}
+    for name, outcome in outcomes.items():
+        told = {n: belief.parameters() for n, belief in outcome.beliefs.items() if name.startswith("ODE")}
+        for parameter in panels:
+            if not all(parameter in parameters for parameters in told.values()) or not told:
+                continue  # it is known
+            mean, std = np.array([parameters[parameter][:2] for parameters in told.values()]).T
+            low, high, samples = mean - _NINETY * std, mean + _NINETY * std, np.array(list(told))
+            panels[parameter].fill_between(samples, low, high, color=_COLOURS[name], alpha=0.2, linewidth=0)
+            panels[parameter].plot(samples, mean, color=_COLOURS[name], label=name, linewidth=1)
+            limits[parameter] += [low[samples >= _SHOWN_FROM].min(), high[samples >= _SHOWN_FROM].max()]
+    for place, ((parameter, axes), unit) in enumerate(zip(panels.items(), units.values(), strict=True)):
+        low, high = min(limits[parameter], default=0.0), max(limits[parameter], default=1.0)
+        axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+        axes.set_xscale("log")
+        axes.set_title(f"{parameter} / {unit}", fontsize=9)
+        axes.grid(alpha=0.3)
+        if place >= 4:
+            axes.set_xlabel("training samples")
+    handles, labels = panels["m"].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    return figure
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure((width, height), layout="constrained", dpi=120)
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()

@@ -1,0 +1,201 @@
+"""Runs the official protocol (`agents.studies.silverbox_protocol`), and says what came out and what was aimed at."""
+
+from __future__ import annotations
+
+import json as json_format
+import platform
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from agents.cli import progress_bar
+from agents.studies.silverbox_figures import draw
+from agents.studies.silverbox_protocol import (
+    CLOSE,
+    GIVEN,
+    SETTINGS,
+    TESTS,
+    TRAINING_SAMPLES,
+    WITHOUT_EXTRAPOLATION,
+    Outcome,
+    Sections,
+    cut,
+    evaluate,
+)
+from duffing_env.silverbox import load_record
+from estimator.belief import Belief
+from estimator.files import write_atomically
+
+TARGETS = {
+    "ODE linear": (0.36, 0.45, 0.36),
+    "ODE look-ahead +e": (0.33, 0.40, 0.33),
+    "ODE spline +e, 2 passes": (0.25, 0.39, 0.26),
+    "NLARX three-tap": (0.45, 0.65, 0.46),
+}
+"""Simulation errors that were aimed at [mV], in the order of `TESTS`."""
+MAX_SAMPLES_UNTIL_CLOSE = 500
+COVERAGE_RANGE = (0.87, 0.93)
+MAX_SECONDS = {"ODE": 5e-6, "paper structured": 2e-6}
+"""Of training for each sample, by the beginnings of the settings' names."""
+RANKED = ("paper structured", "NLARX offset", "NLARX three-tap", "ODE linear")
+"""Accumulated free energy is to rank these as their simulation errors do."""
+
+VERSIONED = ("duffing-env", "numba", "numpy", "scipy")
+
+Compare = Callable[[Sections, Mapping[str, Outcome]], dict[str, Any]]
+"""Compares the outcomes with something else in the same run, prints that, and returns it, fit for JSON."""
+
+
+def run_protocol(
+    data: Path | None = None,
+    json: Path | None = None,
+    figures: Path = Path("runs/silverbox"),
+    compare: Compare | None = None,
+) -> dict[str, Any]:
+    """Evaluates all `SETTINGS`: progress on stderr, table and submission lines on stdout, figures and JSON in files.
+
+    Args:
+        data: File or folder of the record; searched for where it is None (`load_record`).
+        json: File for the results; None writes none.
+        figures: Folder for ``silverbox_arrow.png``, ``silverbox_learning.png`` and ``silverbox_parameters.png``.
+        compare: What follows the table; None is nothing.
+
+    Returns:
+        What the JSON file holds: under ``rows`` the measures of each setting in volts, seconds and nats, under
+        ``targets`` what was aimed at and whether it was reached, under ``comparison`` what ``compare`` returned, and
+        ``meta``.
+
+    Raises:
+        RecordNotFound: The record is not on this machine; the message says where to get it.
+        RecordDamaged: The file found is not the record.
+        OSError: A result cannot be written.
+    """
+    sections = cut(load_record(data))
+    if json is not None and json.is_dir():
+        raise IsADirectoryError(f"json must be a file, but is the folder {json}; name a file in it")
+    figures.mkdir(parents=True, exist_ok=True)
+    outcomes = dict(_evaluate_all(sections))
+    results = summarise(outcomes)
+    for name, png in draw(outcomes, WITHOUT_EXTRAPOLATION).items():
+        write_atomically(figures / f"silverbox_{name}.png", png)
+    report(outcomes, results)
+    if compare is not None:
+        results["comparison"] = compare(sections, outcomes)
+    if json is not None:
+        write_atomically(json, json_format.dumps(results, indent=2, allow_nan=False) + "\n")
+    return results
+
+
+def _evaluate_all(sections: Sections) -> Iterator[tuple[str, Outcome]]:
+    """The outcome of each setting by its name, behind a progress bar on stderr."""
+    with progress_bar() as progress:
+        task = progress.add_task("", total=len(SETTINGS))
+        for name, setting in SETTINGS.items():
+            progress.update(task, description=name)
+            yield name, evaluate(setting, sections)
+            progress.advance(task)
+
+
+def summarise(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
+    """The results as `run_protocol` returns them: plain dictionaries, fit for JSON."""
+    rows = {
+        name: {
+            "model": SETTINGS[name].model.name,
+            "coefficients": list(SETTINGS[name].model.coefficients),
+            "interpolation": SETTINGS[name].rig.interpolation,
+            "delay": SETTINGS[name].rig.delay,
+            "passes": SETTINGS[name].passes,
+            "rmse": {test: _finite(error) for test, error in outcome.rmse.items()},
+            "prediction_rmse": _finite(outcome.prediction_rmse),
+            "coverage": _finite(outcome.coverage),
+            "seconds_per_sample": outcome.seconds,
+            "samples_until_1_mV": outcome.samples_until_close,
+            "free_energy": outcome.free_energy,
+            "arrow_rmse_after": {str(samples): _finite(error) for samples, error in outcome.learning.items()},
+            "parameters": _parameters(outcome.beliefs[TRAINING_SAMPLES]),
+        }
+        for name, outcome in outcomes.items()
+    }
+    meta = {
+        "samples": {"training": TRAINING_SAMPLES, "given": GIVEN},
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in VERSIONED},
+    }
+    return {"rows": rows, "targets": [{"target": text, "reached": ok} for text, ok in targets(outcomes)], "meta": meta}
+
+
+def _finite(value: float) -> float | None:
+    """A number for JSON, which has no other."""
+    return value if np.isfinite(value) else None
+
+
+def _parameters(belief: Belief) -> dict[str, dict[str, Any]]:
+    """Mean, standard deviation and unit of each physical parameter, or coefficient where there is none, by name."""
+    return {name: dict(zip(("mean", "std", "unit"), row, strict=True)) for name, row in belief.parameters().items()}
+
+
+def targets(outcomes: Mapping[str, Outcome]) -> Iterator[tuple[str, bool]]:
+    """What was aimed at, with what was measured, and whether it was reached."""
+    for name, bounds in TARGETS.items():
+        errors = [1e3 * outcomes[name].rmse[test] for test in TESTS]
+        reached = all(error <= bound for error, bound in zip(errors, bounds, strict=True))
+        yield f"{name}: {submission(errors)} mV, at most {submission(bounds, 2)}", reached
+    samples = outcomes["ODE linear"].samples_until_close
+    text = f"ODE linear: arrow below {1e3 * CLOSE:g} mV after {samples} samples, at most {MAX_SAMPLES_UNTIL_CLOSE}"
+    yield text, samples is not None and samples <= MAX_SAMPLES_UNTIL_CLOSE
+    coverages = [outcome.coverage for name, outcome in outcomes.items() if name.startswith("ODE")]
+    low, high = COVERAGE_RANGE
+    text = f"ODE: 90 % intervals cover {min(coverages):.3f} to {max(coverages):.3f}, within {low} to {high}"
+    yield text, all(low <= fraction <= high for fraction in coverages)
+    for start, bound in MAX_SECONDS.items():
+        slowest = max(outcome.seconds for name, outcome in outcomes.items() if name.startswith(start))
+        yield f"{start}: {1e6 * slowest:.1f} µs per sample, at most {1e6 * bound:g}", slowest <= bound
+    by_error = sorted(RANKED, key=lambda name: outcomes[name].rmse["multisine"])
+    by_free_energy = sorted(RANKED, key=lambda name: outcomes[name].free_energy)
+    yield "free energy ranks paper, offset, three-tap and ODE as their simulation errors do", by_error == by_free_energy
+
+
+def submission(errors: Any, digits: int = 3) -> str:
+    """The official line: multisine, arrow, arrow without extrapolation [mV]."""
+    return "[" + "; ".join(f"{error:.{digits}f}" for error in errors) + "]"
+
+
+def report(outcomes: Mapping[str, Outcome], results: Mapping[str, Any]) -> None:
+    """Prints the table, the submission lines, and what became of the targets."""
+    console = Console(highlight=False, markup=False)
+    console.width = max(console.width, 100)
+    console.print(table(outcomes))
+    console.print("d = 0: without feedthrough; +e: with cubic damping; n.e.: without extrapolation;")
+    console.print("1-step and coverage: of the multisine test")
+    console.print("\nSubmission, RMSE in mV [multisine; arrow; arrow without extrapolation]:")
+    for name in TARGETS:
+        errors = [1e3 * outcomes[name].rmse[test] for test in TESTS]
+        console.print(f"  {name:24} {submission(errors)}")
+    console.print("\nTargets:")
+    for row in results["targets"]:
+        console.print(f"  {'PASS' if row['reached'] else 'MISS'}  {row['target']}")
+
+
+def table(outcomes: Mapping[str, Outcome]) -> Table:
+    """A row for each setting, in 100 characters."""
+    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    shown.add_column("")
+    columns = ("multisine\n[mV]", "arrow\n[mV]", "n.e.\n[mV]", "1-step\n[mV]", "90 %\ncovers", "<1 mV\nafter")
+    for title in (*columns, "µs per\nsample", "free energy\n[nats]"):
+        shown.add_column(title, justify="right")
+    for name, outcome in outcomes.items():
+        shown.add_row(
+            name,
+            *(f"{1e3 * outcome.rmse[test]:.3f}" for test in TESTS),
+            f"{1e3 * outcome.prediction_rmse:.3f}",
+            "-" if np.isnan(outcome.coverage) else f"{outcome.coverage:.3f}",
+            str(outcome.samples_until_close or "never"),
+            f"{1e6 * outcome.seconds:.2f}",
+            f"{outcome.free_energy:.0f}",
+        )
+    return shown

@@ -1,0 +1,193 @@
+"""Any model as an environment: `ModelEnv`, whose tracks are entries of `duffing_env.tracks`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from duffing_env.env import DuffingEnv
+from duffing_env.experiment import Experiment, SimulatedExperiment
+from duffing_env.layout import parameter_names
+from duffing_env.vector_env import DuffingVectorEnv
+from estimator.belief import Belief
+from estimator.models import MODELS
+from estimator.models.model import Model
+from estimator.priors import gaussian_moments, weak_prior
+
+
+@dataclass(frozen=True)
+class ModelExperiment(SimulatedExperiment):
+    """An experiment on any model, which is believed as it is.
+
+    Attributes:
+        system: the model: a name of `estimator.models.MODELS`, a `Model`, or a dict of its fields.
+        mean: parameter to its mean, or with ``std`` left out to the middle of its range.
+        std: parameter to its standard deviation: plants are then drawn from a Gaussian. Without it each parameter is
+            log-uniform on mean * [1 - spread, 1 + spread].
+        sampling_step: seconds between two samples.
+        interpolation: of the input of a differential equation between samples: ``zero_order`` or ``linear``.
+        sensor_noise: standard deviation of each further sensor; that of the first, where it is None.
+    """
+
+    system: str | Model | Mapping[str, Any] = "difference"
+    mean: Mapping[str, float] | None = None
+    std: Mapping[str, float] | None = None
+    sampling_step: float = 1.0
+    interpolation: str = "zero_order"
+    sensor_noise: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = parameter_names(self.plant)
+        for name, given in (("mean", self.mean), ("std", self.std)):
+            if given is None and name == "std":
+                continue
+            if not isinstance(given, Mapping) or set(given) != set(names):
+                raise ValueError(f"{name} must give the parameters {list(names)}, but is {given!r}")
+            if not all(np.isfinite(value) for value in given.values()):
+                raise ValueError(f"{name} must be finite, but is {dict(given)}")
+        if self.std is not None and not all(value > 0 for value in self.std.values()):
+            raise ValueError(
+                f"std must be positive, but is {dict(self.std)}; leave a parameter that is known to the model"
+            )
+        self._check_positive("sampling_step")
+        if self.interpolation not in ("zero_order", "linear"):
+            raise ValueError(f"interpolation must be 'zero_order' or 'linear', but is {self.interpolation!r}")
+        if self.factorisation != "structured":
+            raise ValueError(f"factorisation must be 'structured' for a model, but is {self.factorisation!r}")
+        others = self.sensor_noise
+        if others is not None and len(others) != self.plant.n_outputs - 1:
+            raise ValueError(f"sensor_noise must be for the sensors {list(self.plant.outputs)[1:]}, but is {others!r}")
+
+    @cached_property
+    def plant(self) -> Model:
+        """The model."""
+        given = self.system
+        if isinstance(given, Model):
+            return given
+        if isinstance(given, str):
+            if given not in MODELS:
+                raise ValueError(f"system must be one of {list(MODELS)} or a Model, but is {given!r}")
+            return MODELS[given]()
+        fields: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in given.items()
+        }
+        return Model(**fields)
+
+    @property
+    def model(self) -> Model:
+        """The model itself."""
+        return self.plant
+
+    @property
+    def degree(self) -> int:
+        """Of the input over a sample."""
+        return int(self.interpolation == "linear" and self.plant.is_continuous)
+
+    @property
+    def step(self) -> float:
+        """The sampling step."""
+        return float(self.sampling_step)
+
+    @property
+    def center(self) -> dict[str, float]:
+        """The means."""
+        assert self.mean is not None
+        return {name: float(value) for name, value in self.mean.items()}
+
+    @property
+    def noises(self) -> list[float]:
+        """Standard deviation of each sensor's noise."""
+        first = float(self.measurement_noise)
+        return [first, *(self.sensor_noise or [first] * (self.plant.n_outputs - 1))]
+
+    def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
+        """The prior of plants so drawn."""
+        if self.std is None and model.n_outputs == 1:
+            return super().prior_of(model, factorisation)
+        moments = gaussian_moments(model, self.center, dict(self.std or {}), self.step)
+        return weak_prior(model, *moments, self.process_noise, self.noises, self.noise_shape, step=self.step)
+
+    @property
+    def plant_setup(self) -> dict[str, Any]:
+        """The noises, and the range of the plants."""
+        told = {**super().plant_setup, "measurement_noise": np.array(self.noises)}
+        if self.std is not None:
+            scale = 0.0 if self.plant_spread == 0 else 1.0
+            told["width"] = scale * np.array([self.std[name] for name in parameter_names(self.plant)])
+        return told
+
+
+class ModelEnv(DuffingEnv):
+    r"""Choose the input of a plant of any model so that its parameters are identified.
+
+    ## Description
+
+    As `DuffingEnv`, but the plant is a `estimator.models.model.Model`: the environment steps it with its noises, and
+    the estimator that is made of the same declaration keeps the posterior that is observed.
+
+    ## Action space
+
+    `Box(-1, 1, (1,), float32)`, the input in parts of ``max_input``.
+
+    ## Observation space
+
+    `Box(2 K + K (K - 1) / 2 + n + 2 s + 4, float32)` for K coefficients, n states and s sensors, every entry clipped to
+    its bounds: posterior means of the coefficients (deviation from the prior's, in its standard deviations), logarithms
+    of their standard deviations relative to the prior's, their correlations, log E[γ] and log E[ξ] of each sensor
+    relative to the prior's, the states and last outputs in parts of ``max_output``, the last input, the time and the
+    energy that are left, in the order of `duffing_env.layout.observation_bounds`.
+
+    ## Reward
+
+    As `DuffingEnv`.
+
+    ## Starting state
+
+    A plant drawn as ``mean``, ``std`` and ``spread`` say, at rest; the prior is that of plants so drawn.
+
+    ## Episode end
+
+    Terminated at \|y\| > ``max_output`` of the first sensor, or at a number that is not finite; truncated after
+    ``horizon`` samples.
+
+    ## Information
+
+    As `DuffingEnv`; ``truth`` is a `estimator.Parameters`.
+
+    ## Arguments
+
+    Those of `DuffingEnv`, and:
+
+    | Argument | Default | Meaning |
+    |----------|---------|---------|
+    | ``system`` | | a name of `estimator.models.MODELS`, a `Model`, or a dict of its fields |
+    | ``mean`` | | parameter to its mean, or the middle of its range |
+    | ``std`` | None | parameter to its standard deviation: Gaussian; None: log-uniform within ``spread`` |
+    | ``sampling_step`` | 1 | seconds between two samples |
+    | ``interpolation`` | ``zero_order`` | or ``linear``: the input between samples |
+    | ``sensor_noise`` | None | standard deviations of the further sensors |
+
+    >>> import gymnasium as gym
+    >>> import duffing_env
+    >>> env = gym.make("duffing_env/Pendulum-v0")
+    >>> observation, info = env.reset(seed=0)
+    >>> observation.shape
+    (19,)
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    experiment_kind: ClassVar[type[Experiment]] = ModelExperiment
+
+
+class ModelVectorEnv(DuffingVectorEnv):
+    """Many `ModelEnv` at once."""
+
+    single: ClassVar[type[DuffingEnv]] = ModelEnv

@@ -1,0 +1,66 @@
+"""The input of a sample as a model takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from estimator.lanes import part
+from estimator.models.model import Model
+
+#: Ways of the input between samples, and the degree of the polynomial that each takes.
+INTERPOLATIONS = {"zero_order": 0, "linear": 1}
+
+
+def input_degree(model: Model, interpolation: str) -> int:
+    """The degree of the input's polynomial over a sample.
+
+    Raises:
+        ValueError: for an unknown interpolation, or one that is not ``zero_order`` for a difference equation.
+    """
+    if interpolation not in INTERPOLATIONS:
+        raise ValueError(f"interpolation must be one of {list(INTERPOLATIONS)}, but is {interpolation!r}")
+    if not model.is_continuous and interpolation != "zero_order":
+        raise ValueError(
+            f"interpolation must be 'zero_order' for the difference equation {model.name!r}, whose inputs are samples, "
+            f"but is {interpolation!r}"
+        )
+    return INTERPOLATIONS[interpolation]
+
+
+def older_inputs(model: Model, degree: int) -> int:
+    """Inputs before the newest one that a sample depends on."""
+    return degree if model.is_continuous else model.taps - 1
+
+
+def feeder(model: Model, degree: int, places: Sequence[int], lanes: int) -> Any:
+    """Compiled: ``feed(W, j, now, last, older)`` lays the inputs of a sample, newest first, into lane j of a block.
+
+    Args:
+        model: that takes them.
+        degree: of the input's polynomial over a sample, 0 or 1.
+        places: rows of ``U_0``, ``U_1``, ...
+        lanes: systems in the block.
+
+    Raises:
+        ValueError: for another degree.
+    """
+    if degree > 1:
+        raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline's input is not known sample by sample")
+    rows = [place * lanes for place in places]
+    first, second, third = [*rows, 0, 0][:3]
+    count, is_line = len(rows), model.is_continuous and degree == 1
+
+    @part("_".join(map(str, (*rows, is_line, lanes))))
+    def feed(W, j, now, last, older):
+        if is_line:
+            W[first + j] = last
+            W[second + j] = now - last
+        else:
+            W[first + j] = now
+            if count > 1:
+                W[second + j] = last
+            if count > 2:
+                W[third + j] = older
+
+    return feed

@@ -1,0 +1,162 @@
+"""A model's motion without noise, at known coefficients, compiled for one system: what simple rules look at.
+
+Besides the motion itself these are four things that every model has, and that Eq. (2) and Eq. (1) call by other names:
+
+- the *velocity* of the first sensor: its derivative by time without input. Of a difference equation that keeps the last
+  value of what the sensor shows it is the change since; of another, the change that comes without input.
+- the *gain*: how an input first shows, in the lowest derivative by time (or the first of the next samples) that depends
+  on it: η of Eq. (2), δ²/m of Eq. (1).
+- the *regressors*: derivatives of the moves by the coefficients.
+- the *linear part*: derivatives of the moves by the states, at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+from estimator.engine import cache as stored
+from estimator.engine.imagination import coarsened, fed, inputs_of
+from estimator.engine.rows import carried_names
+from estimator.engine.tasks import NAMES
+from estimator.lanes import rows
+from estimator.models.model import Model
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion of a model; all functions are of one system in a flat block ``W``.
+
+    The input of a sample stands in row ``INPUT``; older ones, where the model looks at them, in ``LAST_INPUT`` and
+    ``OLDER_INPUT``, and move on by themselves.
+
+    Attributes:
+        sense: ``sense(W)``: leaves in ``NOW`` what the first sensor shows now, without input, and its ``VELOCITY`` and
+            ``GAIN``.
+        glance: ``glance(W)``: leaves in ``SHOWN`` what it would show after the sample.
+        step: ``step(W)``: a sample; leaves ``SHOWN``, and in ``PHI_<coefficient>`` its derivatives by the coefficients.
+        regress: ``regress(W)``: the regressors, over all moves, into ``E_<coefficient>``.
+        linearise: ``linearise(W)``: the linear part into ``A_<state>_<state>``.
+        layout: rows of the block: states, coefficients, inputs, results.
+        is_odd: whether everything changes its sign with states and input.
+    """
+
+    sense: Any
+    glance: Any
+    step: Any
+    regress: Any
+    linearise: Any
+    layout: Mapping[str, int]
+    is_odd: bool
+
+
+@cache
+def motion(model: Model, degree: int = 0, lag: int = 0) -> Motion:
+    """The motion of a model; arguments as `estimator.engine.imagination.imagination`."""
+    coarse = coarsened(model)
+    names = [*model.names, "INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN"]
+    names += [f"{letter}_{c}" for letter in ("PHI", "E") for c in model.coefficients]
+    names += [f"A_{i}_{j}" for i in model.states for j in model.states]
+    place = rows(" ".join([*names, *carried_names(model)]))
+    key = repr((coarse.digest, degree, lag))
+    code = stored.load(model.name, "motion", key, lambda: _source(coarse, degree, lag, place), NAMES)
+    return Motion(code.sense, code.glance, code.step, code.regress, code.linearise, place, code.IS_ODD)
+
+
+def _source(model: Model, degree: int, lag: int, place: Mapping[str, int]) -> str:
+    from estimator.engine import derive, emit
+
+    found, symbol = derive.calculus(model), derive.symbol
+    given = fed(model, degree, lag)
+
+    def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
+        return "@jit\n" + emit.lane_loop(name, derive.renamed(lines, given), results, place, 1, uniform, doc=doc)
+
+    shown, velocity, gain = _sensor(model)
+    values = {"NOW_e": shown, "VELOCITY_e": velocity, "GAIN_e": gain}
+    source = loop("sense", "The sensor now.", derive.shared(values, "W"), {n.removesuffix("_e"): n for n in values})
+    source += _step_source(model, degree, lag, loop)
+    still = {symbol("u1"): symbol("u"), symbol("u2"): symbol("u")}
+    summed = {f"R_{c}": sum(m.diff(symbol(c)) for m in found.moves).xreplace(still) for c in model.coefficients}
+    lines = derive.renamed(derive.shared(summed, "W"), {"u": "INPUT"})
+    source += loop("regress", "The regressors.", lines, {f"E_{c}": f"R_{c}" for c in model.coefficients})
+    rest = {symbol(name): 0 for name in (*model.states, "u", "u1", "u2")}
+    slopes = {
+        f"L_{i}_{j}": slope.subs(rest)
+        for i, row in zip(model.states, found.by, strict=True)
+        for j, slope in zip(model.states, row, strict=False)
+    }
+    results = {f"A_{name[2:]}": name for name in slopes}
+    source += loop("linearise", "The linear part.", list(slopes.items()), results)
+    over = {symbol(name): -symbol(name) for name in (*model.states, "u", "u1", "u2")}
+    is_odd = all((e + e.xreplace(over)).expand() == 0 for e in (*found.moves, *found.outputs))
+    return source + f"IS_ODD = {is_odd}\n"
+
+
+def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
+    """``glance`` and ``step``."""
+    from estimator.engine import derive, emit
+
+    found, symbol, states = derive.calculus(model), derive.symbol, list(model.states)
+    inputs = inputs_of(model, degree, lag)
+    source, (lines, moved) = "", derive.moved(model)
+    if model.is_continuous:
+        start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
+        source += loop("begin", "The point that moves.", [], start)
+        carried = {name: f"{name}_E" for name in derive.carried(model)}
+        source += loop("move", "One Runge-Kutta step.", derive.motion_step(model, degree), carried, "T")
+        point = {f"M_{x}": f"M_{x}_E" for x in states}
+        source += loop("move_plainly", "The same of the state alone.", derive.plain_step(model, degree), point, "T")
+    at = dict(zip(map(symbol, states), moved.state, strict=True)) | {symbol("u"): derive.input_at_end(model, degree)}
+    shown = found.outputs[0].xreplace(at)
+    readout = [slope.xreplace(at) for slope in found.readouts[0]]
+    n = len(states)
+    phi = [
+        sum((readout[a] * moved.by[a][n + b] for a in range(n)), readout[n + b]) for b in range(model.n_coefficients)
+    ]
+    source += loop("see", "What the sensor will show.", [*lines, ("SHOWN_e", shown)], {"SHOWN": "SHOWN_e"})
+    more = [("SHOWN_e", shown), *((f"PHI_{c}_e", e) for c, e in zip(model.coefficients, phi, strict=True))]
+    more += [(f"END_{x}", value) for x, value in zip(states, moved.state, strict=True)]
+    results = {row: f"{row}_e" for row in ("SHOWN", *(f"PHI_{c}" for c in model.coefficients))}
+    results |= {x: f"END_{x}" for x in states}
+    results |= {older: newer for newer, older in pairwise(inputs)}
+    source += loop("finish", "What the sensor shows, by the coefficients too.", [*lines, *more], results)
+    for name, move, end in (("glance", "move_plainly", "see"), ("step", "move", "finish")):
+        steps = model.substeps
+        body = ["begin(W)", f"for s in range({steps}):", f"    {move}(W, s / {steps})"] if model.is_continuous else []
+        source += f"@jit\ndef {name}(W):\n" + "".join(f"    {line}\n" for line in [*body, f"{end}(W)"])
+    return source
+
+
+def _sensor(model: Model) -> tuple[Any, Any, Any]:
+    """What the first sensor shows without input, its velocity, and its gain."""
+    import sympy as sp
+
+    from estimator.engine.derive import calculus, symbol
+
+    found, u = calculus(model), symbol("u")
+    still = {symbol(name): u for name in ("u1", "u2")}
+    moves = dict(zip(map(symbol, model.states), (m.xreplace(still) for m in found.moves), strict=True))
+    shown = found.outputs[0].xreplace({u: sp.S.Zero})
+
+    def later(value: Any) -> Any:
+        """The derivative by time, or the value one sample later."""
+        if model.is_continuous:
+            return sum(value.diff(x) * rate for x, rate in moves.items())
+        return value.xreplace(moves)
+
+    gain, value = sp.S.Zero, shown
+    for _ in range(model.n_states + 1):
+        value = later(value)
+        gain = value.diff(u)
+        if gain != 0:
+            break
+        value = value.subs(u, 0)
+    gain = gain.subs(u, 0) if gain != 0 else sp.S.One
+    if model.is_continuous:
+        return shown, later(shown).subs(u, 0), gain
+    kept = [x for x, move in moves.items() if move == shown]
+    return shown, shown - kept[0] if kept else later(shown).subs(u, 0) - shown, gain

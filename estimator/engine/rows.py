@@ -1,0 +1,79 @@
+"""What stands in the blocks of the engine: names of rows, in order."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+
+from estimator.lanes import rows
+from estimator.models.model import Model
+
+
+def noise_names(model: Model) -> list[str]:
+    """Names of the noises' Gamma beliefs: γ first, then ξ of each sensor."""
+    return ["GAMMA_SHAPE", "GAMMA_RATE", *(f"XI_{part}_{y}" for y in model.outputs for part in ("SHAPE", "RATE"))]
+
+
+def belief_names(model: Model) -> list[str]:
+    """The flat record of a belief: means, upper triangle of the covariance, shapes and rates of the noises."""
+    covariances = [f"P_{i}_{j}" for i, j in combinations_with_replacement(model.names, 2)]
+    return [*model.names, *covariances, *noise_names(model)]
+
+
+def input_rows(model: Model, degree: int) -> list[str]:
+    """The input over a sample: taps of a difference equation, or coefficients of the polynomial in τ."""
+    return [f"U_{k}" for k in range(model.taps if not model.is_continuous else degree + 1)]
+
+
+def carried_names(model: Model) -> list[str]:
+    """What a differential equation carries over a sample; nothing for a difference equation."""
+    if not model.is_continuous:
+        return []
+    names = [f"M_{i}" for i in model.states]
+    names += [f"S_{i}_{j}" for i in model.states for j in model.movers]
+    if model.held:
+        return [*names, *(f"D_{i}" for i in model.states)]
+    return [*names, *(f"N_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2))]
+
+
+def layout(model: Model, degree: int) -> dict[str, int]:
+    """Rows of an estimator's block: the belief, the sample, and what is carried over it."""
+    outputs = [f"Y_{y}" for y in model.outputs]
+    return rows(" ".join([*belief_names(model), *input_rows(model, degree), *outputs, *carried_names(model)]))
+
+
+def point_names(model: Model) -> list[str]:
+    """Rows of the sigma points (`estimator.engine.points`)."""
+    columns, movers = range(len(model.movers)), model.movers
+    names = [*movers, *(i for i in model.names if i not in movers)]
+    images = [f"I_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
+    at_point = [f"X_{i}" for i in movers if i not in model.states]
+    return [*(f"L_{c}_{i}" for c in columns for i in names), *(f"WEIGHT_{c}" for c in columns), *at_point, *images,
+            "UNSOUND"]  # fmt: skip
+
+
+def trace_names(model: Model, iterations: int) -> list[str]:
+    """Rows that `structured` leaves for the free energy, per sensor."""
+    names = []
+    for k in range(model.n_outputs):
+        names += [f"TRACE_{k}_{what}" for what in ("mean", "innovation", "variance", "shown")]
+        names += [f"TRACE_{k}_{what}_{i}" for i in range(iterations) for what in ("q", "r")]
+    return names
+
+
+def path_names(model: Model) -> list[str]:
+    """Where a path is: the filter's state, its covariance V, and its sensitivities Z to the coefficients."""
+    covariances = [f"V_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2)]
+    return [*model.states, *covariances, *(f"Z_{i}_{c}" for i in model.states for c in model.coefficients)]
+
+
+def path_results(model: Model) -> list[str]:
+    """What a path adds up: minus the log likelihood, its slope, and the information (upper triangle)."""
+    information = [f"F_{c}_{d}" for c, d in combinations_with_replacement(model.coefficients, 2)]
+    return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *information]
+
+
+def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
+    """Rows of a path's block."""
+    shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
+    given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE"]
+    return rows(" ".join([*path_names(model), *path_results(model), *given, *carried_names(model)]))

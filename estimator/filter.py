@@ -1,0 +1,310 @@
+"""The memory of an online estimator: a belief, or several weighed ones, and the inputs that still act."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.belief import Belief, covariance_places
+from estimator.ensemble import LEVELS, NoiseRatio, grid, log_ratio, matched_gamma, ratio_of
+from estimator.inference import samples
+from estimator.inputs import Channel, channel, degree
+from estimator.models.difference import difference
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+from estimator.rig import Rig
+from estimator.settings import Settings
+
+#: Shape of a Gamma belief that further samples do not move.
+_CERTAIN = 1e15
+
+#: What rounding may leave below zero of the eigenvalues of a covariance, in units of its standard deviations.
+_ROUNDING = 1e-5
+
+
+class Filter:
+    """Memory for any model.
+
+    Args:
+        prior: belief before the first sample, one sample before it.
+        rig: what the inputs do.
+        settings: how it learns.
+    """
+
+    def __init__(self, prior: Belief, rig: Rig, settings: Settings) -> None:
+        self.prior, self.rig, self.settings = prior, rig, settings
+        self.model: Model = prior.model
+        self.channel: Channel = channel(self.model, rig)
+        members = 1 if settings.noise_hypotheses == 1 else len(LEVELS) * settings.noise_hypotheses
+        self._loop = self._compiled(members)
+        size, lanes = len(prior.record), self._loop.lanes
+        blocks = -(-members // lanes)
+        self._block = np.zeros((blocks, len(self._loop.layout) * lanes))
+        self._backup = np.empty((blocks, size * lanes))
+        self._weights = np.full(members, 1 / members)
+        self._begun = np.zeros(1)
+        self._inputs = np.zeros(self.channel.past + 1)
+        self._outputs = np.zeros((self.channel.waits + 1, self.model.n_outputs))
+        self._walk = settings.drift**2 * np.diag(prior.coefficients_cov)
+        self._first = prior.record.copy()
+        shape = [self.channel.stride, self.channel.past, self.channel.waits, self.channel.fills]
+        self._steps = np.array(shape, dtype=np.int64)
+        records = np.repeat(prior.record[None], members, axis=0)
+        if members > 1:
+            records[:, -4:] = grid(prior.noises, settings.noise_hypotheses)
+        self._put(records)
+
+    def _compiled(self, members: int) -> samples.Loop:
+        settings = self.settings
+        if settings.factorisation == "mean_field":
+            return samples.published(settings.iterations, settings.as_published)
+        return samples.structured(
+            self.model, degree(self.model, self.rig), settings.iterations, settings.expectations, members
+        )
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "_loop"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state)
+        self._loop = self._compiled(self.members)
+
+    def copy(self) -> Filter:
+        """An independent copy."""
+        other = object.__new__(Filter)
+        other.__dict__.update(self.__dict__)
+        for name in ("_block", "_weights", "_begun", "_inputs", "_outputs"):
+            setattr(other, name, getattr(self, name).copy())
+        return other
+
+    @property
+    def members(self) -> int:
+        """Number of weighed beliefs."""
+        return len(self._weights)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the next sample only waits for the one after it."""
+        return self.channel.waits and not self._begun[0]
+
+    def step(self, u: float, y: float, energies: FloatArray, forecasts: FloatArray) -> int:
+        """Take one sample of one sensor; see `run`."""
+        self._inputs[-1] = u
+        self._outputs[-1, 0] = y
+        bad: int = self._loop.run(
+            self._block, self._backup, self._weights, self._begun, self._inputs, self._outputs,
+            self.channel.stencil, self._steps, self._walk, energies, forecasts,
+        )  # fmt: skip
+        return bad
+
+    def run(self, u: FloatArray, y: FloatArray, energies: FloatArray, forecasts: FloatArray) -> int:
+        """Take samples; one that waits for a later input is used by the next call.
+
+        Args:
+            u: (T,) inputs.
+            y: (T, sensors) outputs.
+            energies: (T or more, iterations) receives the free energies, from the front; empty to follow blindly.
+            forecasts: (T or more, sensors, 2) receives means and variances of the outputs before they were seen.
+
+        Returns:
+            The sample at which the numbers overflowed, or -1. Nothing has changed where they did.
+        """
+        at_once = self.channel.at_once
+        inputs = self.channel.pieces(u).reshape(-1) if at_once else np.concatenate([self._inputs[:-1], u])
+        outputs = np.concatenate([self._outputs[:-1], y])
+        bad: int = self._loop.run(
+            self._block, self._backup, self._weights, self._begun, inputs, outputs,
+            self.channel.stencil, self._steps, self._walk, energies, forecasts,
+        )  # fmt: skip
+        if bad < 0:
+            self._inputs[:-1] = inputs[: self.channel.past]
+            self._outputs[:-1] = outputs[: self.channel.waits]
+        return max(0, bad - int(self.channel.waits)) if bad >= 0 else -1
+
+    def rewind(self) -> None:
+        """Forget the state and the inputs; keep coefficients, noises and weights."""
+        records, n = self.records, self.model.n_states
+        of_states = np.concatenate([np.arange(n), covariance_places(self.model)[:n].reshape(-1)])
+        records[:, of_states] = self._first[of_states]
+        coupled = covariance_places(self.model)[:n, n:].reshape(-1)
+        records[:, coupled] = 0.0
+        self._put(records)
+        self._inputs[:], self._outputs[:], self._begun[:] = 0.0, 0.0, 0.0
+
+    @property
+    def records(self) -> FloatArray:
+        """(members, size) the flat records of all beliefs; a copy."""
+        blocks, lanes, size = len(self._block), self._loop.lanes, len(self._first)
+        rows = self._block[:, : size * lanes].reshape(blocks, size, lanes)
+        return rows.transpose(0, 2, 1).reshape(blocks * lanes, size)[: self.members].copy()
+
+    def _put(self, records: FloatArray) -> None:
+        blocks, lanes, size = len(self._block), self._loop.lanes, len(self._first)
+        spare = records[np.minimum(np.arange(blocks * lanes), len(records) - 1)]  # a spare lane repeats the last
+        self._block[:, : size * lanes] = spare.reshape(blocks, lanes, size).transpose(0, 2, 1).reshape(blocks, -1)
+
+    @property
+    def belief(self) -> Belief:
+        """The belief now, of the mixture where there are several."""
+        return self.prior.with_records(self._mixture()[None])[0]
+
+    @property
+    def noise_ratio(self) -> NoiseRatio:
+        """What the weights say, at the precisions that each member has learned."""
+        weights = self._finite_weights()
+        ratios = np.array([log_ratio(record[-4:]) for record in self.records[weights > 0]])
+        return ratio_of(weights[weights > 0], ratios, self.settings.noise_hypotheses)
+
+    def _finite_weights(self) -> FloatArray:
+        """(members,) weights that sum to 1, 0 where a member overflowed."""
+        weights = np.where(np.isfinite(self.records).all(axis=1), self._weights, 0.0)
+        return weights / weights.sum()
+
+    def _mixture(self) -> FloatArray:
+        """(size,) a record with the mixture's moments."""
+        records = self.records
+        if len(records) == 1:
+            return records[0]
+        weights = self._finite_weights()
+        records, share = records[weights > 0], weights[weights > 0]
+        d, places = len(self.model.names), covariance_places(self.model)
+        about = records[int(np.argmax(share))]  # so that what all members know stays as it is, to the last bit
+        mean = about[:d] + share @ (records[:, :d] - about[:d])
+        deviations = records[:, :d] - mean
+        mixture = about.copy()
+        mixture[places] = np.tensordot(share, records[:, places], 1) + (deviations.T * share) @ deviations
+        mixture[:d] = mean
+        mixture[-4:-2] = matched_gamma(share, records[:, -4], records[:, -3])
+        mixture[-2:] = matched_gamma(share, records[:, -2], records[:, -1])
+        return mixture
+
+    @property
+    def regresses(self) -> bool:
+        """Whether the model is the paper's, which is judged by measured outputs as they are."""
+        return self.model == difference()
+
+    def predict(self, u: FloatArray, y: FloatArray) -> FloatArray:
+        """One-step predictions (T, sensors) with the coefficients fixed at their means."""
+        if not self.regresses:
+            return self._known().follow(u, y)
+        t1, t2, t3, eta = self.belief.coefficients_mean
+        predicted, last = y.copy(), y[1:-1, 0]
+        acting = np.concatenate([np.zeros(self.rig.delay), u])[2 : len(y)]
+        predicted[2:, 0] = t1 * last + t2 * last**3 + t3 * y[:-2, 0] + eta * acting
+        return predicted
+
+    def simulate(self, u: FloatArray, y_init: FloatArray) -> FloatArray:
+        """Free run (T, sensors) from the first outputs, with the coefficients fixed at their means."""
+        given = len(y_init)
+        unseen = np.full((len(u) - given, y_init.shape[1]), np.nan)
+        known = self._known(state=y_init[::-1][:2, 0] if self.regresses else None)
+        if self.regresses:
+            # The state is measured: what acts from now on are the inputs, with those that the delay holds back.
+            kept = known.channel.past
+            known._inputs[:-1] = np.concatenate([np.zeros(kept), u[:given]])[given:]
+            return np.concatenate([y_init, known.follow(u[given:], unseen)]) if len(unseen) else y_init.copy()
+        followed = known.follow(u, np.concatenate([y_init, unseen]))
+        followed[:given] = y_init
+        return followed
+
+    def _known(self, state: FloatArray | None = None) -> Filter:
+        """A filter that knows coefficients and noises, and the state where it is given."""
+        n, d = self.model.n_states, len(self.model.names)
+        record, places = self._mixture(), covariance_places(self.model)
+        cov = np.zeros((d, d))
+        if state is None:
+            record[:n] = self._first[:n]
+            cov[:n, :n] = self._first[places[:n, :n]]
+        else:
+            record[:n] = state
+        record[places] = cov
+        noises = record[-2 - 2 * self.model.n_outputs :]
+        noises *= np.repeat(_CERTAIN / noises[::2], 2)
+        # As many iterations as the filter itself takes, though one were enough: that loop is compiled.
+        settings = replace(self.settings, drift=0.0, noise_hypotheses=1)
+        if settings.factorisation == "mean_field":
+            settings = Settings()
+        known = Filter(self.prior.with_records(record[None])[0], self.rig, settings)
+        return known
+
+    def follow(self, u: FloatArray, y: FloatArray) -> FloatArray:
+        """Forecasts (T, sensors) along a record, whose end may wait for an input that is not there."""
+        forecasts = np.empty((len(u) + 1, y.shape[1], 2))
+        nothing = np.empty((0, 1))
+        used = len(u) - int(self.is_waiting)
+        self.run(u, y, nothing, forecasts)
+        if self.channel.waits:  # the input after the last is taken as the last
+            self.run(u[-1:], np.full((1, y.shape[1]), np.nan), nothing, forecasts[used:])
+        return forecasts[: len(u), :, 0]
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Everything that the future depends on, by name; copies."""
+        return {
+            "records": self.records,
+            "weights": self._weights.copy(),
+            "first": self._first.copy(),
+            "walk": self._walk.copy(),
+            "inputs": self._inputs[:-1].copy(),
+            "outputs": self._outputs[:-1].copy(),
+            "begun": self._begun.copy(),
+        }
+
+    def restore(self, arrays: Mapping[str, npt.ArrayLike]) -> None:
+        """Become what `arrays` said of a filter with the same settings; all of it, or nothing.
+
+        Raises:
+            ValueError: naming the array, for one that is missing, unknown, or none that such a filter can have.
+        """
+        own = self.arrays()
+        if set(arrays) != set(own):
+            raise ValueError(f"arrays must be {sorted(own)}, but are {sorted(arrays)}; use arrays() of an estimator")
+        given = {name: _checked(name, arrays[name], own[name]) for name in own}
+        weights, alive = given["weights"], given["weights"] > 0
+        if not (weights >= 0).all() or not np.isclose(weights.sum(), 1.0, rtol=1e-6):
+            raise ValueError(f"weights must be probabilities, but are {weights.tolist()}; use arrays() of an estimator")
+        if given["begun"][0] not in (0.0, 1.0):
+            raise ValueError(f"begun must be 0 or 1, but is {given['begun'][0]}; use arrays() of an estimator")
+        if (given["walk"] < 0).any():
+            raise ValueError(f"walk must be at least 0, but is {given['walk'].tolist()}; use arrays() of an estimator")
+        for name, records in (("records", given["records"][alive]), ("first", given["first"][None])):
+            for record in records:
+                _check_record(name, self.model, record)
+        for name in ("weights", "first", "walk", "begun"):
+            setattr(self, f"_{name}", given[name])
+        self._inputs[:-1], self._outputs[:-1] = given["inputs"], given["outputs"]
+        self._put(given["records"])
+
+
+def _checked(name: str, value: npt.ArrayLike, own: FloatArray) -> FloatArray:
+    """A copy of an array of the right kind."""
+    array = np.asarray(value)
+    if array.dtype != np.float64 or array.shape != own.shape:
+        raise ValueError(
+            f"{name} must be float64 of shape {own.shape}, but is {array.dtype} of {array.shape}; use arrays() of an "
+            f"estimator with the same settings"
+        )
+    # A member without weight may have overflowed, and an output that waits may be missing.
+    if name not in ("records", "outputs") and not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, but is {array.tolist()}; use arrays() of an estimator")
+    if name == "outputs" and np.isinf(array).any():
+        raise ValueError(f"outputs must be finite or missing, but are {array.tolist()}; use arrays() of an estimator")
+    return np.array(array, order="C")
+
+
+def _check_record(name: str, model: Model, record: FloatArray) -> None:
+    """A belief's record, of which later samples can make sense."""
+    if not np.isfinite(record).all():
+        raise ValueError(f"{name} must be finite, but has {record.tolist()}; use arrays() of an estimator")
+    noises = record[-2 - 2 * model.n_outputs :]
+    if (noises <= 0).any():
+        raise ValueError(f"{name} must have positive shapes and rates, but has {noises.tolist()}")
+    cov = record[covariance_places(model)]
+    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    unit = np.where(std > 0, std, 1.0)
+    known = std == 0
+    smallest = np.linalg.eigvalsh(cov / np.outer(unit, unit))[0]
+    if (np.diag(cov) < 0).any() or (cov[known] != 0).any() or smallest < -_ROUNDING * len(cov):
+        raise ValueError(f"{name} must have a positive definite covariance, but has {cov.tolist()}")

@@ -1,0 +1,258 @@
+"""One compiled function that takes samples, for any model: the loop of the online estimator.
+
+A block ``W`` holds one system, or `LANES` hypotheses about the noises of one. Each sample lets the coefficients walk,
+puts the inputs into their rows, updates, and judges every member by its free energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from estimator.engine import tasks
+from estimator.engine.cache import digest_of
+from estimator.engine.free_energy import free_energies
+from estimator.engine.rows import belief_names
+from estimator.inference import mean_field
+from estimator.lanes import LANES, jit, kernel, part
+from estimator.models.difference import difference
+from estimator.models.model import Model
+
+#: Probability per sample that the hypothesis is drawn anew: no weight stays below it for good.
+SWITCHING = 1e-6
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A compiled loop over samples, and its block.
+
+    Attributes:
+        run: ``run(W, backup, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts)``, which
+            returns -1, or the number of the sample at which the numbers overflowed; then nothing has changed.
+
+            - W: (blocks, rows * lanes), the members' systems one after the other.
+            - backup: (blocks, record * lanes), memory.
+            - weights: (members,) of the hypotheses.
+            - begun: (1,) 0 before the first sample ever.
+            - inputs: those that still act, then a new one for each sample; the former are moved on.
+            - outputs: (samples, sensors), with the one that waits in front; NaN where missing.
+            - stencil: of `estimator.inputs.Channel`.
+            - steps: its stride, past, waits and fills, as int64.
+            - walk: (K,) variances of the coefficients' random walk per sample.
+            - energies: (samples, iterations) receives the free energies [nats]; where it is empty nothing is judged.
+            - forecasts: (samples, sensors, 2) receives mean and variance of each output before it was seen.
+        layout: rows of the block.
+        lanes: systems in a block.
+    """
+
+    run: Any
+    layout: Mapping[str, int]
+    lanes: int
+
+
+@cache
+def structured(model: Model, degree: int, iterations: int, expectations: str = "first_order", members: int = 1) -> Loop:
+    """The structured factorisation, with a lane for each member where there are several."""
+    lanes = 1 if members == 1 else LANES
+    task = tasks.structured(
+        model, degree, iterations=iterations, lanes=lanes, trace=True, missing=True, expectations=expectations
+    )
+    place, update = task.layout, task.update
+    energies_of = free_energies(model, iterations, lanes, place)
+    sensors = model.n_outputs
+    kind = f"{model.name}_{digest_of(model.digest, degree, iterations, lanes, expectations)}"
+    means = tuple(place[f"TRACE_{k}_mean"] * lanes for k in range(sensors))
+    parts = tuple(
+        tuple(place[f"TRACE_{k}_{what}"] * lanes for what in ("variance", f"q_{iterations - 1}", f"r_{iterations - 1}"))
+        for k in range(sensors)
+    )
+    unsound = place.get("UNSOUND", -1) * lanes
+
+    @part(kind)
+    def take(W, before):
+        if unsound >= 0:
+            for j in range(lanes):
+                W[unsound + j] = 0.0
+        update(W)
+
+    @part(kind)
+    def judge(W, j, before, values, forecasts):
+        energies_of(W, j, values)
+        if unsound >= 0 and W[unsound + j] > 0.0:
+            values[:] = np.nan
+        for k in range(sensors):
+            forecasts[k, 0] = W[means[k] + j]
+            forecasts[k, 1] = W[parts[k][0] + j] + W[parts[k][1] + j] + W[parts[k][2] + j]
+
+    return Loop(_loop(kind, model, place, lanes, iterations, take, judge), place, lanes)
+
+
+@cache
+def published(iterations: int, as_published: bool) -> Loop:
+    """The paper's mean field, with or without the departures of the published run. It makes no forecasts."""
+    model = difference()
+    place = mean_field.layout()
+    begin, iterate, end, energy = mean_field.pieces(place, lanes=1)
+    kind = f"mean_field_{digest_of(model.digest, iterations, as_published)}"
+
+    @part(kind)
+    def take(W, before):
+        begin(W)
+        for i in range(iterations):
+            iterate(W, as_published)
+            before[i] = energy(W, 0)
+        end(W)
+
+    @part(kind)
+    def judge(W, j, before, values, forecasts):
+        values[:] = before[:iterations]
+        forecasts[:] = np.nan
+
+    return Loop(_loop(kind, model, place, 1, iterations, take, judge), place, 1)
+
+
+@jit
+def weigh(weights, each, predictions, energies, forecasts):
+    """Weigh the members by their free energies of one sample.
+
+    Args:
+        weights: (M,) before it; overwritten with those after it.
+        each: (M, iterations) free energies of the members [nats].
+        predictions: (M, sensors, 2) mean and variance of each output before it was seen.
+        energies: (iterations,) receives those of the mixture, from the weights before.
+        forecasts: (sensors, 2) receives mean and variance of the mixture before the output was seen.
+
+    A member whose numbers are not finite has no weight. Where none is left, all results are NaN.
+    """
+    members, iterations = each.shape
+    before = np.zeros(members)
+    total = 0.0
+    for m in range(members):
+        if np.isfinite(each[m, -1] + predictions[m].sum()):
+            before[m] = (1.0 - SWITCHING) * weights[m] + SWITCHING / members
+        total += before[m]
+    before /= total
+    for k in range(len(forecasts)):
+        mean, variance = 0.0, 0.0
+        for m in range(members):
+            if before[m] > 0.0:
+                mean += before[m] * predictions[m, k, 0]
+        for m in range(members):
+            if before[m] > 0.0:
+                variance += before[m] * (predictions[m, k, 1] + (predictions[m, k, 0] - mean) ** 2)
+        forecasts[k, 0] = mean if total > 0.0 else np.nan
+        forecasts[k, 1] = variance if total > 0.0 else np.nan
+    for i in range(iterations):
+        least = np.inf
+        for m in range(members):
+            if before[m] > 0.0:
+                least = min(least, each[m, i])
+        evidence = 0.0
+        for m in range(members):
+            weights[m] = 0.0
+            if before[m] > 0.0:
+                weights[m] = before[m] * np.exp(least - each[m, i])
+                evidence += weights[m]
+        weights /= evidence
+        energies[i] = least - np.log(evidence)
+
+
+def _loop(kind: str, model: Model, place: Mapping[str, int], lanes: int, scratch: int, take: Any, judge: Any) -> Any:
+    """The loop of `Loop.run` around an update ``take(W, before)`` and its ``judge(W, j, before, values, forecasts)``.
+
+    Args:
+        kind: names the compiled code; see `estimator.lanes.part`.
+        model: whose rows.
+        place: of the rows.
+        lanes: systems in a block.
+        scratch: numbers that ``take`` leaves in ``before`` for ``judge``.
+        take: updates a block.
+        judge: free energies and forecasts of a lane.
+    """
+    u_row = place["U_0"] * lanes
+    y_row = place[f"Y_{next(iter(model.outputs))}"] * lanes
+    walks = tuple(place[f"P_{c}_{c}"] * lanes for c in model.coefficients)
+    size = len(belief_names(model)) * lanes
+
+    @part(kind)
+    def feed(W, window, stencil, output, walk, changes):
+        if changes:
+            for c in range(len(walks)):
+                for j in range(lanes):
+                    W[walks[c] + j] += walk[c]
+        for i in range(len(stencil)):
+            value = 0.0
+            for w in range(len(window)):
+                value += window[w] * stencil[i, w]
+            for j in range(lanes):
+                W[u_row + i * lanes + j] = value
+        for k in range(len(output)):
+            for j in range(lanes):
+                W[y_row + k * lanes + j] = output[k]
+
+    @kernel(kind=kind)
+    def run(W, backup, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts):
+        stride, past, waits, fills = steps[0], steps[1], steps[2], steps[3]
+        members, samples, iterations = len(weights), len(outputs) - waits, energies.shape[1]
+        judged = energies.shape[0] > 0
+        window, changes = stencil.shape[1], walk.max() > 0.0
+        before = np.empty(scratch)
+        single = np.empty((members, iterations))
+        predictions = np.empty((members, outputs.shape[1], 2))
+        old_weights = weights.copy()
+        first = 1 if waits and begun[0] == 0.0 else 0
+        if fills and begun[0] == 0.0:
+            inputs[:past] = inputs[past]
+        for b in range(len(W)):
+            for i in range(size):
+                backup[b, i] = W[b, i]
+        bad = -1
+        for t in range(first, samples):
+            for b in range(len(W)):
+                feed(W[b], inputs[t * stride : t * stride + window], stencil, outputs[t], walk, changes)
+                take(W[b], before)
+                for j in range(min(lanes, members - b * lanes)):
+                    m = b * lanes + j
+                    judge(W[b], j, before, single[m], predictions[m])
+            here = t - first
+            if not judged:
+                forecasts[here] = predictions[0]
+                continue
+            if members == 1:
+                energies[here] = single[0]
+                forecasts[here] = predictions[0]
+            else:
+                weigh(weights, single, predictions, energies[here], forecasts[here])
+            if not np.isfinite(energies[here].sum()):
+                bad = t
+                break
+        if judged and bad < 0 and samples > first:
+            # What the last sample left is seen by no later free energy.
+            whole = False
+            for m in range(members):
+                finite = weights[m] > 0.0
+                for i in range(m % lanes, size, lanes):
+                    finite = finite and np.isfinite(W[m // lanes, i])
+                whole = whole or finite
+            if not whole:
+                bad = samples - 1
+        if bad >= 0:
+            for b in range(len(W)):
+                for i in range(size):
+                    W[b, i] = backup[b, i]
+            weights[:] = old_weights
+            if fills and begun[0] == 0.0:
+                inputs[:past] = 0.0
+            return bad
+        for i in range(past):
+            inputs[i] = inputs[i + samples]
+        for i in range(waits):
+            outputs[i] = outputs[i + samples]
+        begun[0] = 1.0
+        return bad
+
+    return run

@@ -1,0 +1,285 @@
+"""What an experiment can tell at best: Fisher information and Cramér-Rao bounds, of any model.
+
+The state is latent, so an output tells about the coefficients only what the past outputs did not. With the Kalman
+filter of the model linearised along its trajectory, ν_t the innovation, S_t its variance, s_t = -∂ν_t/∂(coefficients),
+
+    F = Σ_t s_t s_tᵀ / S_t,
+
+summed over the sensors too. What is left out is the sensitivity of the filter's gain and of S themselves: it enters F
+relative to the above by the squared ratio of noise to signal (1e-5 on the tracks), and what S tells needs noises that
+are known exactly. The sample's arithmetic is `estimator.engine.path.path_sample`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.engine.feeding import feeder, input_degree
+from estimator.engine.rows import input_rows, path_results
+from estimator.engine.tasks import path
+from estimator.lanes import LANES, kernel
+from estimator.models.model import Model
+from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.physical import physical_slopes, to_physical
+
+
+def fisher_information(
+    model: Model,
+    coefficients: npt.ArrayLike,
+    u: npt.ArrayLike,
+    process_noise: float,
+    measurement_noise: npt.ArrayLike,
+    *,
+    y: npt.ArrayLike | None = None,
+    interpolation: str = "zero_order",
+    state_std: float = 0.0,
+) -> FloatArray:
+    """Fisher information of a model's coefficients in the outputs that inputs bring about.
+
+    Args:
+        model: the equation.
+        coefficients: (K,) or (n, K), time counted in samples.
+        u: (T,) or (n, T) inputs; the t-th acts over the sample that ends with the t-th output. A series ends before its
+            first NaN, so that episodes of different lengths fit into one array; before its first sample there was no
+            input.
+        process_noise: what the process noise of one sample alone does to the first sensor: standard deviation in its
+            unit, 0 or more.
+        measurement_noise: the sensors' standard deviations, positive: one number, or one for each.
+        y: (T,) or (n, T) the outputs that followed the inputs, or (..., T, p) those of p sensors: the information is
+            then taken along the filter's trajectory on them. Without them it is taken along the response without noise,
+            as a design needs it.
+        interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
+        state_std: standard deviation of every state about 0 at the start; by default the plant starts at rest.
+
+    Returns:
+        (K, K), or (n, K, K) where an argument is a batch. Not finite where the model blows up.
+
+    Raises:
+        ValueError: naming the argument, for shapes that do not fit, or a number that is out of range.
+    """
+    degree = input_degree(model, interpolation)
+    noises = variances(model, process_noise, measurement_noise)
+    if not 0 <= state_std < np.inf:
+        raise ValueError(f"state_std must be 0 or more and finite, but is {state_std}; 0 is at rest")
+    points = np.asarray(coefficients, dtype=np.float64)
+    inputs = np.asarray(u, dtype=np.float64)
+    if points.ndim not in (1, 2) or points.shape[-1] != model.n_coefficients:
+        raise ValueError(f"coefficients must be of {list(model.coefficients)}, but have shape {points.shape}")
+    if inputs.ndim not in (1, 2):
+        raise ValueError(f"u must have shape (T,) or (n, T), but has {inputs.shape}")
+    outputs = None if y is None else outputs_of(model, inputs, y)
+    try:
+        shape = np.broadcast_shapes(points.shape[:-1], inputs.shape[:-1])
+    except ValueError:
+        raise ValueError(
+            f"coefficients and u must be batches of one size, but are of {points.shape[:-1]} and {inputs.shape[:-1]}"
+        ) from None
+    rows, samples = int(np.prod(shape)), inputs.shape[-1]
+
+    def whole(array: FloatArray, *last: int) -> FloatArray:
+        return np.broadcast_to(array, (*shape, *last)).reshape(rows, *last).copy()
+
+    covariance = float(state_std) ** 2 * np.eye(model.n_states)
+    found = follow(
+        model,
+        whole(points, model.n_coefficients),
+        whole(inputs, samples),
+        None if outputs is None else whole(outputs, samples, model.n_outputs),
+        noises,
+        covariance,
+        degree,
+    )
+    k = model.n_coefficients
+    return found.information.reshape(*shape, k, k)
+
+
+def variances(model: Model, process_noise: float, measurement_noise: npt.ArrayLike) -> tuple[float, ...]:
+    """Of the process noise, and of each sensor's, from standard deviations.
+
+    Raises:
+        ValueError: for one that is out of range, or a number of sensors that is not the model's.
+    """
+    if not 0 <= process_noise < np.inf:
+        raise ValueError(
+            f"process_noise must be 0 or more and finite, but is {process_noise}; pass a standard deviation"
+        )
+    stds = np.asarray(measurement_noise, dtype=np.float64)
+    if stds.ndim > 1 or (stds.ndim == 1 and len(stds) != model.n_outputs):
+        raise ValueError(
+            f"measurement_noise must be one number, or one for each of {list(model.outputs)}, but has shape "
+            f"{stds.shape}"
+        )
+    if not (np.all(stds > 0) and np.isfinite(stds).all()):
+        raise ValueError(
+            f"measurement_noise must be positive and finite, but is {stds.tolist()}; pass a standard deviation"
+        )
+    sensors = np.broadcast_to(stds, model.n_outputs)
+    return (float(process_noise) ** 2, *(float(std) ** 2 for std in sensors))
+
+
+def outputs_of(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> FloatArray:
+    """Outputs (..., T, p) that go with inputs (..., T); the last axis may be left out for one sensor.
+
+    Raises:
+        ValueError: for another shape.
+    """
+    outputs = np.asarray(y, dtype=np.float64)
+    if model.n_outputs == 1 and outputs.shape == inputs.shape:
+        outputs = outputs[..., None]
+    if outputs.shape != (*inputs.shape, model.n_outputs):
+        raise ValueError(
+            f"u and y must have one shape, (T,) or (n, T), and y a last axis for several sensors, but have "
+            f"{inputs.shape} and {outputs.shape}"
+        )
+    return outputs
+
+
+def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = None) -> FloatArray:
+    """Lower bound of the error covariance of any estimate of the coefficients.
+
+    Without a prior the bound holds for estimates without bias, at the system whose information is given. With one it
+    is the Bayesian bound (van Trees 1968): E[(error)(error)ᵀ] over systems and noise is at least (Λ0 + E[F])⁻¹, for
+    biased estimates too, and for inputs that were chosen by feedback, because these are functions of past outputs.
+    For that, pass the mean of F over systems that are drawn from the prior. Λ0 = E[∇log p ∇log pᵀ] is the inverse
+    covariance where the prior is Gaussian.
+
+    Args:
+        information: (..., K, K) F, or its mean.
+        prior_precision: (K, K) Λ0; none where it is None.
+
+    Returns:
+        (..., K, K) the bound.
+
+    Raises:
+        ValueError: if Λ0 + F is not finite or not positive definite.
+    """
+    total = np.asarray(information, dtype=np.float64)
+    if prior_precision is not None:
+        total = total + prior_precision
+    if not np.isfinite(total).all():
+        raise ValueError("information must be finite, but has entries that are not; leave out systems that blew up")
+    # In units in which the diagonal is 1, because a cubic coefficient is informed a hundred times less than the others.
+    scale = np.sqrt(np.diagonal(total, axis1=-2, axis2=-1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        unit = total / (scale[..., :, None] * scale[..., None, :])
+    if not np.isfinite(unit).all() or np.linalg.eigvalsh(unit).min() <= 0:
+        raise ValueError("information must be positive definite, but is not; pass more samples or a prior_precision")
+    return np.linalg.inv(unit) / (scale[..., :, None] * scale[..., None, :])
+
+
+def relative_covariance(
+    model: Model, coefficients: npt.ArrayLike, covariance: FloatArray, step: float = SAMPLING_STEP
+) -> FloatArray:
+    """Covariance of the relative errors of the physical parameters, to first order, from one of the coefficients.
+
+    Args:
+        model: whose parameters; of one without any, the coefficients themselves.
+        coefficients: (..., K).
+        covariance: (..., K, K).
+        step: sampling step [s].
+
+    Returns:
+        (..., p, p): the roots of its diagonal are coefficients of variation.
+    """
+    points = np.asarray(coefficients, dtype=np.float64)
+    slopes = physical_slopes(model, points, step) / to_physical(model, points, step)[..., :, None]
+    relative: FloatArray = slopes @ covariance @ np.swapaxes(slopes, -1, -2)
+    return relative
+
+
+class Followed(NamedTuple):
+    """What `follow` adds up over n series.
+
+    Attributes:
+        loss: (n,) minus the log likelihood, up to a constant; zeros where no outputs are followed.
+        slope: (n, K) its slope by the coefficients, likewise.
+        information: (n, K, K).
+    """
+
+    loss: FloatArray
+    slope: FloatArray
+    information: FloatArray
+
+
+def follow(
+    model: Model,
+    points: FloatArray,
+    u: FloatArray,
+    y: FloatArray | None,
+    noises: tuple[float, ...],
+    covariance: FloatArray,
+    degree: int = 0,
+) -> Followed:
+    """Run the filter over n series from rest.
+
+    Args:
+        model: the equation.
+        points: (n, K) coefficients.
+        u: (n, T) inputs; a series ends before its first NaN.
+        y: (n, T, p) outputs; None for the response without noise.
+        noises: variances, see `variances`.
+        covariance: (n_states, n_states) of the states at the start.
+        degree: of the input's polynomial.
+    """
+    k = model.n_coefficients
+    ends = np.isnan(u)
+    lengths = np.where(ends.any(axis=1), ends.argmax(axis=1), u.shape[1])
+    totals = np.zeros((len(u), len(path_results(model))))
+    start = covariance[np.triu_indices(model.n_states)]
+    outputs = np.zeros((0, 0, 0)) if y is None else y
+    follower(model, degree, y is not None)(points, u, outputs, lengths, start, noises, totals)
+    information = np.empty((len(u), k, k))
+    upper = np.triu_indices(k)
+    information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k :]
+    return Followed(totals[:, 0], totals[:, 1 : 1 + k], information)
+
+
+@cache
+def follower(model: Model, degree: int, observed: bool) -> Any:
+    """The compiled loop of `follow`, with totals (n, 1 + K + K (K + 1)/2) packed."""
+    task = path(model, degree, observed=observed)
+    sample, at, size = task.sample, task.layout, len(task.layout)
+    feed = feeder(model, degree, [at[row] for row in input_rows(model, degree)], LANES)
+    n, k, p = model.n_states, model.n_coefficients, model.n_outputs
+    first_total, first_coefficient, live = at["LOSS"], at[next(iter(model.coefficients))], at["LIVE"]
+    shown, n_totals = at[f"Y_{next(iter(model.outputs))}"] if observed else -1, len(path_results(model))
+    spreads = n * (n + 1) // 2
+
+    @kernel(kind=f"{model.name}_{model.digest}_{degree}_{int(observed)}")
+    def run(points, u, y, lengths, start, noises, totals):
+        W = np.empty(size * LANES)
+        for first in range(0, len(u), LANES):
+            lanes = min(LANES, len(u) - first)
+            W[:] = 0.0
+            longest = 0
+            for j in range(LANES):
+                i = first + min(j, lanes - 1)  # a spare lane repeats the last one
+                longest = max(longest, lengths[i])
+                W[live * LANES + j] = 1.0
+                for c in range(k):
+                    W[(first_coefficient + c) * LANES + j] = points[i, c]
+                for c in range(spreads):
+                    W[(n + c) * LANES + j] = start[c]
+            for t in range(longest):
+                for j in range(LANES):
+                    i = first + min(j, lanes - 1)
+                    runs = t < lengths[i]
+                    now = u[i, t] if runs else 0.0
+                    last = u[i, t - 1] if runs and t > 0 else 0.0
+                    feed(W, j, now, last, u[i, t - 2] if runs and t > 1 else 0.0)
+                    if observed:
+                        for c in range(p):
+                            W[(shown + c) * LANES + j] = y[i, t, c] if runs else 0.0
+                sample(W, *noises)
+                for j in range(lanes):
+                    if t + 1 == lengths[first + j]:
+                        for c in range(n_totals):
+                            totals[first + j, c] = W[(first_total + c) * LANES + j]
+                        for c in range(first_total):  # it is over, and goes on at rest
+                            W[c * LANES + j] = 0.0
+
+    return run

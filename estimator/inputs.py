@@ -1,0 +1,98 @@
+"""From recorded inputs to what a model takes over a sample: taps, or the coefficients of a polynomial.
+
+All are linear in a window of the inputs: row ``U_j`` is the sum of ``stencil[j]`` times the window.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+from estimator.rig import INTERPOLATIONS, Rig
+
+#: Inputs that the look-ahead interpolation passes through: the last nine, and the next.
+_WINDOW = 10
+
+#: Of the spline through the inputs: they have power up to two thirds of the Nyquist frequency.
+_DEGREE = INTERPOLATIONS["spline"]
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """How a window of inputs drives a sample.
+
+    Attributes:
+        stencil: (rows, window) of the inputs in the window, oldest first.
+        past: inputs before the newest that must be kept.
+        waits: whether a sample is used only when the next input is known.
+        fills: whether the input before the first is taken as the first; as 0 otherwise.
+        at_once: whether all inputs must be known: then each sample has a window of its own, see `pieces`.
+        delay: of the rig.
+    """
+
+    stencil: FloatArray
+    past: int
+    waits: bool = False
+    fills: bool = False
+    at_once: bool = False
+    delay: int = 0
+
+    @property
+    def stride(self) -> int:
+        """From a sample's window to the next one's."""
+        return len(self.stencil) if self.at_once else 1
+
+    def pieces(self, u: FloatArray) -> FloatArray:
+        """(T, 6) coefficients of the quintic spline through all inputs (T,), on the way to each sample.
+
+        Raises:
+            ValueError: for too few inputs.
+        """
+        from scipy.interpolate import make_interp_spline
+
+        if len(u) <= _DEGREE:
+            raise ValueError(f"u must have more than {_DEGREE} samples for interpolation 'spline', but has {len(u)}")
+        spline = make_interp_spline(np.arange(len(u)), u, k=_DEGREE)
+        begins = np.arange(len(u)) - 1.0 - self.delay
+        pieces = np.stack([spline(np.maximum(begins, 0), nu=n) / math.factorial(n) for n in range(_DEGREE + 1)], axis=1)
+        pieces[begins < 0] = 0.0
+        pieces[begins < 0, 0] = u[0]
+        return pieces
+
+
+def channel(model: Model, rig: Rig) -> Channel:
+    """The way of a model's input in a rig."""
+    if not model.is_continuous:
+        return _channel(np.eye(model.taps)[::-1], rig.delay)
+    if rig.interpolation == "zero_order":
+        return _channel(np.ones((1, 1)), rig.delay + 1)
+    if rig.interpolation == "linear":
+        return _channel(np.array([[1.0, 0.0], [-1.0, 1.0]]), rig.delay)
+    if rig.interpolation == "look_ahead":
+        return _channel(_look_ahead(), rig.delay - 1, fills=True)
+    return Channel(np.eye(_DEGREE + 1), 0, fills=True, at_once=True, delay=rig.delay)
+
+
+def degree(model: Model, rig: Rig) -> int:
+    """Of the input's polynomial over a sample; 0 for a difference equation."""
+    return INTERPOLATIONS[rig.interpolation] if model.is_continuous else 0
+
+
+def _channel(stencil: FloatArray, lag: int, fills: bool = False) -> Channel:
+    """A window whose newest input for y[k] is u[k - lag]."""
+    waits = lag < 0
+    return Channel(np.ascontiguousarray(stencil), stencil.shape[1] - 1 + max(lag, 0), waits, fills)
+
+
+@cache
+def _look_ahead() -> FloatArray:
+    """(6, _WINDOW) what each input of a window adds to the polynomial of its last interval but one."""
+    from scipy.interpolate import make_interp_spline
+
+    spline = make_interp_spline(np.arange(_WINDOW), np.eye(_WINDOW), k=_DEGREE)
+    return np.stack([spline(_WINDOW - 3, nu=n) / math.factorial(n) for n in range(_DEGREE + 1)])

@@ -1,0 +1,101 @@
+"""From a model's coefficients to the plant's physical parameters and back, with slopes: generated from its own maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from estimator.models.model import Model
+from estimator.parameters import SAMPLING_STEP, FloatArray
+
+
+def to_physical(model: Model, coefficients: FloatArray, step: float = SAMPLING_STEP) -> FloatArray:
+    """Physical parameters (..., p) of coefficients (..., K); the coefficients themselves, for a model without any.
+
+    Args:
+        model: whose `Model.physical`.
+        coefficients: (..., K), time counted in samples.
+        step: sampling step [s].
+
+    Raises:
+        ValueError: for a step that is not positive and finite.
+    """
+    if not model.physical:
+        return np.array(coefficients, dtype=np.float64)
+    return _evaluate(_code(model, "physical")[0], coefficients, step)
+
+
+def physical_slopes(model: Model, coefficients: FloatArray, step: float = SAMPLING_STEP) -> FloatArray:
+    """Slopes (..., p, K) of the physical parameters by the coefficients; arguments as `to_physical`."""
+    k = model.n_coefficients
+    if not model.physical:
+        return np.broadcast_to(np.eye(k), (*np.shape(coefficients), k)).copy()
+    flat = _evaluate(_code(model, "physical")[1], coefficients, step)
+    return flat.reshape(*flat.shape[:-1], len(model.physical), k)
+
+
+def propagate(
+    model: Model, mean: FloatArray, cov: FloatArray, step: float = SAMPLING_STEP
+) -> tuple[FloatArray, FloatArray]:
+    """Moments (..., p) and (..., p, p) of the physical parameters from those of the coefficients, to first order."""
+    slopes = physical_slopes(model, mean, step)
+    return to_physical(model, mean, step), slopes @ cov @ np.swapaxes(slopes, -1, -2)
+
+
+def coefficients_of(model: Model, parameters: Mapping[str, Any], step: float = SAMPLING_STEP) -> FloatArray:
+    """Coefficients (..., K) of physical parameters of shape (...), by name; themselves, for a model without any.
+
+    Args:
+        model: whose `Model.inverse`.
+        parameters: name to value, such as `estimator.Parameters`; others than the model's are not looked at.
+        step: sampling step [s].
+
+    Raises:
+        ValueError: for a parameter that is missing, or a step that is not positive and finite.
+    """
+    names = list(model.physical if model.inverse else model.coefficients)
+    missing = [name for name in names if name not in parameters]
+    if missing:
+        raise ValueError(f"parameters must have {names}, but {missing} are missing from {list(parameters)}; add them")
+    columns = [np.asarray(parameters[name], dtype=np.float64) for name in names]
+    points = np.stack(np.broadcast_arrays(*columns), axis=-1)
+    return _evaluate(_code(model, "inverse")[0], points, step) if model.inverse else points
+
+
+def _evaluate(function: Any, given: FloatArray, step: float) -> FloatArray:
+    """Its results, stacked along the last axis, at given numbers along the last axis."""
+    if not 0 < step < np.inf:
+        raise ValueError(f"step must be positive and finite, but is {step}; give the seconds between two samples")
+    columns = np.moveaxis(np.asarray(given, dtype=np.float64), -1, 0)
+    found = [np.broadcast_to(value, columns.shape[1:]) for value in function(*columns, step)]
+    return np.stack(found, axis=-1).astype(np.float64)
+
+
+@cache
+def _code(model: Model, which: str) -> tuple[Any, Any]:
+    """Values and slopes of a map between coefficients and parameters, as functions of all of them and the step."""
+    from estimator.engine import cache as stored
+
+    mapped = getattr(model, which)
+    names = list(model.coefficients if which == "physical" else model.physical)
+
+    def make() -> str:
+        from estimator.engine import derive, emit
+
+        known = {name: derive.symbol(name) for name in (*names, "step")}
+        expressions = [derive.parse(text, known, model.name) for text in mapped.values()]
+        slopes = [e.diff(known[name]) for e in expressions for name in names]
+        source = ""
+        for title, values in (("values", expressions), ("slopes", slopes)):
+            lines = derive.shared({f"V_{i}": e for i, e in enumerate(values)}, "W")
+            body = "".join(f"    {name} = {emit.text_of(e)}\n" for name, e in lines)
+            gathered = ", ".join(f"V_{i}" for i in range(len(values)))
+            source += f"def {title}({', '.join([*names, 'step'])}):\n{body}    return ({gathered},)\n"
+        return source
+
+    functions = {name: getattr(np, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")}
+    code = stored.load(model.name, which, model.digest, make, functions)
+    return code.values, code.slopes

@@ -1,0 +1,89 @@
+"""How an online estimator learns: its options, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator.inference import DEFAULT_ITERATIONS
+from estimator.models.difference import difference
+from estimator.models.model import Model
+
+#: How a step may move a Gaussian belief.
+EXPECTATIONS = ("first_order", "sigma_points")
+
+#: More iterations per sample change nothing that shows.
+_MOST_ITERATIONS = 100
+
+#: More ratios of the noises than data could tell apart.
+_MOST_HYPOTHESES = 1000
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a filter learns.
+
+    Attributes:
+        factorisation: ``structured`` or ``mean_field``.
+        iterations: per sample.
+        as_published: with the departures of the published run.
+        expectations: ``first_order`` or ``sigma_points``.
+        drift: standard deviation of a coefficient's step per sample, in parts of that of its prior.
+        noise_hypotheses: ratios of the noises.
+    """
+
+    factorisation: str = "structured"
+    iterations: int = 3
+    as_published: bool = False
+    expectations: str = "first_order"
+    drift: float = 0.0
+    noise_hypotheses: int = 1
+
+
+def settled(model: Model, given: Settings) -> Settings:
+    """Settings that fit a model, checked.
+
+    Raises:
+        ValueError: naming the option, the value and the remedy.
+    """
+    if given.factorisation not in tuple(DEFAULT_ITERATIONS):
+        raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {given.factorisation!r}")
+    published = given.factorisation == "mean_field"
+    if published and model != difference():
+        raise ValueError(
+            f"factorisation must be 'structured' for {model.name}, but is 'mean_field'; that is for the paper's model"
+        )
+    _whole("iterations", given.iterations, _MOST_ITERATIONS)
+    _whole("noise_hypotheses", given.noise_hypotheses, _MOST_HYPOTHESES)
+    if given.as_published and not published:
+        raise ValueError(
+            f"as_published goes with factorisation='mean_field', but factorisation is {given.factorisation!r}; the "
+            f"published run was mean field"
+        )
+    if given.expectations not in EXPECTATIONS or (published and given.expectations != EXPECTATIONS[0]):
+        allowed = EXPECTATIONS[:1] if published else EXPECTATIONS
+        raise ValueError(f"expectations must be one of {list(allowed)}, but is {given.expectations!r}")
+    drift = given.drift
+    if not isinstance(drift, int | float | np.floating) or not 0 <= drift < np.inf:
+        raise ValueError(f"drift must be at least 0 and finite, but is {drift!r}; 0 is a system that stays")
+    if drift and published:
+        raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {drift!r}; use structured")
+    if given.noise_hypotheses > 1 and (published or model.n_outputs > 1):
+        what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"
+        raise ValueError(
+            f"noise_hypotheses must be 1 for {what}, but is {given.noise_hypotheses}; use factorisation='structured' "
+            f"and one sensor"
+        )
+    return replace(
+        given,
+        iterations=int(given.iterations),
+        as_published=bool(given.as_published),
+        drift=float(drift),
+        noise_hypotheses=int(given.noise_hypotheses),
+    )
+
+
+def _whole(name: str, value: object, most: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= most:
+        raise ValueError(f"{name} must be a whole number from 1 to {most}, but is {value!r}")

@@ -1,0 +1,96 @@
+"""Environments of other models than the oscillator's: the pendulum, which has two sensors."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from test_vector_env import assert_same, random_actions, roll_out, without_empty_keys
+
+from duffing_env.batch import spawn_seeds
+from duffing_env.env import DuffingEnv
+from duffing_env.experiment import SimulatedExperiment
+from duffing_env.vector_env import DuffingVectorEnv
+from estimator.models.pendulum import PENDULUM, STEP
+from estimator.parameters import Parameters
+from estimator.physical import coefficients_of
+
+# Random inputs end some such episodes at the limit, the others at the horizon.
+BOTH_ENDS = {"max_input": 5.0, "max_output": 0.5, "horizon": 30}
+
+
+@dataclass(frozen=True)
+class PendulumExperiment(SimulatedExperiment):
+    """A new pendulum in every episode, hanging at rest."""
+
+    @property
+    def plant(self):
+        return PENDULUM
+
+    @property
+    def model(self):
+        return PENDULUM
+
+    @property
+    def step(self):
+        return STEP
+
+    @property
+    def center(self):
+        return {"p1": 14.7, "p2": 0.5, "p3": 3.0}
+
+
+class PendulumEnv(DuffingEnv):
+    experiment_kind = PendulumExperiment
+
+
+class PendulumVectorEnv(DuffingVectorEnv):
+    single = PendulumEnv
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_rows_are_single_environments(mode):
+    envs = PendulumVectorEnv(5, autoreset_mode=mode, **BOTH_ENDS)
+    singles = SyncVectorEnv([lambda: PendulumEnv(**BOTH_ENDS)] * 5, autoreset_mode=mode)
+    actions = random_actions(120, 5)
+    ours, theirs = roll_out(envs, actions, seed=7), roll_out(singles, actions, seed=spawn_seeds(7, 5))
+    for told, expected in zip(ours, theirs, strict=True):
+        assert_same(told[:-1], expected[:-1])
+        assert without_empty_keys(told[-1]).keys() == expected[-1].keys()
+    steps = [told for told in ours if len(told) == 5]
+    assert np.sum([step[2] for step in steps]) > 3
+    assert np.sum([step[3] for step in steps]) > 3
+
+
+def test_its_observation_has_what_two_sensors_tell():
+    env = PendulumEnv(**BOTH_ENDS)
+    assert env.observation_space.shape == (2 * 3 + 3 + 2 + 2 * 2 + 4,)
+    gymnasium_check(env, skip_render_check=True)
+    first, _ = env.reset(seed=0)
+    np.testing.assert_allclose(first[[*range(6), *range(9, 17)]], 0.0, atol=1e-6)
+    observation, *_ = env.step([1.0])
+    batch = env.unwrapped._batch
+    outputs = [batch.quantity(f"Y_{name}")[0] / 0.5 for name in PENDULUM.outputs]
+    np.testing.assert_allclose(observation[15:17], outputs, rtol=1e-6)
+    assert outputs[0] != outputs[1] != 0
+    assert isinstance(env.truth, Parameters)
+    assert sorted(env.truth) == ["p1", "p2", "p3"]
+
+
+def test_its_beliefs_are_calibrated():
+    # 200 episodes: the squared distance of the truth from the mean, in standard deviations, is 3 on average.
+    envs = PendulumVectorEnv(200, max_input=5.0, max_output=100.0, process_noise=1e-3, measurement_noise=1e-2)
+    envs.reset(seed=0)
+    truth = coefficients_of(PENDULUM, envs.truth, STEP)
+    start = envs.belief(0)
+    for actions in np.clip(random_actions(200, 200), -1, 1):
+        envs.step(actions)
+    distances, shrunk = [], []
+    for row in range(200):
+        belief = envs.belief(row)
+        deviation = truth[row] - belief.coefficients_mean
+        distances.append(deviation @ np.linalg.solve(belief.coefficients_cov, deviation))
+        shrunk.append(start.entropy() - belief.entropy())
+    assert 2.3 < np.mean(distances) < 3.8
+    assert np.mean(shrunk) > 3

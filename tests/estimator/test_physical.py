@@ -1,0 +1,177 @@
+"""Maps between physical parameters and coefficients: hand calculations, differences, Monte Carlo, there and back."""
+
+import copy
+import pickle
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.models.pendulum import PENDULUM
+from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, Parameters
+from estimator.physical import coefficients_of, physical_slopes, propagate, to_physical
+
+EPS = np.finfo(float).eps
+PAPER = difference()
+FULL = duffing(offsets=True, cubic_damping=True, feedthrough=True)
+# About the size of the Silverbox circuit at its sampling step.
+OSCILLATOR = Parameters(m=5e-6, c=2e-4, a=1.0, b=4.0)
+PLANTS = {
+    "paper": (PAPER, OSCILLATOR),
+    "linear": (difference("linear"), OSCILLATOR),
+    "duffing": (duffing(), OSCILLATOR),
+    "all terms": (FULL, Parameters(OSCILLATOR, u0=0.01, y0=-0.02, e=1e-9, d=0.1)),
+}
+
+scale = st.floats(1e-2, 1e2)
+# Below 1e-200 products may leave the normal floats, where rounding is no longer relative.
+signed = st.floats(-1e2, 1e2).map(lambda value: value if abs(value) > 1e-200 else 0.0)
+steps = st.floats(1e-3, 10.0)
+repeatable = settings(derandomize=True, deadline=None)
+
+
+def batch(parameters, rng, shape):
+    return Parameters({name: value * rng.uniform(0.5, 1.5, shape) for name, value in parameters.items()})
+
+
+def vector(model, parameters):
+    return np.stack([parameters[name] for name in model.physical], axis=-1)
+
+
+def test_sampling_step_is_that_of_the_record():
+    assert pytest.approx(610.3515625, rel=1e-15) == 1 / SAMPLING_STEP
+
+
+def test_hand_computed_example():
+    # m + cδ = 2 and δ² = 1/4, so every number is exact in binary.
+    found = coefficients_of(PAPER, {"m": 1.0, "c": 2.0, "a": 4.0, "b": 8.0}, step=0.5)
+    assert found.tolist() == [1.0, -1.0, -0.5, 0.125]
+    assert to_physical(PAPER, found, step=0.5).tolist() == [1.0, 2.0, 4.0, 8.0]
+
+
+def test_coefficients_solve_the_difference_equation():
+    x_before, x, u, p = 0.03, 0.05, 0.2, OSCILLATOR
+    theta1, theta2, theta3, eta = coefficients_of(PAPER, p)
+    x_after = theta1 * x + theta2 * x**3 + theta3 * x_before + eta * u
+    acceleration = (x_after - 2 * x + x_before) / SAMPLING_STEP**2
+    velocity = (x_after - x) / SAMPLING_STEP
+    assert p.m * acceleration + p.c * velocity + p.a * x + p.b * x**3 == pytest.approx(u, rel=1e-12)
+
+
+def test_the_continuous_twin_is_what_it_was_identified_as():
+    found = coefficients_of(duffing(), CONTINUOUS_TWIN) / SAMPLING_STEP ** np.array([2, 2, 1, 2])
+    np.testing.assert_allclose(found, [184255, 730155, 41.8992, 186015], rtol=1e-14)
+
+
+@repeatable
+@given(m=scale, c=scale, a=signed, b=signed, step=steps)
+def test_physical_round_trip(m, c, a, b, step):
+    back = to_physical(PAPER, coefficients_of(PAPER, {"m": m, "c": c, "a": a, "b": b}, step), step)
+    # Each error is some roundings of the largest term in the sum that forms the parameter.
+    divisor = m + c * step
+    assert abs(back[0] - m) <= 20 * EPS * m
+    assert abs(back[1] - c) <= 20 * EPS * divisor / step
+    assert abs(back[2] - a) <= 20 * EPS * (divisor / step**2 + abs(a))
+    assert abs(back[3] - b) <= 20 * EPS * abs(b)
+
+
+@repeatable
+@given(
+    theta1=st.floats(-3, 3), theta2=signed, theta3=st.floats(-2, 2), eta=scale, sign=st.sampled_from([-1, 1]),
+    step=steps,
+)  # fmt: skip
+def test_coefficients_round_trip(theta1, theta2, theta3, eta, sign, step):
+    physical = to_physical(PAPER, np.array([theta1, theta2, theta3, sign * eta]), step)
+    back = coefficients_of(PAPER, dict(zip("mcab", physical, strict=True)), step)
+    # (m + c δ) η / δ² is 1, formed as -θ3 + (1 + θ3): hence the factor 1 + |θ3| throughout.
+    rounding = 40 * EPS * (1 + abs(theta3))
+    assert abs(back[0] - theta1) <= rounding * (1 + abs(theta1) + abs(theta3))
+    assert abs(back[1] - theta2) <= rounding * abs(theta2)
+    assert abs(back[2] - theta3) <= rounding * (1 + abs(theta3))
+    assert abs(back[3] - sign * eta) <= rounding * eta
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_batch_goes_there_and_back_as_its_rows_do(name):
+    model, parameters = PLANTS[name]
+    many = batch(parameters, np.random.default_rng(1), (2, 3))
+    points = coefficients_of(model, many)
+    assert points.shape == (2, 3, model.n_coefficients)
+    cov = 1e-6 * (np.eye(model.n_coefficients) + points[..., :, None] * points[..., None, :])
+    means, covs = propagate(model, points, cov)
+    np.testing.assert_allclose(means, vector(model, many), rtol=1e-11)
+    for index in np.ndindex(2, 3):
+        # The last places differ: a float and an array take different routes to a power.
+        one = coefficients_of(model, {key: value[index] for key, value in many.items()})
+        np.testing.assert_allclose(points[index], one, rtol=1e-12, atol=0)
+        for whole, single in zip((means, covs), propagate(model, points[index], cov[index]), strict=True):
+            np.testing.assert_allclose(whole[index], single, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_slopes_equal_central_differences(name):
+    model, parameters = PLANTS[name]
+    points, size = coefficients_of(model, parameters), vector(model, parameters)
+    columns = []
+    for j in range(model.n_coefficients):
+        width = 1e-6 * abs(points[j]) * np.eye(model.n_coefficients)[j]
+        columns.append((to_physical(model, points + width) - to_physical(model, points - width)) / (2 * width[j]))
+    # Sizes differ by many orders: an entry is judged as a change for a change of 100 %.
+    relative = points / size[:, None]
+    np.testing.assert_allclose(
+        physical_slopes(model, points) * relative, np.stack(columns, axis=-1) * relative, atol=1e-7, rtol=1e-7
+    )
+
+
+def test_propagation_equals_monte_carlo():
+    rng = np.random.default_rng(3)
+    mean = coefficients_of(PAPER, OSCILLATOR)
+    # Deviations of 1e-4 keep the second order far below the sampling error of the mean.
+    factor = 1e-4 * mean[:, None] * rng.normal(size=(4, 4))
+    physical = to_physical(PAPER, mean + rng.normal(size=(200_000, 4)) @ factor.T)
+    found_mean, found_cov = propagate(PAPER, mean, factor @ factor.T)
+    np.testing.assert_allclose(found_mean, vector(PAPER, OSCILLATOR), rtol=1e-12)
+    deviations, root = physical - found_mean, np.sqrt(len(physical))
+    products = deviations[:, :, None] * deviations[:, None, :]
+    assert np.abs(deviations.mean(axis=0) / (physical.std(axis=0) / root)).max() < 4.5
+    assert np.abs((products.mean(axis=0) - found_cov) / (products.std(axis=0) / root)).max() < 4.5
+
+
+def test_a_model_without_parameters_has_its_coefficients():
+    model = difference("three-tap")
+    points = np.arange(12.0).reshape(2, 6) @ np.ones((6, model.n_coefficients))
+    named = dict(zip(model.coefficients, points.T, strict=True))
+    np.testing.assert_array_equal(coefficients_of(model, named), points)
+    np.testing.assert_array_equal(to_physical(model, points), points)
+    np.testing.assert_array_equal(physical_slopes(model, points)[1], np.eye(model.n_coefficients))
+
+
+@pytest.mark.parametrize("step", [0.0, -1.0, np.inf, np.nan])
+def test_a_step_that_is_none_is_named(step):
+    message = f"step must be positive and finite, but is {step}; give the seconds"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        coefficients_of(PAPER, OSCILLATOR, step)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        to_physical(PAPER, np.ones(4), step)
+
+
+def test_a_parameter_that_is_missing_is_named():
+    message = "parameters must have ['m', 'c', 'a', 'b'], but ['c', 'b'] are missing from ['m', 'a']; add them"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        coefficients_of(PAPER, Parameters(m=1.0, a=1.0))
+    with pytest.raises(ValueError, match="are missing"):
+        coefficients_of(PENDULUM, OSCILLATOR)
+
+
+def test_parameters_are_a_mapping_with_attributes():
+    twin = Parameters({"m": 5e-6}, c=2e-4)
+    assert (twin.m, twin["c"], list(twin), len(twin)) == (5e-6, 2e-4, ["m", "c"], 2)
+    assert twin == Parameters(m=5e-6, c=2e-4) == copy.deepcopy(twin) == pickle.loads(pickle.dumps(twin))
+    assert twin != Parameters(m=5e-6, c=1e-4)
+    assert twin != Parameters(c=2e-4, m=5e-6)
+    with pytest.raises(AttributeError, match="there is no parameter 'a'"):
+        _ = twin.a
