@@ -76,7 +76,7 @@ class Compilation(event.Listener):
     """Watches over compilation: Numba tells when it begins and ends to compile a function.
 
     What takes longer than `PATIENCE` says on stderr that it compiles, once in a process. Python's garbage collector
-    rests meanwhile: it finds nothing in what Numba builds, and takes a fifth of the time.
+    rests meanwhile: it looks through all that Numba builds, again and again, and finds nothing.
     """
 
     #: Seconds that the process may spend compiling before it says so.

@@ -24,7 +24,7 @@ from estimator.compiled import Compiled
 LANES = 32
 
 #: No division checks, fused multiply-adds allowed (nothing else: results must not depend on the order of lanes), and no
-#: wrapper for callers in C, which takes a tenth of the compilation and has no user.
+#: wrapper for callers in C, which has no user and takes time to compile.
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "nogil": True, "no_cfunc_wrapper": True}
 
 #: Compile a function that other compiled functions call.

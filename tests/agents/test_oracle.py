@@ -42,7 +42,7 @@ def test_rows_do_not_depend_on_their_number():
     assert few.task.path == many.task.path
 
 
-@pytest.mark.slow  # twenty seconds of searching
+@pytest.mark.slow  # a search
 def test_the_search_keeps_the_limits_and_beats_a_random_signal():
     systems = Systems.of(SHORT, 1)
     rng = np.random.default_rng(0)
@@ -55,7 +55,7 @@ def test_the_search_keeps_the_limits_and_beats_a_random_signal():
     assert value > systems.worth(given)[0][0] + 2.0
 
 
-@pytest.mark.slow  # the search is twenty seconds of compilation
+@pytest.mark.slow  # the search is seconds of compilation
 def test_under_a_budget_the_search_spends_it_in_a_burst():
     systems = Systems.of(POWER, 1)
     u, value = search(systems, 0, np.empty((0, 256)), np.random.default_rng(0), rounds=1)
@@ -66,7 +66,7 @@ def test_under_a_budget_the_search_spends_it_in_a_burst():
     assert value > systems.worth(square[None])[0][0] + 3.0
 
 
-@pytest.mark.slow  # the search is twenty seconds of compilation
+@pytest.mark.slow  # the search is seconds of compilation
 @pytest.mark.parametrize("options", [{}, {"horizon": 96, "max_rms": 0.03}])
 def test_the_search_serves_the_differential_equation_too(options, empty_folder):
     systems = Systems.of(CONTINUOUS, 1, {"horizon": 48, **options})
@@ -84,7 +84,7 @@ def test_the_search_serves_the_differential_equation_too(options, empty_folder):
     np.testing.assert_allclose(Oracle.of(systems).inputs[0], u, atol=1e-12)
 
 
-@pytest.mark.slow  # the search is twenty seconds of compilation
+@pytest.mark.slow  # the search is seconds of compilation
 def test_what_is_better_takes_its_place_and_nothing_else(empty_folder):
     systems = Systems.of(SHORT, 2)
     with pytest.raises(FileNotFoundError, match="no oracle is stored"):
@@ -120,7 +120,7 @@ def test_the_search_starts_from_what_policies_played(empty_folder, monkeypatch):
     np.testing.assert_allclose(stored.inputs, played[0].T, atol=1e-4)
 
 
-@pytest.mark.slow  # the search is twenty seconds of compilation
+@pytest.mark.slow  # the search is seconds of compilation
 def test_a_search_that_starts_from_better_inputs_ends_no_worse(monkeypatch):
     systems = Systems.of(SHORT, 1)
     best = Oracle.of(systems)

@@ -140,7 +140,7 @@ def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
     [
         ("Continuous", {"horizon": 96}),
         pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, marks=pytest.mark.slow),
-        pytest.param("WienerHammerstein", {"horizon": 48}, marks=pytest.mark.slow),  # half a minute of compilation
+        pytest.param("WienerHammerstein", {"horizon": 48}, marks=pytest.mark.slow),  # seconds of compilation
         ("Amplitude", {"horizon": 64, "max_output": 1.0}),  # which is near where the difference equation blows up
         pytest.param("Continuous", {"horizon": 48, "estimator": "nlarx"}, marks=pytest.mark.slow),
     ],

@@ -4,12 +4,13 @@ They share no code with the kernel, and know nothing of the engine that generate
 priors and the twins of the circuit.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+import mean_field_reference as reference
 import numpy as np
 import pytest
+from mean_field_reference import LOG_2PI, expected_log_normal, gamma_divergence
 from rounding import U32
-from scipy.special import digamma, gammaln
 
 from duffing_env.rewards import REWARDS
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Parameters
@@ -34,18 +35,10 @@ PAIRS = [
 
 PARAMETERS = ("m", "c", "a", "b")
 ITERATIONS = {"structured": 3, "mean_field": 10}
-TIE = 1e12  # precision of the identity between the second component of z_t and the first of z_{t-1}
-LOG_2PI = np.log(2 * np.pi)
 
 
-@dataclass(frozen=True)
-class Moments:
-    """A belief: Gaussian over two states and four coefficients, and Gamma (shape, rate) of γ and of ξ."""
-
-    mean: np.ndarray  # (6,)
-    cov: np.ndarray  # (6, 6)
-    gamma: tuple[float, float]
-    xi: tuple[float, float]
+class Moments(reference.Moments):
+    """A belief over two states and four coefficients."""
 
     @classmethod
     def of(cls, belief):
@@ -182,52 +175,9 @@ def structured_update(prior, step, y, iterations):
 
 
 def mean_field_update(prior, u, y, iterations, as_published=False):
-    """The six updates of the paper, ``iterations`` times: the posterior, and the sample's free energy [nats].
-
-    ``as_published``: without the offset of the linearisation, and with E[x_{t-1}]²/2 more in the rate of γ.
-    """
-    S, s = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0])
-    z, theta, eta = slice(0, 2), slice(2, 5), 5
-    prior_z, P_z, prior_theta, P_theta = prior.mean[z], prior.cov[z, z], prior.mean[theta], prior.cov[theta, theta]
-    prior_eta, P_eta = prior.mean[eta], prior.cov[eta, eta]
-    W_z = np.linalg.inv(P_z)
-    gamma, xi, m_theta, m_last, m_z = prior.gamma, prior.xi, prior_theta, prior_z, prior_z
-
-    def features(z):
-        return np.array([z[0], z[0] ** 3, z[1]])
-
-    for _ in range(iterations):
-        E_gamma, E_xi = gamma[0] / gamma[1], xi[0] / xi[1]
-        W = np.diag([E_gamma, TIE])
-        V_eta = 1 / (1 / P_eta + E_gamma * u**2)
-        m_eta = V_eta * (prior_eta / P_eta + E_gamma * u * (m_z[0] - m_theta @ features(m_last)))
-        J_theta = features(m_last)
-        gain = P_theta @ J_theta / (1 / E_gamma + J_theta @ P_theta @ J_theta)
-        V_theta = P_theta - np.outer(gain, P_theta @ J_theta)
-        m_theta = prior_theta + gain * (m_z[0] - m_eta * u - J_theta @ prior_theta)
-        V_z = np.diag([1 / (E_gamma + E_xi), 1 / TIE])
-        m_z = np.array([V_z[0, 0] * (E_gamma * (m_theta @ J_theta + m_eta * u) + E_xi * y), m_last[0]])
-        J_x = np.array([m_theta[0] + 3 * m_theta[1] * m_last[0] ** 2, m_theta[2]])
-        A = S + np.outer(s, J_x)
-        offset = 0.0 if as_published else m_theta @ features(m_last) - J_x @ m_last
-        V_last = np.linalg.inv(W_z + A.T @ W @ A)
-        m_last = V_last @ (W_z @ prior_z + A.T @ W @ (m_z - s * (m_eta * u + offset)))
-        J_theta, J_x = features(m_last), np.array([m_theta[0] + 3 * m_theta[1] * m_last[0] ** 2, m_theta[2]])
-        w_power = (m_z[0] - m_theta @ J_theta - m_eta * u) ** 2 + V_z[0, 0]
-        w_power += J_x @ V_last @ J_x + J_theta @ V_theta @ J_theta + u**2 * V_eta
-        v_power = (y - m_z[0]) ** 2 + V_z[0, 0]
-        gamma = prior.gamma[0] + 0.5, prior.gamma[1] + (w_power + as_published * m_last[0] ** 2) / 2
-        xi = prior.xi[0] + 0.5, prior.xi[1] + v_power / 2
-    told = -entropy(V_theta) - expected_log_gaussian((m_theta - prior_theta, V_theta), P_theta)
-    told += 0.5 * (np.log(P_eta / V_eta) + V_eta / P_eta - 1 + (m_eta - prior_eta) ** 2 / P_eta)
-    told += -entropy(V_last) - expected_log_gaussian((m_last - prior_z, V_last), P_z) - entropy(V_z)
-    told += gamma_divergence(gamma, prior.gamma) + gamma_divergence(xi, prior.xi)
-    tie = (m_z[1] - m_last[0]) ** 2 + V_z[1, 1] + V_last[0, 0]
-    told -= expected_log_normal(w_power, gamma) + 0.5 * (np.log(TIE) - LOG_2PI - TIE * tie)
-    told -= expected_log_normal(v_power, xi)
-    mean, cov = np.concatenate([m_z, m_theta, [m_eta]]), np.zeros((6, 6))
-    cov[z, z], cov[theta, theta], cov[eta, eta] = V_z, V_theta, V_eta
-    return Moments(mean, cov, gamma, xi), told
+    """The six updates of the paper, ``iterations`` times: the posterior, and the sample's free energy [nats]."""
+    posterior, told = reference.mean_field_step(prior, u, y, iterations, as_published)
+    return Moments(posterior.mean, posterior.cov, posterior.gamma, posterior.xi), told[-1]
 
 
 def log_det(cov):
@@ -249,18 +199,6 @@ def log_normal(deviation, cov):
 def expected_log_gaussian(q, cov):
     """E_q log N(0, cov) of a Gaussian q (mean, covariance)."""
     return log_normal(q[0], cov) - 0.5 * np.trace(np.linalg.solve(cov, q[1]))
-
-
-def gamma_divergence(q, p):
-    """KL[q || p] of two Gammas (shape, rate)."""
-    (a, b), (a0, b0) = q, p
-    return (a - a0) * digamma(a) - gammaln(a) + gammaln(a0) + a0 * (np.log(b) - np.log(b0)) + a * (b0 - b) / b
-
-
-def expected_log_normal(power, precision):
-    """E log N(e | 0, 1/p) where E[e²] is ``power`` and p ~ Gamma ``precision`` = (shape, rate)."""
-    shape, rate = precision
-    return 0.5 * (digamma(shape) - np.log(rate) - LOG_2PI - shape / rate * power)
 
 
 def multisine():

@@ -116,7 +116,7 @@ def test_on_a_linear_model_it_is_first_order(monkeypatch):
         assert_agrees(get_belief(W, task.layout, LANES, lane, case), expected, 4 * case.operations * lost)
 
 
-@pytest.mark.slow  # eighteen seconds of compilation
+@pytest.mark.slow  # seconds of compilation
 @pytest.mark.parametrize("name", ["paper", "van der pol"])
 def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
     """Beliefs, inputs and outputs over sixteen decades, sixty samples on end."""
