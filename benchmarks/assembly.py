@@ -99,10 +99,13 @@ def count(function: Any) -> Operations:
         raise NotCounted(f"the assembly of {platform.machine()} is not known to benchmarks/assembly.py")
     uniform = len(inspect.signature(function.py_func).parameters) - 1
     signature = (_BLOCK,) + (types.float64,) * uniform
-    function.compile(signature)
+    function.compiled.compile(signature)
     outputs = sum(step.opname == "STORE_SUBSCR" for step in dis.get_instructions(function.py_func))
-    # The function itself comes first; its wrappers for Python follow it.
-    body = function.inspect_asm(signature).split(".Lfunc_end0:")[0]
+    # The function stands by itself, or where the compiler has inlined it, in the first: that for callers in Python.
+    bodies = re.split(r"\.Lfunc_end\d+:", function.compiled.inspect_asm(signature))
+    body = next(
+        (text for text in bodies if re.search(rf'^"?{function.__name__}\.\w+"?:', text, re.MULTILINE)), bodies[0]
+    )
     return count_text(body, outputs, function.__name__)
 
 

@@ -23,7 +23,8 @@ from duffing_env.kernel import RESET_NEXT_STEP, noise_drawer
 from duffing_env.layout import layout_of
 from duffing_env.sources import parts
 from estimator.inference import mean_field
-from estimator.lanes import LANES, inlined, jit, kernel, lanewise, rows
+from estimator.lanes import LANES, jit, kernel, lanewise, rows
+from estimator.straight import straight
 
 SIZE = 1024
 STEPS = 256
@@ -48,7 +49,7 @@ _ROOTS = "square roots, one thread"
 _STORES = "loads and stores, nearest cache, one thread"
 
 
-@inlined
+@straight
 def _four(value, x, y):
     value = value * x + y
     value = value * x + y
@@ -56,7 +57,7 @@ def _four(value, x, y):
     return value * x + y
 
 
-@inlined
+@straight
 def _sixteen(value, x, y):
     return _four(_four(_four(_four(value, x, y), x, y), x, y), x, y)
 

@@ -68,7 +68,7 @@ def imagined_sample(
     kept = {at[row]: str(derive.renamed([("", entries[row])], at)[0][1]) for row in covariances} if keeps else {}
     text += loop(f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept, "WORK": "GAINED"}, *told)
     arguments = ", ".join(["W", *told])
-    return text + f"@jit\ndef {name}({arguments}):\n{body}    {name}_finish({arguments})\n"
+    return text + f"@straight\ndef {name}({arguments}):\n{body}    {name}_finish({arguments})\n"
 
 
 def hooks(kind: Kind, code: Any) -> Hooks:

@@ -21,7 +21,7 @@ from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, obser
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
 from estimator.engine.rows import belief_names
-from estimator.lanes import LANES, at_lane, kernel, lanewise, part
+from estimator.lanes import LANES, kernel, lanewise, part
 
 #: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.
 RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP, RESET_NOW = 0, 1, 2, 3
@@ -71,11 +71,9 @@ def _pay(REWARD, EARNED, TERMINATED, TRUNCATED, terminal, forfeits, terminated_r
     """
     received = 0.0 if terminal else EARNED
     EARNED += REWARD
-    if terminal:
-        REWARD = EARNED if TERMINATED + TRUNCATED != 0.0 else 0.0
-    if forfeits and TERMINATED != 0.0:
-        REWARD = terminated_return - received
-    return REWARD, EARNED
+    at_end = EARNED if TERMINATED + TRUNCATED != 0.0 else 0.0
+    REWARD = at_end if terminal else REWARD
+    return terminated_return - received if forfeits and TERMINATED != 0.0 else REWARD, EARNED
 
 
 def _draw_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
@@ -138,7 +136,7 @@ def compiled(kind: Kind) -> Kernel:
     play_record = lanewise(place, f"INPUT {sensors[0]} OFF_RECORD", uniform="max_input")(_play_record)
     pay = lanewise(place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(_pay)
     streams = "STREAM_a STREAM_b STREAM_c STREAM_d"
-    draw_jump = at_lane(place, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon")(_draw_jump)
+    draw_jump = lanewise(place, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon", one=True)(_draw_jump)
 
     simulated = kind.plant is not None
     move: Any = _plant_of(kind, code, draw_noise) if simulated else None

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.elementary import log
-from estimator.lanes import inlined
+from estimator.straight import straight
 
 _S3, _S11, _S12, _S24, _S40 = (np.uint64(n) for n in (3, 11, 12, 24, 40))
 _ONE = np.uint64(1)
@@ -25,32 +25,32 @@ def stream_words(generator: np.random.Generator) -> npt.NDArray[np.float64]:
     return words.view(np.float64)
 
 
-@inlined
+@straight
 def as_word(bits):
     """The 64-bit word that a float64 row holds."""
     return np.float64(bits).view(np.uint64)
 
 
-@inlined
+@straight
 def as_bits(word):
     """A 64-bit word as the bits of a float64, to lie in a row."""
     return np.uint64(word).view(np.float64)
 
 
-@inlined
+@straight
 def draw(a, b, c, counter):
     """One 64-bit draw of SFC64: the value and the next four words."""
     value = a + b + counter
     return value, b ^ (b >> _S11), c + (c << _S3), ((c << _S24) | (c >> _S40)) + value, counter + _ONE
 
 
-@inlined
+@straight
 def to_unit(value):
     """A uniform number in (0, 1) from a draw: the middle of one of 2^52 equal intervals."""
     return (np.float64(np.int64(value >> _S12)) + 0.5) * _UNIT_52
 
 
-@inlined
+@straight
 def normal_pair(first, second):
     """Two independent standard normal numbers from two uniform ones (Box and Muller 1958)."""
     radius = np.sqrt(-2.0 * log(first))

@@ -13,11 +13,12 @@ from duffing_env.rewards import REWARDS
 from estimator.engine import cache as stored
 from estimator.engine.rows import belief_names
 from estimator.engine.tasks import NAMES
-from estimator.lanes import LANES, inlined, source_digest
+from estimator.lanes import LANES, source_digest
 from estimator.models.model import Model
+from estimator.straight import straight
 
 
-@inlined
+@straight
 def capped(ratio):
     """Relative error of an estimate, at most 1, from its ratio to the truth."""
     deviation = abs(ratio - 1.0)
@@ -48,11 +49,11 @@ def _source(kind: Kind) -> str:
     place = layout_of(kind)
 
     def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str, one: bool = False) -> str:
-        return "@jit\n" + lane_loop(name, lines, results, place, LANES, uniform, doc=doc, one=one)
+        return "@straight\n" + lane_loop(name, lines, results, place, LANES, uniform, doc=doc, one=one)
 
     def plant_loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
         within = {**place, **inputs_of(kind, kind.truth, place)}
-        return "@jit\n" + lane_loop(name, lines, results, within, LANES, uniform, doc=doc)
+        return "@straight\n" + lane_loop(name, lines, results, within, LANES, uniform, doc=doc)
 
     source = _truth(kind, loop) + _judgement(kind, loop) + _observation(kind, loop)
     if kind.plant is not None:
@@ -71,7 +72,7 @@ def _walk(model: Model, loop: Any) -> str:
     results = {f"P_{c}_{c}": f"V_{c}" for c in names}
     source = loop("walk_lanes", "The coefficients walk.", lines, results, *(f"WALK_{c}" for c in names))
     told = ", ".join(f"variances[{i}]" for i in range(len(names)))
-    return source + f"@jit\ndef walk(W, variances):\n    walk_lanes(W, {told})\n"
+    return source + f"@straight\ndef walk(W, variances):\n    walk_lanes(W, {told})\n"
 
 
 def _plant(model: Model, degree: int, loop: Any) -> str:
@@ -294,4 +295,4 @@ def _observation(kind: Kind, loop: Any) -> str:
     told += [f"log_precisions[{i}]" for i in range(1 + model.n_outputs)]
     arguments = ", ".join(["W", *told, *scales])
     signature = ", ".join(["W", "prior", "inverse_std", "log_precisions", *scales])
-    return source + f"@jit\ndef observe({signature}):\n    observe_lanes({arguments})\n"
+    return source + f"@straight\ndef observe({signature}):\n    observe_lanes({arguments})\n"

@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 
-from estimator.lanes import inlined, jit
+from estimator.lanes import jit
+from estimator.straight import straight
 
 LOG_2PI = math.log(2 * math.pi)
 
@@ -21,7 +22,7 @@ _LN2_HIGH = 6.93147180369123816490e-01
 _LN2_LOW = 1.90821492927058770002e-10
 
 
-@inlined
+@straight
 def log(x):
     """Natural logarithm of a positive, normal number, to 3 units in the last place.
 
@@ -89,14 +90,14 @@ _HALF_PI_HIGH, _HALF_PI_LOW = 1.5707963267948966, 6.123233995736766e-17
 _ROUNDER = 1.5 * 2.0**52
 
 
-@inlined
+@straight
 def _reduced(x):
     """The quarter turn nearest to x, as a whole number, and what is left of x, within ±π/4."""
     quarter = (x * _TWO_OVER_PI + _ROUNDER) - _ROUNDER
     return quarter, (x - quarter * _HALF_PI_HIGH) - quarter * _HALF_PI_LOW
 
 
-@inlined
+@straight
 def _sine_on_quarter(r):
     z = r * r
     p = -7.6471637318198164759e-13 + z * 2.8114572543455207632e-15
@@ -105,7 +106,7 @@ def _sine_on_quarter(r):
     return r + r * (z * p)
 
 
-@inlined
+@straight
 def _cosine_on_quarter(r):
     z = r * r
     p = 4.7794773323873852974e-14 - z * 1.5619206968586226462e-16
@@ -115,7 +116,7 @@ def _cosine_on_quarter(r):
     return 1.0 - 0.5 * z + z * z * (1 / 24 + z * (-1 / 720 + z * p))
 
 
-@inlined
+@straight
 def sin(x):
     """Sine, to 2 units in the last place of its largest value for |x| up to 1e5, without branches."""
     quarter, r = _reduced(x)
@@ -124,7 +125,7 @@ def sin(x):
     return -value if (n & 2) == 2 else value
 
 
-@inlined
+@straight
 def cos(x):
     """Cosine, as `sin`."""
     quarter, r = _reduced(x)
@@ -133,7 +134,7 @@ def cos(x):
     return -value if ((n + 1) & 2) == 2 else value
 
 
-@inlined
+@straight
 def exp(x):
     """Exponential to 2 units in the last place, without branches; 0 below -700, and its value at 700 above."""
     bounded = min(max(x, -700.0), 700.0)
@@ -146,7 +147,7 @@ def exp(x):
     return value if x == x else x
 
 
-@inlined
+@straight
 def tanh(x):
     """Hyperbolic tangent to 4 units in the last place of 1, without branches."""
     e = exp(-2.0 * abs(x))

@@ -61,10 +61,14 @@ def _compiled(model: Model, degree: int) -> Any:
 
         lines, results = derive.state_step(model, degree, {name: name for name in model.names})
         uniform = ("T",) if model.is_continuous else ()
-        source = "@jit\n" + emit.lane_loop("move", lines, results, place, 1, uniform, doc="The state moves.")
+        source = "@straight\n" + emit.lane_loop("move", lines, results, place, 1, uniform, doc="The state moves.")
         end = derive.input_at_end(model, degree)
         shown = derive.renamed([("", derive.calculus(model).outputs[0])], {"u": end})[0][1]
-        return source + "@jit\n" + emit.lane_loop("sense", [("S", shown)], {"SHOWN": "S"}, place, 1, doc="The sensor.")
+        return (
+            source
+            + "@straight\n"
+            + emit.lane_loop("sense", [("S", shown)], {"SHOWN": "S"}, place, 1, doc="The sensor.")
+        )
 
     code = stored.load(model.name, "free-run", repr((model.digest, degree)), make, NAMES)
     move, sense, size, steps, n = code.move, code.sense, len(place), model.substeps, len(model.names)

@@ -19,6 +19,7 @@ from typing import Any
 import numba
 
 from estimator.compiled import Compiled
+from estimator.straight import straight, straight_within
 
 #: Systems in a block. A multiple of the vector width (8 doubles in AVX-512); 32 lanes of ~120 rows stay within 32 KiB.
 LANES = 32
@@ -29,9 +30,6 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "no
 
 #: Compile a function that other compiled functions call.
 jit = numba.njit(**OPTIONS)
-
-#: Compile a scalar function that is always inlined into its callers, as vectorisation needs.
-inlined = numba.njit(forceinline=True, **OPTIONS)
 
 
 def rows(*groups: str, start: int = 0) -> dict[str, int]:
@@ -44,9 +42,9 @@ def rows(*groups: str, start: int = 0) -> dict[str, int]:
 
 
 def lanewise(
-    layout: Mapping[str, int], outputs: str, uniform: str = "", lanes: int = LANES
+    layout: Mapping[str, int], outputs: str, uniform: str = "", lanes: int = LANES, one: bool = False
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a scalar function to run over all lanes of a block.
+    """Compile a straight scalar function (`estimator.straight`) to run over all lanes of a block.
 
     The function's parameters are read from the rows of their names, its results are written to the rows named in
     ``outputs``. Parameters named in ``uniform`` are the same for all lanes, and become arguments of the loop after
@@ -57,53 +55,45 @@ def lanewise(
         outputs: the rows that the function returns, in its order, separated by spaces.
         uniform: parameters that are no rows, in the order in which the loop takes them.
         lanes: systems in the block.
+        one: for one lane: ``f(W, j, *uniform)``.
 
     Raises:
         ValueError: for a parameter that is neither a row nor uniform, or both.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        arguments, targets = _places(function, layout, outputs, uniform, lanes)
-        source = (
-            f"def {function.__name__}({', '.join(['W', *uniform.split()])}):\n"
-            f"    for j in range({lanes}):\n"
-            f"        {targets} = scalar({arguments})\n"
-        )
-        return jit(_define(source, function, scalar=inlined(function)))
+        arguments = _places(function, layout, uniform, lanes)
+        targets = ", ".join(f"W[{layout[n] * lanes} + j]" for n in outputs.split())
+        head = f"def {function.__name__}({', '.join(['W', *(['j'] if one else []), *uniform.split()])}):\n"
+        loop = "" if one else f"    for j in range({lanes}):\n    "
+        source = f"{head}{loop}    {targets} = scalar({arguments})\n"
+        return straight_within(source)(_define(source, function, scalar=straight(function)))
 
     return decorate
 
 
-def at_lane(
-    layout: Mapping[str, int], outputs: str = "", uniform: str = "", lanes: int = LANES
-) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a scalar function to run on one lane: ``f(W, j, *uniform)``, otherwise as `lanewise`.
+def of_lane(layout: Mapping[str, int], function: Callable[..., Any], lanes: int = LANES) -> Any:
+    """Compile ``f(W, j)``: what a scalar function, which may be anything that Numba compiles, gives in lane j.
 
-    Without ``outputs`` it writes nothing, and returns its results. A block holds ``lanes`` systems.
+    Args:
+        layout: name of a quantity to its row; the function's parameters are rows.
+        function: to compile.
+        lanes: systems in the block.
+
+    Raises:
+        ValueError: for a parameter that is no row.
     """
-
-    def decorate(function: Callable[..., Any]) -> Any:
-        arguments, targets = _places(function, layout, outputs, uniform, lanes)
-        source = (
-            f"def {function.__name__}({', '.join(['W', 'j', *uniform.split()])}):\n"
-            f"    {targets + ' =' if outputs else 'return'} scalar({arguments})\n"
-        )
-        return jit(_define(source, function, scalar=jit(function)))
-
-    return decorate
+    source = f"def {function.__name__}(W, j):\n    return scalar({_places(function, layout, '', lanes)})\n"
+    return jit(_define(source, function, scalar=jit(function)))
 
 
-def _places(
-    function: Callable[..., Any], layout: Mapping[str, int], outputs: str, uniform: str, lanes: int
-) -> tuple[str, str]:
-    """The arguments of a scalar function, and the places of its results, as source text."""
+def _places(function: Callable[..., Any], layout: Mapping[str, int], uniform: str, lanes: int) -> str:
+    """The arguments of a scalar function, as source text."""
     names = list(inspect.signature(function).parameters)
     for name in names:
         if (name in layout) == (name in uniform.split()):
             raise ValueError(f"{name} of {function.__name__} must be a row or uniform, and not both; rename it")
-    arguments = ", ".join(f"W[{layout[n] * lanes} + j]" if n in layout else n for n in names)
-    targets = ", ".join(f"W[{layout[n] * lanes} + j]" for n in outputs.split())
-    return arguments, targets
+    return ", ".join(f"W[{layout[n] * lanes} + j]" if n in layout else n for n in names)
 
 
 def kernel(function: Callable[..., Any] | None = None, *, kind: str = "", **options: Any) -> Any:

@@ -8,11 +8,12 @@ from typing import Any
 
 from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
 from estimator.engine import cache as stored
-from estimator.lanes import inlined, jit
+from estimator.lanes import jit
 from estimator.models.model import Model
+from estimator.straight import straight
 
 
-@inlined
+@straight
 def half_noise_powers(innovation, variance, q, r):
     """Half of E[w²] and of E[v²] under the Kalman step with noise variances q and r.
 

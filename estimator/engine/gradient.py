@@ -14,7 +14,6 @@ from typing import Any
 from estimator.engine import cache as stored
 from estimator.engine.rows import input_rows, path_names, path_results
 from estimator.engine.tasks import NAMES
-from estimator.lanes import inlined
 from estimator.models.model import Model
 
 
@@ -49,7 +48,7 @@ def pieces(model: Model, degree: int = 0) -> Any:
     if degree not in (0, 1):
         raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline's input is not known sample by sample")
     key = repr((model.digest, degree))
-    return stored.load(model.name, "gradient", key, lambda: _source(model, degree), {**NAMES, "inlined": inlined})
+    return stored.load(model.name, "gradient", key, lambda: _source(model, degree), NAMES)
 
 
 def _source(model: Model, degree: int) -> str:
@@ -72,7 +71,7 @@ def _source(model: Model, degree: int) -> str:
     held: dict[str, Sequence[str]] = {"P": path_rows, "F": information, **({"M": carried} if carried else {})}
     held |= {"C": coefficients, "U": inputs, "N": noises}
     after = [path_after, [results.get(row, row) for row in information], [results[shown], results["SPREAD"]]]
-    source = "@jit\n" + emit.scalar_function("finish", lines, after, held, doc="Predict and see.")
+    source = "@straight\n" + emit.scalar_function("finish", lines, after, held, doc="Predict and see.")
     followed = {row: results[row] for row in (*path_rows, *information, shown) if row in results}
     adjoints = {"G": [f"G_{row}" for row in path_rows], "H": [f"G_{row}" for row in information]}
     held = {**{name: names for name, names in held.items() if name != "F"}, **adjoints, "S": [f"G_{shown}"]}
@@ -90,15 +89,19 @@ def _motion(model: Model, degree: int, carried: list[str], path_rows: list[str])
     held = {"M": carried, "C": list(model.coefficients), "U": input_rows(model, degree)}
     start = [emit.text_of(value) for value in derive.carried_at_start(model).values()]
     step, moves = derive.motion_step(model, degree), {name: f"{name}_E" for name in carried}
-    source = "@jit\n" + emit.scalar_function("start", [], [start], {"P": path_rows}, doc="The point that moves.")
-    source += "@jit\n" + emit.scalar_function("move", step, [list(moves.values())], held, ("T",), "A Runge-Kutta step.")
+    source = "@straight\n" + emit.scalar_function("start", [], [start], {"P": path_rows}, doc="The point that moves.")
+    source += "@straight\n" + emit.scalar_function(
+        "move", step, [list(moves.values())], held, ("T",), "A Runge-Kutta step."
+    )
     adjoints = {"GM": [f"G_{name}" for name in carried], "GU": [f"G_{name}" for name in held["U"]]}
     source += _reverse("move_back", step, moves, [carried, held["U"]], {**held, **adjoints}, ("T",), held["U"])
     # The point begins at the path's states, with slopes and noise that are constants.
     states = list(model.states)
     results = [f"G_M_{i}" for i in states] + [f"G_{row}" for row in path_rows[len(states) :]]
     arguments = {"G": [f"G_{row}" for row in path_rows], "GM": adjoints["GM"]}
-    return source + "@jit\n" + emit.scalar_function("start_back", [], [results], arguments, doc="Reverse of start.")
+    return (
+        source + "@straight\n" + emit.scalar_function("start_back", [], [results], arguments, doc="Reverse of start.")
+    )
 
 
 def _reverse(
@@ -142,8 +145,7 @@ def _reverse(
         for target, e in back[split:]
     ]
     outcome = [[before[f"G_{row}"] for row in group] for group in groups]
-    # A sample's reverse is as long as its call would be; a Runge-Kutta step's would only cost time to compile.
-    return f"@{'jit' if uniform else 'inlined'}\n" + emit.scalar_function(
+    return "@straight\n" + emit.scalar_function(
         name, [*forward, *back[:split], *ends], outcome, held, uniform, "The reverse derivative."
     )  # fmt: skip
 
@@ -166,10 +168,10 @@ def _frame(model: Model, degree: int, carried: list[str], path_rows: list[str], 
     seeds = ", ".join(f"{'0.5 * ' if i == j else ''}inverse[{j}, {i}]" for i, j in upper)
     source = (
         f"n_path, n_tape = {n}, {n + (model.substeps + 1) * m}\n"
-        f"@jit\ndef begin(start):\n    return {taken('start', n)}, {zeros(len(information))}\n"
-        f"@jit\ndef coefficients(values):\n    return {taken('values', k)}\n"
-        f"@jit\ndef noises(values):\n    return {taken('values', 1 + model.n_outputs)}\n"
-        f"@jit\ndef lay(now, last, older):\n    return {laid}\n"
+        f"@straight\ndef begin(start):\n    return {taken('start', n)}, {zeros(len(information))}\n"
+        f"@straight\ndef coefficients(values):\n    return {taken('values', k)}\n"
+        f"@straight\ndef noises(values):\n    return {taken('values', 1 + model.n_outputs)}\n"
+        f"@straight\ndef lay(now, last, older):\n    return {laid}\n"
         f"@jit\ndef gather(F, precision, total):\n{fill}"
         f"@jit\ndef seed(inverse):\n    return {zeros(n)}, ({seeds},)\n"
     )
@@ -177,7 +179,7 @@ def _frame(model: Model, degree: int, carried: list[str], path_rows: list[str], 
         return source + (
             f"@jit\ndef step(P, F, C, U, N, tape, t):\n{kept}    P, F, (shown, spread) = finish(P, F, C, U, N)\n"
             "    return P, F, shown, spread\n"
-            "@inlined\ndef back(G, H, C, U, N, shown, tape, t):\n"
+            "@jit\ndef back(G, H, C, U, N, shown, tape, t):\n"
             f"    P = {taken('tape', n, 't, ')}\n    G, U = finish_back(P, C, U, N, G, H, (shown,))\n"
             f"    return G, {slopes}\n"
         )
@@ -189,7 +191,7 @@ def _frame(model: Model, degree: int, carried: list[str], path_rows: list[str], 
         f"    for s in range({model.substeps}):\n        keep(M, tape, t, {n} + {m} * s)\n"
         f"        M = move(M, C, U, s / {model.substeps})\n    keep(M, tape, t, {n + model.substeps * m})\n"
         "    P, F, (shown, spread) = finish(P, F, M, C, U, N)\n    return P, F, shown, spread\n"
-        "@inlined\ndef back(G, H, C, U, N, shown, tape, t):\n"
+        "@jit\ndef back(G, H, C, U, N, shown, tape, t):\n"
         f"    P, M, V = {taken('tape', n, 't, ')}, point(tape, t, {n + model.substeps * m}), U\n"
         "    G, GM, U = finish_back(P, M, C, V, N, G, H, (shown,))\n"
         f"    for s in range({model.substeps - 1}, -1, -1):\n"

@@ -118,11 +118,17 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
     source = ""
     if model.is_continuous:
         start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
-        source += "@jit\n" + emit.lane_loop("begin", [], start, place, LANES, doc="The point that moves, at the mean.")
+        source += "@straight\n" + emit.lane_loop(
+            "begin", [], start, place, LANES, doc="The point that moves, at the mean."
+        )
         step = derive.renamed(derive.motion_step(model, degree), given)
         moves = {name: f"{name}_E" for name in derive.carried(model)}
-        source += "@jit\n" + emit.lane_loop("move", step, moves, place, LANES, ("T", *coefficients), doc="One step.")
-    source += "@jit\n" + emit.lane_loop("expect", lines, results, place, LANES, uniform, doc="One expected sample.")
+        source += "@straight\n" + emit.lane_loop(
+            "move", step, moves, place, LANES, ("T", *coefficients), doc="One step."
+        )
+    source += "@straight\n" + emit.lane_loop(
+        "expect", lines, results, place, LANES, uniform, doc="One expected sample."
+    )
     return source + _composed(model) + _judgement(model, place)
 
 
@@ -137,7 +143,7 @@ def _composed(model: Model) -> str:
     if model.is_continuous:
         steps = model.substeps
         body = ["begin(W)", f"for s in range({steps}):", f"    move(W, s / {steps}, {means})", *body]
-    return "@jit\ndef advance(W, record, walk):\n" + "".join(f"    {line}\n" for line in body)
+    return "@straight\ndef advance(W, record, walk):\n" + "".join(f"    {line}\n" for line in body)
 
 
 def _judgement(model: Model, place: Mapping[str, int]) -> str:
@@ -172,7 +178,7 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
     known = choose(symbol("NOW"), choose(ratio - 1e-300, known, sp.Float(LOST)), sp.Float(LOST))
     lines.append(("NATS", known))
     uniform = [str(factor[i][j]) for i in range(k) for j in range(i + 1)]
-    source = "@jit\n" + emit.lane_loop(
+    source = "@straight\n" + emit.lane_loop(
         "judge_lanes", lines, {"KNOWN": "NATS"}, place, LANES, uniform, doc="What will be known."
     )  # fmt: skip
     told_entries = ", ".join(f"M[{i}, {j}]" for i in range(k) for j in range(i + 1))

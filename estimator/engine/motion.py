@@ -73,7 +73,7 @@ def _source(model: Model, degree: int, lag: int, place: Mapping[str, int]) -> st
     given = fed(model, degree, lag)
 
     def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
-        return "@jit\n" + emit.lane_loop(name, derive.renamed(lines, given), results, place, 1, uniform, doc=doc)
+        return "@straight\n" + emit.lane_loop(name, derive.renamed(lines, given), results, place, 1, uniform, doc=doc)
 
     shown, velocity, gain = _sensor(model)
     values = {"NOW_e": shown, "VELOCITY_e": velocity, "GAIN_e": gain}
@@ -127,7 +127,7 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     for name, move, end in (("glance", "move_plainly", "see"), ("step", "move", "finish")):
         steps = model.substeps
         body = ["begin(W)", f"for s in range({steps}):", f"    {move}(W, s / {steps})"] if model.is_continuous else []
-        source += f"@jit\ndef {name}(W):\n" + "".join(f"    {line}\n" for line in [*body, f"{end}(W)"])
+        source += f"@straight\ndef {name}(W):\n" + "".join(f"    {line}\n" for line in [*body, f"{end}(W)"])
     return source
 
 

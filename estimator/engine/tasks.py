@@ -16,11 +16,12 @@ import numpy as np
 from estimator import elementary
 from estimator.engine import cache as stored
 from estimator.engine.rows import layout, path_layout, point_names, trace_names
-from estimator.lanes import LANES, inlined, rows
+from estimator.lanes import LANES, rows
 from estimator.models.model import Model
+from estimator.straight import straight
 
 
-@inlined
+@straight
 def sqrt(value):
     """Square root."""
     return np.sqrt(value)
@@ -120,7 +121,7 @@ def _structured(
         # Every layer of functions is compiled: what a difference equation finishes is all of its update.
         whole = not (points or model.is_continuous)
         name = "update" if whole else "finish"
-        finish = "@jit\n" + emit.lane_loop(name, lines + more, results, place, lanes, doc="Predict and condition.")
+        finish = "@straight\n" + emit.lane_loop(name, lines + more, results, place, lanes, doc="Predict and condition.")
         if whole:
             return finish
         if points:
@@ -143,7 +144,7 @@ def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
     by_point |= {f"I_P_{i}": f"{first} + P*{model.n_states} + {k}" for k, i in enumerate(model.states)}
 
     def loop(name: str, lines: Any, results: Any, uniform: tuple[str, ...], doc: str) -> str:
-        return "@jit\n" + emit.lane_loop(name, lines, results, by_point, lanes, uniform, doc)
+        return "@straight\n" + emit.lane_loop(name, lines, results, by_point, lanes, uniform, doc)
 
     source = loop("spread", *points.spread(model), (), "Columns of the covariance's factor, and their weights.")
     if not model.is_continuous:
@@ -168,7 +169,7 @@ def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
 
 def _looped(model: Model, before: str, body: str) -> str:
     """Source of ``update(W)`` over all sigma points."""
-    head = f"@jit\ndef update(W):\n    spread(W)\n{before}    for P in range({2 * len(model.movers)}):\n"
+    head = f"@straight\ndef update(W):\n    spread(W)\n{before}    for P in range({2 * len(model.movers)}):\n"
     return head + body + "    finish(W)\n"
 
 
@@ -180,9 +181,9 @@ def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
         return ""
     start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
     moved = {name: f"{name}_E" for name in derive.carried(model)}
-    source = "@jit\n" + emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
+    source = "@straight\n" + emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
     step = derive.motion_step(model, degree)
-    return source + "@jit\n" + emit.lane_loop(
+    return source + "@straight\n" + emit.lane_loop(
         "move", step, moved, place, lanes, ("T",), doc="One Runge-Kutta step, from T in [0, 1) of a sample on."
     )  # fmt: skip
 
@@ -190,9 +191,9 @@ def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
 def _composed(name: str, model: Model, finish: str = "finish(W)", arguments: str = "W") -> str:
     """Source of the whole sample: begin, all steps, finish."""
     if not model.is_continuous:
-        return f"@jit\ndef {name}({arguments}):\n    {finish}\n"
+        return f"@straight\ndef {name}({arguments}):\n    {finish}\n"
     return (
-        f"@jit\ndef {name}({arguments}):\n    begin(W)\n    for s in range({model.substeps}):\n"
+        f"@straight\ndef {name}({arguments}):\n    begin(W)\n    for s in range({model.substeps}):\n"
         f"        move(W, s / {model.substeps})\n    {finish}\n"
     )
 
@@ -233,7 +234,7 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -
         more, results = path_sample(model, moved, degree, observed)
         lines += more
         source = _motion_source(model, degree, place, lanes)
-        source += "@jit\n" + emit.lane_loop("finish", lines, results, place, lanes, noises, doc="Predict and see.")
+        source += "@straight\n" + emit.lane_loop("finish", lines, results, place, lanes, noises, doc="Predict and see.")
         arguments = ", ".join(noises)
         return source + _composed("sample", model, f"finish(W, {arguments})", f"W, {arguments}")
 

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
 from estimator.engine.cache import digest_of
 from estimator.engine.rows import layout as layout_of_update
-from estimator.lanes import LANES, at_lane, inlined, jit, lanewise, part, rows
+from estimator.lanes import LANES, jit, lanewise, of_lane, part, rows
 from estimator.models.difference import difference
+from estimator.straight import straight
 
 #: Precision of the identity x_{t-1} = x_{t-1} between z_t and z_{t-1}: 1/ε of the paper.
 TIE = 1e12
@@ -73,7 +74,7 @@ def pieces(place: Mapping[str, int], lanes: int = LANES) -> Pieces:
             lanes,
         )(iterate),
         lanewise(place, "x1 x2 P_x1_x1 P_x1_x2 P_x2_x2", lanes=lanes)(end),
-        at_lane(place, lanes=lanes)(free_energy),
+        of_lane(place, free_energy, lanes),
     )
 
 
@@ -195,7 +196,7 @@ def iterate(
     )  # fmt: skip
 
 
-@inlined
+@straight
 def _residual_power(
     theta1, theta2, theta3, eta, u, z0, z0_variance, q0, q1, Q_00, Q_01, Q_11,
     V_11, V_12, V_13, V_22, V_23, V_33, eta_variance,

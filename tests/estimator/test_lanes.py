@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from estimator import lanes
-from estimator.lanes import LANES, at_lane, lanewise, part, rows
+from estimator.lanes import LANES, lanewise, of_lane, part, rows
 
 LAYOUT = {"a": 0, "b": 1, "total": 2, "product": 3}
 
@@ -53,14 +53,18 @@ def test_lanewise_writes_after_it_has_read():
     np.testing.assert_array_equal(W.reshape(-1, LANES)[:2], [b, a])
 
 
-def test_at_lane_touches_one_lane_or_none():
+def sum_and_product(a, b):
+    return a + b, a * b
+
+
+def test_one_lane_is_touched_or_none():
     W = block()
     before = W.reshape(-1, LANES).copy()
     a, b = before[:2]
-    total, product = at_lane(LAYOUT, uniform="factor shift")(add_and_multiply)(W, 5, 2.0, 100.0)
-    np.testing.assert_allclose([total, product], [a[5] + 2.0 * b[5], a[5] * b[5] + 100.0], rtol=1e-14)
+    total, product = of_lane(LAYOUT, sum_and_product)(W, 5)
+    np.testing.assert_allclose([total, product], [a[5] + b[5], a[5] * b[5]], rtol=1e-14)
     np.testing.assert_array_equal(W.reshape(-1, LANES), before)
-    at_lane(LAYOUT, "total product", uniform="factor shift")(add_and_multiply)(W, 5, 2.0, 100.0)
+    lanewise(LAYOUT, "total product", uniform="factor shift", one=True)(add_and_multiply)(W, 5, 2.0, 100.0)
     changed = W.reshape(-1, LANES) != before
     np.testing.assert_array_equal(np.argwhere(changed), [[2, 5], [3, 5]])
 

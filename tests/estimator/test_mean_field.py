@@ -100,8 +100,8 @@ def test_lanes_are_independent(as_published):
 def test_the_loop_holds_packed_vector_instructions():
     wide = "[yz]mm" if has_fused_multiply_add() else "xmm"  # without AVX2 two doubles are all that a register holds
     signature = (numba.float64[::1], numba.boolean)
-    PIECES.iterate.compile(signature)
-    assembly = PIECES.iterate.inspect_asm(signature)
+    PIECES.iterate.compiled.compile(signature)
+    assembly = PIECES.iterate.compiled.inspect_asm(signature)
     packed = re.findall(rf"^\s+(?:v?mulpd|vfn?m(?:add|sub)\d+pd)\s.*%{wide}", assembly, flags=re.MULTILINE)
     scalar = re.findall(r"^\s+(?:v?mulsd|vfn?m(?:add|sub)\d+sd)\s", assembly, flags=re.MULTILINE)
     # Scalar code has none of the first kind; of the second, a uniform argument may bring a few.

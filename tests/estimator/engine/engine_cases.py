@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from engine_reference import EPS, Belief, Plant
 
-from estimator.engine import tasks
 from estimator.engine.rows import input_rows
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
@@ -185,12 +184,6 @@ def get_belief(W, layout, lanes, lane, case: Case) -> Belief:
 def block(layout, lanes: int) -> np.ndarray:
     """An empty block."""
     return np.zeros((max(layout.values()) + 1) * lanes)
-
-
-def interpreted(monkeypatch) -> None:
-    """Let the tasks define their functions without compiling them: the same source, a thousand times slower."""
-    plain = {"sqrt": tasks.NAMES["sqrt"].py_func}
-    monkeypatch.setattr(tasks, "NAMES", tasks.NAMES | plain | {"jit": lambda function: function})
 
 
 def assert_agrees(actual: Belief, outcome, operations: int) -> None:

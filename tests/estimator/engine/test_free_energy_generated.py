@@ -15,7 +15,6 @@ from estimator.engine.free_energy import free_energies
 ITERATIONS = 3
 
 
-@pytest.mark.slow  # seconds of compilation
 @pytest.mark.parametrize("name", ["duffing", "paper", "pendulum"])
 def test_free_energies_equal_their_definition(name):
     """Over one and over two sensors, of which only the first tells of the process noise."""

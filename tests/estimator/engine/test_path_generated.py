@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engine_cases import CASES, FIVE, block, interpreted, put, random_inputs
+from engine_cases import CASES, FIVE, block, put, random_inputs
 from engine_reference import EPS, moved, path, spread
 
 from estimator.engine import gradient, tasks
@@ -70,10 +70,9 @@ def walked(case, task, walks, observed):
 
 @pytest.mark.parametrize("observed", [True, False], ids=["along outputs", "without noise"])
 @pytest.mark.parametrize("name", CASES)
-def test_a_path_equals_its_equations(name, observed, monkeypatch):
-    interpreted(monkeypatch)
+def test_a_path_equals_its_equations(name, observed):
     case = CASES[name]
-    task = tasks.path.__wrapped__(case.model, case.degree, observed=observed, lanes=1)
+    task = tasks.path(case.model, case.degree, observed=observed, lanes=1)
     assert_equals_reference(case, task, observed)
 
 
@@ -125,12 +124,11 @@ def central(f, x, step):
 
 
 @pytest.mark.parametrize("name", FIVE)
-def test_the_information_is_that_of_the_responses_slopes(name, monkeypatch):
+def test_the_information_is_that_of_the_responses_slopes(name):
     """Without process noise and from a known state, F is the sum of slopes of what is shown, over r."""
-    interpreted(monkeypatch)
     case = CASES[name]
     z, V, c, inputs, R, _ = some_walk(case, 2)
-    task = tasks.path.__wrapped__(case.model, case.degree, observed=False, lanes=1)
+    task = tasks.path(case.model, case.degree, observed=False, lanes=1)
     W = block(task.layout, 1)
     start(case, task.layout, z, 0 * V, c, W)
     for taps in inputs:
@@ -154,19 +152,16 @@ def test_the_information_is_that_of_the_responses_slopes(name, monkeypatch):
 
 
 @pytest.mark.parametrize("name", FIVE)
-def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
+def test_the_gradient_by_the_inputs_equals_differences(name):
     """Of a weighted sum of all that the path leaves, with process noise and an uncertain start."""
-    interpreted(monkeypatch)
-    monkeypatch.setattr(gradient, "NAMES", tasks.NAMES)
-    monkeypatch.setattr(gradient, "inlined", lambda function: function)
     case = CASES[name]
-    code = gradient.pieces.__wrapped__(case.model, case.degree)
+    code = gradient.pieces(case.model, case.degree)
     z, V, c, _, R, _ = some_walk(case, 3)
     rng, n = np.random.default_rng(4), case.model.n_states
     begun = np.zeros(code.n_path)
     begun[:n] = z
     begun[n : n + n * (n + 1) // 2] = V[np.triu_indices(n)]
-    inputs, C, N = 0.1 * rng.standard_normal(SAMPLES), code.coefficients(c), code.noises([NOISE, *R])
+    inputs, C, N = 0.1 * rng.standard_normal(SAMPLES), code.coefficients(c), code.noises(np.array([NOISE, *R]))
 
     def forward(u, tape):
         """What the path leaves, its information, and what the first sensor shows."""
@@ -197,10 +192,9 @@ def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
     np.testing.assert_allclose(found[2:], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
-def test_a_lane_that_is_over_counts_nothing(monkeypatch):
-    interpreted(monkeypatch)
+def test_a_lane_that_is_over_counts_nothing():
     case = CASES["paper"]
-    task = tasks.path.__wrapped__(case.model, case.degree, observed=True, lanes=1)
+    task = tasks.path(case.model, case.degree, observed=True, lanes=1)
     z, V, c, inputs, R, y = some_walk(case, 5)
     W = block(task.layout, 1)
     start(case, task.layout, z, V, c, W)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from engine_cases import CASES, Case, assert_agrees, block, get_belief, interpreted, put_belief, random_belief
+from engine_cases import CASES, Case, assert_agrees, block, get_belief, put_belief, random_belief
 from engine_reference import EPS, Plant, update
 from test_structured_generated import LANES, some_samples, updated
 
@@ -17,12 +17,8 @@ from estimator.models.model import Model
 NAMES = ["duffing", "duffing, all terms", "cubic", "pendulum", "wiener-hammerstein", "van der pol"]
 
 
-def generated(case, **options):
-    options = {"iterations": 3, "trace": False, "missing": True} | options
-    return tasks._structured.__wrapped__(
-        case.model, case.degree, options["iterations"], LANES, None, options["trace"], options["missing"],
-        "sigma_points",
-    )  # fmt: skip
+def generated(case):
+    return tasks.structured(case.model, case.degree, lanes=LANES, missing=True, expectations="sigma_points")
 
 
 def movers(case):
@@ -40,9 +36,8 @@ def assert_equals_reference(case, task, samples):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_update_equals_its_equations(name, monkeypatch):
+def test_an_update_equals_its_equations(name):
     """With an output missing in a lane, and quantities that are known in others."""
-    interpreted(monkeypatch)
     case = CASES[name]
     samples = some_samples(case, 11)
     samples[0][2][:] = np.nan
@@ -51,14 +46,12 @@ def test_an_update_equals_its_equations(name, monkeypatch):
     assert_equals_reference(case, generated(case), samples)
 
 
-@pytest.mark.slow  # as below; without compilation the tests above ask the same
-def test_a_compiled_update_equals_its_equations():
+def test_free_energies_of_an_update_equal_their_definition():
     case = CASES["van der pol"]
     task = tasks.structured(
         case.model, case.degree, lanes=LANES, missing=True, trace=True, expectations="sigma_points"
     )  # fmt: skip
     samples = some_samples(case, 12)
-    assert_equals_reference(case, task, samples)
     W, out = updated(case, task, samples), np.empty(3)
     free_energies(case.model, 3, LANES, task.layout)(W, 0, out)
     belief, inputs, y = samples[0]
@@ -66,8 +59,7 @@ def test_a_compiled_update_equals_its_equations():
     np.testing.assert_allclose(out, expected, rtol=1e-9)
 
 
-def test_quantities_that_depend_on_others_get_no_points(monkeypatch):
-    interpreted(monkeypatch)
+def test_quantities_that_depend_on_others_get_no_points():
     case = CASES["van der pol"]
     samples = some_samples(case, 13)
     onto = np.eye(5)
@@ -81,21 +73,19 @@ def test_quantities_that_depend_on_others_get_no_points(monkeypatch):
     np.testing.assert_allclose(weights[weights > 0], 1 / 6, rtol=4 * EPS)
 
 
-def test_a_belief_without_doubt_moves_with_its_mean(monkeypatch):
-    interpreted(monkeypatch)
+def test_a_belief_without_doubt_moves_with_its_mean():
     case = CASES["pendulum"]
     belief, inputs, _ = some_samples(case, 14)[0]
     sure = replace(belief, cov=np.zeros((5, 5)))
     W = updated(case, generated(case), [(sure, inputs, [np.nan, np.nan])] * LANES)
-    first = tasks._structured.__wrapped__(case.model, case.degree, 3, LANES, None, False, True)
+    first = tasks.structured(case.model, case.degree, lanes=LANES, missing=True)
     V = updated(case, first, [(sure, inputs, [np.nan, np.nan])] * LANES)
     ours, theirs = (get_belief(w, first.layout, LANES, 0, case) for w in (W, V))
     np.testing.assert_allclose(ours.mean, theirs.mean, rtol=EPS * case.operations)
     np.testing.assert_allclose(ours.cov, theirs.cov, rtol=EPS * case.operations, atol=0)
 
 
-def test_on_a_linear_model_it_is_first_order(monkeypatch):
-    interpreted(monkeypatch)
+def test_on_a_linear_model_it_is_first_order():
     linear = Model(
         "linear", {"x": "1", "v": "1"}, {"force": "1", "gain": "1", "bias": "1"}, noise=("0", "sqrt(3)"),
         outputs={"y": "x + bias"}, rates=("v", "force + gain*u - x/2 - v/10"), substeps=4,
@@ -116,7 +106,6 @@ def test_on_a_linear_model_it_is_first_order(monkeypatch):
         assert_agrees(get_belief(W, task.layout, LANES, lane, case), expected, 4 * case.operations * lost)
 
 
-@pytest.mark.slow  # seconds of compilation
 @pytest.mark.parametrize("name", ["paper", "van der pol"])
 def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
     """Beliefs, inputs and outputs over sixteen decades, sixty samples on end."""
@@ -165,8 +154,7 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
         ({(2, 2): 0.0}, False),
     ],
 )
-def test_what_is_no_covariance_is_flagged(entries, flagged, monkeypatch):
-    interpreted(monkeypatch)
+def test_what_is_no_covariance_is_flagged(entries, flagged):
     case = CASES["van der pol"]
     belief = random_belief(case, np.random.default_rng(17))
     cov = np.eye(5)

@@ -10,7 +10,6 @@ from engine_cases import (
     assert_agrees,
     block,
     get_belief,
-    interpreted,
     put,
     put_belief,
     random_belief,
@@ -56,18 +55,14 @@ def assert_equals_reference(case, task, samples, iterations):
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("iterations", [1, 3])
-def test_an_update_equals_its_equations(name, iterations, monkeypatch):
-    interpreted(monkeypatch)
+def test_an_update_equals_its_equations(name, iterations):
     case = CASES[name]
-    task = tasks._structured.__wrapped__(case.model, case.degree, iterations, LANES, None, False, False)
+    task = tasks.structured(case.model, case.degree, iterations=iterations, lanes=LANES)
     assert_equals_reference(case, task, some_samples(case, 1), iterations)
 
 
-# Compiling a model takes seconds; the same source is tested without the compiler above, so one is enough here.
-@pytest.mark.parametrize(
-    "name", ["pendulum", *(pytest.param(name, marks=pytest.mark.slow) for name in ("duffing, all terms", "cubic"))]
-)
-def test_a_compiled_update_equals_its_equations_with_missing_outputs(name):
+@pytest.mark.parametrize("name", ["pendulum", "duffing, all terms", "cubic"])
+def test_an_update_equals_its_equations_with_missing_outputs(name):
     """Of two sensors none, the first, the second or both are missing."""
     case = CASES[name]
     task = tasks.structured(case.model, case.degree, iterations=2, lanes=LANES, missing=True)
@@ -94,26 +89,24 @@ def test_a_missing_output_leaves_the_belief_bit_by_bit_as_predicted():
     assert (still.gamma, still.xi) == (belief.gamma, belief.xi)
 
 
-def test_noise_that_no_sensor_shows_widens_the_state_and_is_not_learned(monkeypatch):
-    interpreted(monkeypatch)
+def test_noise_that_no_sensor_shows_widens_the_state_and_is_not_learned():
     hidden = Model(
         "hidden", {"x": "1", "w": "1"}, {"k": "1"}, noise=("0", "1"), outputs={"y": "x"}, next_state=("k*x + w", "w/2")
     )
     plant = Plant(lambda z, c, u: [c[0] * z[0] + z[1], z[1] / 2], lambda z, c, u: [z[0]], lambda z, c: [0.0, 1.0])
     case = Case(hidden, plant, (0.5, 0.2, 0.9))
-    task = tasks._structured.__wrapped__(hidden, 0, 3, LANES, None, True, False)
+    task = tasks.structured(hidden, lanes=LANES, trace=True)
     samples = some_samples(case, 7)
     assert_equals_reference(case, task, samples, 3)
     W = updated(case, task, samples)
     assert get_belief(W, task.layout, LANES, 0, case).gamma == samples[0][0].gamma
 
 
-def test_noise_that_depends_on_the_state_may_vanish(monkeypatch):
-    interpreted(monkeypatch)
+def test_noise_that_depends_on_the_state_may_vanish():
     growing = Model("growing", {"x": "1"}, {"k": "1"}, noise=("x",), outputs={"y": "x"}, next_state=("k*x + u",))
     plant = Plant(lambda z, c, u: [c[0] * z[0] + u[0]], lambda z, c, u: [z[0]], lambda z, c: [z[0]])
     case = Case(growing, plant, (0.5, 0.9))
-    task = tasks._structured.__wrapped__(growing, 0, 3, LANES, None, True, False)
+    task = tasks.structured(growing, lanes=LANES, trace=True)
     samples = some_samples(case, 8)
     assert_equals_reference(case, task, samples, 3)
     at_rest = replace(samples[0][0], mean=np.array([0.0, 0.9]))
@@ -124,9 +117,8 @@ def test_noise_that_depends_on_the_state_may_vanish(monkeypatch):
     assert rate / shape == pytest.approx(at_rest.gamma[1] / at_rest.gamma[0], rel=4 * EPS)
 
 
-def test_what_is_generated_names_nothing_twice(monkeypatch):
+def test_what_is_generated_names_nothing_twice():
     """Names of a model that look like those of stages, lanes and loops."""
-    interpreted(monkeypatch)
     model = Model(
         "odd", {"j": "1", "j_a": "1", "j_e": "1"}, {"s": "1", "lane": "1"}, noise=("1", "0", "0"), outputs={"w": "j"},
         rates=("j_a - s*j", "lane*u - j", "j - j_e"), substeps=2,
@@ -136,7 +128,7 @@ def test_what_is_generated_names_nothing_twice(monkeypatch):
         lambda z, c: [1.0, 0.0, 0.0], substeps=2,
     )  # fmt: skip
     case = Case(model, plant, (0.1, 0.2, 0.3, 0.4, 0.5))
-    task = tasks._structured.__wrapped__(model, 0, 2, LANES, None, False, False)
+    task = tasks.structured(model, iterations=2, lanes=LANES)
     assert_equals_reference(case, task, some_samples(case, 9), 2)
 
 
