@@ -170,24 +170,25 @@ def compiled(kind: Kind) -> Kernel:
         W[stream + 2 * LANES + j], W[stream + 3 * LANES + j] = as_bits(c), as_bits(d)
 
     @inner
-    def reset_lane(W, j, setup, is_new):
-        """Start an episode in lane j: draw its plant, put it at rest, and put the belief to the prior.
-
-        With ``is_new`` False only its true coefficients are settled anew, after its parameters changed.
-        """
-        if is_new:
-            for i in range(n_record):
-                W[i * LANES + j] = setup.prior[i]
-            draw_plant(W, j, setup)
-            W[jump_at + j] = -1.0
-            if setup.jump > 0.0:
-                draw_jump(W, j, setup.jump, setup.horizon)
-            for r in at_rest:
-                W[r + j] = 0.0
+    def meet_truth(W, j, setup):
+        """Settle the true coefficients of lane j after its parameters changed."""
         settle_truth(W, j, setup.step)
         appraise(W, j, setup.step)
         if is_worked:
             begin_work(W, j, setup)
+
+    @inner
+    def reset_lane(W, j, setup):
+        """Start an episode in lane j: draw its plant, put it at rest, and put the belief to the prior."""
+        for i in range(n_record):
+            W[i * LANES + j] = setup.prior[i]
+        draw_plant(W, j, setup)
+        W[jump_at + j] = -1.0
+        if setup.jump > 0.0:
+            draw_jump(W, j, setup.jump, setup.horizon)
+        for r in at_rest:
+            W[r + j] = 0.0
+        meet_truth(W, j, setup)
 
     def step_blocks(
         first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations, outcomes,
@@ -216,7 +217,7 @@ def compiled(kind: Kind) -> Kernel:
                     for j in range(LANES):
                         if W[elapsed + j] == W[jump_at + j]:
                             W[drawn + j] *= W[jump_factor + j]
-                            reset_lane(W, j, setup, False)
+                            meet_truth(W, j, setup)
                 draw_noise(W)
                 if is_worked:
                     before(W, setup)
@@ -272,7 +273,7 @@ def compiled(kind: Kind) -> Kernel:
                     if reset_mode == RESET_NOW
                     else W[waiting + j] != 0.0 and reset_mode == RESET_NEXT_STEP
                 ):
-                    reset_lane(W, j, setup, True)
+                    reset_lane(W, j, setup)
                     for k in range(n_outcome):
                         W[outcome + k * LANES + j] = 0.0
                 elif reset_mode != RESET_NOW and W[terminated + j] + W[truncated + j] != 0.0:
@@ -297,7 +298,7 @@ def compiled(kind: Kind) -> Kernel:
                             final_observations[lane + j, k] = observations[lane + j, k]
                         for i in range(n_rows):
                             ended[b, i * LANES + j] = W[i * LANES + j]
-                        reset_lane(W, j, setup, True)
+                        reset_lane(W, j, setup)
 
     step, inner_step = entry(step_blocks), inner(step_blocks)
 

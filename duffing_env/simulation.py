@@ -82,7 +82,8 @@ def hooks(kind: Kind, code: Any) -> Hooks:
         for k in range(len(inputs)):
             for j in range(LANES):
                 kept[k * LANES + j] = W[inputs[k] + j]
-        W[first:last] = 0.0
+        for i in range(first, last):
+            W[i] = 0.0
         for t in range(SAMPLES):
             now = max_input * TEST_INPUT[t]
             before = max_input * TEST_INPUT[t - 1] if t > 0 else 0.0
@@ -105,7 +106,9 @@ def hooks(kind: Kind, code: Any) -> Hooks:
     @part(kind.name)
     def begin(W, j, setup):
         """Of lane j alone: the other lanes keep what they had."""
-        works, misfits = W[work : work + LANES].copy(), W[misfit : misfit + LANES].copy()
+        works, misfits = np.empty(LANES), np.empty(LANES)
+        for k in range(LANES):
+            works[k], misfits[k] = W[work + k], W[misfit + k]
         run(W, setup.max_input)
         for k in range(LANES):
             W[work + k] = works[k]

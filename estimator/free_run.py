@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from estimator.arrays import copy
 from estimator.engine import cache as stored
 from estimator.engine.feeding import feeder, input_degree
 from estimator.engine.rows import input_rows
@@ -78,7 +79,7 @@ def _compiled(model: Model, degree: int) -> Any:
     @kernel(kind=f"{model.name}_{model.digest}_{degree}")
     def run(start, u, y):
         W = np.zeros(size)
-        W[:n] = start
+        copy(W, 0, start, n)
         for t in range(len(u)):
             feed(W, 0, u[t], u[t - 1] if t > 0 else 0.0, u[t - 2] if t > 1 else 0.0)
             if continuous:

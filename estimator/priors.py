@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +46,16 @@ def log_uniform_moments(
     for name in names:
         if name not in center or not np.isfinite(center[name]) or center[name] == 0:
             raise ValueError(f"center must have a finite {name} other than 0, but is {dict(center)}")
+    mean, cov = _log_uniform_moments(model, tuple(float(center[name]) for name in names), float(spread), float(step))
+    return mean.copy(), cov.copy()
+
+
+@lru_cache(maxsize=256)  # every environment, and every evaluation of one, asks for the same
+def _log_uniform_moments(
+    model: Model, center: tuple[float, ...], spread: float, step: float
+) -> tuple[FloatArray, FloatArray]:
+    """The integral of `log_uniform_moments`, with the parameters in their order."""
+    names = list(model.physical or model.coefficients)
     nodes_per_axis = max(2, min(_NODES, int(_POINTS ** (1 / len(names)) + 1e-9)))
     nodes, weights = np.polynomial.legendre.leggauss(nodes_per_axis)
     # log(1 ± spread) = log(1 - spread²) / 2 ± artanh(spread)
@@ -54,7 +64,7 @@ def log_uniform_moments(
     probabilities = np.ones(1)
     for _ in names:
         probabilities = np.outer(probabilities, weights / 2).ravel()  # the weights sum to 2, the length of [-1, 1]
-    points = coefficients_of(model, {name: center[name] * row for name, row in zip(names, grid, strict=True)}, step)
+    points = coefficients_of(model, {name: c * row for name, c, row in zip(names, center, grid, strict=True)}, step)
     return _moments(points, probabilities)
 
 

@@ -37,11 +37,12 @@ class Moments:
         return np.concatenate([self.mean, self.cov[UPPER], self.gamma, self.xi])
 
 
-def mean_field_step(prior, u, y, iterations, as_published=False, nonlinear=True):
+def mean_field_step(prior, u, y, iterations, as_published=False, nonlinear=True, evaluated=None):
     """The six updates of the published experiment, ``iterations`` times.
 
     Returns:
-        The posterior (mean field knows no cross-covariances: they are 0), and the free energy after each iteration.
+        The posterior (mean field knows no cross-covariances: they are 0), and the free energy after each iteration, or
+        after the last ``evaluated`` ones alone.
     """
     S, s = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0])
     theta = [2, 3, 4] if nonlinear else [2, 4]
@@ -64,7 +65,7 @@ def mean_field_step(prior, u, y, iterations, as_published=False, nonlinear=True)
     gamma, xi = prior.gamma, prior.xi
     m_theta, m_eta, m_last, m_z = prior_theta[0], prior_eta[0][0], prior_z[0], prior_z[0]
     free_energies = []
-    for _ in range(iterations):
+    for i in range(iterations):
         E_gamma, E_xi = gamma[0] / gamma[1], xi[0] / xi[1]
 
         w = w_eta + E_gamma * u**2
@@ -92,6 +93,8 @@ def mean_field_step(prior, u, y, iterations, as_published=False, nonlinear=True)
         gamma = prior.gamma[0] + 0.5, prior.gamma[1] + (B + m_last[0] ** 2 * as_published) / 2
         xi = prior.xi[0] + 0.5, prior.xi[1] + D / 2
 
+        if evaluated is not None and i < iterations - evaluated:
+            continue
         tie = (m_z[1] - m_last[0]) ** 2 + V_z[1, 1] + V_last[0, 0]
         free_energies.append(
             gaussian_divergence((m_theta, V_theta), prior_theta)

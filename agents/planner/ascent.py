@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner.design import Known, designer
+from estimator.arrays import copy
 from estimator.lanes import jit, kernel, part
 from estimator.models.model import Model
 
@@ -73,21 +74,25 @@ def climber(model: Model, degree: int = 0) -> Climber:
 
     @part(kind)
     def ascend(known, limits, rate, iterations, start, u, best, memory):
-        best[:] = u
+        copy(best, 0, u, len(u))
         best_value = -np.inf
-        gradient = memory.gradient[: len(u)]
+        gradient = memory.gradient
         radius = min(np.sqrt(limits.energy), limits.amplitude * np.sqrt(len(u)))
         for k in range(iterations + 1):
             value, peak = climb(known, limits.aim, PENALTY, start, u, memory)
             if peak <= limits.output and value > best_value:
                 best_value = value
-                best[:] = u
-            length = np.sqrt(np.sum(gradient * gradient))
-            if k == iterations or not length > 0.0:
+                copy(best, 0, u, len(u))
+            power = 0.0
+            for t in range(len(u)):
+                power += gradient[t] * gradient[t]
+            if k == iterations or not power > 0.0:
                 break
-            u += (rate * (1.0 - (1.0 - _LAST) * k / iterations) * radius / length) * gradient
+            stride = rate * (1.0 - (1.0 - _LAST) * k / iterations) * radius / np.sqrt(power)
+            for t in range(len(u)):
+                u[t] += stride * gradient[t]
             project(u, limits.amplitude, limits.energy)
-        u[:] = best
+        copy(u, 0, best, len(u))
         return best_value
 
     @kernel(kind=kind)
@@ -124,4 +129,6 @@ def project(u, amplitude, energy):
         total += u[t] * u[t]
     if total > energy:
         # A little less, because the square of what is rounded may be above again.
-        u *= (1.0 - 1e-12) * np.sqrt(energy / total)
+        share = (1.0 - 1e-12) * np.sqrt(energy / total)
+        for t in range(len(u)):
+            u[t] *= share

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from estimator.arrays import fill
 from estimator.engine.feeding import older_inputs
 from estimator.engine.gradient import pieces
 from estimator.lanes import jit, kernel, part
@@ -146,7 +147,7 @@ def designer(model: Model, degree: int = 0) -> Designer:
         invert(memory.F, memory.G)
         tape, shown, gradient, noises = memory.tape, memory.shown, memory.gradient, known.noises
         C = coefficients_of(known.coefficients)
-        gradient[: len(u)] = 0.0
+        fill(gradient, 0.0)
         G, H = seed(memory.G)
         for t in range(steps - 1, -1, -1):
             over = max(0.0, abs(shown[t]) / limit - 1.0)

@@ -137,7 +137,7 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
 
     @inner
     def appraise(W, M, scale):
-        judge(W, scale * M)
+        judge(W, M, scale)
         weigh(W)
 
     @inner

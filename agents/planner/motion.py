@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.layout import observation_bounds
+from estimator.arrays import copy, fill
 from estimator.engine.motion import motion
 from estimator.lanes import kernel
 from estimator.models.model import Model
@@ -95,8 +96,8 @@ def _surveyor(model: Model) -> Any:
     def survey(means, states, shown, velocities, slopes):
         W = np.zeros(size)
         for i in range(len(means)):
-            W[:n] = states[i]
-            W[n : n + k] = means[i]
+            copy(W, 0, states[i], n)
+            copy(W, n, means[i], k)
             sense(W)
             linearise(W)
             shown[i], velocities[i] = W[now], W[velocity]
@@ -143,8 +144,8 @@ def _swinger(view: View) -> Any:
     @kernel(kind=f"{view.model.name}_{view.model.digest}_{view.degree}_{view.lag}")
     def swing(means, max_input, limit, peaks):
         W = np.zeros(size)
-        W[n : n + k] = means
-        peaks[:] = 0.0
+        copy(W, n, means, k)
+        fill(peaks, 0.0)
         for _ in range(_SAMPLES):
             sense(W)
             W[u] = max_input if W[velocity] >= 0.0 else -max_input
@@ -196,10 +197,12 @@ def _describer(model: Model) -> Any:
     @kernel(kind=f"{model.name}_{model.digest}")
     def describe(means, states, u_now, made):
         W = np.zeros(size)
-        W[:n], W[n : n + k], W[u] = states, means, u_now
+        copy(W, 0, states, n)
+        copy(W, n, means, k)
+        W[u] = u_now
         sense(W)
         regress(W)
-        made[:] = W[first : first + k]
+        copy(made, 0, W[first:], k)
         return W[gain]
 
     return describe

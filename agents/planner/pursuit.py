@@ -17,6 +17,7 @@ import numpy as np
 from agents.planner.ascent import Limits, climber, project
 from agents.planner.design import Known, designer, half_log_det, invert
 from agents.planner.search import uniform
+from estimator.arrays import copy
 from estimator.belief import covariance_places
 from estimator.engine.rows import belief_names
 from estimator.lanes import kernel, part
@@ -134,23 +135,25 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
             begin(mean, cov, precision, start)
             if start_size > n_path:
                 start[n_path] = last[i]
-            coefficients[:] = mean[n:]
+            copy(coefficients, 0, mean[n:], k)
             for a in range(sensors + 1):
                 variances[a] = records[i, noise + 2 * a + 1] / records[i, noise + 2 * a]
             known = Known(coefficients, precision, as_noises(variances))
             _, _, spread = rest(known, start, last[i], memory.tape)
             aim = rule.limit - rule.margin * np.sqrt(spread)
             u, other = plans[i, :steps], challenger[:steps]
-            fresh = not np.any(plans[i])
-            plans[i, :-1] = plans[i, 1:].copy()
-            plans[i, -1] = 0.0
+            fresh = plans[i, 0] == 0.0
+            for t in range(T - 1):
+                fresh = fresh and plans[i, t + 1] == 0.0
+                plans[i, t] = plans[i, t + 1]
+            plans[i, T - 1] = 0.0
             limits = Limits(np.inf, aim, rule.amplitude, energies[i])
             project(u, rule.amplitude, energies[i])
             swing(known, start, rule.limit, energies[i], fresh, other, words[i], memory.tape)
             project(other, rule.amplitude, energies[i])
             scores[i] = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
             if fresh or ascend(known, limits, _RATE, _TRIAL, start, other, best[:steps], memory) > scores[i]:
-                u[:] = other
+                copy(u, 0, other, steps)
                 scores[i] = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
             actions[i] = u[0]
 
@@ -174,7 +177,7 @@ def _beginning(n: int, k: int) -> Any:
                 work[a, b] = cov[n + a, n + b]
         half_log_det(work)
         invert(work, precision)
-        start[:n] = mean[:n]
+        copy(start, 0, mean, n)
         # State = Z (coefficients' error) + what is left of it, with Z = P_xc Λ.
         first = n + spreads
         for a in range(n):

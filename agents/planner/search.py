@@ -23,6 +23,7 @@ import numpy as np
 from agents.planner.design import half_log_det
 from agents.planner.imagination import mind
 from duffing_env.noise import draw, to_unit
+from estimator.arrays import copy, copy_scaled, fill
 from estimator.lanes import LANES, jit, kernel, part
 from estimator.models.model import Model
 
@@ -115,7 +116,7 @@ class Task(NamedTuple):
 @cache
 def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     """The search for a model; arguments as `estimator.engine.imagination.imagination`."""
-    size, kept, U, SCORE, fill, collect, advance, appraise, precision = mind(model, degree, lag)
+    size, kept, U, SCORE, begin, collect, advance, appraise, precision = mind(model, degree, lag)
     k, is_plane = model.n_coefficients, model.n_states > 1
     kind = f"{model.name}_{model.digest}_{degree}_{lag}"
     inner, entry = part(kind), kernel(kind=kind)
@@ -133,7 +134,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         ``best``, the scores of the cells, becomes that of the ways.
         """
         ways, continued = memory.ways, memory.continued
-        enough = np.max(best) - _HOPELESS
+        enough = best[highest(best, len(best))] - _HOPELESS
         count = 0
         for cell in range(len(best)):
             if best[cell] >= enough and best[cell] > -np.inf:
@@ -158,13 +159,13 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         n_cells = cells * cells if is_plane else cells
         best, ends = np.empty(n_cells), np.empty(n_cells, np.int64)
         right, up = uniform(words), uniform(words)
-        fill(ways[0], task.record, task.lasts)
+        begin(ways[0], task.record, task.lasts)
         count = 1
         for h in range(task.steps):
-            best[:] = -np.inf
+            fill(best, -np.inf)
             for b in range(_CHOICES * (-(-count // LANES))):
                 W = continued[b]
-                W[:kept] = ways[b // _CHOICES, :kept]
+                copy(W, 0, ways[b // _CHOICES], kept)
                 for j in range(LANES):
                     W[U + j] = choose(b % _CHOICES, W[U + j], terms)
                 advance(W, task.record, terms)
@@ -177,7 +178,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                         best[cell] = W[SCORE + j]
                         ends[cell] = b * LANES + j
             count = gather(memory, h, best, ends)
-        way = np.argmax(best[:count])
+        way = highest(best, count)
         for h in range(task.steps - 1, -1, -1):
             found[h] = memory.inputs[h, way]
             way = memory.origins[h, way]
@@ -185,7 +186,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     @inner
     def follow(W, task, candidates):
         """Imagine the candidates (LANES, horizon) from the belief on, or one for all lanes."""
-        fill(W, task.record, task.lasts)
+        begin(W, task.record, task.lasts)
         for h in range(task.steps):
             for j in range(LANES):
                 W[U + j] = candidates[j % len(candidates), h]
@@ -195,13 +196,18 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     def refresh(W, task, best, rate):
         """Let the information per sample of a plan into the running mean; the first one is taken as it is."""
         before, after = np.empty((k, k)), np.empty((k, k))
-        fill(W, task.record, task.lasts)
+        begin(W, task.record, task.lasts)
         precision(W, before)
         follow(W, task, best.reshape(1, -1))
         precision(W, after)
-        brought = (after - before) / task.steps
-        if np.all(np.isfinite(brought)):
-            rate += (_REFRESHED if rate[0, 0] > 0.0 else 1.0) * (brought - rate)
+        share, is_finite = _REFRESHED if rate[0, 0] > 0.0 else 1.0, True
+        for a in range(k):
+            for b in range(k):
+                is_finite = is_finite and np.isfinite(after[a, b] - before[a, b])
+        for a in range(k):
+            for b in range(k):
+                if is_finite:
+                    rate[a, b] += share * ((after[a, b] - before[a, b]) / task.steps - rate[a, b])
 
     @inner
     def improve(memory, record, left, steps, rounds, terms, lasts, best, rate, words):
@@ -214,22 +220,23 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         factorise(rate, M)
         task = Task(record, left, steps, terms, lasts, M)
         turned = -best[0]
-        best[:-1] = best[1:].copy()
+        for h in range(len(best) - 1):
+            best[h] = best[h + 1]
         best[steps - 1] = turned
         bound(best, steps, last, terms)
-        candidates[0] = best
-        candidates[1] = 0.0
+        copy(candidates[0], 0, best, len(best))
+        fill(candidates[1], 0.0)
         bound(candidates[1], steps, last, terms)
         find_way(memory, task, cells, candidates[2], words)
         for j in range(3, LANES):
-            candidates[j] = candidates[2 * (j % 2)]
+            copy(candidates[j], 0, candidates[2 * (j % 2)], len(best))
             change(candidates[j], steps, terms.amplitude, words)
             bound(candidates[j], steps, last, terms)
         W = memory.ways[0]
         score = -np.inf
         for round_ in range(rounds):
             for j in range(LANES if round_ > 0 else 0):
-                candidates[j] = best
+                copy(candidates[j], 0, best, len(best))
                 change(candidates[j], steps, terms.amplitude, words)
                 bound(candidates[j], steps, last, terms)
             follow(W, task, candidates)
@@ -237,9 +244,12 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             for j in range(LANES):
                 if W[SCORE + j] > score:
                     score = W[SCORE + j]
-                    best[:] = candidates[j]
+                    copy(best, 0, candidates[j], len(best))
         # Where the coefficients walk, what is learned later does not add to what is learned now.
-        if not np.any(terms.walk):
+        walks = False
+        for variance in terms.walk:
+            walks = walks or variance > 0.0
+        if not walks:
             refresh(W, task, best, rate)
         return score
 
@@ -263,8 +273,9 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             if t >= first:
                 improve(kept_memory, record, left, min(horizon, left), rounds, terms, lasts, best, rate, words)
                 u[t] = best[0]
-            fill(W, record, lasts)
-            W[U : U + LANES] = u[t]
+            begin(W, record, lasts)
+            for j in range(LANES):
+                W[U + j] = u[t]
             advance(W, record, terms)
             collect(W, record)
             lasts[1], lasts[0] = lasts[0], u[t]
@@ -302,9 +313,19 @@ def bound(candidate, steps, last, terms):
 @jit
 def factorise(information, M):
     """The factor M of an information M Mᵀ; zeros where there is none, or it tells nothing of a coefficient."""
-    M[:] = information
+    copy_scaled(M, 1.0, information)
     if half_log_det(M) == -np.inf:
-        M[:] = 0.0
+        copy_scaled(M, 0.0, information)
+
+
+@jit
+def highest(values, count):
+    """Where the highest of the first values is."""
+    place = 0
+    for i in range(1, count):
+        if values[i] > values[place]:
+            place = i
+    return place
 
 
 @jit

@@ -27,6 +27,7 @@ import numpy.typing as npt
 from agents.planner.design import half_log_det, invert
 from agents.planner.motion import View, places
 from duffing_env.layout import observation_bounds
+from estimator.arrays import copy, copy_scaled, fill
 from estimator.engine.motion import motion
 from estimator.lanes import jit, kernel, part
 from estimator.models.model import Model
@@ -175,7 +176,7 @@ def lookout(view: View) -> Any:
     def play(prospect, W, first, continuation, code, brought):
         """Play a sequence: fills what it has brought by each horizon, and gives the highest output with its margin."""
         push, limit = prospect.push, prospect.limit
-        W[:] = prospect.start
+        copy(W, 0, prospect.start, size)
         total, peak, h = 0.0, 0.0, 0
         for t in range(HORIZONS[-1]):
             if t == 0:
@@ -209,11 +210,13 @@ def lookout(view: View) -> Any:
     def attempt(prospect, W, shown, safe):
         """Play all first inputs and continuations; fills their features, and which first inputs are safe."""
         played, brought, best = np.empty(len(HORIZONS)), np.empty((3, len(HORIZONS))), np.empty(3)
-        lowest = np.full(3, np.inf)
+        lowest = np.empty(3)
+        fill(lowest, np.inf)
         place, most = own, 0.0
         for continuation in range(len(CONTINUATIONS)):
             for first in range(3):
-                brought[first], best[first] = -np.inf, np.inf
+                fill(brought[first], -np.inf)
+                best[first] = np.inf
                 for code in range(1 << _TRIED if continuation == 0 else 1):
                     peak = play(prospect, W, (1.0 - first) * prospect.push, continuation, code, played)
                     best[first] = min(best[first], peak)
@@ -229,10 +232,11 @@ def lookout(view: View) -> Any:
                 shown[place] = best[first] / prospect.limit
                 place += 1
             if continuation == 0:
-                most = max(0.0, brought[:, -1].max())
+                h = len(HORIZONS) - 1
+                most = max(0.0, brought[0, h], brought[1, h], brought[2, h])
         shown[place] = np.log(most + 1e-3)
         for first in range(3):
-            safe[first] = lowest[first] <= prospect.limit or lowest[first] == lowest.min()
+            safe[first] = lowest[first] <= prospect.limit or lowest[first] == min(lowest[0], lowest[1], lowest[2])
 
     @inner
     def believe(seen, outlook, start, C):
@@ -266,9 +270,10 @@ def lookout(view: View) -> Any:
     @inner
     def drift(start, prospect, outlook, shown, place):
         """Follow the system without input; fills three features, and gives the motion in terms of an input."""
-        W, limit = start.copy(), prospect.limit
-        typical = start.copy()
-        typical[n : n + k] = outlook.center
+        W, typical, limit = np.empty(size), np.empty(size), prospect.limit
+        copy(W, 0, start, size)
+        copy(typical, 0, start, size)
+        copy(typical, n, outlook.center, k)
         sense(typical)
         way = 1.0 if typical[gain] > 0.0 else -1.0
         motion = start[velocity] - start[now]
@@ -285,9 +290,10 @@ def lookout(view: View) -> Any:
     def look(observations, outlook, features, safe, signs, motions):
         samples, limit, rate = outlook.samples, outlook.max_output, outlook.rate
         C, unknown, work = np.empty((k, k)), np.empty((k, k)), np.empty((k, k))
-        start, W = np.zeros(size), np.zeros(size)
+        start, W, seen = np.zeros(size), np.zeros(size), np.empty(own)
         for i in range(len(observations)):
-            seen, shown = observations[i].astype(np.float64), features[i]
+            copy(seen, 0, observations[i], own)
+            shown = features[i]
             believe(seen, outlook, start, C)
             left = max(1.0, seen[at.time_left] * samples)
             share, push = seen[at.time_left], outlook.max_input
@@ -297,9 +303,9 @@ def lookout(view: View) -> Any:
                 push = min(push, _THRIFT * np.sqrt(max(0.0, seen[at.budget_left]) * outlook.energy / left))
             to_come = weigh(C, rate, share * samples, unknown, work)
             weight = samples / (2.0 * k * outlook.variance)
-            unknown *= weight
+            copy_scaled(unknown, weight, unknown)
             signs[i] = stand(seen, outlook, start)
-            shown[:own] = seen
+            copy(shown, 0, seen, own)
             prospect = Prospect(start, C, unknown, push, limit, outlook.variance, outlook.scales)
             attempt(prospect, W, shown, safe[i])
             place = n_features - 6
@@ -321,7 +327,7 @@ def lookout(view: View) -> Any:
 @jit
 def weigh(C, rate, count, W, work):
     """W = (C⁻¹ + count rate)⁻¹, and ½ log det(I + count rate C) [nats], which is still to come."""
-    work[:] = C
+    copy_scaled(work, 1.0, C)
     known = half_log_det(work)
     if known == -np.inf:  # rounding has made correlations impossible; without them the covariance is one again
         for i in range(len(C)):
@@ -329,7 +335,9 @@ def weigh(C, rate, count, W, work):
                 work[i, j] = C[i, j] if i == j else 0.0
         known = half_log_det(work)
     invert(work, W)
-    work[:] = W + count * rate
+    for i in range(len(C)):
+        for j in range(len(C)):
+            work[i, j] = W[i, j] + count * rate[i, j]
     known += half_log_det(work)
     invert(work, W)
     return known

@@ -41,8 +41,8 @@ class Imagination:
             noises' precisions are those of a belief's record; ``walk`` (K,) are variances by which the coefficients
             walk before the sample. Leaves in ``SHOWN`` what the first sensor is expected to show, and in ``SPREAD`` the
             variance of that output.
-        judge: ``judge(W, M)``: leaves ½ log det(C⁻¹ + M Mᵀ) in ``KNOWN``, with C the coefficients' covariance and M
-            (K, K), lower triangular, the factor of the information that is still to come; `LOST` where C is no
+        judge: ``judge(W, M, s)``: leaves ½ log det(C⁻¹ + s² M Mᵀ) in ``KNOWN``, with C the coefficients' covariance and
+            M (K, K), lower triangular, the factor of the information that is still to come; `LOST` where C is no
             covariance any more.
         layout: rows of the block. The first are all that stands for a plan between two samples: the states, their joint
             covariance with the coefficients (``P_i_j``), the inputs, and ``COST``. That one and ``SCORE`` are the
@@ -181,8 +181,8 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
     source = "@straight\n" + emit.lane_loop(
         "judge_lanes", lines, {"KNOWN": "NATS"}, place, LANES, uniform, doc="What will be known."
     )  # fmt: skip
-    told_entries = ", ".join(f"M[{i}, {j}]" for i in range(k) for j in range(i + 1))
-    return source + f"@jit\ndef judge(W, M):\n    judge_lanes(W, {told_entries})\n"
+    told_entries = ", ".join(f"scale * M[{i}, {j}]" for i in range(k) for j in range(i + 1))
+    return source + f"@jit\ndef judge(W, M, scale):\n    judge_lanes(W, {told_entries})\n"
 
 
 def determinant(entries: Mapping[tuple[int, int], Any], size: int, tag: str) -> tuple[Any, Any]:

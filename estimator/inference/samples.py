@@ -83,7 +83,8 @@ def structured(model: Model, degree: int, iterations: int, expectations: str = "
     def judge(W, j, before, values, forecasts):
         energies_of(W, j, values)
         if unsound >= 0 and W[unsound + j] > 0.0:
-            values[:] = np.nan
+            for i in range(iterations):
+                values[i] = np.nan
         for k in range(sensors):
             forecasts[k, 0] = W[means[k] + j]
             forecasts[k, 1] = W[parts[k][0] + j] + W[parts[k][1] + j] + W[parts[k][2] + j]
@@ -109,8 +110,9 @@ def published(iterations: int, as_published: bool) -> Loop:
 
     @part(kind)
     def judge(W, j, before, values, forecasts):
-        values[:] = before[:iterations]
-        forecasts[:] = np.nan
+        for i in range(iterations):
+            values[i] = before[i]
+        forecasts[0, 0] = forecasts[0, 1] = np.nan
 
     return Loop(_loop(kind, model, place, 1, iterations, take, judge), place, 1)
 
@@ -132,10 +134,14 @@ def weigh(weights, each, predictions, energies, forecasts):
     before = np.zeros(members)
     total = 0.0
     for m in range(members):
-        if np.isfinite(each[m, -1] + predictions[m].sum()):
+        told = each[m, iterations - 1]
+        for k in range(len(forecasts)):
+            told += predictions[m, k, 0] + predictions[m, k, 1]
+        if np.isfinite(told):
             before[m] = (1.0 - SWITCHING) * weights[m] + SWITCHING / members
         total += before[m]
-    before /= total
+    for m in range(members):
+        before[m] /= total
     for k in range(len(forecasts)):
         mean, variance = 0.0, 0.0
         for m in range(members):
@@ -157,7 +163,8 @@ def weigh(weights, each, predictions, energies, forecasts):
             if before[m] > 0.0:
                 weights[m] = before[m] * np.exp(least - each[m, i])
                 evidence += weights[m]
-        weights /= evidence
+        for m in range(members):
+            weights[m] /= evidence
         energies[i] = least - np.log(evidence)
 
 
@@ -176,58 +183,73 @@ def _loop(kind: str, model: Model, place: Mapping[str, int], lanes: int, scratch
     u_row = place["U_0"] * lanes
     y_row = place[f"Y_{next(iter(model.outputs))}"] * lanes
     walks = tuple(place[f"P_{c}_{c}"] * lanes for c in model.coefficients)
+    sensors, alone = model.n_outputs, lanes == 1
     size = len(belief_names(model)) * lanes
 
     @part(kind)
-    def feed(W, window, stencil, output, walk, changes):
+    def feed(W, inputs, start, window, stencil, output, walk, changes):
         if changes:
             for c in range(len(walks)):
                 for j in range(lanes):
                     W[walks[c] + j] += walk[c]
         for i in range(len(stencil)):
             value = 0.0
-            for w in range(len(window)):
-                value += window[w] * stencil[i, w]
+            for w in range(window):
+                value += inputs[start + w] * stencil[i, w]
             for j in range(lanes):
                 W[u_row + i * lanes + j] = value
-        for k in range(len(output)):
+        for k in range(sensors):
             for j in range(lanes):
                 W[y_row + k * lanes + j] = output[k]
+
+    @part(kind)
+    def keep(kept, blocks):
+        """Copy the beliefs in some blocks to others."""
+        for b in range(len(blocks)):
+            for i in range(size):
+                kept[b, i] = blocks[b, i]
 
     @kernel(kind=kind)
     def run(W, backup, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts):
         stride, past, waits, fills = steps[0], steps[1], steps[2], steps[3]
         members, samples, iterations = len(weights), len(outputs) - waits, energies.shape[1]
         judged = energies.shape[0] > 0
-        window, changes = stencil.shape[1], walk.max() > 0.0
+        window, changes = stencil.shape[1], walk[0] > 0.0
+        for c in range(1, len(walks)):
+            changes = changes or walk[c] > 0.0
         before = np.empty(scratch)
         single = np.empty((members, iterations))
-        predictions = np.empty((members, outputs.shape[1], 2))
-        old_weights = weights.copy()
+        predictions = np.empty((members, sensors, 2))
+        old_weights = np.empty(members)
+        for m in range(members):
+            old_weights[m] = weights[m]
         first = 1 if waits and begun[0] == 0.0 else 0
         if fills and begun[0] == 0.0:
-            inputs[:past] = inputs[past]
-        for b in range(len(W)):
-            for i in range(size):
-                backup[b, i] = W[b, i]
+            for i in range(past):
+                inputs[i] = inputs[past]
+        keep(backup, W)
         bad = -1
         for t in range(first, samples):
             for b in range(len(W)):
-                feed(W[b], inputs[t * stride : t * stride + window], stencil, outputs[t], walk, changes)
+                feed(W[b], inputs, t * stride, window, stencil, outputs[t], walk, changes)
                 take(W[b], before)
                 for j in range(min(lanes, members - b * lanes)):
                     m = b * lanes + j
                     judge(W[b], j, before, single[m], predictions[m])
             here = t - first
-            if not judged:
-                forecasts[here] = predictions[0]
-                continue
-            if members == 1:
-                energies[here] = single[0]
-                forecasts[here] = predictions[0]
+            if alone or not judged:
+                for k in range(sensors):
+                    forecasts[here, k, 0], forecasts[here, k, 1] = predictions[0, k, 0], predictions[0, k, 1]
             else:
                 weigh(weights, single, predictions, energies[here], forecasts[here])
-            if not np.isfinite(energies[here].sum()):
+            if not judged:
+                continue
+            whole = True
+            for i in range(iterations):
+                if alone:
+                    energies[here, i] = single[0, i]
+                whole = whole and np.isfinite(energies[here, i])
+            if not whole:
                 bad = t
                 break
         if judged and bad < 0 and samples > first:
@@ -241,17 +263,18 @@ def _loop(kind: str, model: Model, place: Mapping[str, int], lanes: int, scratch
             if not whole:
                 bad = samples - 1
         if bad >= 0:
-            for b in range(len(W)):
-                for i in range(size):
-                    W[b, i] = backup[b, i]
-            weights[:] = old_weights
+            keep(W, backup)
+            for m in range(members):
+                weights[m] = old_weights[m]
             if fills and begun[0] == 0.0:
-                inputs[:past] = 0.0
+                for i in range(past):
+                    inputs[i] = 0.0
             return bad
         for i in range(past):
             inputs[i] = inputs[i + samples]
         for i in range(waits):
-            outputs[i] = outputs[i + samples]
+            for k in range(sensors):
+                outputs[i, k] = outputs[i + samples, k]
         begun[0] = 1.0
         return bad
 

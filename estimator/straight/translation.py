@@ -244,7 +244,7 @@ class Translation:
 
     def _call_on_block(self, function: Any, given: Sequence[Any]) -> None:
         """Call a function of blocks, which is one of its own for LLVM too, and leaves its results in them."""
-        values = tuple(Scalar("double", self._double(value)) if _is_number(value) else value for value in given)
+        values = tuple(self._scalar(value) if _is_number(value) else value for value in given)
         called = function.translated(self._kinds(values))
         self._called |= called.definitions
         flat = ", ".join(f"{_LLVM[value.kind]} {value.text}" for value in self._flat(values))
@@ -333,6 +333,11 @@ class Translation:
         if _is_number(value) or value.kind == "double":
             raise TypeError(f"a whole number is needed in {self.source.function.__qualname__}, and not a float")
         return self._op("i64", f"zext i1 {value.text} to i64").text if value.kind == "i1" else str(value.text)
+
+    def _scalar(self, number: Any) -> Scalar:
+        """A number as a value."""
+        is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
+        return Scalar("i64", self._whole(number)) if is_whole else Scalar("double", self._double(number))
 
     def _flat(self, value: Any) -> list[Scalar]:
         """The numbers in tuples of tuples."""

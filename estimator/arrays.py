@@ -1,0 +1,31 @@
+"""Arrays in compiled code, number by number.
+
+What NumPy does with whole arrays takes long to compile: an assignment alone brings with it the message that it would
+raise for other shapes, which is three seconds.
+"""
+
+from __future__ import annotations
+
+from estimator.lanes import jit
+
+
+@jit
+def copy(into, at, given, count):
+    """The first ``count`` numbers of ``given`` go into ``into``, from ``at`` on; both are flat."""
+    for i in range(count):
+        into[at + i] = given[i]
+
+
+@jit
+def copy_scaled(into, factor, given):
+    """``factor`` times a matrix."""
+    for i in range(given.shape[0]):
+        for j in range(given.shape[1]):
+            into[i, j] = factor * given[i, j]
+
+
+@jit
+def fill(into, value):
+    """One number everywhere in a flat array."""
+    for i in range(len(into)):
+        into[i] = value

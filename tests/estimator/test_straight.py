@@ -1,0 +1,207 @@
+"""Straight functions: each construct does what Python does with it, and what is not straight is refused."""
+
+import math
+import re
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimator.straight import straight, straight_within
+
+# The first call compiles.
+settings.register_profile("compiled", deadline=None)
+settings.load_profile("compiled")
+
+NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
+
+
+def same(actual, expected):
+    """Whether two numbers are equal; NaN is equal to itself."""
+    np.testing.assert_array_equal(actual, expected)
+
+
+# One operation each, so that nothing can be fused with another.
+@straight
+def arithmetic(a, b):
+    return a + b, a - b, a * b, -a, a**2, (1 / 4) * a
+
+
+@straight
+def comparisons(a, b):
+    return a < b, a <= b, a > b, a >= b, a == b, a != b, a == a
+
+
+@straight
+def choices(a, b):
+    both = a > 0.0 and b > 0.0
+    either = not (a <= 0.0 and b <= 0.0) or a > b
+    return a if a > b else b, 1.0 if both else 0.0, 1.0 if either else 0.0, min(a, b), max(a, b, 0.0), abs(a)
+
+
+@pytest.mark.parametrize("function", [arithmetic, comparisons, choices], ids=lambda f: f.__name__)
+@given(a=NUMBERS, b=NUMBERS)
+def test_operations_are_those_of_python(function, a, b):
+    with np.errstate(all="ignore"):
+        expected = function.py_func(np.float64(a), np.float64(b))
+    same(function(a, b), expected)
+
+
+@straight
+def elementary(a):
+    return math.sqrt(a), np.sqrt(a), math.floor(a), math.exp(-a), math.log(a), math.log1p(a), 1.0 / a
+
+
+@given(a=st.floats(1e-6, 1e6))
+def test_elementary_functions_are_those_of_the_library(a):
+    np.testing.assert_allclose(elementary(a), elementary.py_func(a), rtol=4e-16)
+
+
+@straight
+def whole_numbers(i, j):
+    half, odd = i // 2, i % 2
+    return i + j, i - j, i * j, half, odd, i << 3, i >> 1, i & j, i | j, i ^ j, -i, i < j, half * 0.5, i / 4
+
+
+@given(i=st.integers(0, 2**30), j=st.integers(-(2**30), 2**30))
+def test_whole_numbers_are_those_of_python(i, j):
+    assert whole_numbers(i, j) == whole_numbers.py_func(i, j)
+
+
+@straight
+def bits(x):
+    word = np.float64(x).view(np.uint64)
+    number = np.float64(x).view(np.int64)
+    return word >> np.uint64(60), number >> np.int64(60), np.uint64(word).view(np.float64), word > np.uint64(2**63)
+
+
+@given(x=st.floats(allow_nan=False))
+def test_bits_are_those_of_numpy(x):
+    same(bits(x), bits.py_func(x))
+
+
+@straight
+def swapped(pair, more):
+    (a, b), c = pair, more[1]
+    return (b, a), c
+
+
+@straight
+def called(a, b):
+    total = a + b
+    (b, a), c = swapped((a, b), (0.0, total))
+    total *= 2.0
+    return a, b, c, total
+
+
+def test_functions_take_and_give_tuples():
+    assert called(1.0, 2.0) == (1.0, 2.0, 3.0, 6.0)
+
+    @numba.njit
+    def from_numba(a):
+        (first, second), third = swapped((a, 2.0), (3.0, 4.0))
+        return first, second, third
+
+    assert from_numba(1.0) == (2.0, 1.0, 4.0)
+    assert swapped((1.0, 2.0), (3.0, 4.0)) == ((2.0, 1.0), 4.0)
+
+
+@straight
+def scale(W, place, factor):
+    """One row of a block."""
+    for j in range(4):
+        W[place * 4 + j] = factor * W[place * 4 + j]
+
+
+@straight
+def scale_rows(W, factor):
+    """Rows 1 and 2 of a block, twice: loops in loops."""
+    for row in range(2):
+        for _ in range(2):
+            scale(W, row + 1, factor)
+    scale(W, 0, 1)
+
+
+def test_functions_of_blocks_write_into_them():
+    W = np.arange(16.0)
+    assert scale_rows(W, 3.0) is None
+    expected = np.arange(16.0).reshape(4, 4) * [[1], [9], [9], [1]]
+    np.testing.assert_array_equal(W.reshape(4, 4), expected)
+
+
+def made(factor):
+    @straight
+    def multiplied(a):
+        return factor * a
+
+    return multiplied
+
+
+def test_what_a_function_has_from_around_is_its_own():
+    two, three = made(2.0), made(3.0)
+
+    @straight
+    def both(a):
+        return two(a), three(a)
+
+    assert both(1.0) == (2.0, 3.0)
+    names = {f.translated(("double",)).name for f in (two, three, made(2.0))}
+    assert len(names) == 2, "compiled code is joined by names, which must differ where the code does"
+
+
+def test_functions_of_a_source_need_no_file():
+    source = (
+        "@straight\ndef double(a):\n    return 2.0 * a\n@straight\ndef fourfold(a):\n    return double(double(a))\n"
+    )
+    names = {"straight": straight_within(source)}
+    exec(source, names)
+    assert names["fourfold"](1.5) == 6.0
+
+
+def keeps(W, a):
+    for j in range(4):
+        a = a + W[j]
+    W[0] = a
+
+
+def repeats(a):
+    while a > 1.0:
+        a = a / 2.0
+    return a
+
+
+def calls(a):
+    return math.gamma(a)
+
+
+def indexes(W, a):
+    W[a] = 0.0
+
+
+def forgets(a):
+    return a + nothing_of_this_name  # noqa: F821
+
+
+def powers(a, b):
+    return a**b
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "said"),
+    [
+        (keeps, (np.zeros(4), 1.0), "'range(4)' in keeps keeps ['a'], which must go into a block; compile it with jit"),
+        (repeats, (4.0,), "stands in no straight function; compile it with jit instead"),
+        (calls, (4.0,), "'math.gamma(a)' in calls calls what is not straight"),
+        (indexes, (np.zeros(4), 1.0), "a whole number is needed in indexes, and not a float"),
+        (forgets, (1.0,), "name 'nothing_of_this_name' is not defined in forgets"),
+        (powers, (1.0, 2.0), "Pow of floats stands in powers"),
+        (scale_rows.py_func, (np.zeros((4, 4)), 1.0), "scale_rows needs flat, contiguous float64 arrays, but is given"),
+        (scale_rows.py_func, (np.zeros(16, np.float32), 1.0), "scale_rows needs flat, contiguous float64 arrays"),
+        (arithmetic.py_func, ("a", "b"), "arithmetic takes numbers, tuples of them and flat arrays, but is given"),
+    ],
+)
+def test_what_is_not_straight_is_refused(function, arguments, said):
+    with pytest.raises(Exception, match=re.escape(said)):
+        straight(function)(*arguments)
