@@ -21,7 +21,7 @@ from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, obser
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
 from estimator.engine.rows import belief_names
-from estimator.lanes import LANES, kernel, lanewise, part
+from estimator.lanes import LANES, jit, kernel, lanewise, part
 
 #: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.
 RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP, RESET_NOW = 0, 1, 2, 3
@@ -86,6 +86,28 @@ def _draw_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
     return as_bits(a), as_bits(b), as_bits(c), as_bits(d), at, factor
 
 
+@jit
+def draw_plant(W, j, setup, stream, drawn):
+    """The parameters of lane j's plant, each log-uniform about its centre, or from a Gaussian.
+
+    ``stream`` and ``drawn`` say where the first word of the stream and the first parameter stand.
+    """
+    a, b = as_word(W[stream + j]), as_word(W[stream + LANES + j])
+    c, d = as_word(W[stream + 2 * LANES + j]), as_word(W[stream + 3 * LANES + j])
+    low = math.log(1.0 - setup.spread)
+    width = math.log(1.0 + setup.spread) - low
+    for p in range(len(setup.center)):
+        first, a, b, c, d = draw(a, b, c, d)
+        if setup.width[p] > 0.0:
+            second, a, b, c, d = draw(a, b, c, d)
+            deviation, _ = normal_pair(to_unit(first), to_unit(second))
+            W[drawn + p * LANES + j] = setup.center[p] + setup.width[p] * deviation
+        else:
+            W[drawn + p * LANES + j] = setup.center[p] * math.exp(low + width * to_unit(first))
+    W[stream + j], W[stream + LANES + j] = as_bits(a), as_bits(b)
+    W[stream + 2 * LANES + j], W[stream + 3 * LANES + j] = as_bits(c), as_bits(d)
+
+
 @dataclass(frozen=True)
 class Kernel:
     """The entry points of one kind of experiment.
@@ -115,7 +137,7 @@ def compiled(kind: Kind) -> Kernel:
     place, code = layout_of(kind), sources.parts(kind)
     n_rows = max(place.values()) + 1
     row = {name: number * LANES for name, number in place.items()}
-    n_record, n_parameters = len(belief_names(kind.belief)), len(parameter_names(kind.truth))
+    n_record = len(belief_names(kind.belief))
     n_observation, n_outcome = len(observation_bounds(kind.belief)), len(OUTCOME)
     n_saved = n_record * LANES
     stream, drawn = row["STREAM_a"], row[f"PARAM_{parameter_names(kind.truth)[0]}"]
@@ -152,24 +174,6 @@ def compiled(kind: Kind) -> Kernel:
     inner, entry = part(kind.name), kernel(kind=kind.name)
 
     @inner
-    def draw_plant(W, j, setup):
-        """The parameters of lane j's plant, each log-uniform about its centre, or from a Gaussian."""
-        a, b = as_word(W[stream + j]), as_word(W[stream + LANES + j])
-        c, d = as_word(W[stream + 2 * LANES + j]), as_word(W[stream + 3 * LANES + j])
-        low = math.log(1.0 - setup.spread)
-        width = math.log(1.0 + setup.spread) - low
-        for p in range(n_parameters):
-            first, a, b, c, d = draw(a, b, c, d)
-            if setup.width[p] > 0.0:
-                second, a, b, c, d = draw(a, b, c, d)
-                deviation, _ = normal_pair(to_unit(first), to_unit(second))
-                W[drawn + p * LANES + j] = setup.center[p] + setup.width[p] * deviation
-            else:
-                W[drawn + p * LANES + j] = setup.center[p] * math.exp(low + width * to_unit(first))
-        W[stream + j], W[stream + LANES + j] = as_bits(a), as_bits(b)
-        W[stream + 2 * LANES + j], W[stream + 3 * LANES + j] = as_bits(c), as_bits(d)
-
-    @inner
     def meet_truth(W, j, setup):
         """Settle the true coefficients of lane j after its parameters changed."""
         settle_truth(W, j, setup.step)
@@ -182,7 +186,8 @@ def compiled(kind: Kind) -> Kernel:
         """Start an episode in lane j: draw its plant, put it at rest, and put the belief to the prior."""
         for i in range(n_record):
             W[i * LANES + j] = setup.prior[i]
-        draw_plant(W, j, setup)
+        # Variables, because a function is compiled anew for every constant.
+        draw_plant(W, j, setup, np.int64(stream), np.int64(drawn))
         W[jump_at + j] = -1.0
         if setup.jump > 0.0:
             draw_jump(W, j, setup.jump, setup.horizon)

@@ -144,5 +144,5 @@ def test_functions_within_functions_are_named_apart():
             for inner in ast.walk(outer) if isinstance(outer, ast.FunctionDef) else ():
                 if isinstance(inner, ast.FunctionDef) and inner is not outer:
                     names = [ast.unparse(decorator) for decorator in inner.decorator_list]
-                    unnamed += [f"{path.name}: {inner.name}" for name in names if name in ("jit", "inlined", "kernel")]
+                    unnamed += [f"{path.name}: {inner.name}" for name in names if name in ("jit", "kernel")]
     assert unnamed == []
