@@ -22,9 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from llvmlite import binding
 from numba.core import event
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from estimator.files import write_atomically
@@ -175,7 +177,6 @@ class Compiled(_Cache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled function; None where there is none, or a damaged one."""
-        target_context.refresh()
         path = self._path(sig, target_context.codegen())
         try:
             content = path.read_bytes() if path is not None else b""
@@ -187,7 +188,12 @@ class Compiled(_Cache):
         try:
             if hashlib.sha256(payload).hexdigest().encode() != digest:
                 raise ValueError("the digest is another")
-            return CompileResult._rebuild(target_context, *pickle.loads(payload))
+            called, *reduced = pickle.loads(payload)
+            # All of Numba, which takes half a second to import, is needed only where the code calls what that brings.
+            rtsys.initialize(target_context)
+            if any(binding.address_of_symbol(name) is None for name in called):
+                target_context.refresh()
+            return CompileResult._rebuild(target_context, *reduced)
         except Exception:  # whatever a pickle raises
             _warn_of_damage(str(path.parent))
             return None
@@ -197,7 +203,9 @@ class Compiled(_Cache):
         path = self._path(sig, data.codegen)
         if path is None or data.lifted or data.library.has_dynamic_globals:
             return
-        payload = dumps(data._reduce())
+        functions = data.library._final_module.functions
+        called = [f.name for f in functions if f.is_declaration and not f.name.startswith("llvm.")]
+        payload = dumps((called, *data._reduce()))
         write(path, self._stamp + hashlib.sha256(payload).hexdigest().encode() + payload)
 
     def _path(self, sig: Any, codegen: Any) -> Path | None:
