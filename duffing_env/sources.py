@@ -153,31 +153,23 @@ def log_det_and_density(
     import sympy as sp
 
     from estimator.engine.derive import pair, symbol
+    from estimator.engine.factor import factorise
 
-    names, order = list(model.coefficients), list(model.names)
-    lines: Any = []
-    scaled: dict[tuple[str, str], Any] = {}
-    unscaled: dict[tuple[str, str], Any] = {}
-    pivots: list[Any] = []
-    whitened: dict[str, Any] = {}
-    for a, i in enumerate(names):
-        for b, k in enumerate(names[: a + 1]):
-            entry = pair("P", k, i, order)
-            entry = (entries or {}).get(str(entry), entry)
-            unscaled[i, k] = symbol(f"{tag}D_{i}_{k}")
-            lines.append((f"{tag}D_{i}_{k}", entry - sum(scaled[i, m] * unscaled[k, m] for m in names[:b])))
-            if k != i:
-                scaled[i, k] = symbol(f"{tag}L_{i}_{k}")
-                lines.append((f"{tag}L_{i}_{k}", unscaled[i, k] / pivots[b]))
-        pivots.append(unscaled[i, i])
-        if at is not None:
-            whitened[i] = symbol(f"{tag}Z_{i}")
-            lines.append((f"{tag}Z_{i}", at[i] - sum(scaled[i, m] * whitened[m] for m in names[:a])))
+    names = list(model.coefficients)
+    of = lambda i, k: pair("P", names[k], names[i], model.names)  # noqa: E731
+    believed = {(i, k): of(i, k) for i in range(len(names)) for k in range(i + 1)}
+    found = factorise({place: (entries or {}).get(str(e), e) for place, e in believed.items()}, len(names), tag)
+    lines, square = [*found.lines], sp.S.Zero
+    whitened: list[Any] = []
+    for i, name in enumerate(names if at else ()):
+        assert at is not None
+        lines.append((f"{tag}Z_{i}", at[name] - sum(found.below[i, m] * whitened[m] for m in range(i))))
+        whitened.append(symbol(f"{tag}Z_{i}"))
+        square += whitened[i] ** 2 / found.pivots[i]
     determinant = symbol(f"{tag}DET")
-    lines.append((f"{tag}DET", sp.Mul(*pivots)))
-    square = sum(whitened[i] ** 2 / p for i, p in zip(names, pivots, strict=True)) if at is not None else sp.S.Zero
+    lines.append((f"{tag}DET", found.determinant))
     check = sp.Function("positive")
-    sound = sp.Mul(*(check(p) for p in pivots))
+    sound = sp.Mul(*(check(p) for p in found.pivots))
     sound *= check(determinant - sp.Float(_SMALLEST)) * check(sp.Float(_LARGEST) - determinant)
     return lines, determinant, square, sound
 

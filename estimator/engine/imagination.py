@@ -151,6 +151,7 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
     import sympy as sp
 
     from estimator.engine import derive, emit
+    from estimator.engine.factor import factorise
 
     symbol, names = derive.symbol, list(model.coefficients)
     k = len(names)
@@ -168,10 +169,9 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
             entry = sum(factor[m][i] * product[m, j] for m in range(i, k)) + (1 if i == j else 0)
             lines.append((f"A_{i}_{j}", entry))
             told[i, j] = symbol(f"A_{i}_{j}")
-    more, to_come = determinant(told, k, "J")
-    lines += more
-    more, now = determinant({(i, j): cov[j][i] for i in range(k) for j in range(i + 1)}, k, "N")
-    lines += [*more, ("NOW", now), ("RATIO", to_come / symbol("NOW"))]
+    to_come = factorise(told, k, "J", known=True)
+    now = factorise({(i, j): cov[j][i] for i in range(k) for j in range(i + 1)}, k, "N", known=True)
+    lines += [*to_come.lines, *now.lines, ("NOW", now.determinant), ("RATIO", to_come.determinant / symbol("NOW"))]
     choose, ratio = sp.Function("select"), symbol("RATIO")
     # `log` is that of positive, normal numbers; comparisons with NaN do not hold.
     known = choose(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(LOST))
@@ -183,35 +183,3 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
     )  # fmt: skip
     told_entries = ", ".join(f"scale * M[{i}, {j}]" for i in range(k) for j in range(i + 1))
     return source + f"@jit\ndef judge(W, M, scale):\n    judge_lanes(W, {told_entries})\n"
-
-
-def determinant(entries: Mapping[tuple[int, int], Any], size: int, tag: str) -> tuple[Any, Any]:
-    """Assignments of an L D Lᵀ factorisation of a symmetric matrix, and its determinant.
-
-    A pivot of 0, of what is known, counts as 1.
-
-    Args:
-        entries: (i, j) with j <= i to the entry.
-        size: of the matrix.
-        tag: of the names that are assigned.
-    """
-    import sympy as sp
-
-    from estimator.engine.derive import symbol
-
-    lines: Any = []
-    scaled: dict[tuple[int, int], Any] = {}
-    pivots: list[Any] = []
-    for i in range(size):
-        unscaled: dict[int, Any] = {}
-        for j in range(i):
-            value = entries[i, j] - sum(scaled[j, m] * unscaled[m] for m in range(j))
-            unscaled[j] = symbol(f"{tag}U_{i}_{j}")
-            lines.append((f"{tag}U_{i}_{j}", value))
-            scaled[i, j] = symbol(f"{tag}L_{i}_{j}")
-            lines.append((f"{tag}L_{i}_{j}", unscaled[j] / pivots[j]))
-        left = symbol(f"{tag}R_{i}")
-        lines.append((f"{tag}R_{i}", entries[i, i] - sum(scaled[i, m] * unscaled[m] for m in range(i))))
-        lines.append((f"{tag}D_{i}", sp.Function("select")(left**2, left, sp.S.One)))
-        pivots.append(symbol(f"{tag}D_{i}"))
-    return lines, sp.Mul(*pivots)
