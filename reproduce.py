@@ -1,14 +1,13 @@
 """Repeats the experiment of Kouw (2020) on the Silverbox record, or runs the Silverbox benchmark's official protocol.
 
 python reproduce.py                     the paper's experiment, against its published numbers
-python reproduce.py silverbox           the official protocol, for every estimator and other packages
+python reproduce.py silverbox           the official protocol, for every estimator
 python reproduce.py silverbox --select  other settings, compared without test data
 """
 
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import tyro
@@ -40,7 +39,10 @@ class Config:
 
 @dataclass(frozen=True)
 class Silverbox:
-    """Run the official protocol of the Silverbox benchmark, for every estimator of this project and for peers."""
+    """Run the official protocol of the Silverbox benchmark, for every estimator of this project.
+
+    `python -m benchmarks.silverbox` puts other packages beside them.
+    """
 
     json: Path | None = None
     """File for the results, machine-readable."""
@@ -54,9 +56,6 @@ class Silverbox:
     select: bool = False
     """Print what other settings give on the last quarter of the training section, and do nothing else."""
 
-    peers: bool = True
-    """Put other packages beside ours, installed into .venv-peers; what cannot be installed is reported as missing."""
-
     def run(self) -> None:
         """Runs the protocol, or compares settings."""
         from agents.studies.silverbox_results import run_protocol
@@ -64,10 +63,8 @@ class Silverbox:
 
         if self.select:
             select(data=self.data)
-            return
-        from benchmarks.silverbox import compare
-
-        run_protocol(self.data, self.json, self.figures, partial(compare, wanted=self.peers))
+        else:
+            run_protocol(self.data, self.json, self.figures)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -31,7 +32,7 @@ from agents.studies.silverbox_protocol import (
     samples_until_close,
     simulation_error,
 )
-from agents.studies.silverbox_results import submission
+from agents.studies.silverbox_results import run_protocol, submission
 from benchmarks.peer_process import NotAvailable, Peers
 from benchmarks.report import ratio
 from benchmarks.timing import Result, Row, measure, timed
@@ -133,9 +134,6 @@ def compare(sections: Sections, outcomes: Mapping[str, Outcome], wanted: bool = 
     }
 
 
-# --- What they get -------------------------------------------------------------------------------------------------
-
-
 def given(sections: Sections, outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
     """What `benchmarks.silverbox_peers` reads: samples, models, priors, noises, and the tests' first outputs."""
     training, test = sections.training, sections.multisine
@@ -152,10 +150,8 @@ def given(sections: Sections, outcomes: Mapping[str, Outcome]) -> dict[str, Any]
     for name, ours in MODELS.items():
         prior = prior_of(name)
         learned = outcomes[ours].beliefs[TRAINING_SAMPLES]
-        arrays |= {
-            f"{name}_process_variance": 1 / learned.gamma_mean,
-            f"{name}_measurement_variance": 1 / learned.xi_mean,
-        }
+        arrays[f"{name}_process_variance"] = 1 / learned.gamma_mean
+        arrays[f"{name}_measurement_variance"] = 1 / learned.xi_mean
         mean, cov, direction = prior.mean, prior.cov, np.array([1.0, 0.0])
         if name == "ode":
             mean, cov, direction = mean[_MOTION], cov[np.ix_(_MOTION, _MOTION)], _DIRECTION
@@ -177,9 +173,6 @@ def terms_of(name: str) -> FloatArray:
     return np.array([(t.lag1, t.lag2, -1 if t.tap is None else t.tap + delay) for t in PRESETS[name]])
 
 
-# --- What they come to ---------------------------------------------------------------------------------------------
-
-
 def run(
     peers: Peers, sections: Sections, outcomes: Mapping[str, Outcome], on_row: Callable[[str], None]
 ) -> dict[str, Contender]:
@@ -189,11 +182,8 @@ def run(
     rows = []
     for name, ours in MODELS.items():
         rows.append(Row(ours, UNIT, timed(_passes(ours, u, y))))
-        rows += [
-            peers.row(f"silverbox {peer} {name} time", title, UNIT)
-            for title, (peer, model) in PEERS.items()
-            if model == name
-        ]
+        theirs = [(title, peer) for title, (peer, model) in PEERS.items() if model == name]
+        rows += [peers.row(f"silverbox {peer} {name} time", title, UNIT) for title, peer in theirs]
     times = measure(rows, REPETITIONS, on_row)
     contenders: dict[str, Contender] = {}
     for title, time in times.items():
@@ -270,18 +260,9 @@ def _offline(peers: Peers, sections: Sections) -> Contender:
         return Contender(Result(OFFLINE, UNIT), reason=str(error))
     time = Result(OFFLINE, UNIT, (1e6 * answer["seconds"] / answer["work"],))
     with np.errstate(over="ignore", invalid="ignore"):
-        learning = {
-            int(samples): rmse(np.array(simulated) - sections.arrow.y)
-            for samples, simulated in answer["learning"].items()
-        }
-        errors = {
-            test: rmse(np.array(simulated) - getattr(sections, test).y)
-            for test, simulated in answer["simulations"].items()
-        }
+        learning = {int(n): rmse(np.array(x) - sections.arrow.y) for n, x in answer["learning"].items()}
+        errors = {test: rmse(np.array(x) - getattr(sections, test).y) for test, x in answer["simulations"].items()}
     return Contender(time, errors, learning=learning)
-
-
-# --- Results -------------------------------------------------------------------------------------------------------
 
 
 def faster(contenders: Mapping[str, Contender], title: str) -> tuple[float, bool]:
@@ -352,3 +333,18 @@ def table(contenders: Mapping[str, Contender]) -> Table:
 def _finite(value: float) -> float | None:
     """A number for JSON, which has no other."""
     return value if np.isfinite(value) else None
+
+
+def main(json: Path | None = None, figures: Path = Path("runs/silverbox"), data: Path | None = None) -> None:
+    """Run the official Silverbox protocol for every estimator of this project, and for other packages beside them.
+
+    Args:
+        json: file for the results, machine-readable.
+        figures: folder for the figures of errors, learning and parameters, as PNG.
+        data: the record, or its folder; searched for on this machine if not given.
+    """
+    run_protocol(data, json, figures, compare)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m benchmarks.silverbox")

@@ -288,7 +288,7 @@ def command(*arguments):
 def test_command_explains_itself():
     finished = command("silverbox", "--help")
     assert finished.returncode == 0
-    for word in ("reproduce.py silverbox", "--json", "--figures", "--data", "--select", "--no-peers", "SNLS80mV.csv"):
+    for word in ("reproduce.py silverbox", "--json", "--figures", "--data", "--select", "SNLS80mV.csv"):
         assert word in finished.stdout
     assert "reproduce.py silverbox" in command("--help").stdout
 
