@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.experiment import SimulatedExperiment
-from duffing_env.kernel import noise_drawer
 from duffing_env.layout import layout_of
 from duffing_env.noise import stream_words
 from duffing_env.sources import parts
+from duffing_env.stages import noise_drawer
 from estimator.engine.tasks import structured
 from estimator.inference import mean_field
 from estimator.lanes import LANES, kernel, part

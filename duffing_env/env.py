@@ -220,17 +220,14 @@ class DuffingEnv(gym.Env[Any, Any]):
         """
         if not self._running:
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        value = _one_number(action)
-        batch = self._batch
-        outcome = self._play(value)
+        outcome = self._play(_one_number(action))
         terminated, truncated = bool(outcome["terminated"]), bool(outcome["truncated"])
         info: dict[str, Any] = {name: outcome[name] for name in self._reported}
-        for flag in self._flags:
-            info[flag] = bool(outcome[flag])
+        info |= {flag: bool(outcome[flag]) for flag in self._flags}
         if terminated or truncated:
             self._running = False
             info |= self._final_info()
-        return batch.observations[0].copy(), outcome["reward"], terminated, truncated, info
+        return self._batch.observations[0].copy(), outcome["reward"], terminated, truncated, info
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)
@@ -271,9 +268,8 @@ class DuffingEnv(gym.Env[Any, Any]):
         from duffing_env.rendering import Screen
 
         if self._screen is None:
-            self._screen = Screen(
-                self.render_mode, self.max_input, self.experiment.max_output, self.metadata["render_fps"]
-            )  # fmt: skip
+            limits, fps = (self.max_input, self.experiment.max_output), self.metadata["render_fps"]
+            self._screen = Screen(self.render_mode, *limits, fps)
         self._screen.start(self._batch.true_of(0), self.belief, self.horizon)
 
     def _draw(self) -> None:

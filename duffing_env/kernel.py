@@ -7,7 +7,6 @@ batch with one live lane, so both faces give bit-identical trajectories.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -15,97 +14,15 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from duffing_env import sources
+from duffing_env import sources, stages
 from duffing_env.inference import updater
 from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, observation_bounds, parameter_names, unpacker
-from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
 from estimator.engine.rows import belief_names
-from estimator.lanes import LANES, jit, kernel, lanewise, part
+from estimator.lanes import LANES, kernel, lanewise, part
 
 #: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.
 RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP, RESET_NOW = 0, 1, 2, 3
-
-# A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).
-_FLOAT32_ROUNDING = 2.0**-22
-
-
-def _draw_noise(STREAM_a, STREAM_b, STREAM_c, STREAM_d, WAITING):
-    """Two standard normal numbers. The stream of an environment that waits for its reset stands still."""
-    first, a, b, c, d = draw(as_word(STREAM_a), as_word(STREAM_b), as_word(STREAM_c), as_word(STREAM_d))
-    second, a, b, c, d = draw(a, b, c, d)
-    w, v = normal_pair(to_unit(first), to_unit(second))
-    live = WAITING == 0.0
-    return (
-        as_bits(a) if live else STREAM_a, as_bits(b) if live else STREAM_b,
-        as_bits(c) if live else STREAM_c, as_bits(d) if live else STREAM_d, w, v,
-    )  # fmt: skip
-
-
-def noise_drawer(place: Mapping[str, int]) -> Any:
-    """``draw_noise(W)``: two standard normal numbers in every lane, into rows ``NOISE_w`` and ``NOISE_v``."""
-    return lanewise(place, "STREAM_a STREAM_b STREAM_c STREAM_d NOISE_w NOISE_v")(_draw_noise)
-
-
-def _limit_input(ASKED, INPUT, LAST_INPUT, SPENT, budget, max_slew):
-    """The input that the generator gives when it is asked for one: near enough to the last, and paid for.
-
-    ``SPENT`` is the energy Σ u²; what is left of the budget bounds the next input, so it cannot be exceeded.
-    """
-    given = min(max(ASKED, INPUT - max_slew), INPUT + max_slew)
-    left = np.sqrt(max(budget - SPENT, 0.0))
-    given = min(max(given, -left), left)
-    return given, INPUT, LAST_INPUT, given - INPUT, SPENT + given * given
-
-
-def _play_record(INPUT, RECORDED_u, RECORDED_y, max_input):
-    """The recorded plant: a record answers the recorded input only."""
-    deviates = abs(INPUT - RECORDED_u) > _FLOAT32_ROUNDING * max_input
-    return RECORDED_u, RECORDED_y, 1.0 if deviates else 0.0
-
-
-def _pay(REWARD, EARNED, TERMINATED, TRUNCATED, terminal, forfeits, terminated_return):
-    """When the reward is paid, and what an episode that is terminated returns.
-
-    ``EARNED`` is what the episode gave so far, as if it were paid sample by sample.
-    """
-    received = 0.0 if terminal else EARNED
-    EARNED += REWARD
-    at_end = EARNED if TERMINATED + TRUNCATED != 0.0 else 0.0
-    REWARD = at_end if terminal else REWARD
-    return terminated_return - received if forfeits and TERMINATED != 0.0 else REWARD, EARNED
-
-
-def _draw_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
-    """The sample at which the first parameter jumps, in the middle half of the episode, and its log-uniform factor."""
-    low = math.log(1.0 - jump)
-    first, a, b, c, d = draw(as_word(STREAM_a), as_word(STREAM_b), as_word(STREAM_c), as_word(STREAM_d))
-    second, a, b, c, d = draw(a, b, c, d)
-    at = math.floor(horizon * (0.25 + 0.5 * to_unit(first)))
-    factor = math.exp(low + (math.log(1.0 + jump) - low) * to_unit(second))
-    return as_bits(a), as_bits(b), as_bits(c), as_bits(d), at, factor
-
-
-@jit
-def draw_plant(W, j, setup, stream, drawn):
-    """The parameters of lane j's plant, each log-uniform about its centre, or from a Gaussian.
-
-    ``stream`` and ``drawn`` say where the first word of the stream and the first parameter stand.
-    """
-    a, b = as_word(W[stream + j]), as_word(W[stream + LANES + j])
-    c, d = as_word(W[stream + 2 * LANES + j]), as_word(W[stream + 3 * LANES + j])
-    low = math.log(1.0 - setup.spread)
-    width = math.log(1.0 + setup.spread) - low
-    for p in range(len(setup.center)):
-        first, a, b, c, d = draw(a, b, c, d)
-        if setup.width[p] > 0.0:
-            second, a, b, c, d = draw(a, b, c, d)
-            deviation, _ = normal_pair(to_unit(first), to_unit(second))
-            W[drawn + p * LANES + j] = setup.center[p] + setup.width[p] * deviation
-        else:
-            W[drawn + p * LANES + j] = setup.center[p] * math.exp(low + width * to_unit(first))
-    W[stream + j], W[stream + LANES + j] = as_bits(a), as_bits(b)
-    W[stream + 2 * LANES + j], W[stream + 3 * LANES + j] = as_bits(c), as_bits(d)
 
 
 @dataclass(frozen=True)
@@ -153,21 +70,21 @@ def compiled(kind: Kind) -> Kernel:
     cleared += left_out(kind)
     at_rest = tuple(row[name] for name in [*cleared, *sensors, *(f"X_{x}" for x in kind.truth.states)])
 
-    draw_noise = noise_drawer(place)
-    limit_input = lanewise(place, "INPUT LAST_INPUT OLDER_INPUT RISE SPENT", uniform="budget max_slew")(_limit_input)
-    play_record = lanewise(place, f"INPUT {sensors[0]} OFF_RECORD", uniform="max_input")(_play_record)
-    pay = lanewise(place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(_pay)
+    draw_noise = stages.noise_drawer(place)
+    limited = "INPUT LAST_INPUT OLDER_INPUT RISE SPENT"
+    limit_input = lanewise(place, limited, uniform="budget max_slew")(stages.limit_input)
+    play_record = lanewise(place, f"INPUT {sensors[0]} OFF_RECORD", uniform="max_input")(stages.play_record)
+    pay = lanewise(place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(stages.pay)
     streams = "STREAM_a STREAM_b STREAM_c STREAM_d"
-    draw_jump = lanewise(place, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon", one=True)(_draw_jump)
+    draw_jump = lanewise(place, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon", one=True)(stages.draw_jump)
 
     simulated = kind.plant is not None
     move: Any = _plant_of(kind, code, draw_noise) if simulated else None
     infer = updater(kind)
     make_hooks = REWARDS[kind.work].hooks if kind.work else None
-    hooks = Hooks(nothing_in_lane, nothing, nothing, nothing) if make_hooks is None else make_hooks(kind, code)
-    begin_work, before, expect, after = hooks
-    is_worked = make_hooks is not None
-    is_structured = kind.factorisation == "structured"
+    idle_hooks = Hooks(nothing_in_lane, nothing, nothing, nothing)
+    begin_work, before, expect, after = make_hooks(kind, code) if make_hooks else idle_hooks
+    is_worked, is_structured = make_hooks is not None, kind.factorisation == "structured"
     settle_truth, appraise, settle, observe = code.settle_truth, code.appraise, code.settle, code.observe
     walk: Any = code.walk
     unpack = unpacker(kind)
@@ -175,7 +92,7 @@ def compiled(kind: Kind) -> Kernel:
 
     @inner
     def meet_truth(W, j, setup):
-        """Settle the true coefficients of lane j after its parameters changed."""
+        """Settle lane j's true coefficients after its parameters changed."""
         settle_truth(W, j, setup.step)
         appraise(W, j, setup.step)
         if is_worked:
@@ -187,7 +104,7 @@ def compiled(kind: Kind) -> Kernel:
         for i in range(n_record):
             W[i * LANES + j] = setup.prior[i]
         # Variables, because a function is compiled anew for every constant.
-        draw_plant(W, j, setup, np.int64(stream), np.int64(drawn))
+        stages.draw_plant(W, j, setup, np.int64(stream), np.int64(drawn))
         W[jump_at + j] = -1.0
         if setup.jump > 0.0:
             draw_jump(W, j, setup.jump, setup.horizon)
@@ -257,11 +174,10 @@ def compiled(kind: Kind) -> Kernel:
                 void = 0
                 for j in range(LANES):
                     void += (W[diverged + j] != 0.0) | (W[off_record + j] != 0.0)
-                if void:
-                    for j in range(LANES):
-                        if W[diverged + j] != 0.0 or W[off_record + j] != 0.0:
-                            for i in range(n_record):
-                                W[i * LANES + j] = saved[i * LANES + j]
+                for j in range(LANES if void else 0):
+                    if W[diverged + j] != 0.0 or W[off_record + j] != 0.0:
+                        for i in range(n_record):
+                            W[i * LANES + j] = saved[i * LANES + j]
                 if s > 0:
                     for j in range(LANES):
                         if saved[n_saved + terminated + j] + saved[n_saved + truncated + j] != 0.0:

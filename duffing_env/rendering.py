@@ -41,7 +41,6 @@ PARAMETERS = (
 )
 
 NAMES = ("m", "c", "a", "b")
-
 MILLISECONDS = 1e3 * SAMPLING_STEP
 
 INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
@@ -333,7 +332,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m duffing_env.rendering", description=main.__doc__)
     parser.add_argument("path", type=Path, help="the file to write")
     path: Path = parser.parse_args().path
-
     import matplotlib.image
 
     env = gym.make("duffing_env/Amplitude-v0", render_mode="rgb_array")

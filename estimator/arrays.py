@@ -29,3 +29,13 @@ def fill(into, value):
     """One number everywhere in a flat array."""
     for i in range(len(into)):
         into[i] = value
+
+
+@jit
+def highest(values, count):
+    """Where the highest of the first values is."""
+    place = 0
+    for i in range(1, count):
+        if values[i] > values[place]:
+            place = i
+    return place

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner.ascent import Limits, climber, project
+from agents.planner.candidates import uniform
 from agents.planner.design import Known, designer, half_log_det, invert
-from agents.planner.search import uniform
 from estimator.arrays import copy
 from estimator.belief import covariance_places
 from estimator.engine.rows import belief_names

@@ -45,10 +45,7 @@ EXPECTED = (
     *(
         f"{continuation}_{name}"
         for continuation in CONTINUATIONS
-        for name in (
-            *(f"{which}_{horizon}" for horizon in HORIZONS for which in ("up", "none")),
-            *(f"peak_{first}" for first in FIRST_INPUTS),
-        )
+        for name in (*(f"{way}_{h}" for h in HORIZONS for way in ("up", "none")), *(f"peak_{f}" for f in FIRST_INPUTS))
     ),
     *("best_16", "free_1", "free_2", "free_3", "push", "to_come", "still_open"),
 )
@@ -65,15 +62,11 @@ def feature_names(model: Model) -> tuple[str, ...]:
 #: Pushes of ``best`` after the first input; all of their signs are tried.
 _TRIED = 3
 
-#: Samples in which an output can still be kept within the limit: half a period, where an oscillator of the
-#: tracks is slowest.
+#: Samples in which an output can still be kept within the limit: half a period of the tracks' slowest oscillators.
 _IN_REACH = 8
 
-#: Where ``pump`` turns, in parts of the limit.
-_TURN = 0.95
-
-#: What an output of twice the limit takes away, in parts of what a whole episode brings.
-_BEYOND = 500.0
+#: Where ``pump`` turns, in parts of the limit; what twice the limit takes away, in parts of what an episode brings.
+_TURN, _BEYOND = 0.95, 500.0
 
 #: Covariances of float32 correlations are made positive definite by this much.
 _RIDGE = 1e-6

@@ -14,7 +14,7 @@ from importlib.metadata import version
 from json import dumps
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,15 +24,13 @@ from rich.table import Table
 
 from agents.cli import progress_bar
 from agents.policies import make_policy
+from agents.studies.kouw2020_figures import draw
 from duffing_env.silverbox import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
 from estimator.files import write_atomically
 from estimator.offline import PEMNARX
 from estimator.parameters import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PUBLISHED = {
     "PEM-NARX": {"prediction_mse": 5.830793034083989e-05, "simulation_mse": 1.001367833873263e-03},
@@ -43,9 +41,6 @@ PUBLISHED = {
 
 MEASURES = ("prediction", "simulation")
 VERSIONED = ("duffing-env", "gymnasium", "matplotlib", "numba", "numpy", "scipy")
-
-EVERY = 80
-"""The figures show one sample of this many, as the paper's do."""
 
 
 @dataclass(frozen=True)
@@ -348,30 +343,3 @@ def deviation(errors: dict[str, dict[str, float]]) -> float:
         for model in ("FEM-LARX", "FEM-NLARX")
         for measure, mse in errors[model].items()
     )
-
-
-def draw(runs: dict[str, Run], validation: Regime, measure: str) -> Figure:
-    """One of the paper's two figures of errors: a column for each model, the lower row in log scale.
-
-    Args:
-        runs: The models by name.
-        validation: What they were validated on.
-        measure: ``prediction`` or ``simulation``.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 5.2), dpi=100, layout="constrained")
-    axes = figure.subplots(2, len(runs), sharex=True, sharey="row", squeeze=False)
-    samples = np.arange(0, len(validation.y), EVERY)
-    for (upper, lower), (model, run) in zip(axes.T, runs.items(), strict=True):
-        output = getattr(run, measure)[samples]
-        squared_error = (output - validation.y[samples]) ** 2
-        upper.plot(samples, output, color="purple", linewidth=0.8, label=f"{measure} [V]")
-        upper.plot(samples, squared_error, color="black", linewidth=1.0, label="squared error [V²]")
-        upper.set_title(f"{model}: MSE {getattr(run, f'{measure}_mse'):.3e} V²", fontsize=11)
-        lower.semilogy(samples, squared_error, color="black", linewidth=0.6, nonpositive="mask")
-        lower.set_xlabel("sample")
-    axes[0, 0].set_ylabel("output [V], squared error [V²]")
-    axes[1, 0].set_ylabel("squared error [V²]")
-    axes[0, 0].legend(loc="lower left", fontsize=9)
-    return figure

@@ -53,7 +53,7 @@ class Straight(_Intrinsic):  # type: ignore[misc]
     def translated(self, kinds: Kinds) -> Translated:
         """The function for arguments of some kinds."""
         if kinds not in self._translated:
-            self._translated[kinds] = Translation(self.source).whole(kinds)
+            self._translated[kinds] = Translation(self.source).function(kinds)
         return self._translated[kinds]
 
     def _define(self, _typing: Any, *given: Any) -> Any:

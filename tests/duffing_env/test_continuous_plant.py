@@ -8,11 +8,12 @@ from scipy.integrate import solve_ivp
 from twin import continuous_step, to_rates
 
 from duffing_env.experiment import ContinuousExperiment
-from duffing_env.kernel import _draw_noise, _plant_of
+from duffing_env.kernel import _plant_of
 from duffing_env.layout import layout_of
 from duffing_env.sources import parts
+from duffing_env.stages import noise_drawer
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP
-from estimator.lanes import LANES, lanewise
+from estimator.lanes import LANES
 from estimator.models.duffing import duffing
 
 EXPERIMENT = ContinuousExperiment()
@@ -37,7 +38,7 @@ def lanes(seed=0, **rows):
 def compiled(kind):
     """The two functions that a sample of the plant takes."""
     assert layout_of(kind) == PLACE
-    draw_noise = lanewise(PLACE, " ".join([*STREAM, "NOISE_w", "NOISE_v"]))(_draw_noise)
+    draw_noise = noise_drawer(PLACE)
     return draw_noise, _plant_of(kind, parts(kind), draw_noise)
 
 

@@ -6,11 +6,11 @@ from rounding import U64
 from twin import to_coefficients
 
 from duffing_env.experiment import SimulatedExperiment
-from duffing_env.kernel import _draw_noise, _play_record
 from duffing_env.layout import layout_of
 from duffing_env.sources import parts
+from duffing_env.stages import noise_drawer, play_record
 from estimator import SILVERBOX_TWIN
-from estimator.lanes import LANES, lanewise
+from estimator.lanes import LANES
 
 KIND = SimulatedExperiment().kind
 PLACE = layout_of(KIND)
@@ -77,7 +77,7 @@ def test_noise_is_scaled_once_and_the_stream_of_a_waiting_lane_stands_still():
     words = np.random.default_rng(0).integers(1, 2**60, (4, LANES), dtype=np.uint64)
     waiting = np.arange(LANES) % 2
     flat, row = block(WAITING=waiting, **dict(zip(STREAM, words.view(np.float64), strict=True)))
-    lanewise(PLACE, " ".join([*STREAM, "NOISE_w", "NOISE_v"]))(_draw_noise)(flat)
+    noise_drawer(PLACE)(flat)
     still = np.stack([row(name) for name in STREAM]).copy().view(np.uint64) == words
     np.testing.assert_array_equal(still.all(axis=0), waiting == 1)
 
@@ -85,5 +85,5 @@ def test_noise_is_scaled_once_and_the_stream_of_a_waiting_lane_stands_still():
 @pytest.mark.parametrize(("deviation", "off_record"), [(0.0, 0.0), (2e-8, 0.0), (-2e-8, 0.0), (1e-7, 1.0), (-0.1, 1.0)])
 def test_a_record_answers_the_recorded_input_only(deviation, off_record):
     # A float32 action in [-1, 1] is within 3e-8 of the number that it stands for; here it is scaled by 0.15.
-    told = _play_record(0.1 + deviation, RECORDED_u=0.1, RECORDED_y=-0.3, max_input=0.15)
+    told = play_record(0.1 + deviation, RECORDED_u=0.1, RECORDED_y=-0.3, max_input=0.15)
     assert told == (0.1, -0.3, off_record)

@@ -6,10 +6,10 @@ from scipy.stats import multivariate_normal
 from twin import to_coefficients, to_parameters
 
 from duffing_env.experiment import SimulatedExperiment
-from duffing_env.kernel import _pay
 from duffing_env.layout import layout_of
 from duffing_env.rewards import REWARDS, check_reward
 from duffing_env.sources import parts
+from duffing_env.stages import pay
 from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.belief import Belief
 from estimator.engine.rows import belief_names
@@ -70,8 +70,8 @@ class Lanes:
         self.code.settle(self.rows.reshape(-1), SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
         forfeits = terminated_return is not None
         if terminal or forfeits:
-            pay = lanewise(self.place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(_pay)
-            pay(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)
+            paid = lanewise(self.place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(pay)
+            paid(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)
 
     @property
     def belief(self):
