@@ -1,7 +1,7 @@
 """Arrays in compiled code, number by number.
 
 What NumPy does with whole arrays takes long to compile: an assignment alone brings with it the message that it would
-raise for other shapes, which is three seconds.
+raise for other shapes, with all that writes numbers as text.
 """
 
 from __future__ import annotations

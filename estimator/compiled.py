@@ -189,7 +189,7 @@ class Compiled(_Cache):
             if hashlib.sha256(payload).hexdigest().encode() != digest:
                 raise ValueError("the digest is another")
             called, *reduced = pickle.loads(payload)
-            # All of Numba, which takes half a second to import, is needed only where the code calls what that brings.
+            # All of Numba, which takes long to import, is needed only where the code calls what that brings.
             rtsys.initialize(target_context)
             if any(binding.address_of_symbol(name) is None for name in called):
                 target_context.refresh()

@@ -2,8 +2,8 @@
 
 Nearly all that the kernels execute is *straight*: assignments of numbers, one after another, perhaps in a loop over the
 lanes of a block. Numba infers types and manages references for whatever Python there is, and spends most of its time on
-that. `straight` translates the little that such functions need, from their syntax tree, so that a kernel compiles in
-half the time; the functions are called from code that Numba compiles, or from Python, like Numba's own.
+that. `straight` translates the little that such functions need, from their syntax tree; they are called from code that
+Numba compiles, or from Python, like Numba's own.
 
 A straight function may hold
 

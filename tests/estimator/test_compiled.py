@@ -65,6 +65,19 @@ def test_compiled_code_is_read_again(place):
     assert called() == (42, 0)
 
 
+def test_code_that_calls_what_numba_brings_is_read_by_another_process(tmp_path):
+    """The symbols of BLAS are there only once Numba has imported what brings them."""
+    source = "from estimator.lanes import kernel\n@kernel\ndef run(x):\n    return x @ x\n"
+    (tmp_path / "run_of_compiled.py").write_text(source)
+    program = "import numpy as np\nfrom run_of_compiled import run\n"
+    program += "print(run(np.ones(3)), sum(run.stats.cache_hits.values()))"
+    variables = {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]), "NUMBA_CACHE_DIR": str(tmp_path / "code")}
+    command = [sys.executable, "-c", program]
+    for expected in ("3.0 0", "3.0 1"):
+        finished = subprocess.run(command, env=os.environ | variables, capture_output=True, text=True)
+        assert finished.stdout.strip() == expected, finished.stderr
+
+
 @pytest.mark.parametrize(
     "damage",
     [

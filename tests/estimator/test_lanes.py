@@ -75,7 +75,7 @@ def test_a_parameter_is_a_row_or_uniform(uniform):
         lanewise(LAYOUT, "total product", uniform=uniform)(add_and_multiply)
 
 
-def testsource_digest_covers_every_source_of_the_package(tmp_path):
+def test_source_digest_covers_every_source_of_the_package(tmp_path):
     digest = lanes.source_digest.__wrapped__
     (tmp_path / "folder").mkdir()
     (tmp_path / "kernel.py").write_text("a = 1\n")

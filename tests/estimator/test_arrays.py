@@ -1,0 +1,22 @@
+"""Arrays, number by number."""
+
+import numpy as np
+
+from estimator.arrays import copy, copy_scaled, fill, highest
+
+
+def test_numbers_go_where_they_are_told():
+    into = np.zeros(5)
+    copy(into, 2, np.array([1.0, 2.0, 3.0]), 2)
+    np.testing.assert_array_equal(into, [0, 0, 1, 2, 0])
+    fill(into, 7.0)
+    np.testing.assert_array_equal(into, 7.0)
+    matrix = np.arange(4.0).reshape(2, 2)
+    copy_scaled(matrix, 2.0, matrix)
+    np.testing.assert_array_equal(matrix, [[0, 2], [4, 6]])
+
+
+def test_the_highest_is_the_first_of_its_like():
+    values = np.array([1.0, 3.0, 3.0, 9.0])
+    assert highest(values, 3) == 1
+    assert highest(values, 4) == 3
