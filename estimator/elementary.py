@@ -86,7 +86,9 @@ def expected_log_gamma(shape, rate):
 
 
 _TWO_OVER_PI = 2 / math.pi
-_HALF_PI_HIGH, _HALF_PI_LOW = 1.5707963267948966, 6.123233995736766e-17
+# π/2 in three parts (those of fdlibm). The first two have 33 bits, so that their products with a whole number of up to
+# 20 bits are exact, also on a processor that rounds a product before it is subtracted.
+_HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _ROUNDER = 1.5 * 2.0**52
 
 
@@ -94,7 +96,7 @@ _ROUNDER = 1.5 * 2.0**52
 def _reduced(x):
     """The quarter turn nearest to x, as a whole number, and what is left of x, within ±π/4."""
     quarter = (x * _TWO_OVER_PI + _ROUNDER) - _ROUNDER
-    return quarter, (x - quarter * _HALF_PI_HIGH) - quarter * _HALF_PI_LOW
+    return quarter, ((x - quarter * _HALF_PI[0]) - quarter * _HALF_PI[1]) - quarter * _HALF_PI[2]
 
 
 @straight
