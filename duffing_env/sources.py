@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 from duffing_env.layout import Kind, inputs_of, layout_of, observation_bounds, parameter_names
@@ -13,7 +12,7 @@ from duffing_env.rewards import REWARDS
 from estimator.engine import cache as stored
 from estimator.engine.rows import belief_names
 from estimator.engine.tasks import NAMES
-from estimator.lanes import LANES, source_digest
+from estimator.lanes import LANES, source_digest, sources_of
 from estimator.models.model import Model
 from estimator.straight import straight
 
@@ -38,7 +37,7 @@ _SMALLEST, _LARGEST = 2.0**-1000, 2.0**1000
 def parts(kind: Kind) -> Any:
     """The compiled functions of a kind of experiment: see `_source` for their names."""
     digests = (kind.belief.digest, kind.plant and kind.plant.digest)
-    key = source_digest(Path(__file__).parent) + repr((kind[2:], digests))
+    key = source_digest(sources_of(__file__)) + repr((kind[2:], digests))
     return stored.load(kind.belief.name, "environment", key, lambda: _source(kind), _NAMES)
 
 

@@ -18,7 +18,7 @@ def copy(into, at, given, count):
 
 @jit
 def copy_scaled(into, factor, given):
-    """``factor`` times a matrix."""
+    """``factor`` times a matrix goes into another, or into itself."""
     for i in range(given.shape[0]):
         for j in range(given.shape[1]):
             into[i, j] = factor * given[i, j]

@@ -110,7 +110,7 @@ def kernel(function: Callable[..., Any] | None = None, *, kind: str = "", **opti
     if function is None:
         return partial(kernel, kind=kind, **options)
     dispatcher = numba.njit(**OPTIONS | options)(_renamed(function, kind))
-    dispatcher._cache = Compiled(function, source_digest(Path(function.__code__.co_filename).parent), named=bool(kind))
+    dispatcher._cache = Compiled(function, source_digest(sources_of(function.__code__.co_filename)), named=bool(kind))
     return dispatcher
 
 
@@ -129,11 +129,24 @@ def _renamed(function: Callable[..., Any], kind: str) -> Callable[..., Any]:
     return function
 
 
+#: The packages, each of which may use those before it.
+_FLOORS = ("estimator", "duffing_env", "agents")
+
+
+def sources_of(file: str) -> tuple[Path, ...]:
+    """The folders of all that the code in a file may use: its package, and the packages below."""
+    path, root = Path(file), Path(__file__).parents[1]
+    package = path.relative_to(root).parts[0] if path.is_relative_to(root) else ""
+    if package in _FLOORS:
+        return tuple(root / name for name in _FLOORS[: _FLOORS.index(package) + 1])
+    return (*(root / name for name in _FLOORS), path.parent)
+
+
 @cache
-def source_digest(package: Path) -> str:
-    """Of the sources of a package, and of this one."""
+def source_digest(folders: tuple[Path, ...]) -> str:
+    """Of the sources in some folders."""
     digest = hashlib.sha256()
-    for folder in sorted({Path(__file__).parent, package}):
+    for folder in folders:
         for path in sorted(folder.rglob("*.py")):
             # What the engine generated stands there too, and follows from the rest.
             if path.parent.name != "__pycache__":

@@ -297,4 +297,5 @@ def factorise(information, M):
     """The factor M of an information M Mᵀ; zeros where there is none, or it tells nothing of a coefficient."""
     copy_scaled(M, 1.0, information)
     if half_log_det(M) == -np.inf:
-        copy_scaled(M, 0.0, information)
+        for row in range(len(M)):
+            fill(M[row], 0.0)

@@ -8,10 +8,11 @@ Numba compiles, or from Python, like Numba's own.
 A straight function may hold
 
 - assignments of names, tuples and entries of blocks ``W[...]`` (flat float64 arrays), and calls for their effect;
-- numbers, ``+ - * /``, whole powers up to 8, comparisons, ``a if c else b`` (both sides are evaluated), ``and or not``;
-  of whole numbers also ``// % << >> & | ^``, where ``//`` and ``%`` are of numbers that are not negative;
-- ``abs min max``, ``math.floor sqrt exp log log1p``, ``numpy.sqrt float64 int64 uint64`` and ``.view`` of these types,
-  and other straight functions;
+- numbers, ``+ - * /``, whole powers up to 8, comparisons, ``a if c else b`` (both sides are evaluated), ``and or not``,
+  which give truths; of whole numbers also ``// % << >> & | ^``, where ``//`` and ``%`` are of numbers that are not
+  negative, and not by 0;
+- ``abs min max``, ``math.floor`` (a float), ``math.sqrt exp log log1p``, ``numpy.sqrt float64 int64 uint64`` and
+  ``.view`` of these types, and other straight functions;
 - loops ``for name in range(n)`` of at least one turn, which keep nothing but what they write into blocks; and a
   ``return`` at its end.
 

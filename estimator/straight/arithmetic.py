@@ -15,7 +15,9 @@ FUSED = "contract"
 LLVM = {"double": "double", "i1": "i1", "i64": "i64", "word": "i64", "ptr": "ptr"}
 _ORDER = {ast.Lt: "lt", ast.LtE: "le", ast.Gt: "gt", ast.GtE: "ge", ast.Eq: "eq", ast.NotEq: "ne"}
 _FLOATS = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
-_WHOLES = {
+_SIGNED: dict[type[ast.operator], str] = {ast.RShift: "ashr"}
+_UNSIGNED: dict[type[ast.operator], str] = {ast.RShift: "lshr", ast.FloorDiv: "udiv", ast.Mod: "urem"}
+_WHOLES: dict[type[ast.operator], str] = {
     ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.FloorDiv: "sdiv", ast.Mod: "srem",
     ast.LShift: "shl", ast.BitAnd: "and", ast.BitOr: "or", ast.BitXor: "xor",
 }  # fmt: skip
@@ -35,6 +37,11 @@ class Scalar(NamedTuple):
 def is_number(value: Any) -> bool:
     """Whether a value is a number of Python or NumPy, known while the text is written."""
     return isinstance(value, bool | int | float | np.generic)
+
+
+def is_float(value: Any) -> bool:
+    """Whether a value is a number that need not be whole."""
+    return isinstance(value, float | np.floating)
 
 
 def is_tuple(value: Any) -> bool:
@@ -64,6 +71,8 @@ class Arithmetic:
         """A sign or ``not``."""
         if isinstance(operator, ast.Not):
             return self.op("i1", f"xor i1 {self.truth(value)}, true")
+        if not isinstance(operator, ast.USub) or (isinstance(value, Scalar) and value.kind in ("i1", "ptr")):
+            raise TypeError(f"{self.name} changes a sign that is none; negate numbers with a minus")
         if is_number(value):
             return -value
         if value.kind == "double":
@@ -78,7 +87,7 @@ class Arithmetic:
             return eval(compile(ast.fix_missing_locations(tree), "", "eval"), {"a": a, "b": b})
         if how is ast.Pow and is_number(b) and b in range(1, 9):
             return reduce(lambda x, y: self.binary(ast.Mult(), x, y), [a] * int(b))
-        kinds = {x.kind if isinstance(x, Scalar) else "double" if isinstance(x, float) else "whole" for x in (a, b)}
+        kinds = {x.kind if isinstance(x, Scalar) else self.scalar(x).kind if is_float(x) else "" for x in (a, b)}
         if how in (ast.BitAnd, ast.BitOr) and kinds == {"i1"}:
             return self.op("i1", f"{_WHOLES[how]} i1 {a.text}, {b.text}")
         if how is ast.Div or "double" in kinds:
@@ -86,13 +95,17 @@ class Arithmetic:
                 raise TypeError(f"{how.__name__} of floats stands in {self.name}")
             return self.op("double", f"{_FLOATS[how]} {FUSED} double {self.double(a)}, {self.double(b)}")
         kind = "word" if "word" in kinds else "i64"
-        name = ("lshr" if kind == "word" else "ashr") if how is ast.RShift else _WHOLES[how]
+        name = (_UNSIGNED if kind == "word" else _SIGNED).get(how) or _WHOLES.get(how)
+        if name is None or kinds >= {"i64", "word"}:
+            raise TypeError(f"{self.name} has {how.__name__} of {sorted(kinds - {''})}; convert one, or use jit")
         return self.op(kind, f"{name} i64 {self.integer(a)}, {self.integer(b)}")
 
     def compared(self, order: type[ast.cmpop], a: Any, b: Any) -> Scalar:
         """The truth of a comparison, which does not hold with NaN but for ``!=``."""
+        if order not in _ORDER:
+            raise TypeError(f"{self.name} compares by {order.__name__}; use < <= > >= == or !=")
         word = _ORDER[order]
-        if all(isinstance(x, int) or (isinstance(x, Scalar) and x.kind in ("i64", "word")) for x in (a, b)):
+        if all(x.kind in ("i64", "word") if isinstance(x, Scalar) else not is_float(x) for x in (a, b)):
             is_word = any(isinstance(x, Scalar) and x.kind == "word" for x in (a, b))
             sign = "" if word in ("eq", "ne") else "u" if is_word else "s"
             return self.op("i1", f"icmp {sign}{word} i64 {self.integer(a)}, {self.integer(b)}")
@@ -101,7 +114,10 @@ class Arithmetic:
 
     def chosen(self, truth: str, a: Any, b: Any) -> Scalar:
         """The first of two values where something is true, else the second."""
-        if isinstance(a, Scalar) and isinstance(b, Scalar) and a.kind == b.kind:
+        a, b = (self.scalar(x) if is_number(x) else x for x in (a, b))
+        if is_tuple(a) or is_tuple(b):
+            raise TypeError(f"{self.name} chooses between tuples; choose between their parts")
+        if a.kind == b.kind:
             return self.op(a.kind, f"select i1 {truth}, {LLVM[a.kind]} {a.text}, {LLVM[b.kind]} {b.text}")
         return self.op("double", f"select i1 {truth}, double {self.double(a)}, double {self.double(b)}")
 
@@ -132,7 +148,7 @@ class Arithmetic:
 
     def integer(self, value: Any) -> str:
         """A value as a whole number."""
-        if is_number(value) and not isinstance(value, float):
+        if is_number(value) and not is_float(value):
             return str(int(value))
         if is_number(value) or value.kind == "double":
             raise TypeError(f"a whole number is needed in {self.name}, and not a float")
@@ -140,17 +156,18 @@ class Arithmetic:
 
     def scalar(self, number: Any) -> Scalar:
         """A number as a value."""
-        is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
-        return Scalar("i64", self.integer(number)) if is_whole else Scalar("double", self.double(number))
+        if isinstance(number, bool | np.bool_):
+            return Scalar("i1", self.truth(number))
+        return Scalar("double", self.double(number)) if is_float(number) else Scalar("i64", self.integer(number))
 
     def flat(self, value: Any) -> list[Scalar]:
         """The numbers in tuples of tuples."""
         if is_tuple(value):
             return [leaf for entry in value for leaf in self.flat(entry)]
-        return [value if isinstance(value, Scalar) else Scalar("double", self.double(value))]
+        return [value if isinstance(value, Scalar) else self.scalar(value)]
 
     def kinds(self, value: Any) -> Any:
         """The kinds of a value."""
         if is_tuple(value):
             return tuple(map(self.kinds, value))
-        return value.kind if isinstance(value, Scalar) else "double"
+        return value.kind if isinstance(value, Scalar) else self.scalar(value).kind

@@ -60,7 +60,7 @@ class Translation(Arithmetic):
     """
 
     def __init__(self, source: Source) -> None:
-        super().__init__(source.function.__qualname__)
+        super().__init__(source.name)
         self.source = source
         self._block = "entry"
         self._called: dict[str, str] = {}
@@ -84,7 +84,7 @@ class Translation(Arithmetic):
             answer = f"%r{i}"
         self.lines.append(f"ret {type_} {answer}" if values else "ret void")
         taken = ", ".join(f"{LLVM[a.kind]} {a.text}" for a in arguments)
-        # What has no block is called in the midst of arithmetic.
+        # What has no block is called in the midst of arithmetic; what has one stays a function of its own.
         inline = "" if "ptr" in kinds else " alwaysinline"
         body = f"({taken}){inline} {{\nentry:\n" + "\n".join(self.lines) + "\n}\n"
         # All that a function depends on stands in its body, or in the names of those that it calls.
@@ -94,9 +94,13 @@ class Translation(Arithmetic):
 
     def _inlined(self, source: Source, arguments: Sequence[Any]) -> Any:
         """Write a function's lines here; what it returns."""
-        outer, self.source = self.source, source
+        if len(arguments) != len(source.arguments):
+            raise TypeError(
+                f"{source.name} takes {source.arguments}, but is given {len(arguments)} arguments; give all"
+            )
+        outer, self.source, self.name = self.source, source, source.name
         returned = self._statements(source.tree.body, dict(zip(source.arguments, arguments, strict=True)))
-        self.source = outer
+        self.source, self.name = outer, outer.name
         return returned
 
     def _statements(self, body: Iterable[ast.stmt], names: dict[str, Any]) -> Any:
@@ -107,8 +111,8 @@ class Translation(Arithmetic):
                     return None
                 case ast.Return():
                     return self._value(statement.value, names)
-                case ast.Assign():
-                    self._assign(statement.targets[0], self._value(statement.value, names), names)
+                case ast.Assign(targets=[target]):
+                    self._assign(target, self._value(statement.value, names), names)
                 case ast.AugAssign():
                     before, by = self._value(statement.target, names), self._value(statement.value, names)
                     self._assign(statement.target, self.binary(statement.op, before, by), names)
@@ -136,10 +140,17 @@ class Translation(Arithmetic):
 
     def _loop(self, loop: ast.For, names: dict[str, Any]) -> None:
         """Write a loop; what it assigns is forgotten after each turn."""
-        turns, target = loop.iter, loop.target
-        if not (isinstance(turns, ast.Call) and isinstance(target, ast.Name) and len(turns.args) == 1):
-            raise self._error(loop.iter, "is no range(n)")
-        end = self.integer(self._value(turns.args[0], names))
+        match loop.target, loop.iter, loop.orelse:
+            case ast.Name() as target, ast.Call(func=function, args=[turns], keywords=[]), []:
+                is_range = self._value(function, names) is range
+            case _:
+                is_range = False
+        if not is_range or any(isinstance(node, ast.Return) for node in ast.walk(loop)):
+            raise self._error(loop.iter, "is no plain loop over range(n)")
+        count = self._value(turns, names)
+        if target.id in names or (is_number(count) and count < 1):
+            raise self._error(loop.iter, f"must have a turn, and a new name instead of {target.id}")
+        end = self.integer(count)
         self.count += 1
         n, before, at = self.count, self._block, len(self.lines)
         self.lines += [f"br label %loop{n}", f"loop{n}:", ""]
@@ -162,7 +173,10 @@ class Translation(Arithmetic):
             case ast.Name():
                 return names[node.id] if node.id in names else self.source.resolve(node.id)
             case ast.Attribute():
-                return getattr(self._value(node.value, names), node.attr)
+                base = self._value(node.value, names)
+                if isinstance(base, Scalar):
+                    raise self._error(node, "asks a number or a block for an attribute")
+                return getattr(base, node.attr)
             case ast.Tuple():
                 return tuple(self._value(entry, names) for entry in node.elts)
             case ast.Subscript():
@@ -194,13 +208,20 @@ class Translation(Arithmetic):
         base = self._value(node.value, names)
         if not (isinstance(base, Scalar) and base.kind == "ptr"):
             raise self._error(node, "is no entry of a block")
-        index = self.integer(self._value(node.slice, names))
+        at = self._value(node.slice, names)
+        if is_number(at) and at < 0:
+            raise self._error(node, "counts from the end")
+        index = self.integer(at)
         return self.op("ptr", f"getelementptr inbounds double, ptr {base.text}, i64 {index}").text
 
     def _call(self, node: ast.Call, names: Mapping[str, Any]) -> Any:
         """The value of a call."""
+        if node.keywords:
+            raise self._error(node, "gives arguments by name")
         if isinstance(node.func, ast.Attribute) and node.func.attr == "view":
-            value, kind = self._value(node.func.value, names), _CONVERSIONS[self._value(node.args[0], names)]
+            value, kind = self._value(node.func.value, names), _CONVERSIONS.get(self._value(node.args[0], names))
+            if not isinstance(value, Scalar) or kind is None or value.kind in ("i1", "ptr"):
+                raise self._error(node, "views something else than the bits of a number")
             return self.op(kind, f"bitcast {LLVM[value.kind]} {value.text} to {LLVM[kind]}")
         function, given = self._value(node.func, names), [self._value(argument, names) for argument in node.args]
         source = getattr(function, "source", None)
@@ -208,12 +229,12 @@ class Translation(Arithmetic):
             if any(isinstance(value, Scalar) and value.kind == "ptr" for value in given):
                 return self._call_on_block(function, given)
             return self._inlined(source, given)
-        if function in (min, max):
+        if function in (min, max) and len(given) > 1:
             order = ast.Lt if function is min else ast.Gt
             return reduce(lambda a, b: self.chosen(self.compared(order, b, a).text, b, a), given)
-        if function in _CONVERSIONS:
+        if function in _CONVERSIONS and len(given) == 1:
             return self.converted(_CONVERSIONS[function], given[0])
-        if function in _FUNCTIONS:
+        if function in _FUNCTIONS and len(given) == 1:
             return self.op("double", f"call {FUSED} double @{_FUNCTIONS[function]}(double {self.double(given[0])})")
         raise self._error(node, "calls what is not straight")
 
@@ -221,6 +242,10 @@ class Translation(Arithmetic):
         """Call a function of blocks, which is one of its own for LLVM too, and leaves its results in them."""
         values = tuple(self.scalar(value) if is_number(value) else value for value in given)
         called = function.translated(self.kinds(values))
+        if called.result is not None:
+            raise TypeError(
+                f"{self.name} calls {function.__name__}, which returns something; let it write into a block"
+            )
         self._called |= called.definitions
         flat = ", ".join(f"{LLVM[value.kind]} {value.text}" for value in self.flat(values))
         self.lines.append(f"call void @{called.name}({flat})")
@@ -228,4 +253,4 @@ class Translation(Arithmetic):
     def _error(self, node: ast.AST, what: str) -> TypeError:
         """That a function is not straight."""
         text = textwrap.shorten(ast.unparse(node), 60)
-        return TypeError(f"{text!r} in {self.source.function.__qualname__} {what}; compile it with jit instead")
+        return TypeError(f"{text!r} in {self.name} {what}; compile it with jit instead")

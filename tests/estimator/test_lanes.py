@@ -75,8 +75,10 @@ def test_a_parameter_is_a_row_or_uniform(uniform):
         lanewise(LAYOUT, "total product", uniform=uniform)(add_and_multiply)
 
 
-def test_source_digest_covers_every_source_of_the_package(tmp_path):
-    digest = lanes.source_digest.__wrapped__
+def test_the_digest_of_sources_covers_each_of_them(tmp_path):
+    def digest(folder):
+        return lanes.source_digest.__wrapped__((folder,))
+
     (tmp_path / "folder").mkdir()
     (tmp_path / "kernel.py").write_text("a = 1\n")
     (tmp_path / "folder" / "scalar.py").write_text("b = 1\n")
@@ -89,6 +91,15 @@ def test_source_digest_covers_every_source_of_the_package(tmp_path):
     assert changed != first
     (tmp_path / "new.py").write_text("c = 1\n")
     assert digest(tmp_path) not in (first, changed)
+
+
+def test_code_depends_on_its_package_and_those_below():
+    root = Path(lanes.__file__).parents[1]
+    names = {name: [folder.name for folder in lanes.sources_of(str(root / name))] for name in (
+        "estimator/engine/emit.py", "duffing_env/kernel.py", "agents/planner/search.py", "benchmarks/pieces.py",
+    )}  # fmt: skip
+    below = ["estimator", "duffing_env", "agents"]
+    assert list(names.values()) == [below[:1], below[:2], below, [*below, "benchmarks"]]
 
 
 def test_a_cached_kernel_follows_the_functions_it_calls(tmp_path, monkeypatch):

@@ -11,10 +11,6 @@ from hypothesis import strategies as st
 
 from estimator.straight import straight, straight_within
 
-# The first call compiles.
-settings.register_profile("compiled", deadline=None)
-settings.load_profile("compiled")
-
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
 
 
@@ -42,6 +38,7 @@ def choices(a, b):
 
 
 @pytest.mark.parametrize("function", [arithmetic, comparisons, choices], ids=lambda f: f.__name__)
+@settings(deadline=None)  # the first call compiles
 @given(a=NUMBERS, b=NUMBERS)
 def test_operations_are_those_of_python(function, a, b):
     with np.errstate(all="ignore"):
@@ -54,6 +51,7 @@ def elementary(a):
     return math.sqrt(a), np.sqrt(a), math.floor(a), math.exp(-a), math.log(a), math.log1p(a), 1.0 / a
 
 
+@settings(deadline=None)
 @given(a=st.floats(1e-6, 1e6))
 def test_elementary_functions_are_those_of_the_library(a):
     np.testing.assert_allclose(elementary(a), elementary.py_func(a), rtol=4e-16)
@@ -65,6 +63,7 @@ def whole_numbers(i, j):
     return i + j, i - j, i * j, half, odd, i << 3, i >> 1, i & j, i | j, i ^ j, -i, i < j, half * 0.5, i / 4
 
 
+@settings(deadline=None)
 @given(i=st.integers(0, 2**30), j=st.integers(-(2**30), 2**30))
 def test_whole_numbers_are_those_of_python(i, j):
     assert whole_numbers(i, j) == whole_numbers.py_func(i, j)
@@ -77,6 +76,7 @@ def bits(x):
     return word >> np.uint64(60), number >> np.int64(60), np.uint64(word).view(np.float64), word > np.uint64(2**63)
 
 
+@settings(deadline=None)
 @given(x=st.floats(allow_nan=False))
 def test_bits_are_those_of_numpy(x):
     same(bits(x), bits.py_func(x))
@@ -188,6 +188,66 @@ def powers(a, b):
     return a**b
 
 
+def chains(a):
+    b = c = a
+    return b + c
+
+
+def names_arguments(a):
+    return max(a, 1.0, key=abs)
+
+
+def returns_within(W):
+    for j in range(4):
+        return W[j]
+
+
+def never_turns(W):
+    for j in range(0):
+        W[j] = 0.0
+
+
+def starts_elsewhere(W):
+    for j in range(1, 4):
+        W[j] = 0.0
+
+
+def remembers(W):
+    for j in range(4):
+        b = W[j]
+        W[j] = 2.0 * b
+    W[0] = b
+
+
+@straight
+def total(W):
+    return W[0] + W[1]
+
+
+def loses(W):
+    W[0] = total(W)
+
+
+def counts_back(W):
+    W[-1] = 0.0
+
+
+def inverts(i):
+    return ~i
+
+
+def is_none(a):
+    return 1.0 if a is None else 0.0
+
+
+def asks(W):
+    W[0] = W.size
+
+
+def gives_too_much(a):
+    return swapped((a, a), (a, a), a)
+
+
 @pytest.mark.parametrize(
     ("function", "arguments", "said"),
     [
@@ -197,6 +257,18 @@ def powers(a, b):
         (indexes, (np.zeros(4), 1.0), "a whole number is needed in indexes, and not a float"),
         (forgets, (1.0,), "name 'nothing_of_this_name' is not defined in forgets"),
         (powers, (1.0, 2.0), "Pow of floats stands in powers"),
+        (chains, (1.0,), "'b = c = a' in chains stands in no straight function"),
+        (names_arguments, (1.0,), "in names_arguments gives arguments by name"),
+        (returns_within, (np.zeros(4),), "'range(4)' in returns_within is no plain loop over range(n)"),
+        (never_turns, (np.zeros(4),), "'range(0)' in never_turns must have a turn"),
+        (starts_elsewhere, (np.zeros(4),), "'range(1, 4)' in starts_elsewhere is no plain loop over range(n)"),
+        (remembers, (np.zeros(4),), "name 'b' is not defined in remembers; assign it before, and not in a loop"),
+        (loses, (np.zeros(4),), "loses calls total, which returns something; let it write into a block"),
+        (counts_back, (np.zeros(4),), "'W[-1]' in counts_back counts from the end"),
+        (inverts, (1,), "inverts changes a sign that is none"),
+        (is_none, (1.0,), "is_none compares by Is; use < <= > >= == or !="),
+        (asks, (np.zeros(4),), "'W.size' in asks asks a number or a block for an attribute"),
+        (gives_too_much, (1.0,), "swapped takes ['pair', 'more'], but is given 3 arguments; give all"),
         (scale_rows.py_func, (np.zeros((4, 4)), 1.0), "scale_rows needs flat, contiguous float64 arrays, but is given"),
         (scale_rows.py_func, (np.zeros(16, np.float32), 1.0), "scale_rows needs flat, contiguous float64 arrays"),
         (arithmetic.py_func, ("a", "b"), "arithmetic takes numbers, tuples of them and flat arrays, but is given"),
