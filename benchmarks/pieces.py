@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.experiment import SimulatedExperiment
-from duffing_env.layout import layout_of
+from duffing_env.layout import layout_of, noise_rows
 from duffing_env.noise import stream_words
 from duffing_env.sources import parts
 from duffing_env.stages import noise_drawer
@@ -38,20 +38,20 @@ _PLACE = layout_of(_EXPERIMENT.kind)
 
 @cache
 def plant_mover() -> Any:
-    """``move_all(blocks, inputs, noise)``: move the plants of all blocks by one sample, noise drawn within.
+    """``move_all(blocks, inputs)``: move the plants of all blocks by one sample, noise drawn within.
 
     Not cached on disk: the cache's stamp does not know the sources of duffing_env (see `estimator.lanes.kernel`).
     """
     draw_noise, plant, u = noise_drawer(_PLACE), parts(_EXPERIMENT.kind).plant, _PLACE["U_0"] * LANES
 
     @part(_EXPERIMENT.kind.name)
-    def move_all(blocks, inputs, noise):
+    def move_all(blocks, inputs):
         for b in range(len(blocks)):
             W = blocks[b]
             for j in range(LANES):
                 W[u + j] = inputs[b * LANES + j]
             draw_noise(W)
-            plant(W, noise, noise)
+            plant(W)
 
     return move_all
 
@@ -100,6 +100,7 @@ def plants(num_envs: int, factorisation: str = "structured") -> npt.NDArray[np.f
     coefficients = coefficients_of(experiment.plant, experiment.center, experiment.step)
     truth = {f"TRUE_{name}": value for name, value in zip(experiment.plant.coefficients, coefficients, strict=True)}
     truth |= {f"PARAM_{name}": value for name, value in experiment.center.items()}
+    truth |= dict.fromkeys(noise_rows(experiment.plant).values(), NOISE)
     for name, value in truth.items():
         blocks[:, place[name]] = value
     first = place["STREAM_a"]
@@ -117,7 +118,7 @@ def play(num_envs: int) -> Data:
     inputs = np.random.default_rng(1).uniform(-0.15, 0.15, (SAMPLES, len(blocks) * LANES))
     outputs = np.empty_like(inputs)
     for t in range(SAMPLES):
-        move_all(blocks, inputs[t], NOISE)
+        move_all(blocks, inputs[t])
         outputs[t] = blocks.reshape(len(blocks), -1, LANES)[:, _PLACE["Y_y"]].reshape(-1)
     return Data(inputs, outputs)
 
@@ -132,7 +133,7 @@ class PlantOnly:
 
     def step(self, t: int) -> None:
         """Move by the t-th sample."""
-        self._move(self._blocks, self._inputs[t % SAMPLES], NOISE)
+        self._move(self._blocks, self._inputs[t % SAMPLES])
 
 
 class EstimatorOnly:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from duffing_env.experiment import Experiment
 from duffing_env.kernel import RESET_NOW, compiled
-from duffing_env.layout import OUTCOME, layout_of, observation_bounds, pack, parameter_names
+from duffing_env.layout import OUTCOME, layout_of, noise_rows, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
 from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
@@ -42,7 +42,8 @@ class Batch:
         self._place = layout_of(self._kind)
         self._packed = pack(experiment.setup._replace(hold=hold))
         self._prior = experiment.believed
-        self._parameters = parameter_names(experiment.truth_model)
+        model, drawn = experiment.truth_model, experiment.setup.noise_range > 1
+        self._truth = {name: f"PARAM_{name}" for name in parameter_names(model)} | (noise_rows(model) if drawn else {})
         n_rows, n_observation = max(self._place.values()) + 1, len(observation_bounds(experiment.model))
         # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
         self._recorded = tuple(series.copy() for series in experiment.recorded)
@@ -129,9 +130,11 @@ class Batch:
         return self._prior.with_records(records)
 
     def truth(self) -> Parameters:
-        """The true plants, a batch of n; where a record is replayed, the twin of its circuit."""
-        values = {name: self.quantity(f"PARAM_{name}") for name in self._parameters}
-        return Parameters(values)
+        """The true plants, a batch of n; where a record is replayed, the twin of its circuit.
+
+        With the standard deviations of their noises, where those are drawn.
+        """
+        return Parameters({name: self.quantity(row) for name, row in self._truth.items()})
 
     def true_of(self, index: int) -> Parameters:
         """The true plant of environment ``index``."""
@@ -139,9 +142,9 @@ class Batch:
 
     def truths(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[Parameters]:
         """The true plants of some environments; ``final``: those of their last episodes, if reset since."""
-        first = self._place[f"PARAM_{self._parameters[0]}"]
-        rows = self._adjacent(indices, first, len(self._parameters), final=final).tolist()
-        return [Parameters(zip(self._parameters, values, strict=True)) for values in rows]
+        first = self._place[next(iter(self._truth.values()))]
+        rows = self._adjacent(indices, first, len(self._truth), final=final).tolist()
+        return [Parameters(zip(self._truth, values, strict=True)) for values in rows]
 
     def _adjacent(self, indices: npt.NDArray[np.intp], first: int, count: int, *, final: bool) -> FloatArray:
         """(k, count) adjacent rows of some environments, now or at the end of their last episodes; a copy."""

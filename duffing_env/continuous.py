@@ -2,10 +2,58 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 from duffing_env.env import DuffingEnv
-from duffing_env.experiment import ContinuousExperiment, Experiment
+from duffing_env.experiment import Experiment, SimulatedExperiment
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.models.model import Model
+
+
+@dataclass(frozen=True)
+class ContinuousExperiment(SimulatedExperiment):
+    """An experiment on the plant ``sde``, with a new oscillator in every episode.
+
+    The fields of `SimulatedExperiment` are the same, but for ``process_noise``: the standard deviation of what one
+    sample's process noise alone does to x [V]. Oscillators are drawn about `CONTINUOUS_TWIN`.
+
+    Attributes:
+        estimator: ``ode``, the plant's own equation, structured; or ``nlarx``, the paper's difference equation, which
+            no plant of this kind obeys.
+    """
+
+    estimator: str = "ode"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.estimator not in ["ode", "nlarx"]:
+            raise ValueError(f"estimator must be one of ['ode', 'nlarx'], but is {self.estimator!r}")
+        if self.reward == "fisher" and self.estimator != "ode":
+            raise ValueError(
+                "reward must not be 'fisher' for estimator='nlarx', whose equation the plant does not obey"
+            )
+        if self.estimator == "ode" and self.factorisation != "structured":
+            raise ValueError(
+                f"factorisation must be 'structured' for estimator='ode', but is {self.factorisation!r}; mean field "
+                f"is for estimator='nlarx'"
+            )
+
+    @property
+    def plant(self) -> Model:
+        """The differential equation."""
+        return duffing()
+
+    @property
+    def model(self) -> Model:
+        """The plant's equation, or the paper's."""
+        return self.plant if self.estimator == "ode" else difference()
+
+    @property
+    def degree(self) -> int:
+        """The input goes linearly from one action to the next."""
+        return 1
 
 
 class ContinuousEnv(DuffingEnv):
@@ -104,6 +152,8 @@ class ContinuousEnv(DuffingEnv):
     | ``process_noise`` | 5e-4 | standard deviation of what a sample's process noise alone does to x [V] |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
     | ``spread`` | 0.3 | half width of the parameters' range, relative |
+    | ``noise_range`` | 1 | both noises are drawn for every episode, as `DuffingEnv` |
+    | ``process_noise_guess``, ``measurement_noise_guess`` | None | as `DuffingEnv` |
     | ``noise_shape`` | 2 | shape of the Gamma priors of γ and ξ |
     | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |

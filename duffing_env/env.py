@@ -14,7 +14,6 @@ from duffing_env.batch import Batch
 from duffing_env.experiment import Experiment, SimulatedExperiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND
 from duffing_env.layout import SUMMED, observation_bounds
-from duffing_env.replay import ReplayExperiment
 from estimator.belief import Belief
 from estimator.models.model import Model
 from estimator.parameters import FloatArray, Parameters
@@ -97,6 +96,10 @@ class DuffingEnv(gym.Env[Any, Any]):
     1.1747, 3.7672 V⁻²). The oscillator is at rest. The posterior is the prior: Gaussian, with the mean and covariance
     of the coefficients of oscillators so drawn; γ and ξ are Gamma of shape 2 about the true noise precisions.
 
+    With ``noise_range`` above 1 each noise's standard deviation is drawn log-uniformly about ``process_noise`` and
+    ``measurement_noise``, over a range of that factor: 10 is a decade, from 1/√10 to √10 times. The prior is then about
+    the middle of the range, and ``truth`` has ``process_noise`` and ``measurement_noise``, too.
+
     ## Episode end
 
     - Termination: \|y\| > ``max_output`` (0.6 V); or a number that is not finite (``info["diverged"]``), which leaves
@@ -125,7 +128,10 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``process_noise`` | 5e-4 | standard deviation of w̃ [V] |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
     | ``spread`` | 0.3 | half width of the parameters' range, relative |
-    | ``noise_shape`` | 2 | shape of the Gamma priors of γ and ξ |
+    | ``noise_range`` | 1 | both noises are drawn for every episode; see below |
+    | ``process_noise_guess`` | None | where the prior of γ is centred [V]; None: at ``process_noise`` |
+    | ``measurement_noise_guess`` | None | where that of ξ is centred [V]; None: at ``measurement_noise`` |
+    | ``noise_shape`` | 2 | shape of these Gamma priors |
     | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
     | ``max_rms`` | None | largest RMS input over a whole episode [V]; see `PowerEnv` |
     | ``max_slew`` | None | largest change of the input between samples [V]; a larger one is cut |
@@ -282,65 +288,6 @@ class DuffingEnv(gym.Env[Any, Any]):
         if self._screen is not None:
             self._screen.close()
             self._screen = None
-
-
-class SilverboxReplayEnv(DuffingEnv):
-    r"""The paper's experiment: the recorded Silverbox input, sample by sample, through the environment.
-
-    ## Description
-
-    The record of the Silverbox circuit (Wigren and Schoukens 2013) takes the place of the plant. A record can only
-    answer the input that was applied: an action further than float32 rounding from the recorded input ends the
-    episode, flagged ``off_record``. Otherwise the recorded float64 input and output are what the estimator gets.
-    The reference policies ``silverbox-multisine`` and ``silverbox-arrow`` of `agents` play the record.
-
-    ## Action space, observation space, reward
-
-    As `DuffingEnv`. The true parameters of a circuit are not known: ``log_posterior``, ``parameter_error`` and
-    ``simulation_error`` are relative to its twin, identified from the whole training part.
-
-    ## Starting state
-
-    The first sample of the regime; the prior is the one named by ``prior``.
-
-    ## Episode end
-
-    - Termination: an action off the record; \|y\| > ``max_output``; a number that is not finite.
-    - Truncation: the end of the regime.
-
-    ## Information
-
-    As `DuffingEnv`, and ``off_record``.
-
-    ## Arguments
-
-    ``factorisation``, ``iterations``, ``reward``, ``terminal``, ``terminated_return``, ``max_input``, ``max_output``
-    and ``render_mode`` as `DuffingEnv`. There is no ``hold``: a record is answered sample by sample.
-
-    | Argument | Default | Meaning |
-    |----------|---------|---------|
-    | ``regime`` | ``multisine`` | the paper's training part, or ``arrow``, its validation part |
-    | ``prior`` | ``silverbox_twin`` | or ``published_run``, ``paper_text`` |
-    | ``input_delay`` | 1 | samples between an input and the output it acts on; the published run had 0 |
-    | ``nonlinear`` | True | whether the estimator's model has the cubic term |
-    | ``as_published`` | False | mean field with the two departures of the published run |
-    | ``data`` | None | file or folder of the record; searched for where None |
-
-    Raises:
-        duffing_env.silverbox.RecordNotFound: saying where to get the record and where to put it.
-
-    ## Version history
-
-    * v0: initial version
-    """
-
-    experiment_kind: ClassVar[type[Experiment]] = ReplayExperiment
-    _flags: ClassVar[tuple[str, ...]] = ("diverged", "off_record")
-
-    @property
-    def recorded_input(self) -> FloatArray:
-        """The inputs that the record can answer, in order [V]."""
-        return self.experiment.recorded[0]
 
 
 def _one_number(action: npt.ArrayLike) -> float:

@@ -30,16 +30,16 @@ def source(kind: Kind, loop: Any) -> str:
 
 
 def imagined_sample(
-    name: str, kind: Kind, loop: Any, at: Mapping[str, Any], told: Sequence[str] = (), keeps: bool = False
+    name: str, kind: Kind, loop: Any, at: Mapping[str, Any], given: Sequence[tuple[str, Any]] = (), keeps: bool = False
 ) -> str:
-    """Source of ``name(W, *told)``: outputs as expected; leaves ½ log det C - ½ log det C' in ``WORK`` [nats].
+    """Source of ``name(W)``: outputs as expected; leaves ½ log det C - ½ log det C' in ``WORK`` [nats].
 
     Args:
         name: of the function.
         kind: whose model is believed.
         loop: as `duffing_env.sources` makes it.
         at: quantity of the model to what stands in its place: another row, or an expression.
-        told: further arguments.
+        given: assignments that come first.
         keeps: whether the covariance afterwards is kept, in the rows of ``at``.
     """
     import sympy as sp
@@ -64,11 +64,10 @@ def imagined_sample(
     before, now, _, _ = log_det_and_density(model, tag="B")
     entries = {row: derive.symbol(results[row]) for row in covariances}
     after, then, _, _ = log_det_and_density(model, entries=entries, tag="A")
-    lines = derive.renamed([*lines, *more, *before, *after, ("GAINED", (log(now) - log(then)) / 2)], at)
+    lines = derive.renamed([*given, *lines, *more, *before, *after, ("GAINED", (log(now) - log(then)) / 2)], at)
     kept = {at[row]: str(derive.renamed([("", entries[row])], at)[0][1]) for row in covariances} if keeps else {}
-    text += loop(f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept, "WORK": "GAINED"}, *told)
-    arguments = ", ".join(["W", *told])
-    return text + f"@straight\ndef {name}({arguments}):\n{body}    {name}_finish({arguments})\n"
+    text += loop(f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept, "WORK": "GAINED"})
+    return text + f"@straight\ndef {name}(W):\n{body}    {name}_finish(W)\n"
 
 
 def hooks(kind: Kind, code: Any) -> Hooks:

@@ -17,7 +17,6 @@ from duffing_env.rewards import REWARDS, check_reward
 from estimator.belief import Belief
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
-from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
@@ -151,6 +150,7 @@ class Experiment:
             "iterations": self._iterations,
             "process_noise": 0.0,
             "measurement_noise": np.zeros(self.truth_model.n_outputs),
+            "noise_range": 1.0,
             "step": self.step,
             "center": np.array([self.center[name] for name in names]),
             "width": np.zeros(len(names)),
@@ -184,7 +184,11 @@ class SimulatedExperiment(Experiment):
         process_noise: standard deviation of the process noise w̃, on x [V].
         measurement_noise: standard deviation of the measurement noise v, on y [V].
         spread: m, c, a and b are drawn log-uniformly on the twin's value * [1 - spread, 1 + spread]; in (0, 1).
-        noise_shape: shape of the Gamma priors of γ and ξ, which are centred on the true precisions; 2 is weak.
+        noise_range: for every episode each of the two is drawn log-uniformly about these, over a range of this factor:
+            10 is a decade, from 1/√10 to √10 times. They are part of the truth then. 1: they are these.
+        process_noise_guess: standard deviation at which the prior of γ is centred [V]; ``process_noise`` where None.
+        measurement_noise_guess: the same of ξ; ``measurement_noise`` where None.
+        noise_shape: shape of the Gamma priors of γ and ξ; 2 is weak.
         plant_spread: as ``spread``, for the plant alone, whose range the prior then does not match: with 0 every
             oscillator is the twin itself. That of the prior where it is None.
         max_rms: the input's root mean square over a whole episode [V]: the energy horizon * max_rms² is a budget, and
@@ -201,6 +205,9 @@ class SimulatedExperiment(Experiment):
     process_noise: float = 5e-4
     measurement_noise: float = 5e-4
     spread: float = 0.3
+    noise_range: float = 1.0
+    process_noise_guess: float | None = None
+    measurement_noise_guess: float | None = None
     noise_shape: float = 2.0
     plant_spread: float | None = None
     max_rms: float | None = None
@@ -218,9 +225,13 @@ class SimulatedExperiment(Experiment):
             raise ValueError(f"spread must be below 1, but is {self.spread!r}; masses are positive")
         if self.plant_spread is not None and not (_is_number(self.plant_spread) and 0 <= self.plant_spread < 1):
             raise ValueError(f"plant_spread must be in [0, 1), but is {self.plant_spread!r}; 0 is the twin itself")
-        for name in ("max_rms", "max_slew"):
+        for name in ("max_rms", "max_slew", "process_noise_guess", "measurement_noise_guess"):
             if getattr(self, name) is not None:
                 self._check_positive(name)
+        if not (_is_number(self.noise_range) and 1 <= self.noise_range < np.inf):
+            raise ValueError(
+                f"noise_range must be 1 or more and finite, but is {self.noise_range!r}; 1 draws no noises"
+            )
         for name, limit in (("input_cost", np.inf), ("jump", 1.0), ("drift", np.inf)):
             value = getattr(self, name)
             if not (_is_number(value) and 0 <= value < limit):
@@ -246,8 +257,17 @@ class SimulatedExperiment(Experiment):
     def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
         """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
         mean, cov = log_uniform_moments(model, self.center, self.spread, self.step)
-        noises = self.process_noise, self.measurement_noise, self.noise_shape
+        noises = *self.noise_guesses, self.noise_shape
         return weak_prior(model, mean, cov, *noises, step=self.step).factorised(factorisation)
+
+    @property
+    def noise_guesses(self) -> tuple[float, float]:
+        """Standard deviations at which the priors of γ and of the first sensor's ξ are centred."""
+        process, sensor = self.process_noise_guess, self.measurement_noise_guess
+        return (
+            float(self.process_noise if process is None else process),
+            float(self.measurement_noise if sensor is None else sensor),
+        )
 
     @property
     def plant_setup(self) -> dict[str, Any]:
@@ -255,6 +275,7 @@ class SimulatedExperiment(Experiment):
         return {
             "process_noise": float(self.process_noise),
             "measurement_noise": np.full(self.plant.n_outputs, float(self.measurement_noise)),
+            "noise_range": float(self.noise_range),
             "spread": float(self.spread if self.plant_spread is None else self.plant_spread),
             "budget": np.inf if self.max_rms is None else self.horizon * self.max_rms * self.max_rms,
             "max_slew": np.inf if self.max_slew is None else float(self.max_slew),
@@ -263,50 +284,6 @@ class SimulatedExperiment(Experiment):
             "drifts": self.drift > 0,
             "walk": self.drift**2 * np.diag(self.believed.coefficients_cov),
         }
-
-
-@dataclass(frozen=True)
-class ContinuousExperiment(SimulatedExperiment):
-    """An experiment on the plant ``sde``, with a new oscillator in every episode.
-
-    The fields of `SimulatedExperiment` are the same, but for ``process_noise``: the standard deviation of what one
-    sample's process noise alone does to x [V]. Oscillators are drawn about `CONTINUOUS_TWIN`.
-
-    Attributes:
-        estimator: ``ode``, the plant's own equation, structured; or ``nlarx``, the paper's difference equation, which
-            no plant of this kind obeys.
-    """
-
-    estimator: str = "ode"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.estimator not in ["ode", "nlarx"]:
-            raise ValueError(f"estimator must be one of ['ode', 'nlarx'], but is {self.estimator!r}")
-        if self.reward == "fisher" and self.estimator != "ode":
-            raise ValueError(
-                "reward must not be 'fisher' for estimator='nlarx', whose equation the plant does not obey"
-            )
-        if self.estimator == "ode" and self.factorisation != "structured":
-            raise ValueError(
-                f"factorisation must be 'structured' for estimator='ode', but is {self.factorisation!r}; mean field "
-                f"is for estimator='nlarx'"
-            )
-
-    @property
-    def plant(self) -> Model:
-        """The differential equation."""
-        return duffing()
-
-    @property
-    def model(self) -> Model:
-        """The plant's equation, or the paper's."""
-        return self.plant if self.estimator == "ode" else difference()
-
-    @property
-    def degree(self) -> int:
-        """The input goes linearly from one action to the next."""
-        return 1
 
 
 def twin_of(model: Model) -> dict[str, float]:

@@ -10,18 +10,22 @@ from __future__ import annotations
 from typing import Any
 
 from duffing_env.expectation import imagined_sample
-from duffing_env.layout import Kind, layout_of
+from duffing_env.layout import Kind, layout_of, noise_rows
 from duffing_env.rewards import Hooks, nothing
 from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, part
 
 
 def source(kind: Kind, loop: Any) -> str:
-    """``ideal(W, Q, R_<sensor>...)``: an imagined sample at the truth."""
+    """``ideal(W)``: an imagined sample at the truth."""
+    from estimator.engine.derive import symbol
+
     model = kind.belief
     true = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
     true |= {name: f"I_{name}" for name in belief_names(model) if name.startswith("P_")}
-    return imagined_sample("ideal", kind, loop, true, ("Q", *(f"R_{y}" for y in model.outputs)), keeps=True)
+    names, stds = ["Q", *(f"R_{y}" for y in model.outputs)], noise_rows(kind.truth).values()
+    noises = [(name, symbol(std) ** 2) for name, std in zip(names, stds, strict=True)]
+    return imagined_sample("ideal", kind, loop, true, noises, keeps=True)
 
 
 def hooks(kind: Kind, code: Any) -> Hooks:
@@ -41,6 +45,6 @@ def hooks(kind: Kind, code: Any) -> Hooks:
 
     @part(kind.name)
     def before(W, setup):
-        ideal(W, setup.process_noise**2, setup.measurement_noise[0] ** 2)
+        ideal(W)
 
     return Hooks(begin, before, nothing, nothing)

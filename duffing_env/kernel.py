@@ -144,7 +144,7 @@ def compiled(kind: Kind) -> Kernel:
                 if is_worked:
                     before(W, setup)
                 if simulated:
-                    move(W, setup)
+                    move(W)
                 else:
                     last = len(recorded_y) - 1
                     for j in range(LANES):
@@ -239,7 +239,7 @@ def compiled(kind: Kind) -> Kernel:
 
 
 def _plant_of(kind: Kind, code: Any, draw_noise: Any) -> Any:
-    """``move(W, setup)``: the simulated plant over a sample with its noise, and its sensors. Noise has been drawn."""
+    """``move(W)``: the simulated plant over a sample with its noise, and its sensors. Noise has been drawn."""
     assert kind.plant is not None
     model, n_outputs = kind.plant, kind.plant.n_outputs
     if n_outputs > 3:
@@ -252,20 +252,20 @@ def _plant_of(kind: Kind, code: Any, draw_noise: Any) -> Any:
     continuous = model.is_continuous
 
     @part(kind.name)
-    def move(W, setup):
+    def move(W):
         if continuous:
             for s in range(steps):
-                plant(W, s / steps, setup.process_noise, length, root, root_3)
+                plant(W, s / steps, length, root, root_3)
                 if draws_each_step:
                     draw_noise(W)
-            sense_0(W, setup.measurement_noise[0])
+            sense_0(W)
         else:
-            plant(W, setup.measurement_noise[0], setup.process_noise)
+            plant(W)
         if n_outputs > 1:
             draw_noise(W)
-            sense_1(W, setup.measurement_noise[1])
+            sense_1(W)
         if n_outputs > 2:
             draw_noise(W)
-            sense_2(W, setup.measurement_noise[2])
+            sense_2(W)
 
     return move

@@ -73,6 +73,7 @@ class Setup(NamedTuple):
         iterations: variational iterations per sample.
         process_noise: standard deviation of what a sample's process noise does to the first sensor.
         measurement_noise: (sensors,) standard deviations.
+        noise_range: largest over smallest of what is drawn for an episode about each of them; 1 leaves them.
         step: sampling step [s].
         center: (p,) parameters in the middle of the range, or their means.
         width: (p,) standard deviations of those that are drawn from a Gaussian; 0 for the others.
@@ -101,6 +102,7 @@ class Setup(NamedTuple):
     iterations: int
     process_noise: float
     measurement_noise: npt.NDArray[np.float64]
+    noise_range: float
     step: float
     center: npt.NDArray[np.float64]
     width: npt.NDArray[np.float64]
@@ -174,6 +176,13 @@ def parameter_names(model: Model) -> tuple[str, ...]:
     return tuple(model.physical or model.coefficients)
 
 
+def noise_rows(model: Model) -> dict[str, str]:
+    """Name of a noise of the plant to the row of its standard deviation: the process noise, then each sensor's."""
+    one = model.n_outputs == 1
+    sensors = {"measurement_noise" if one else f"measurement_noise_{y}": f"SENSOR_STD_{y}" for y in model.outputs}
+    return {"process_noise": "PROCESS_STD", **sensors}
+
+
 @cache
 def layout_of(kind: Kind) -> Mapping[str, int]:
     """Name of a quantity to its row in a block of this kind."""
@@ -182,6 +191,7 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
     place = {name: row for row, name in enumerate(place)}
     wanted = [f"Y_{y}" for y in truth.outputs]
     wanted += [f"PARAM_{p}" for p in parameter_names(truth)]
+    wanted += noise_rows(truth).values()  # behind the parameters, see `stages.draw_plant`
     wanted += [f"X_{x}" for x in truth.states]
     wanted += [f"TRUE_{c}" for model in {truth: None, belief: None} for c in model.coefficients]
     wanted += ["STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d", "NOISE_w", "NOISE_v"]

@@ -110,7 +110,9 @@ class ModelExperiment(SimulatedExperiment):
         if self.std is None and model.n_outputs == 1:
             return super().prior_of(model, factorisation)
         moments = gaussian_moments(model, self.center, dict(self.std or {}), self.step)
-        return weak_prior(model, *moments, self.process_noise, self.noises, self.noise_shape, step=self.step)
+        process, first = self.noise_guesses
+        sensors = [first / self.measurement_noise * std for std in self.noises]  # all as far off as the first
+        return weak_prior(model, *moments, process, sensors, self.noise_shape, step=self.step)
 
     @property
     def plant_setup(self) -> dict[str, Any]:

@@ -1,14 +1,15 @@
-"""What is fixed about the recorded Silverbox experiment, where a record takes the place of the plant."""
+"""The recorded Silverbox experiment, where a record takes the place of the plant: `SilverboxReplayEnv`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
+from duffing_env.env import DuffingEnv
 from duffing_env.experiment import Experiment
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
 from estimator.belief import Belief
@@ -95,3 +96,62 @@ class ReplayExperiment(Experiment):
     def plant_setup(self) -> dict[str, Any]:
         """How the record is played, and how the estimator departs from the model."""
         return {"as_published": self.as_published, "delay": self.input_delay}
+
+
+class SilverboxReplayEnv(DuffingEnv):
+    r"""The paper's experiment: the recorded Silverbox input, sample by sample, through the environment.
+
+    ## Description
+
+    The record of the Silverbox circuit (Wigren and Schoukens 2013) takes the place of the plant. A record can only
+    answer the input that was applied: an action further than float32 rounding from the recorded input ends the
+    episode, flagged ``off_record``. Otherwise the recorded float64 input and output are what the estimator gets.
+    The reference policies ``silverbox-multisine`` and ``silverbox-arrow`` of `agents` play the record.
+
+    ## Action space, observation space, reward
+
+    As `DuffingEnv`. The true parameters of a circuit are not known: ``log_posterior``, ``parameter_error`` and
+    ``simulation_error`` are relative to its twin, identified from the whole training part.
+
+    ## Starting state
+
+    The first sample of the regime; the prior is the one named by ``prior``.
+
+    ## Episode end
+
+    - Termination: an action off the record; \|y\| > ``max_output``; a number that is not finite.
+    - Truncation: the end of the regime.
+
+    ## Information
+
+    As `DuffingEnv`, and ``off_record``.
+
+    ## Arguments
+
+    ``factorisation``, ``iterations``, ``reward``, ``terminal``, ``terminated_return``, ``max_input``, ``max_output``
+    and ``render_mode`` as `DuffingEnv`. There is no ``hold``: a record is answered sample by sample.
+
+    | Argument | Default | Meaning |
+    |----------|---------|---------|
+    | ``regime`` | ``multisine`` | the paper's training part, or ``arrow``, its validation part |
+    | ``prior`` | ``silverbox_twin`` | or ``published_run``, ``paper_text`` |
+    | ``input_delay`` | 1 | samples between an input and the output it acts on; the published run had 0 |
+    | ``nonlinear`` | True | whether the estimator's model has the cubic term |
+    | ``as_published`` | False | mean field with the two departures of the published run |
+    | ``data`` | None | file or folder of the record; searched for where None |
+
+    Raises:
+        duffing_env.silverbox.RecordNotFound: saying where to get the record and where to put it.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    experiment_kind: ClassVar[type[Experiment]] = ReplayExperiment
+    _flags: ClassVar[tuple[str, ...]] = ("diverged", "off_record")
+
+    @property
+    def recorded_input(self) -> FloatArray:
+        """The inputs that the record can answer, in order [V]."""
+        return self.experiment.recorded[0]

@@ -7,7 +7,7 @@ from functools import cache
 from itertools import combinations
 from typing import Any
 
-from duffing_env.layout import Kind, inputs_of, layout_of, observation_bounds, parameter_names
+from duffing_env.layout import Kind, inputs_of, layout_of, noise_rows, observation_bounds, parameter_names
 from duffing_env.rewards import REWARDS
 from estimator.engine import cache as stored
 from estimator.engine.rows import belief_names
@@ -25,9 +25,6 @@ def capped(ratio):
 
 
 _NAMES = {**NAMES, "capped": capped}
-
-#: What the plant of a difference equation is told.
-_NOISES = ("measurement_noise", "process_noise")
 
 #: Bounds of a determinant that has a logarithm: below, numbers lose digits.
 _SMALLEST, _LARGEST = 2.0**-1000, 2.0**1000
@@ -51,7 +48,8 @@ def _source(kind: Kind) -> str:
         return "@straight\n" + lane_loop(name, lines, results, place, LANES, uniform, doc=doc, one=one)
 
     def plant_loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
-        within = {**place, **inputs_of(kind, kind.truth, place)}
+        noises = {name: place[row] for name, row in noise_rows(kind.truth).items()}
+        within = {**place, **inputs_of(kind, kind.truth, place), **noises}
         return "@straight\n" + lane_loop(name, lines, results, within, LANES, uniform, doc=doc)
 
     source = _truth(kind, loop) + _judgement(kind, loop) + _observation(kind, loop)
@@ -84,7 +82,8 @@ def _plant(model: Model, degree: int, loop: Any) -> str:
     names = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
     lines, results = derive.state_step(model, degree, names)
     found, symbol = derive.calculus(model), derive.symbol
-    strength, w, v = symbol("process_noise"), symbol("NOISE_w"), symbol("NOISE_v")
+    noises = list(noise_rows(model))
+    strength, w, v = symbol(noises[0]), symbol("NOISE_w"), symbol("NOISE_v")
     after: dict[str, Any] = {}
     for a, x in enumerate(model.states):
         kick = strength * found.noise[a] * w
@@ -104,16 +103,16 @@ def _plant(model: Model, degree: int, loop: Any) -> str:
     end = derive.input_at_end(model, degree)
     source = ""
     for k, (y, shown) in enumerate(zip(model.outputs, found.outputs, strict=True)):
-        noise = (v, w)[k % 2] * symbol("measurement_noise")
+        noise = (v, w)[k % 2] * symbol(noises[1 + k])
         now = names if model.is_continuous or k else {**names, **after}
         value = derive.renamed([("", shown)], {**now, "u": end})[0][1] + noise
         if model.is_continuous or k:
-            source += loop(f"sense_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"}, "measurement_noise")
+            source += loop(f"sense_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"})
         else:
             lines.append(("SHOWN", value))
             results |= {f"Y_{y}": "SHOWN"}
-    first = ("T", "process_noise", "length", "root", "root_3") if model.is_continuous else _NOISES
-    return source + loop("plant", "The plant moves.", lines, results, *first)
+    told = ("T", "length", "root", "root_3") if model.is_continuous else ()
+    return source + loop("plant", "The plant moves.", lines, results, *told)
 
 
 def _truth(kind: Kind, loop: Any) -> str:

@@ -73,7 +73,7 @@ def draw_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
 
 @jit
 def draw_plant(W, j, setup, stream, drawn):
-    """The parameters of lane j's plant, each log-uniform about its centre, or from a Gaussian.
+    """The parameters of lane j's plant, each log-uniform about its centre, or from a Gaussian; then its noises.
 
     ``stream`` and ``drawn`` say where the first word of the stream and the first parameter stand.
     """
@@ -89,5 +89,12 @@ def draw_plant(W, j, setup, stream, drawn):
             W[drawn + p * LANES + j] = setup.center[p] + setup.width[p] * deviation
         else:
             W[drawn + p * LANES + j] = setup.center[p] * math.exp(low + width * to_unit(first))
+    noises, decades = drawn + len(setup.center) * LANES, math.log(setup.noise_range)
+    for k in range(1 + len(setup.measurement_noise)):
+        std = setup.process_noise if k == 0 else setup.measurement_noise[k - 1]
+        if setup.noise_range > 1.0:
+            first, a, b, c, d = draw(a, b, c, d)
+            std *= math.exp(decades * (to_unit(first) - 0.5))
+        W[noises + k * LANES + j] = std
     W[stream + j], W[stream + LANES + j] = as_bits(a), as_bits(b)
     W[stream + 2 * LANES + j], W[stream + 3 * LANES + j] = as_bits(c), as_bits(d)

@@ -69,7 +69,7 @@ TRACKS: dict[str, dict[str, Any]] = {
         },
     },
     "duffing_env/SilverboxReplay-v0": {
-        "entry_point": "duffing_env.env:SilverboxReplayEnv",
+        "entry_point": "duffing_env.replay:SilverboxReplayEnv",
         "vector_entry_point": "duffing_env.vector_env:SilverboxReplayVectorEnv",
         "kwargs": {"regime": "multisine"},
     },

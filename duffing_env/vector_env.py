@@ -15,10 +15,11 @@ from gymnasium.vector.utils import batch_space
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.continuous import ContinuousEnv
-from duffing_env.env import DuffingEnv, SilverboxReplayEnv, action_space, observation_space
+from duffing_env.env import DuffingEnv, action_space, observation_space
 from duffing_env.experiment import Experiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import OUTCOME
+from duffing_env.replay import SilverboxReplayEnv
 from estimator.belief import Belief
 from estimator.parameters import FloatArray, Parameters
 

@@ -58,8 +58,11 @@ class Task:
     def of(cls, envs: DuffingVectorEnv) -> Task:
         """The task of an environment; ValueError where its plant is none that is simulated and stays as it is."""
         e: Any = envs.experiment
-        if not isinstance(e, SimulatedExperiment) or e.jump or e.max_slew is not None:
-            raise ValueError(f"env must simulate a plant without jump and slew limit, but is {e}; choose another track")
+        if not isinstance(e, SimulatedExperiment) or e.jump or e.max_slew is not None or e.noise_range > 1:
+            raise ValueError(
+                f"env must simulate a plant without jump, slew limit and range of noises, but is {e}; choose another "
+                f"track"
+            )
         spread = e.spread if e.plant_spread is None else e.plant_spread
         limits = e.max_input, e.max_output, e.samples, e.process_noise, e.measurement_noise, e.spread, spread, e.max_rms
         plant = plant_of(e)

@@ -77,11 +77,11 @@ def evaluate(
     Learned policies act by their mean. With ``hold`` in the options, inputs, outputs and what is made of them are those
     of every sample; a stored oracle is that of the track without it. An episode that a limit ends is never dropped: it
     counts with what was known by then. Information at the truth, what other estimators make of the inputs and
-    outputs, and the arrow error need a simulated plant whose truth stays as it is; what is measured by free runs or
-    in samples of the Silverbox regime, the difference equation. The arrow error is that of the difference equation
-    identified on the track's twin (``plant_spread=0``) in a free run over the real arrow record; it is left out
-    without the record, and for the differential equation: the simulated plant has no offsets, and those of the
-    circuit, 8 mV at the input, would be nearly all of its error (5.3 mV for the twin itself).
+    outputs, and the arrow error need a simulated plant whose truth stays as it is, with noises that all systems share;
+    what is measured by free runs or in samples of the Silverbox regime, the difference equation. The arrow error is
+    that of the difference equation identified on the track's twin (``plant_spread=0``) in a free run over the real
+    arrow record; it is left out without the record, and for the differential equation: the simulated plant has no
+    offsets, and those of the circuit, 8 mV at the input, would be nearly all of its error (5.3 mV for the twin itself).
 
     Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the
     entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.
@@ -150,7 +150,7 @@ def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str
     evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
     if not isinstance(experiment, SimulatedExperiment):
         return evaluation
-    found, stays = evaluation.metrics, experiment.jump == 0
+    found, stays = evaluation.metrics, experiment.jump == 0 and experiment.noise_range == 1
     is_difference = experiment.plant == difference()
     if stays:
         gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)

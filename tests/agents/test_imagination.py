@@ -8,7 +8,8 @@ import pytest
 from agents.planner.design import Known, designer
 from agents.planner.imagination import Terms, mind
 from agents.planner.pursuit import pursuit
-from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment
+from duffing_env.continuous import ContinuousExperiment
+from duffing_env.experiment import SimulatedExperiment
 from estimator.belief import Belief
 from estimator.engine.imagination import LOST, imagination
 from estimator.lanes import LANES

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from twin import continuous_step, to_rates
 
-from duffing_env.experiment import ContinuousExperiment
+from duffing_env.continuous import ContinuousExperiment
 from duffing_env.kernel import _plant_of
 from duffing_env.layout import layout_of
 from duffing_env.sources import parts
@@ -44,9 +44,9 @@ def compiled(kind):
 
 def step(by_row, process_noise=0.0, measurement_noise=0.0, kind=KIND):
     draw_noise, move = compiled(kind)
-    noises = {"process_noise": process_noise, "measurement_noise": np.array([measurement_noise])}
+    by_row[PLACE["PROCESS_STD"]], by_row[PLACE["SENSOR_STD_y"]] = process_noise, measurement_noise
     draw_noise(by_row.reshape(-1))
-    move(by_row.reshape(-1), EXPERIMENT.setup._replace(**noises))
+    move(by_row.reshape(-1))
 
 
 def test_the_drift_is_eq_1_to_far_below_the_noise():

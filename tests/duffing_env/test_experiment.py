@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from duffing_env.experiment import ContinuousExperiment, SimulatedExperiment, make_experiment
+from duffing_env.continuous import ContinuousExperiment
+from duffing_env.experiment import SimulatedExperiment, make_experiment
 from duffing_env.layout import pack, unpacker
 from duffing_env.replay import ReplayExperiment
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN
@@ -25,6 +26,9 @@ BAD = [
     ("measurement_noise", [0, -1e-4, np.inf, np.nan, None]),
     ("spread", [0, -0.1, 1, 1.5, np.nan, None]),
     ("noise_shape", [0, -2, np.inf, np.nan]),
+    ("noise_range", [0, 0.5, -10, np.inf, np.nan, None, True, "10"]),
+    ("process_noise_guess", [0, -1e-4, np.inf, np.nan, True, "1e-4"]),
+    ("measurement_noise_guess", [0, -1e-4, np.inf, np.nan, True, "1e-4"]),
     ("plant_spread", [-0.1, 1, np.nan, "0.1", False]),
     ("hold", [0, -1, 2.0, True, None, "2"]),
     ("terminal", [0, 1, None, "yes"]),

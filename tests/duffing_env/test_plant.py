@@ -21,7 +21,9 @@ TRUE = dict(zip(COEFFICIENTS, to_coefficients(SILVERBOX_TWIN), strict=True))
 
 def move_plant(flat, process_noise, measurement_noise):
     """A sample of the plant, with the noise that stands in the block."""
-    parts(KIND).plant(flat, measurement_noise, process_noise)
+    for name, std in (("PROCESS_STD", process_noise), ("SENSOR_STD_y", measurement_noise)):
+        flat[PLACE[name] * LANES : (PLACE[name] + 1) * LANES] = std
+    parts(KIND).plant(flat)
 
 
 def block(**rows):

@@ -13,7 +13,7 @@ from rounding import U32
 from twin import ITERATIONS, Moments, difference_step, mean_field_update, structured_update
 
 from agents.policies import make_policy
-from duffing_env.env import SilverboxReplayEnv
+from duffing_env.replay import SilverboxReplayEnv
 from duffing_env.silverbox import RecordNotFound
 from duffing_env.vector_env import SilverboxReplayVectorEnv
 from estimator import SILVERBOX_TWIN

@@ -255,6 +255,9 @@ class TwinEnv:
         process_noise=5e-4,
         measurement_noise=5e-4,
         spread=0.3,
+        noise_range=1.0,
+        process_noise_guess=None,
+        measurement_noise_guess=None,
         max_rms=np.inf,
         max_slew=np.inf,
         input_cost=0.0,
@@ -267,9 +270,11 @@ class TwinEnv:
         self.process_noise, self.measurement_noise, self.spread = process_noise, measurement_noise, spread
         self.budget, self.max_slew, self.input_cost = horizon * max_rms**2, max_slew, input_cost
         self.jump, self.drift = jump, drift
+        self.noise_range, self.noise_centers = noise_range, (process_noise, measurement_noise)
         center = {name: getattr(self.center, name) for name in PARAMETERS}
         moments = log_uniform_moments(self.model, center, spread)
-        prior = weak_prior(self.model, *moments, process_noise, measurement_noise).factorised(factorisation)
+        guesses = process_noise_guess or process_noise, measurement_noise_guess or measurement_noise
+        prior = weak_prior(self.model, *moments, *guesses).factorised(factorisation)
         self.first_belief = Moments.of(prior)
 
     def reset(self):
@@ -278,6 +283,10 @@ class TwinEnv:
         factors = [low * (high / low) ** self.stream.uniform() for _ in PARAMETERS]
         drawn = [getattr(self.center, name) * f for name, f in zip(PARAMETERS, factors, strict=True)]
         self.truth = Parameters(zip(PARAMETERS, drawn, strict=True))
+        if self.noise_range > 1:
+            powers = [self.stream.uniform() - 0.5 for _ in self.noise_centers]
+            noises = [std * self.noise_range**p for std, p in zip(self.noise_centers, powers, strict=True)]
+            self.process_noise, self.measurement_noise = noises
         self.state = np.zeros(2)
         self.u = self.last_u = self.y = self.spent = 0.0
         self.elapsed = 0
@@ -476,6 +485,9 @@ def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
         np.testing.assert_allclose(observation, twin.reset(), **ROUNDED)
         for name in PARAMETERS:
             np.testing.assert_allclose(getattr(env.truth, name), getattr(twin.truth, name), rtol=1e-14)
+        if twin.noise_range > 1:
+            told = env.truth.process_noise, env.truth.measurement_noise
+            np.testing.assert_allclose(told, (twin.process_noise, twin.measurement_noise), rtol=1e-14)
         terminated = truncated = False
         while not (terminated or truncated):
             action = rng.uniform(-1.2, 1.2, 1).astype(np.float32)

@@ -1,0 +1,105 @@
+"""Noises that nobody knows: drawn for every episode, guessed wrong."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from twin import PARAMETERS, TwinContinuousEnv, TwinEnv, assert_env_follows_twin
+
+from duffing_env.batch import Batch, spawn_seeds
+from duffing_env.continuous import ContinuousEnv
+from duffing_env.env import DuffingEnv
+from duffing_env.experiment import SimulatedExperiment
+from duffing_env.kernel import RESET_BY_HAND
+from duffing_env.model_env import ModelEnv
+from duffing_env.tracks import TRACKS
+from duffing_env.vector_env import DuffingVectorEnv
+
+UNKNOWN = {"noise_range": 10.0, "process_noise_guess": 2e-4, "measurement_noise_guess": 1e-3, "horizon": 40}
+ENVS = {"difference": (DuffingEnv, TwinEnv), "continuous": (ContinuousEnv, TwinContinuousEnv)}
+
+
+def begun(size, **options):
+    """A batch at the begin of its episodes."""
+    batch = Batch(SimulatedExperiment(**options), size, RESET_BY_HAND)
+    for row, seed in enumerate(spawn_seeds(0, size)):
+        batch.seed(row, np.random.default_rng(seed))
+    batch.reset(np.ones(size, dtype=np.bool_))
+    return batch
+
+
+# --- Drawn for every episode ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reward", ["information_gain", "fisher"])
+@pytest.mark.parametrize("equation", ENVS)
+def test_an_environment_with_unknown_noises_follows_its_twin(equation, reward):
+    env, twin = ENVS[equation]
+    assert_env_follows_twin(env(reward=reward, **UNKNOWN), twin(0, **UNKNOWN), reward, 0)
+
+
+def test_noises_are_log_uniform_about_what_is_given_and_independent():
+    centers = {"process_noise": 2e-3, "measurement_noise": 1e-4}
+    batch = begun(4000, noise_range=100.0, **centers)
+    truth = batch.truth()
+    assert list(truth) == [*PARAMETERS, *centers]
+    powers = np.stack([np.log(truth[name] / centers[name]) / np.log(100.0) + 0.5 for name in centers])
+    assert powers.min() > 0
+    assert powers.max() < 1
+    for row in powers:
+        assert stats.kstest(row, "uniform").pvalue > 0.01
+    drawn = np.log(np.stack([truth[name] for name in truth]))
+    assert np.abs(np.corrcoef(drawn)[np.triu_indices(len(drawn), 1)]).max() < 4 / np.sqrt(4000)
+
+
+def test_they_change_nothing_else_of_the_plant_and_are_what_it_has():
+    loud, plain = begun(100, noise_range=10.0), begun(100)
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(loud.truth()[name], plain.truth()[name])
+    assert list(plain.truth()) == list(PARAMETERS)
+    np.testing.assert_array_equal(plain.quantity("PROCESS_STD"), 5e-4)
+    loud.step(np.zeros(100))  # from rest: the noise is all that moves it
+    x, truth = loud.quantity("X_x1"), loud.truth()
+    np.testing.assert_allclose(x, truth.process_noise * loud.quantity("NOISE_w"), rtol=1e-14)
+    shown = truth.measurement_noise * loud.quantity("NOISE_v")
+    np.testing.assert_allclose(loud.quantity("Y_y") - x, shown, rtol=0, atol=1e-17)
+
+
+def test_the_truth_tells_them_at_the_end_of_an_episode():
+    env = DuffingEnv(noise_range=10.0, horizon=3)
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, info = env.step([0.5])
+    assert info["truth"] == env.truth
+    assert list(info["truth"]) == [*PARAMETERS, "process_noise", "measurement_noise"]
+    envs = DuffingVectorEnv(2, autoreset_mode="SameStep", noise_range=10.0, horizon=3)
+    envs.reset(seed=[0, 1])
+    for _ in range(3):
+        *_, infos = envs.step(np.full((2, 1), 0.5, dtype=np.float32))
+    assert infos["final_info"]["truth"][0] == info["truth"]
+    assert envs.truth.process_noise[0] != info["truth"].process_noise
+
+
+def test_every_sensor_has_a_noise_of_its_own():
+    env = ModelEnv(**TRACKS["duffing_env/Pendulum-v0"]["kwargs"], noise_range=10.0)
+    env.reset(seed=0)
+    noises = dict(list(env.truth.items())[3:])
+    assert list(noises) == ["process_noise", "measurement_noise_angle", "measurement_noise_velocity"]
+    assert len(set(noises.values())) == 3
+
+
+# --- Guessed ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_prior_is_centred_at_the_guess():
+    experiment = SimulatedExperiment(process_noise_guess=2e-4, measurement_noise_guess=3e-3, noise_shape=4.0)
+    known = SimulatedExperiment(process_noise=2e-4, measurement_noise=3e-3, noise_shape=4.0)
+    assert experiment.believed == known.believed
+    assert experiment.setup.process_noise == 5e-4
+    assert experiment.setup.measurement_noise.tolist() == [5e-4]
+
+
+def test_the_guess_of_further_sensors_is_as_far_off_as_that_of_the_first():
+    told = TRACKS["duffing_env/Pendulum-v0"]["kwargs"]
+    env = ModelEnv(**told, sensor_noise=(4e-6,), measurement_noise_guess=3e-6)
+    stds = np.sqrt(env.belief.noises[1::2] / env.belief.noises[::2])
+    np.testing.assert_allclose(stds, [told["process_noise"], 3e-6, 12e-6], rtol=1e-12)
