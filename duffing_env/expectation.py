@@ -45,7 +45,7 @@ def imagined_sample(
     import sympy as sp
 
     from duffing_env.sources import log_det_and_density
-    from estimator.engine import algebra, derive
+    from estimator.engine import algebra, derive, sensitivity
 
     model, text, body = kind.belief, "", ""
     lines, motion = derive.moved(model)
@@ -55,7 +55,7 @@ def imagined_sample(
         text += loop(
             f"{name}_begin", "The point that moves.", derive.renamed(start, at), {row: f"V_{row}" for row in carried}
         )
-        step = derive.renamed(derive.motion_step(model, kind.degree), at)
+        step = derive.renamed(sensitivity.motion_step(model, kind.degree), at)
         text += loop(f"{name}_move", "One Runge-Kutta step.", step, {row: f"{row}_E" for row in carried}, "T")
         steps = model.substeps
         body = f"    {name}_begin(W)\n    for s in range({steps}):\n        {name}_move(W, s / {steps})\n"

@@ -187,34 +187,6 @@ def moved(model: Model) -> tuple[Assignments, Moved]:
     return ([], carried_at_end(model)) if model.is_continuous else difference_step(model)
 
 
-@cache
-def _stage(model: Model) -> Assignments:
-    """``K_<name>``, the time derivative of everything that is carried, at the carried values and the input u."""
-    c, states = calculus(model), list(model.states)
-    at = {symbol(i): symbol(f"M_{i}") for i in states}
-    n = len(states)
-    named = {f"K_M_{i}": move.xreplace(at) for i, move in zip(states, c.moves, strict=True)}
-    slopes = [[slope.xreplace(at) for slope in row] for row in c.by]
-    for a, i in enumerate(states):
-        for b, j in enumerate(model.movers):
-            through = sum(slopes[a][k] * symbol(f"S_{states[k]}_{j}") for k in range(n))
-            named[f"K_S_{i}_{j}"] = through + (slopes[a][b] if b >= n else 0)
-    noise = [e.xreplace(at) for e in c.noise]
-    if model.held:
-        for a, i in enumerate(states):
-            named[f"K_D_{i}"] = sum(slopes[a][k] * symbol(f"D_{states[k]}") for k in range(n)) + noise[a]
-    else:
-        for a in range(n):
-            for b in range(a, n):
-                spread = sum(
-                    slopes[a][k] * pair("N", states[k], states[b], states)
-                    + slopes[b][k] * pair("N", states[k], states[a], states)
-                    for k in range(n)
-                )
-                named[f"K_N_{states[a]}_{states[b]}"] = spread + noise[a] * noise[b]
-    return shared(named, "W")
-
-
 def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assignments:
     """One step of order 4, of a ``substeps``-th of a sample: from ``names`` to ``<name>_E``.
 
@@ -264,11 +236,6 @@ def input_over_step(degree: int, substeps: int) -> Assignments:
             value = symbol(f"U_{k}") + symbol(f"T_{tag}") * value
         lines.append((f"V_{tag}", value))
     return lines
-
-
-def motion_step(model: Model, degree: int) -> Assignments:
-    """One Runge-Kutta step of the state with its sensitivities and noise."""
-    return input_over_step(degree, model.substeps) + runge_kutta(carried(model), _stage(model), model.substeps)
 
 
 def plain_stage(model: Model) -> Assignments:

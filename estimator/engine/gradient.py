@@ -84,11 +84,11 @@ def _source(model: Model, degree: int) -> str:
 
 def _motion(model: Model, degree: int, carried: list[str], path_rows: list[str]) -> str:
     """Source of what carries a differential equation over a sample, and of its reverse."""
-    from estimator.engine import derive, emit
+    from estimator.engine import derive, emit, sensitivity
 
     held = {"M": carried, "C": list(model.coefficients), "U": input_rows(model, degree)}
     start = [emit.text_of(value) for value in derive.carried_at_start(model).values()]
-    step, moves = derive.motion_step(model, degree), {name: f"{name}_E" for name in carried}
+    step, moves = sensitivity.motion_step(model, degree), {name: f"{name}_E" for name in carried}
     source = "@straight\n" + emit.scalar_function("start", [], [start], {"P": path_rows}, doc="The point that moves.")
     source += "@straight\n" + emit.scalar_function(
         "move", step, [list(moves.values())], held, ("T",), "A Runge-Kutta step."

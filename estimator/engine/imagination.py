@@ -101,7 +101,7 @@ def fed(model: Model, degree: int, lag: int) -> dict[str, Any]:
 
 
 def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mapping[str, int]) -> str:
-    from estimator.engine import algebra, derive, emit
+    from estimator.engine import algebra, derive, emit, sensitivity
 
     symbol, coefficients = derive.symbol, list(model.coefficients)
     given = fed(model, degree, lag)
@@ -121,7 +121,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
         source += "@straight\n" + emit.lane_loop(
             "begin", [], start, place, LANES, doc="The point that moves, at the mean."
         )
-        step = derive.renamed(derive.motion_step(model, degree), given)
+        step = derive.renamed(sensitivity.motion_step(model, degree), given)
         moves = {name: f"{name}_E" for name in derive.carried(model)}
         source += "@straight\n" + emit.lane_loop(
             "move", step, moves, place, LANES, ("T", *coefficients), doc="One step."

@@ -98,7 +98,7 @@ def _source(model: Model, degree: int, lag: int, place: Mapping[str, int]) -> st
 
 def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     """``glance`` and ``step``."""
-    from estimator.engine import derive, emit
+    from estimator.engine import derive, emit, sensitivity
 
     found, symbol, states = derive.calculus(model), derive.symbol, list(model.states)
     inputs = inputs_of(model, degree, lag)
@@ -107,7 +107,7 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
         start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
         source += loop("begin", "The point that moves.", [], start)
         carried = {name: f"{name}_E" for name in derive.carried(model)}
-        source += loop("move", "One Runge-Kutta step.", derive.motion_step(model, degree), carried, "T")
+        source += loop("move", "One Runge-Kutta step.", sensitivity.motion_step(model, degree), carried, "T")
         point = {f"M_{x}": f"M_{x}_E" for x in states}
         source += loop("move_plainly", "The same of the state alone.", derive.plain_step(model, degree), point, "T")
     at = dict(zip(map(symbol, states), moved.state, strict=True)) | {symbol("u"): derive.input_at_end(model, degree)}

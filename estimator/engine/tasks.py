@@ -135,7 +135,7 @@ def _structured(
 
 def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
     """Source of ``spread(W)``, and of ``update(W)`` that takes all points through the sample."""
-    from estimator.engine import derive, emit, points
+    from estimator.engine import derive, emit, points, sensitivity
 
     names = points.order(model)
     by_point: dict[str, int | str] = dict(place)
@@ -154,7 +154,7 @@ def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
     noise = [name for name in derive.carried(model) if name[0] != "S"]
     start = {i: emit.text_of(value) for i, value in derive.carried_at_start(model).items() if i in noise}
     source += loop("begin", [], start, (), "The mean, and its process noise.")
-    step = derive.motion_step(model, degree)
+    step = sensitivity.motion_step(model, degree)
     source += loop("drift", step, {i: f"{i}_E" for i in noise}, ("T",), "One Runge-Kutta step of mean and noise.")
     source += loop("place", *points.point(model), ("C", "SIGN"), "A point at the begin of the sample.")
     step, moved = points.point_step(model, degree), {f"M_{i}": f"M_{i}_E" for i in model.states}
@@ -175,14 +175,14 @@ def _looped(model: Model, before: str, body: str) -> str:
 
 def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
     """Source of ``begin(W)`` and ``move(W, T)``, which carry a state over a sample; empty for a difference equation."""
-    from estimator.engine import derive, emit
+    from estimator.engine import derive, emit, sensitivity
 
     if not model.is_continuous:
         return ""
     start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
     moved = {name: f"{name}_E" for name in derive.carried(model)}
     source = "@straight\n" + emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
-    step = derive.motion_step(model, degree)
+    step = sensitivity.motion_step(model, degree)
     return source + "@straight\n" + emit.lane_loop(
         "move", step, moved, place, lanes, ("T",), doc="One Runge-Kutta step, from T in [0, 1) of a sample on."
     )  # fmt: skip
