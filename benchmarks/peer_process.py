@@ -1,14 +1,16 @@
-"""The peers' own environment, and the process in it that runs their rows (`benchmarks.peers`)."""
+"""Processes that run rows for the benchmark, and the peers' own environment, in which one of them is."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from benchmarks.timing import Row
 
@@ -56,27 +58,25 @@ def _last_line(text: str) -> str:
     return lines[-1] if lines else "no reason given"
 
 
-class Peers:
-    """The child process that runs the peers' rows, one request at a time. A context manager.
+class Child:
+    """A process that runs rows, one request at a time: see `benchmarks.peers` for what it is asked. A context manager.
 
     Args:
-        samples: file with the samples and the prior of the estimators' rows, see `benchmarks.estimators`.
-        wanted: whether there are to be peers at all; without them every row is reported as not available.
+        command: that starts it.
+        cwd: where it runs; None for here.
+        settings: of its environment, besides those of this process.
     """
 
-    def __init__(self, samples: Path, wanted: bool = True) -> None:
-        self._samples = samples
+    def __init__(
+        self, command: Sequence[str | Path] = (), cwd: Path | None = None, settings: Mapping[str, str] | None = None
+    ) -> None:
+        self._command, self._cwd = list(command), cwd
+        self._settings = {**os.environ, **(settings or {})}
         self._process: subprocess.Popen[str] | None = None
-        self._reason = "" if wanted else "--no-peers"
-        self._python = Path()
+        self._reason = ""
         self.answers: dict[str, dict[str, Any]] = {}
-        if wanted:
-            try:
-                self._python = ensure_environment()
-            except (NotAvailable, OSError) as error:
-                self._reason = str(error)
 
-    def __enter__(self) -> Peers:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -97,7 +97,7 @@ class Peers:
         return process.returncode
 
     def row(self, name: str, title: str, unit: str) -> Row:
-        """The row ``name`` of `benchmarks.peers`, under a title of ours."""
+        """The row that the process knows by ``name``, under a title of ours."""
 
         def run(count: int) -> tuple[float, float]:
             answer = self.ask(name, count)
@@ -106,24 +106,19 @@ class Peers:
 
         return Row(title, unit, run)
 
-    def versions(self) -> dict[str, str]:
-        """Versions of the peers' packages; empty without peers."""
-        try:
-            return self.ask("versions", 0)
-        except NotAvailable:
-            return {}
-
     def ask(self, name: str, count: int) -> dict[str, Any]:
         """Send a request and wait for its answer.
 
         Raises:
-            NotAvailable: if there are no peers, the row raised, or its process died. A dead one is started anew
+            NotAvailable: if there is no such process, the row raised, or its process died. A dead one is started anew
                 for the next request.
         """
         if self._reason:
             raise NotAvailable(self._reason)
         process = self._process = self._process or subprocess.Popen(
-            [self._python, "-I", Path(__file__).with_name("peers.py"), self._samples],
+            self._command,
+            cwd=self._cwd,
+            env=self._settings,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -137,8 +132,33 @@ class Peers:
         except BrokenPipeError:
             line = ""
         if not line:
-            raise NotAvailable(f"the peers' process ended with status {self._stop()}; it is started anew")
+            raise NotAvailable(f"the process ended with status {self._stop()}; it is started anew")
         answer: dict[str, Any] = json.loads(line)
         if "error" in answer:
             raise NotAvailable(answer["error"])
         return answer
+
+
+class Peers(Child):
+    """The process of the peers.
+
+    Args:
+        samples: file with the samples and the prior of the estimators' rows, see `benchmarks.estimators`.
+        wanted: whether there are to be peers at all; without them every row is reported as not available.
+    """
+
+    def __init__(self, samples: Path, wanted: bool = True) -> None:
+        super().__init__()
+        self._reason = "" if wanted else "--no-peers"
+        if wanted:
+            try:
+                self._command = [ensure_environment(), "-I", Path(__file__).with_name("peers.py"), samples]
+            except (NotAvailable, OSError) as error:
+                self._reason = str(error)
+
+    def versions(self) -> dict[str, str]:
+        """Versions of the peers' packages; empty without peers."""
+        try:
+            return self.ask("versions", 0)
+        except NotAvailable:
+            return {}
