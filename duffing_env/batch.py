@@ -11,6 +11,7 @@ from duffing_env.experiment import Experiment
 from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, noise_rows, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
+from duffing_env.recycling import Recycled
 from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, Parameters
@@ -27,9 +28,9 @@ class Batch:
         hold: samples that a step plays, at most: an environment stops where its episode ends.
 
     Attributes:
-        observations: (n, entries) float32, overwritten by every step.
-        final_observations: the same, for what was reset within the step.
-        outcomes: (len(OUTCOME), n), overwritten by every step.
+        observations: (n, entries) float32, overwritten by every step, unless `renew` is called before.
+        final_observations: the same, for what was reset within the step; always overwritten.
+        outcomes: (len(OUTCOME), n), as the observations.
     """
 
     def __init__(self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1, hold: int = 1) -> None:
@@ -55,11 +56,10 @@ class Batch:
         self._flat_ended = self._ended.reshape(n_blocks, -1)
         self._saved = np.zeros((threads, 2 * n_rows * LANES))
         self._actions = np.zeros(padded, dtype=np.float32)
-        self._observations = np.zeros((padded, n_observation), dtype=np.float32)
+        self._all_observations = Recycled((padded, n_observation), np.float32)
+        self._all_outcomes = Recycled((len(OUTCOME), padded), np.float64)
+        self.renew()
         self._final_observations = np.zeros_like(self._observations)
-        self._outcomes = np.zeros((len(OUTCOME), padded))
-        self.outcomes = self._outcomes[:, :size]
-        self.observations = self._observations[:size]
         self.final_observations = self._final_observations[:size]
         # Lanes beyond the last environment do the same work as the others, so that none of them runs wild.
         self._mask = np.ones(padded, dtype=np.bool_)
@@ -79,6 +79,18 @@ class Batch:
 
     def _reset(self) -> None:
         self._call(RESET_NOW)
+
+    def renew(self, *, observations: bool = True) -> None:
+        """Keep the arrays of the last step as they are, for as long as anybody holds them: the next gets others.
+
+        Args:
+            observations: whether those of the observations too, and not only those of the outcomes.
+        """
+        self._outcomes = self._all_outcomes.take()
+        self.outcomes = self._outcomes[:, : self.size]
+        if observations:
+            self._observations = self._all_observations.take()
+            self.observations = self._observations[: self.size]
 
     def step(self, actions: npt.ArrayLike) -> None:
         """Apply actions (n,) for a step: in parts of the largest input, clipped to [-1, 1], in float32's range."""

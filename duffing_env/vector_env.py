@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -29,9 +30,9 @@ _RESET_MODES = {
     AutoresetMode.SAME_STEP: RESET_SAME_STEP,
 }
 
-#: Name of what a step leaves to its place in a batch's outcomes.
+#: Name of what a step leaves to its place in a batch's outcomes; the flags are the last of them.
 _PLACES = {name.lower(): place for place, name in enumerate(OUTCOME)}
-_TERMINATED, _TRUNCATED = _PLACES["terminated"], _PLACES["truncated"]
+_FIRST_FLAG = _PLACES["terminated"]
 
 Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -50,7 +51,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         autoreset_mode: when a finished row starts its next episode: in the step after (``NEXT_STEP``, the default),
             in the same step (``SAME_STEP``: ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended
             with), or by ``reset(options={"reset_mask": mask})`` (``DISABLED``).
-        copy: give out copies of the observations; without it they are overwritten by the next step.
+        copy: give out observations that stay as they are; without it the next step overwrites them.
         threads: threads that step the rows, at most Numba's; results do not depend on it.
         render_mode: None; render a single environment to look at one.
         options: those of the single environment.
@@ -152,11 +153,12 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         """
         mask = self._reset_mask(options)
         self._seed(seed, mask)
+        self._batch.renew(observations=self._copy)
         self._batch.reset(mask)
         self._finished[mask] = False
         due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
         self._any_due = bool(due.any())
-        return self._observations(), {}
+        return self._batch.observations, {}
 
     def step(
         self, actions: npt.NDArray[np.float32]
@@ -170,28 +172,28 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         actions = np.asarray(actions)
         if actions.shape != (self.num_envs, 1):
             raise ValueError(f"actions must have shape {(self.num_envs, 1)}, but have {actions.shape}; one per row")
-        if not np.isfinite(actions.sum()) and not np.isfinite(actions).all():
+        given = actions[:, 0]
+        if not math.isfinite(given.sum()) and not np.isfinite(given).all():
             row = int(np.argmin(np.isfinite(actions)))
             raise ValueError(f"actions must be finite, but row {row} is {actions[row, 0]}; pass values in [-1, 1]")
-        if actions.dtype != np.float32:
-            actions = np.clip(actions, -1.0, 1.0)
+        if given.dtype != np.float32:
+            given = np.clip(given, -1.0, 1.0)
         if self._any_due:
             due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
             rows = np.flatnonzero(due).tolist()
             raise ResetNeeded(f"rows {rows} have finished or not begun: reset them with options={{'reset_mask': mask}}")
-        self._batch.step(actions[:, 0])
-        outcomes = self._batch.outcomes.copy()
-        flags = outcomes != 0.0
-        terminated, truncated = flags[_TERMINATED], flags[_TRUNCATED]
+        self._batch.renew(observations=self._copy)
+        self._batch.step(given)
+        outcomes = self._batch.outcomes
+        flags = outcomes[_FIRST_FLAG:] != 0.0
+        terminated, truncated = flags[0], flags[1]
         finished = terminated | truncated
-        infos = self._infos(outcomes, flags, was_finished=self._finished, finished=finished)
+        any_finished = bool(np.count_nonzero(finished))
+        infos = self._infos(outcomes, flags, self._finished, finished if any_finished else None)
         self._finished = finished
         if self._autoreset_mode == AutoresetMode.DISABLED:
-            self._any_due = bool(finished.any())
-        return self._observations(), outcomes[0], terminated, truncated, infos
-
-    def _observations(self) -> Observations:
-        return self._batch.observations.copy() if self._copy else self._batch.observations
+            self._any_due = any_finished
+        return self._batch.observations, outcomes[0], terminated, truncated, infos
 
     def _reset_mask(self, options: dict[str, Any] | None) -> Flags:
         if not options or "reset_mask" not in options:
@@ -222,12 +224,12 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         self._seeded |= mask
 
     def _infos(
-        self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], was_finished: Flags, finished: Flags
+        self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], was_finished: Flags, finished: Flags | None
     ) -> dict[str, Any]:
-        """What is told of a step, by the rows that had finished before it and those that finished in it."""
+        """What is told of a step, by the rows that had finished before it and those that finished in it, if any."""
         told = ~was_finished if self._autoreset_mode == AutoresetMode.NEXT_STEP else self._everywhere
         infos = self._step_infos(outcomes, flags, told)
-        if not finished.any():
+        if finished is None:
             return infos
         if self._autoreset_mode != AutoresetMode.SAME_STEP:
             return infos | self._endings(finished)
@@ -248,10 +250,10 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
 
     def _step_infos(self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], mask: Flags) -> dict[str, Any]:
         infos: dict[str, Any] = {}
-        for names, values in ((self.single._reported, outcomes), (self.single._flags, flags)):
-            for name in names:
-                infos[name] = values[_PLACES[name]]
-                infos[f"_{name}"] = mask.copy()
+        for name in self.single._reported:
+            infos[name], infos[f"_{name}"] = outcomes[_PLACES[name]], mask.copy()
+        for name in self.single._flags:
+            infos[name], infos[f"_{name}"] = flags[_PLACES[name] - _FIRST_FLAG], mask.copy()
         return infos
 
     def _endings(self, finished: Flags) -> dict[str, Any]:
@@ -260,8 +262,8 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
         rows = np.flatnonzero(finished)
         beliefs[rows] = self._batch.beliefs(rows, final=same_step)
-        for row, truth in zip(rows, self._batch.truths(rows, final=same_step), strict=True):
-            truths[row] = truth  # one by one: NumPy would take what has a length for a row of its own
+        # One by one: NumPy would take what has a length for a row of its own.
+        truths[rows] = np.fromiter(self._batch.truths(rows, final=same_step), dtype=object, count=len(rows))
         return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}
 
 

@@ -141,7 +141,8 @@ class Belief:
         for record in records:
             # Past the checks, which take as long as 20 steps of one of a thousand environments.
             belief = object.__new__(type(self))
-            belief.__dict__.update(self.__dict__, record=record)
+            belief.__dict__.update(self.__dict__)
+            belief.__dict__["record"] = record
             beliefs.append(belief)
         return beliefs
 

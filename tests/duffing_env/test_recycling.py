@@ -1,0 +1,40 @@
+"""Arrays that are given out again are those that nobody holds."""
+
+import copy
+
+import numpy as np
+
+from duffing_env.recycling import Recycled
+
+
+def test_what_is_held_is_not_given_out_again() -> None:
+    arrays = Recycled((3, 2), np.float32)
+    held = [arrays.take() for _ in range(2 * Recycled.MOST)]
+    assert len({id(array) for array in held}) == len(held)
+
+
+def test_a_view_holds_its_array() -> None:
+    arrays = Recycled((3, 2), np.float64)
+    view = arrays.take()[1:, 0]
+    view[:] = 7.0
+    for _ in range(2 * Recycled.MOST):
+        arrays.take()[:] = 0.0
+    np.testing.assert_array_equal(view, 7.0)
+
+
+def test_what_nobody_holds_is_given_out_again() -> None:
+    arrays = Recycled((3, 2), np.float64)
+    places, held = set(), None
+    for _ in range(20):
+        held = arrays.take()
+        places.add(held.ctypes.data)
+    assert held is not None
+    assert len(places) == 2
+
+
+def test_a_copy_gives_out_arrays_of_its_own() -> None:
+    arrays = Recycled((3, 2), np.float64)
+    other = copy.deepcopy(arrays)
+    ours, theirs = arrays.take(), other.take()
+    assert not np.shares_memory(ours, theirs)
+    assert not np.shares_memory(theirs, other.take())
