@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.leaderboard import print_estimators, print_table, write_json
+from agents.evaluation.leaderboard import print_estimators, print_table, write_evaluations
 from agents.evaluation.rollout import Evaluation, evaluate
 
 
@@ -33,7 +33,7 @@ def compare(
     print_table(evaluations, title)
     print_estimators(evaluations)
     settings = {"env": env_id, "systems": systems, "seed": seed, "options": options}
-    write_json(folder / "evaluation.json", evaluations, settings)
+    write_evaluations(folder / "evaluation.json", evaluations, settings)
     written = ["evaluation.json"]
     if report:
         from agents.evaluation.report import write_report
@@ -41,10 +41,10 @@ def compare(
         write_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
         written += ["report.html"]
     else:
-        from agents.evaluation.figures import draw_contraction, draw_excitations
+        from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, save
 
-        draw_contraction(folder / "contraction.png", evaluations, title)
-        draw_excitations(folder / "excitations.png", evaluations)
+        save(figure_of_contraction(evaluations, title), folder / "contraction.png")
+        save(figure_of_inputs(evaluations), folder / "excitations.png")
         written += ["contraction.png", "excitations.png"]
     for name in written:
         print(folder / name)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +13,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from agents.evaluation.rollout import Evaluation
-from estimator.files import write_atomically
+from agents.results import write_json
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -72,6 +71,7 @@ METRICS = {
     "efficiency": Metric("D-efficiency / %", 1, 100),
     # Infinite where the whole regime tells less, so only a median says something of many.
     "silverbox_equivalent": Metric("Silverbox equivalent / samples", 0, 1.0, MEDIAN, MEDIAN),
+    "full_peak_equivalent": Metric("the same at full peak / samples", 0, 1.0, MEDIAN, MEDIAN),
     "simulation_rmse": Metric("RMSE on the twin's arrow / mV", 3, 1e3, MEDIAN),
     "arrow_rmse": Metric("RMSE on the real arrow / mV", 2, 1e3, MEDIAN),
 }
@@ -122,28 +122,19 @@ def center_and_interval(values: FloatArray, metric: Metric, seed: int = 0) -> di
     return entry
 
 
-def write_json(path: Path, evaluations: list[Evaluation], settings: dict[str, Any]) -> None:
-    """Write summaries and the settings that they were made with; a number that is not finite, as null."""
+def write_evaluations(path: Path, evaluations: list[Evaluation], settings: dict[str, Any]) -> None:
+    """Write summaries and the settings that they were made with."""
     results = {
         evaluation.policy: {
-            **finite(summarise(evaluation)),
+            **summarise(evaluation),
             "estimators": {
-                estimator: finite(summarise(replace(evaluation, metrics=values)))
+                estimator: summarise(replace(evaluation, metrics=values))
                 for estimator, values in evaluation.estimators.items()
             },
         }
         for evaluation in evaluations
     }
-    write_atomically(path, json.dumps({"settings": settings, "policies": results}, indent=2, allow_nan=False))
-
-
-def finite(summary: Any) -> Any:
-    """What JSON can hold: a number that is not finite becomes null."""
-    if isinstance(summary, dict):
-        return {key: finite(value) for key, value in summary.items()}
-    if isinstance(summary, list):
-        return [finite(value) for value in summary]
-    return None if isinstance(summary, float) and not np.isfinite(summary) else summary
+    write_json(path, {"settings": settings, "policies": results})
 
 
 def print_table(evaluations: list[Evaluation], title: str) -> None:

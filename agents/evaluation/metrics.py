@@ -24,6 +24,9 @@ LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}
 
 _TWIN_ARROW_SAMPLES = 8_192
 
+#: Lengths of the stretches of the Silverbox regime that inputs are compared with.
+_LENGTHS = np.unique(np.round(2 ** np.arange(4, 15.6, 0.5)).astype(int))
+
 
 def estimate_metrics(
     means: FloatArray, covs: FloatArray, truth: Any, model: Model, step: float
@@ -98,41 +101,41 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatAr
     return oracle.efficiency(evaluation.inputs.T[:n], evaluation.outputs.T[:n])
 
 
-def silverbox_equivalents(gains: FloatArray, truth: Any, experiment: Any, seed: int) -> FloatArray:
-    """(n,) samples of the Silverbox multisine regime that tell as much as ``gains`` (n,) of `information`.
-
-    Each system is given a stretch of the regime as recorded, at its own power (`regime_information`). Interpolated
-    between powers of √2; inf where even the longest stretch, 46,340 samples, tells less.
-    """
-    return equal_information(gains, *regime_information(truth, experiment, seed))
-
-
-def regime_information(
-    truth: Any, experiment: Any, seed: int, scale: float = 1.0, longest: float = 15.5
-) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    """What stretches of the Silverbox multisine regime, times ``scale``, tell of each system.
+def regime_information(truth: Any, experiment: Any, seed: int, scale: float = 1.0) -> FloatArray:
+    """(lengths, n) what stretches of the Silverbox multisine regime, times ``scale``, tell of each system [nats].
 
     They start anywhere in the regime and go on at its begin where it ends, so that every part of it counts alike: rare
     peaks of the displacement tell most of what is known of b, and some parts have more of them.
-
-    Returns:
-        Their lengths (k,) up to 2**longest samples, and (k, n) the `information` in them [nats].
     """
-    lengths = np.unique(np.round(2 ** np.arange(4, longest + 0.1, 0.5)).astype(int))
     rng = np.random.default_rng(seed)
     regime = regime_input("multisine", rng)
     starts = rng.integers(len(regime), size=np.size(truth.m))
-    inputs = scale * np.take(regime, np.arange(lengths[-1])[:, None] + starts, mode="wrap")
-    return lengths, np.array([information(inputs[:length], truth, experiment) for length in lengths])
+    inputs = scale * np.take(regime, np.arange(_LENGTHS[-1])[:, None] + starts, mode="wrap")
+    return np.array([information(inputs[:length], truth, experiment) for length in _LENGTHS])
 
 
-def equal_information(gains: FloatArray, lengths: npt.NDArray[np.int64], told: FloatArray) -> FloatArray:
-    """(n,) the lengths at which ``told`` (k, n) reaches ``gains`` (n,); inf where it does not."""
-    equivalents = np.empty(len(gains))
+def regimes(truth: Any, experiment: Any, seed: int) -> dict[str, FloatArray]:
+    """`regime_information` by metric: of the regime as recorded, and scaled up to the limit of the input.
+
+    Where the input's power is limited, there is no regime at the limit: it would have more than the budget.
+    """
+    scales = {"silverbox_equivalent": 1.0}
+    if experiment.max_rms is None:
+        peak = np.abs(regime_input("multisine", np.random.default_rng(seed))).max()
+        scales["full_peak_equivalent"] = float(experiment.max_input / peak)
+    return {name: regime_information(truth, experiment, seed, scale) for name, scale in scales.items()}
+
+
+def equivalents(gains: FloatArray, told: FloatArray) -> FloatArray:
+    """(n,) samples of a regime that tell as much as ``gains`` (n,) of `information`, with ``told`` of it (lengths, n).
+
+    Interpolated between powers of √2; inf where even the longest stretch, 46,341 samples, tells less.
+    """
+    found = np.empty(len(gains))
     for i, gain in enumerate(gains):
         curve = np.maximum.accumulate(told[:, i])
-        equivalents[i] = np.exp(np.interp(gain, curve, np.log(lengths))) if gain <= curve[-1] else np.inf
-    return equivalents
+        found[i] = np.exp(np.interp(gain, curve, np.log(_LENGTHS))) if gain <= curve[-1] else np.inf
+    return found
 
 
 def simulation_errors(means: FloatArray, truth: Any) -> FloatArray:

@@ -74,7 +74,7 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
         (
             "The chosen inputs",
             figure_of_inputs(evaluations),
-            "Input of the first system in time, and the mean spectrum over systems.",
+            "Input and output of the first system in time, and the inputs' mean spectrum over systems.",
         ),
         (
             "Error against information",

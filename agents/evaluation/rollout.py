@@ -46,6 +46,7 @@ class Evaluation:
             truth takes away is in it.
         inputs: (horizon, systems) inputs that the plant was given [V], NaN after the end of an episode.
         outputs: (horizon, systems) outputs [V], likewise.
+        step: sampling step [s].
         estimators: what others make of the same inputs and outputs: name of an estimator to its `metrics`.
         seeds: number of policies.
     """
@@ -55,6 +56,7 @@ class Evaluation:
     curve: FloatArray
     inputs: FloatArray
     outputs: FloatArray
+    step: float
     estimators: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
     seeds: int = 1
 
@@ -103,13 +105,14 @@ def evaluate(
     if systems < 2:
         raise ValueError(f"systems must be at least 2, but is {systems}; intervals need more than one")
     evaluations = []
+    told: dict[str, FloatArray] = {}
     for name in policies:
         title, members = _members(name)
         each = []
         for member in members:
             if on_policy is not None:
                 on_policy(member)
-            each.append(_evaluate(member, env_id, systems, seed, dict(options or {})))
+            each.append(_evaluate(member, env_id, systems, seed, dict(options or {}), told))
         evaluations.append(each[0] if title is None else pooled(title, each))
     return evaluations
 
@@ -140,13 +143,16 @@ def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
         np.concatenate([e.curve for e in evaluations], axis=1),
         np.concatenate([e.inputs for e in evaluations], axis=1),
         np.concatenate([e.outputs for e in evaluations], axis=1),
+        evaluations[0].step,
         {name: join([e.estimators[name] for e in evaluations]) for name in evaluations[0].estimators},
         sum(e.seeds for e in evaluations),
     )
 
 
-def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]) -> Evaluation:
-    """One policy."""
+def _evaluate(
+    name: str, env_id: str, systems: int, seed: int, options: dict[str, Any], told: dict[str, FloatArray]
+) -> Evaluation:
+    """One policy; ``told`` keeps what the Silverbox regime tells of the systems, which are those of all policies."""
     evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
     if not isinstance(experiment, SimulatedExperiment):
         return evaluation
@@ -160,7 +166,8 @@ def _evaluate(name: str, env_id: str, systems: int, seed: int, options: dict[str
         if efficiency is not None:  # an oracle is stored, of the systems of seed 0
             found["efficiency"] = efficiency
     if stays and is_difference:
-        found["silverbox_equivalent"] = metrics.silverbox_equivalents(gains, truth, experiment, seed)
+        told.update(told or metrics.regimes(truth, experiment, seed))
+        found |= {regime: metrics.equivalents(gains, information) for regime, information in told.items()}
     if is_difference:
         means = np.array([belief.coefficients_mean for belief in beliefs])
         found["simulation_rmse"] = metrics.simulation_errors(means, truth)
@@ -234,7 +241,7 @@ def roll_out(
         # Processor time. The first call may compile, and counts where there is no other.
         "decision_time": np.full(systems, np.mean(deciding[1:] or deciding) / systems),
     }
-    return Evaluation(name, values, curve, inputs, outputs), beliefs, truth, envs.experiment
+    return Evaluation(name, values, curve, inputs, outputs, prior.step), beliefs, truth, envs.experiment
 
 
 def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:

@@ -1,1 +1,1 @@
-"""What docs print: the paper repeated, the Silverbox protocol, rewards compared, and the policies that ship."""
+"""What docs print: the paper repeated, the Silverbox protocol, and the policies that ship."""

@@ -7,30 +7,27 @@ from the first two of them. `reproduce` does it all; ``docs/reproduction.md`` di
 
 from __future__ import annotations
 
-import io
-import platform
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
-from json import dumps
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
 from agents.cli import progress_bar
+from agents.evaluation.figures import new_figure, save
 from agents.policies import make_policy
-from agents.studies.kouw2020_figures import draw
+from agents.results import check_file, show, table, versions, write_json
 from duffing_env.silverbox import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
-from estimator.files import write_atomically
 from estimator.offline import PEMNARX
 from estimator.parameters import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PUBLISHED = {
     "PEM-NARX": {"prediction_mse": 5.830793034083989e-05, "simulation_mse": 1.001367833873263e-03},
@@ -40,7 +37,8 @@ PUBLISHED = {
 """Mean squared errors [V²] of the published run, from its own files; the paper's text has 1.002e-3 for FEM-LARX."""
 
 MEASURES = ("prediction", "simulation")
-VERSIONED = ("duffing-env", "gymnasium", "matplotlib", "numba", "numpy", "scipy")
+_EVERY = 80
+"""The figures show one sample of this many, as the paper's do."""
 
 
 @dataclass(frozen=True)
@@ -137,20 +135,15 @@ def reproduce(
         OSError: A result cannot be written; found out before the work begins, where it can be.
     """
     record = load_record(data)
-    if json is not None:
-        if json.is_dir():
-            raise IsADirectoryError(f"json must be a file, but is the folder {json}; name a file in it")
-        json.parent.mkdir(parents=True, exist_ok=True)
+    check_file("json", json)
     figures.mkdir(parents=True, exist_ok=True)
 
     runs = run_all(record, data)
     results = summarise(runs, record)
     if json is not None:
-        write_atomically(json, dumps(results, indent=2) + "\n")
+        write_json(json, results)
     for measure in MEASURES:
-        png = io.BytesIO()
-        draw(runs["as_published"], record.arrow, measure).savefig(png, format="png")
-        write_atomically(figures / f"{measure}_error.png", png.getvalue())
+        save(draw(runs["as_published"], record.arrow, measure), figures / f"{measure}_error.png")
 
     report(results)
     return results
@@ -299,41 +292,33 @@ def summarise(runs: dict[str, dict[str, Run]], record: SilverboxRecord) -> dict[
         "settings": {name: asdict(setting) for name, setting in SETTINGS.items()},
         "seconds": {name: {model: run.seconds for model, run in models.items()} for name, models in runs.items()},
         "samples": {"training": len(record.multisine.u), "validation": len(record.arrow.u)},
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in VERSIONED},
+        "versions": versions("duffing-env", "gymnasium", "matplotlib", "numba", "numpy", "scipy"),
     }
     return {"published": PUBLISHED, **errors, "meta": meta}
 
 
 def report(results: dict[str, Any]) -> None:
-    """Prints the table and what its rows are."""
-    console = Console(highlight=False)
-    console.print(table(results))
-    console.print("\nratio: to the published error of the same model")
-    for name, setting in SETTINGS.items():
-        console.print(f"{name + ':':20} {setting.summary}")
-    for name in ("as_published", "through_environment"):
-        console.print(f"{name} is within {deviation(results[name]):.1e} of the published FEM errors, relative")
-
-
-def table(results: dict[str, Any]) -> Table:
-    """The errors, their ratios to the published errors of the same models, and their roots, in 80 characters."""
-    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=0)
-    shown.add_column("\nrun")
-    shown.add_column("\nmodel")
+    """Prints the errors, their ratios to the published errors of the same models, and their roots."""
+    titles, rows = ["\nrun", "\nmodel"], []
     for measure in MEASURES:
-        shown.add_column(f"{measure}\nMSE [V²]", justify="right")
-        shown.add_column("\nratio", justify="right")
-        shown.add_column("RMSE\n\\[mV]", justify="right")  # escaped: rich takes it for a style
+        titles += [f"{measure}\nMSE [V²]", "\nratio", "RMSE\n[mV]"]
     for name in ("published", *SETTINGS):
         for model, errors in results[name].items():
-            cells = []
+            cells = [name, model]
             for measure in MEASURES:
                 mse = errors[f"{measure}_mse"]
                 ratio = mse / PUBLISHED[model][f"{measure}_mse"]
                 cells += [f"{mse:.4e}", f"{ratio:.4f}", f"{1e3 * np.sqrt(mse):.3f}"]
-            shown.add_row(name, model, *cells)
-        shown.add_section()
-    return shown
+            rows.append(cells)
+    show(
+        table(titles, rows),
+        "\nratio: to the published error of the same model",
+        *(f"{name + ':':20} {setting.summary}" for name, setting in SETTINGS.items()),
+        *(
+            f"{name} is within {deviation(results[name]):.1e} of the published FEM errors, relative"
+            for name in ("as_published", "through_environment")
+        ),
+    )
 
 
 def deviation(errors: dict[str, dict[str, float]]) -> float:
@@ -343,3 +328,28 @@ def deviation(errors: dict[str, dict[str, float]]) -> float:
         for model in ("FEM-LARX", "FEM-NLARX")
         for measure, mse in errors[model].items()
     )
+
+
+def draw(runs: Mapping[str, Any], validation: Regime, measure: str) -> Figure:
+    """One of the paper's two figures of errors: a column for each model, the lower row in log scale.
+
+    Args:
+        runs: The models by name.
+        validation: What they were validated on.
+        measure: ``prediction`` or ``simulation``.
+    """
+    figure = new_figure(11, 5.2)
+    axes = figure.subplots(2, len(runs), sharex=True, sharey="row", squeeze=False)
+    samples = np.arange(0, len(validation.y), _EVERY)
+    for (upper, lower), (model, run) in zip(axes.T, runs.items(), strict=True):
+        output = getattr(run, measure)[samples]
+        squared_error = (output - validation.y[samples]) ** 2
+        upper.plot(samples, output, color="purple", linewidth=0.8, label=f"{measure} [V]")
+        upper.plot(samples, squared_error, color="black", linewidth=1.0, label="squared error [V²]")
+        upper.set_title(f"{model}: MSE {getattr(run, f'{measure}_mse'):.3e} V²", fontsize=11)
+        lower.semilogy(samples, squared_error, color="black", linewidth=0.6, nonpositive="mask")
+        lower.set_xlabel("sample")
+    axes[0, 0].set_ylabel("output [V], squared error [V²]")
+    axes[1, 0].set_ylabel("squared error [V²]")
+    axes[0, 0].legend(loc="lower left", fontsize=9)
+    return figure

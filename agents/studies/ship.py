@@ -21,9 +21,10 @@ import numpy as np
 
 from agents import policies
 from agents.cli import run_script
-from agents.evaluation.leaderboard import finite, print_table, summarise
+from agents.evaluation.leaderboard import print_table, summarise
 from agents.evaluation.rollout import evaluate, pooled
 from agents.policies.learned import CARD, WEIGHTS
+from agents.results import write_json
 from estimator.files import write_atomically
 
 
@@ -67,13 +68,13 @@ def ship(config: Config) -> Path:
         "scores": {
             "settings": {"env": env, "systems": config.systems, "seed": 0, "options": options},
             # How long a decision took is of the machine, not of the policy.
-            **{name: finite(entry) for name, entry in scores.items() if name != "decision_time"},
+            **{name: entry for name, entry in scores.items() if name != "decision_time"},
         },
     }
     folder = policies.TRAINED / config.name
     # The weights first: a card without them is none, and a card that is older than they are is mended by a second try.
     write_atomically(folder / WEIGHTS, (config.runs[chosen] / WEIGHTS).read_bytes())
-    write_atomically(folder / CARD, json.dumps(card, indent=2, allow_nan=False))
+    write_json(folder / CARD, card)
     print_table([together], f"{env}, {config.systems} systems")
     print(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
     return folder

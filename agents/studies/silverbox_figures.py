@@ -1,13 +1,14 @@
-"""Figures of the Silverbox protocol, as PNG. No display is needed."""
+"""Figures of the Silverbox protocol. No display is needed."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from agents.evaluation.figures import new_figure
+from agents.studies.silverbox_protocol import NINETY, WITHOUT_EXTRAPOLATION
 from estimator import duffing
 
 if TYPE_CHECKING:
@@ -27,30 +28,19 @@ _COLOURS = {
 _WINDOW = 400
 """Samples of the running root mean square."""
 
-_NINETY = 1.6448536269514722
 _SHOWN_FROM = 200
 """The parameters' axes are cut to hold their intervals from this many samples on."""
 
 
-def draw(outcomes: Mapping[str, Outcome], trained: int) -> dict[str, bytes]:
-    """The three figures, by name: ``arrow``, ``learning``, ``parameters``.
-
-    Args:
-        outcomes: By the names of the settings.
-        trained: Samples of the arrow whose amplitude does not exceed the training's.
-    """
+def figures_of(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
+    """The three figures, ``arrow``, ``learning`` and ``parameters``, of outcomes by the names of their settings."""
     shown = {name: outcomes[name] for name in _COLOURS if name in outcomes}
-    figures = {
-        "arrow": _draw_arrow(shown, trained),
-        "learning": _draw_learning(shown),
-        "parameters": _draw_parameters(shown),
-    }
-    return {name: _png(figure) for name, figure in figures.items()}
+    return {"arrow": _arrow(shown), "learning": _learning(shown), "parameters": _parameters(shown)}
 
 
-def _draw_arrow(outcomes: Mapping[str, Outcome], trained: int) -> Figure:
+def _arrow(outcomes: Mapping[str, Outcome]) -> Figure:
     """Simulation error over the arrow: every sample, and its running root mean square."""
-    figure = _figure(9, 5)
+    figure = new_figure(9, 5)
     axes = figure.add_subplot()
     for name, outcome in outcomes.items():
         if name in ("ODE look-ahead", "ODE spline"):
@@ -60,7 +50,7 @@ def _draw_arrow(outcomes: Mapping[str, Outcome], trained: int) -> Figure:
         mean_square = np.convolve(error**2, np.full(_WINDOW, 1 / _WINDOW), mode="valid")
         middle = np.arange(len(mean_square)) + _WINDOW / 2
         axes.plot(middle, np.sqrt(mean_square), color=_COLOURS[name], linewidth=1.2, label=name)
-    axes.axvline(trained, color="black", linestyle=":", linewidth=1)
+    axes.axvline(WITHOUT_EXTRAPOLATION, color="black", linestyle=":", linewidth=1)
     axes.set_yscale("log")
     axes.set_ylim(3e-3, 300)
     axes.set_xlim(0, len(error))
@@ -72,9 +62,9 @@ def _draw_arrow(outcomes: Mapping[str, Outcome], trained: int) -> Figure:
     return figure
 
 
-def _draw_learning(outcomes: Mapping[str, Outcome]) -> Figure:
+def _learning(outcomes: Mapping[str, Outcome]) -> Figure:
     """Simulation error on the arrow over the number of training samples."""
-    figure = _figure(7, 4.5)
+    figure = new_figure(7, 4.5)
     axes = figure.add_subplot()
     for name, outcome in outcomes.items():
         samples, errors = np.array(list(outcome.learning.items())).T
@@ -87,9 +77,9 @@ def _draw_learning(outcomes: Mapping[str, Outcome]) -> Figure:
     return figure
 
 
-def _draw_parameters(outcomes: Mapping[str, Outcome]) -> Figure:
+def _parameters(outcomes: Mapping[str, Outcome]) -> Figure:
     """Posterior means and 90 % intervals of the physical parameters over the number of training samples."""
-    figure = _figure(11, 5.5)
+    figure = new_figure(11, 5.5)
     units = duffing(offsets=True, cubic_damping=True, feedthrough=True).physical_units
     panels = dict(zip(units, figure.subplots(2, 4, sharex=True).flat, strict=True))
     limits: dict[str, list[float]] = {parameter: [] for parameter in panels}
@@ -99,7 +89,7 @@ def _draw_parameters(outcomes: Mapping[str, Outcome]) -> Figure:
             if not all(parameter in parameters for parameters in told.values()) or not told:
                 continue  # it is known
             mean, std = np.array([parameters[parameter][:2] for parameters in told.values()]).T
-            low, high, samples = mean - _NINETY * std, mean + _NINETY * std, np.array(list(told))
+            low, high, samples = mean - NINETY * std, mean + NINETY * std, np.array(list(told))
             panels[parameter].fill_between(samples, low, high, color=_COLOURS[name], alpha=0.2, linewidth=0)
             panels[parameter].plot(samples, mean, color=_COLOURS[name], label=name, linewidth=1)
             limits[parameter] += [low[samples >= _SHOWN_FROM].min(), high[samples >= _SHOWN_FROM].max()]
@@ -114,15 +104,3 @@ def _draw_parameters(outcomes: Mapping[str, Outcome]) -> Figure:
     handles, labels = panels["m"].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return figure
-
-
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure((width, height), layout="constrained", dpi=120)
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()

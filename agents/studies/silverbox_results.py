@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import json as json_format
-import platform
 from collections.abc import Callable, Iterator, Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
 from agents.cli import progress_bar
-from agents.studies.silverbox_figures import draw
+from agents.evaluation.figures import save
+from agents.results import check_file, finite, show, table, versions, write_json
+from agents.studies.silverbox_figures import figures_of
 from agents.studies.silverbox_protocol import (
     CLOSE,
     GIVEN,
     SETTINGS,
     TESTS,
     TRAINING_SAMPLES,
-    WITHOUT_EXTRAPOLATION,
     Outcome,
     Sections,
     cut,
@@ -30,7 +25,6 @@ from agents.studies.silverbox_protocol import (
 )
 from duffing_env.silverbox import load_record
 from estimator.belief import Belief
-from estimator.files import write_atomically
 
 TARGETS = {
     "ODE linear": (0.36, 0.45, 0.36),
@@ -45,8 +39,6 @@ MAX_SECONDS = {"ODE": 5e-6, "paper structured": 2e-6}
 """Of training for each sample, by the beginnings of the settings' names."""
 RANKED = ("paper structured", "NLARX offset", "NLARX three-tap", "ODE linear")
 """Accumulated free energy is to rank these as their simulation errors do."""
-
-VERSIONED = ("duffing-env", "numba", "numpy", "scipy")
 
 Compare = Callable[[Sections, Mapping[str, Outcome]], dict[str, Any]]
 """Compares the outcomes with something else in the same run, prints that, and returns it, fit for JSON."""
@@ -77,18 +69,17 @@ def run_protocol(
         OSError: A result cannot be written.
     """
     sections = cut(load_record(data))
-    if json is not None and json.is_dir():
-        raise IsADirectoryError(f"json must be a file, but is the folder {json}; name a file in it")
+    check_file("json", json)
     figures.mkdir(parents=True, exist_ok=True)
     outcomes = dict(_evaluate_all(sections))
     results = summarise(outcomes)
-    for name, png in draw(outcomes, WITHOUT_EXTRAPOLATION).items():
-        write_atomically(figures / f"silverbox_{name}.png", png)
+    for name, figure in figures_of(outcomes).items():
+        save(figure, figures / f"silverbox_{name}.png")
     report(outcomes, results)
     if compare is not None:
         results["comparison"] = compare(sections, outcomes)
     if json is not None:
-        write_atomically(json, json_format.dumps(results, indent=2, allow_nan=False) + "\n")
+        write_json(json, results)
     return results
 
 
@@ -103,7 +94,7 @@ def _evaluate_all(sections: Sections) -> Iterator[tuple[str, Outcome]]:
 
 
 def summarise(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
-    """The results as `run_protocol` returns them: plain dictionaries, fit for JSON."""
+    """The results as `run_protocol` returns them: plain dictionaries, for JSON."""
     rows = {
         name: {
             "model": SETTINGS[name].model.name,
@@ -111,27 +102,23 @@ def summarise(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
             "interpolation": SETTINGS[name].rig.interpolation,
             "delay": SETTINGS[name].rig.delay,
             "passes": SETTINGS[name].passes,
-            "rmse": {test: _finite(error) for test, error in outcome.rmse.items()},
-            "prediction_rmse": _finite(outcome.prediction_rmse),
-            "coverage": _finite(outcome.coverage),
+            "rmse": outcome.rmse,
+            "prediction_rmse": outcome.prediction_rmse,
+            "coverage": outcome.coverage,
             "seconds_per_sample": outcome.seconds,
             "samples_until_1_mV": outcome.samples_until_close,
             "free_energy": outcome.free_energy,
-            "arrow_rmse_after": {str(samples): _finite(error) for samples, error in outcome.learning.items()},
+            "arrow_rmse_after": {str(samples): error for samples, error in outcome.learning.items()},
             "parameters": _parameters(outcome.beliefs[TRAINING_SAMPLES]),
         }
         for name, outcome in outcomes.items()
     }
     meta = {
         "samples": {"training": TRAINING_SAMPLES, "given": GIVEN},
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in VERSIONED},
+        "versions": versions("duffing-env", "numba", "numpy", "scipy"),
     }
-    return {"rows": rows, "targets": [{"target": text, "reached": ok} for text, ok in targets(outcomes)], "meta": meta}
-
-
-def _finite(value: float) -> float | None:
-    """A number for JSON, which has no other."""
-    return value if np.isfinite(value) else None
+    reached = [{"target": text, "reached": ok} for text, ok in targets(outcomes)]
+    return {"rows": finite(rows), "targets": reached, "meta": meta}
 
 
 def _parameters(belief: Belief) -> dict[str, dict[str, Any]]:
@@ -167,35 +154,32 @@ def submission(errors: Any, digits: int = 3) -> str:
 
 def report(outcomes: Mapping[str, Outcome], results: Mapping[str, Any]) -> None:
     """Prints the table, the submission lines, and what became of the targets."""
-    console = Console(highlight=False, markup=False)
-    console.width = max(console.width, 100)
-    console.print(table(outcomes))
-    console.print("d = 0: without feedthrough; +e: with cubic damping; n.e.: without extrapolation;")
-    console.print("1-step and coverage: of the multisine test")
-    console.print("\nSubmission, RMSE in mV [multisine; arrow; arrow without extrapolation]:")
-    for name in TARGETS:
-        errors = [1e3 * outcomes[name].rmse[test] for test in TESTS]
-        console.print(f"  {name:24} {submission(errors)}")
-    console.print("\nTargets:")
-    for row in results["targets"]:
-        console.print(f"  {'PASS' if row['reached'] else 'MISS'}  {row['target']}")
+    show(
+        as_table(outcomes),
+        "d = 0: without feedthrough; +e: with cubic damping; n.e.: without extrapolation;",
+        "1-step and coverage: of the multisine test",
+        "\nSubmission, RMSE in mV [multisine; arrow; arrow without extrapolation]:",
+        *(f"  {name:24} {submission([1e3 * outcomes[name].rmse[test] for test in TESTS])}" for name in TARGETS),
+        "\nTargets:",
+        *(f"  {'PASS' if row['reached'] else 'MISS'}  {row['target']}" for row in results["targets"]),
+    )
 
 
-def table(outcomes: Mapping[str, Outcome]) -> Table:
+def as_table(outcomes: Mapping[str, Outcome]) -> Any:
     """A row for each setting, in 100 characters."""
-    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    shown.add_column("")
     columns = ("multisine\n[mV]", "arrow\n[mV]", "n.e.\n[mV]", "1-step\n[mV]", "90 %\ncovers", "<1 mV\nafter")
-    for title in (*columns, "µs per\nsample", "free energy\n[nats]"):
-        shown.add_column(title, justify="right")
-    for name, outcome in outcomes.items():
-        shown.add_row(
-            name,
-            *(f"{1e3 * outcome.rmse[test]:.3f}" for test in TESTS),
-            f"{1e3 * outcome.prediction_rmse:.3f}",
-            "-" if np.isnan(outcome.coverage) else f"{outcome.coverage:.3f}",
-            str(outcome.samples_until_close or "never"),
-            f"{1e6 * outcome.seconds:.2f}",
-            f"{outcome.free_energy:.0f}",
-        )
-    return shown
+    return table(
+        ("", *columns, "µs per\nsample", "free energy\n[nats]"),
+        (
+            (
+                name,
+                *(f"{1e3 * outcome.rmse[test]:.3f}" for test in TESTS),
+                f"{1e3 * outcome.prediction_rmse:.3f}",
+                "-" if np.isnan(outcome.coverage) else f"{outcome.coverage:.3f}",
+                str(outcome.samples_until_close or "never"),
+                f"{1e6 * outcome.seconds:.2f}",
+                f"{outcome.free_energy:.0f}",
+            )
+            for name, outcome in outcomes.items()
+        ),
+    )

@@ -6,11 +6,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
-
 from agents.cli import progress_bar
+from agents.results import show, table
 from agents.studies.silverbox_protocol import (
     SETTINGS,
     TRAINING_SAMPLES,
@@ -64,7 +61,10 @@ def select(data: Path | None = None) -> dict[str, dict[str, tuple[float, float]]
                 estimator, _, _ = identify(candidate, first, split)
                 scores[name][label] = rmse(simulation_error(estimator, last)), coverage(estimator, first, last)
             progress.advance(task)
-    _report(scores)
+    rows = (
+        (name, *(f"{1e3 * error:.4f}\n{covers:.3f}" for error, covers in row.values())) for name, row in scores.items()
+    )
+    show(table(("simulation [mV]\n90 % covers", *next(iter(scores.values()))), rows))
     return scores
 
 
@@ -75,15 +75,3 @@ def _candidates(setting: Setting) -> Iterator[tuple[str, Setting]]:
         yield f"{1e6 * noise:g} µV", replace(setting, prior=recorded_prior(setting.model, process_noise=noise))
     for substeps in SUBSTEPS:
         yield f"{substeps} steps", replace(setting, model=replace(setting.model, substeps=substeps))
-
-
-def _report(scores: dict[str, dict[str, tuple[float, float]]]) -> None:
-    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    shown.add_column("simulation [mV]\n90 % covers")
-    for label in next(iter(scores.values())):
-        shown.add_column(label, justify="right")
-    for name, row in scores.items():
-        shown.add_row(name, *(f"{1e3 * error:.4f}\n{covers:.3f}" for error, covers in row.values()))
-    console = Console(highlight=False, markup=False)
-    console.width = max(console.width, 100)
-    console.print(shown)

@@ -188,7 +188,7 @@ class _Training:
     def run(self) -> Run:
         from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
-        from agents.evaluation.figures import draw_learning_curve
+        from agents.evaluation.figures import figure_of_learning, save
         from agents.training.callbacks import ContinuedCSV
 
         if not (self._folder / "config.json").exists():
@@ -201,7 +201,7 @@ class _Training:
             self._model.set_logger(logger)
             self._learn()
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
-        draw_learning_curve(self._folder / "learning_curve.png", curve, self._config.reward)
+        save(figure_of_learning(curve, self._config.reward), self._folder / "learning_curve.png")
         save_policy(self._folder, self._model, self._card())
         drop_states(self._folder)
         self._envs.close()

@@ -195,7 +195,7 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
         full_prior = silverbox_prior(spread=options.get("spread", 0.3))  # mean field leaves out its cross-covariances
         gain = fisher_gain(coefficients, single.inputs, single.outputs, full_prior)
         assert measured.pop("fisher_gain") == pytest.approx(gain, abs=1e-3)
-        assert measured.pop("silverbox_equivalent") > 0
+        assert min(measured.pop("full_peak_equivalent"), measured.pop("silverbox_equivalent")) > 0
         u = regime_input("arrow", np.random.default_rng(0))[-8192:]
         believed, true_run = (free_run(c, u, np.zeros(2)) for c in (posterior.coefficients_mean, coefficients))
         error = np.sqrt(np.mean((believed - true_run) ** 2))
@@ -231,8 +231,26 @@ def test_what_a_jump_of_the_truth_takes_away_is_counted(monkeypatch):
     assert min(steepest) < -100  # a jump that the belief does not know of
     assert "simulation_rmse" in evaluation.metrics
     # These are of one oscillator; here there are two.
-    assert not {"fisher_gain", "efficiency", "silverbox_equivalent", "arrow_rmse"} & set(evaluation.metrics)
+    assert not {"fisher_gain", "efficiency", "silverbox_equivalent", "full_peak_equivalent", "arrow_rmse"} & set(
+        evaluation.metrics
+    )
     assert evaluation.estimators == {}
+
+
+def test_a_sample_of_the_regime_is_worth_one_and_one_of_a_better_policy_more(without_record):
+    prbs, regime = evaluate(["prbs", "silverbox-multisine"], systems=24)
+    found = {
+        (evaluation.policy, name): np.median(evaluation.metrics[name] / (~np.isnan(evaluation.inputs)).sum(axis=0))
+        for evaluation in (prbs, regime)
+        for name in ("silverbox_equivalent", "full_peak_equivalent")
+    }
+    assert 0.5 < found["silverbox-multisine", "silverbox_equivalent"] < 2
+    assert found["prbs", "silverbox_equivalent"] > 20
+    # At the limit of 0.15 V instead of its own peak of some 0.12 V, the regime tells more.
+    assert 1 < found["prbs", "silverbox_equivalent"] / found["prbs", "full_peak_equivalent"] < 6
+    # There is none of more power than the budget.
+    (limited,) = evaluate(["uniform"], "duffing_env/Power-v0", 2)
+    assert "full_peak_equivalent" not in limited.metrics
 
 
 def test_all_policies_meet_the_same_systems_and_the_same_noise(without_record):

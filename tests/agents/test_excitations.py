@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import agents.evaluation.figures
 from agents import make_policy
 from agents.policies.excitations import EXCITATIONS, LEVELS, resonance
 from agents.policies.export import draw_signal, export_signal
@@ -342,13 +341,3 @@ def test_export_from_the_command_line(tmp_path):
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
     assert "32 samples" in done.stdout
     np.testing.assert_array_equal(np.loadtxt(path, delimiter=",", skiprows=1)[:, 1], draw_signal("prbs-4", samples=32))
-
-
-def test_figure_shows_every_policy(tmp_path, monkeypatch):
-    shown = {}
-    monkeypatch.setattr(agents.evaluation.figures, "_save", lambda figure, path: shown.update({path: figure}))
-    agents.evaluation.figures.draw_policies(tmp_path / "policies.png", systems=2, samples=64)
-    axes = shown[tmp_path / "policies.png"].axes
-    titles = [each.get_title(loc="left") for each in axes]
-    assert [title for title in titles if title] == [*EXCITATIONS, *FEEDBACK]
-    assert all(each.get_ylabel() for each in axes)

@@ -11,14 +11,14 @@ import pytest
 import agents.evaluation.figures
 import agents.evaluation.rollout
 from agents.evaluation.comparison import compare
-from agents.evaluation.figures import draw_contraction, draw_excitations, draw_learning_curve
+from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, figure_of_learning, save
 from agents.evaluation.leaderboard import (
     ESTIMATOR_METRICS,
     METRICS,
     print_estimators,
     print_table,
     summarise,
-    write_json,
+    write_evaluations,
 )
 from agents.evaluation.rollout import Evaluation
 from estimator import SAMPLING_STEP
@@ -43,6 +43,7 @@ CONSTANTS = {
     "fisher_gain": (19.394, "Fisher information / nat", "19.39"),
     "efficiency": (0.8766, "D-efficiency / %", "87.7"),
     "silverbox_equivalent": (10707.6, "Silverbox equivalent / samples", "10708"),
+    "full_peak_equivalent": (6037.2, "the same at full peak / samples", "6037"),
     "simulation_rmse": (0.0004216, "RMSE on the twin's arrow / mV", "0.422"),
     "arrow_rmse": (0.00512, "RMSE on the real arrow / mV", "5.12"),
 }
@@ -56,7 +57,7 @@ def make_evaluation(policy="policy", *, samples=20, systems=30, seed=0, shift=0.
         metrics["log_posterior_gain"] = metrics["log_posterior_gain"] + shift
     curve = np.cumsum(rng.normal(1.0, 0.3, (samples + 1, systems)), axis=0) + shift
     inputs, outputs = rng.uniform(-0.1, 0.1, (2, samples, systems))
-    return Evaluation(policy, metrics, curve, inputs, outputs)
+    return Evaluation(policy, metrics, curve, inputs, outputs, SAMPLING_STEP)
 
 
 def test_every_metric_of_an_evaluation_has_a_column(monkeypatch):
@@ -70,6 +71,7 @@ def test_centres_are_means_and_medians():
     values = np.array([1.0, 2.0, 3.0, 10.0, 100.0])
     summary = summarise(make_evaluation(**dict.fromkeys(METRICS, values)))
     medians = {"error_m", "error_c", "error_a", "error_b", "silverbox_equivalent", "simulation_rmse", "arrow_rmse"}
+    medians |= {"full_peak_equivalent"}
     for name, entry in summary.items():
         kind, expected = ("median", 3.0) if name in medians else ("mean", 23.2)
         assert set(entry) == {kind, "low", "high"}
@@ -242,7 +244,7 @@ def load_strictly(path):
 def test_json_is_valid_and_complete(tmp_path):
     evaluations = [make_evaluation("one"), make_evaluation("two", seed=1)]
     settings = {"env": "duffing_env/Amplitude-v0", "systems": 30, "seed": 0, "options": {"horizon": 20}}
-    write_json(tmp_path / "made" / "evaluation.json", evaluations, settings)
+    write_evaluations(tmp_path / "made" / "evaluation.json", evaluations, settings)
     written = load_strictly(tmp_path / "made" / "evaluation.json")
     assert set(written) == {"settings", "policies"}
     assert written["settings"] == settings
@@ -253,7 +255,7 @@ def test_json_is_valid_and_complete(tmp_path):
 
 def test_json_stays_valid_where_a_figure_is_infinite(tmp_path):
     evaluation = make_evaluation(log_posterior_gain=np.zeros(3), arrow_rmse=np.array([1.0, np.inf, np.inf]))
-    write_json(tmp_path / "evaluation.json", [evaluation], {})
+    write_evaluations(tmp_path / "evaluation.json", [evaluation], {})
     entry = load_strictly(tmp_path / "evaluation.json")["policies"]["policy"]["arrow_rmse"]
     assert entry == {"median": None, "low": 1.0, "high": None}
 
@@ -288,27 +290,13 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
         timed = {"estimators": ANY, "decision_time": ANY}
         assert written["policies"][evaluation.policy] == {**summarise(repeated), **timed}
     check_picture(folder / "contraction.png", 900, 540, colours=2)
-    check_picture(folder / "excitations.png", 1080, 480, colours=2)
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures, which are drawn and then kept instead of written."""
-    figures = []
-
-    def keep(figure, path):
-        figure.draw_without_rendering()
-        figures.append(figure)
-
-    monkeypatch.setattr(agents.evaluation.figures, "_save", keep)
-    return figures
+    check_picture(folder / "excitations.png", 1440, 480, colours=2)
 
 
 @pytest.mark.parametrize("policies", [1, 10])
-def test_contraction_shows_the_quartiles_of_every_policy(drawn, tmp_path, policies):
+def test_contraction_shows_the_quartiles_of_every_policy(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
-    draw_contraction(tmp_path / "figure", evaluations, "title")
-    (axes,) = drawn[0].axes
+    (axes,) = figure_of_contraction(evaluations, "title").axes
     assert axes.get_title() == "title"
     assert "nat" in axes.get_ylabel()
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [str(i) for i in range(policies)]
@@ -321,10 +309,8 @@ def test_contraction_shows_the_quartiles_of_every_policy(drawn, tmp_path, polici
         assert edges.max() == pytest.approx(np.percentile(ordered[-1], 75))
 
 
-def test_contraction_shows_losses_too(drawn, tmp_path):
-    draw_contraction(tmp_path / "figure", [make_evaluation()], "gains")
-    draw_contraction(tmp_path / "figure", [make_evaluation(shift=-40.0)], "losses")
-    gains, losses = (figure.axes[0] for figure in drawn)
+def test_contraction_shows_losses_too():
+    gains, losses = (figure_of_contraction([make_evaluation(shift=shift)]).axes[0] for shift in (0.0, -40.0))
     assert gains.get_ylim()[0] == 0.0
     low, high = losses.get_ylim()
     assert low < high
@@ -332,25 +318,29 @@ def test_contraction_shows_losses_too(drawn, tmp_path):
 
 
 @pytest.mark.parametrize("policies", [1, 10])
-def test_excitations_shows_one_system_under_every_policy(drawn, tmp_path, policies):
+def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
-    draw_excitations(tmp_path / "figure", evaluations, system=4)
-    panels = drawn[0].axes
-    assert len(panels) == 2 * policies
-    for left, right, evaluation in zip(panels[::2], panels[1::2], evaluations, strict=True):
-        for axes, signal, label in ((left, evaluation.inputs, "u / V"), (right, evaluation.outputs, "y / V")):
+    panels = figure_of_inputs(evaluations, system=4).axes
+    assert len(panels) == 3 * policies
+    for row, evaluation in enumerate(evaluations):
+        left, middle, right = panels[3 * row : 3 * row + 3]
+        for axes, signal, label in ((left, evaluation.inputs, "u / V"), (middle, evaluation.outputs, "y / V")):
             (line,) = axes.lines
             np.testing.assert_array_equal(line.get_ydata(), signal[:, 4])
             np.testing.assert_allclose(line.get_xdata(), 1e3 * SAMPLING_STEP * np.arange(20))
             assert axes.get_ylabel() == label
         assert left.get_title(loc="left") == evaluation.policy
+        frequencies, sizes = right.lines[0].get_data()
+        tones = np.exp(-2j * np.pi * SAMPLING_STEP * np.outer(frequencies, np.arange(20)))
+        power = np.mean(np.abs(tones @ evaluation.inputs / 20) ** 2, axis=1)
+        np.testing.assert_allclose(sizes, 1e3 * np.sqrt(power))
+        assert frequencies[-1] == pytest.approx(0.5 / SAMPLING_STEP)
 
 
 @pytest.mark.parametrize("updates", [1, 2, 30])
-def test_learning_curve_shows_returns_over_samples(drawn, tmp_path, updates):
+def test_learning_curve_shows_returns_over_samples(updates):
     curve = [(4096 * (i + 1), 0.5 * i + 0.1, np.nan if i == 0 else float(i)) for i in range(updates)]
-    draw_learning_curve(tmp_path / "figure", curve, "information_gain")
-    axes = drawn[0].axes[0]
+    axes = figure_of_learning(curve, "information_gain").axes[0]
     np.testing.assert_allclose(axes.lines[0].get_xdata(), 4096e-6 * np.arange(1, updates + 1))
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), [point[2] for point in curve])
     assert axes.get_ylabel() == "mean return: information gain"
@@ -358,10 +348,10 @@ def test_learning_curve_shows_returns_over_samples(drawn, tmp_path, updates):
 
 def test_pictures_are_written(tmp_path):
     curve = [(4096 * (i + 1), 0.5 * i + 0.1, float(i)) for i in range(9)]
-    draw_learning_curve(tmp_path / "curve.png", curve, "information_gain")
+    save(figure_of_learning(curve, "information_gain"), tmp_path / "curve.png")
     check_picture(tmp_path / "curve.png", 840, 480)
     evaluations = [make_evaluation(str(i), seed=i, shift=3.0 * i) for i in range(4)]
-    draw_contraction(tmp_path / "contraction.png", evaluations, "title")
+    save(figure_of_contraction(evaluations, "title"), tmp_path / "contraction.png")
     check_picture(tmp_path / "contraction.png", 900, 540, colours=4)
-    draw_excitations(tmp_path / "excitations.png", evaluations)
-    check_picture(tmp_path / "excitations.png", 1080, 864, colours=4)
+    save(figure_of_inputs(evaluations), tmp_path / "excitations.png")
+    check_picture(tmp_path / "excitations.png", 1440, 864, colours=4)

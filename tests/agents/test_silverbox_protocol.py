@@ -203,7 +203,7 @@ def results(record, tmp_path_factory):
         patch.setattr(module, "TIMINGS", 1)
         with patch.context() as output:
             printed = []
-            output.setattr(reporting.Console, "print", lambda self, *parts: printed.extend(parts))
+            output.setattr(reporting, "show", lambda *parts: printed.extend(parts))
             found = reporting.run_protocol(json=folder / "new" / "results.json", figures=folder / "figures")
     return found, folder, printed
 

@@ -1,0 +1,80 @@
+"""How results are printed and written: tables, JSON files, and the versions that they were made with."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimator.files import write_atomically
+
+
+def show(*parts: Any, width: int = 100) -> None:
+    """Print texts and tables, as wide as the terminal but at least so many characters."""
+    from rich.console import Console
+
+    console = Console(highlight=False, markup=False)
+    console.width = max(console.width, width)
+    for part in parts:
+        console.print(part)
+
+
+def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: bool = False, title: str = "") -> Any:
+    """A table of texts for `show`: the first column to the left, the others to the right.
+
+    Args:
+        titles: of the columns.
+        rows: their cells.
+        markdown: whether the manual is to take the table as it is.
+        title: above the table.
+    """
+    from rich.box import MARKDOWN, SIMPLE_HEAD
+    from rich.table import Table
+
+    made = Table(
+        box=MARKDOWN if markdown else SIMPLE_HEAD, show_edge=markdown, padding=(0, 1) if markdown else (0, 1, 0, 0),
+        title=title or None,
+    )  # fmt: skip
+    for place, text in enumerate(titles):
+        made.add_column(text, justify="left" if markdown or place == 0 else "right", no_wrap=markdown)
+    for row in rows:
+        made.add_row(*row)
+    return made
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a JSON file in one piece; a number that is not finite, as null.
+
+    Raises:
+        OSError: where it cannot be written.
+    """
+    write_atomically(path, json.dumps(finite(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def finite(content: Any) -> Any:
+    """What JSON can hold: a number that is not finite becomes null."""
+    if isinstance(content, dict):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    return None if isinstance(content, float) and not np.isfinite(content) else content
+
+
+def check_file(name: str, path: Path | None) -> None:
+    """Refuse a folder where a file is to be written, before the work begins.
+
+    Raises:
+        IsADirectoryError: naming the argument.
+    """
+    if path is not None and path.is_dir():
+        raise IsADirectoryError(f"{name} must be a file, but is the folder {path}; name a file in it")
+
+
+def versions(*packages: str) -> dict[str, str]:
+    """Of Python, and of these packages."""
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
