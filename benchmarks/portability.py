@@ -34,7 +34,7 @@ COMPILED = (
     "tests/duffing_env/test_simulation.py",
     "tests/agents/test_design.py",
     "tests/agents/test_planner.py",
-    "tests/benchmarks/test_assembly.py",
+    "tests/benchmarks/test_roofline.py",
     "tests/benchmarks/test_pieces.py",
 )
 #: Networks, beside torch's.

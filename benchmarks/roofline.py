@@ -2,17 +2,21 @@
 
 The yardsticks are compiled the same way as the step (`estimator.lanes.lanewise`): multiply-adds, divisions, square
 roots and copies on independent values that stay in the nearest cache. Everything here runs on one thread.
+
+Operations are counted in what `estimator.straight` gives to LLVM, where each stands once for every lane. The compiler
+still finds an expression or two that are written twice; divisions and roots are as many in the assembly.
 """
 
 from __future__ import annotations
 
 import inspect
+import re
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from benchmarks.assembly import NotCounted, Operations, count
 from benchmarks.pieces import experiment_of, plants
 from benchmarks.report import Claim, Section
 from benchmarks.timing import Result, Row, measure, timed
@@ -24,7 +28,7 @@ from duffing_env.layout import layout_of
 from duffing_env.sources import parts
 from duffing_env.stages import noise_drawer
 from estimator.inference import mean_field
-from estimator.lanes import LANES, jit, kernel, lanewise, rows
+from estimator.lanes import LANES, jit, lanewise, rows
 from estimator.straight import straight
 
 SIZE = 1024
@@ -76,8 +80,8 @@ def divide(a, b, c, d, x):
     return x / a, x / b, x / c, x / d
 
 
-@lanewise(_YARDSTICK, "a b c d", uniform="x")
-def take_root(a, b, c, d, x):
+@lanewise(_YARDSTICK, "a b c d")
+def take_root(a, b, c, d):
     """4 square roots per lane."""
     return np.sqrt(a), np.sqrt(b), np.sqrt(c), np.sqrt(d)
 
@@ -88,28 +92,36 @@ def move(a, b, c, d, x):
     return b + x, c + x, d + x, a + x
 
 
-@kernel
-def _multiply_add_often(W, repeats):
-    for _ in range(repeats):
-        multiply_add(W, 0.999999, 1e-6)
+#: What each yardstick measures: its function, and what it counts as work.
+_YARDSTICKS = {
+    _FUSED: (multiply_add, "flop"),
+    _DIVISIONS: (divide, "division"),
+    _ROOTS: (take_root, "root"),
+    _STORES: (move, "store"),
+}
+
+#: An instruction of LLVM's to what it is counted as.
+_INSTRUCTIONS = {
+    r"= f(?:add|sub|mul) ": ("flop",),
+    r"= fdiv ": ("flop", "division"),
+    r"@llvm\.sqrt": ("flop", "root"),
+    r"\bstore double": ("store",),
+}
 
 
-@kernel
-def _divide_often(W, repeats):
-    for _ in range(repeats):
-        divide(W, 1.0)
+def count(functions: dict[Any, int]) -> Counter[str]:
+    """Operations per lane of lane functions that are each called so often: ``flop``, ``division``, ``root``, ``store``.
 
-
-@kernel
-def _take_root_often(W, repeats):
-    for _ in range(repeats):
-        take_root(W, 1.0)
-
-
-@kernel
-def _move_often(W, repeats):
-    for _ in range(repeats):
-        move(W, 1e-9)
+    Divisions and roots are among the ``flop``.
+    """
+    counted: Counter[str] = Counter()
+    for function, times in functions.items():
+        kinds = ("ptr",) + ("double",) * (len(function.source.arguments) - 1)
+        text = "".join(function.translated(kinds).definitions.values())
+        for instruction, names in _INSTRUCTIONS.items():
+            for name in names:
+                counted[name] += times * len(re.findall(instruction, text))
+    return counted
 
 
 def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
@@ -133,78 +145,59 @@ def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
 
 def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
     """Time the step, its pieces and the yardsticks, and put the ones beside the others."""
-    title = "Roofline, one thread"
     found = {rule: pieces(rule) for rule in _STEPS}
-    try:
-        operations = {name: _count(found[rule][name]) for name, rule in _PIECES.items()}
-        wholes = {
-            name: _total([_count(functions) for functions in found[rule].values()]) for rule, name in _STEPS.items()
-        }
-        per_lane = {_FUSED: 2 * count(multiply_add).fused, _DIVISIONS: count(divide).divisions,
-                    _ROOTS: count(take_root).roots, _STORES: count(move).stores}  # fmt: skip
-    except NotCounted as reason:
-        return Section(title, [Result("operations", "flop/env-step", reason=str(reason))])
-    yardsticks = {
-        _FUSED: _multiply_add_often,
-        _DIVISIONS: _divide_often,
-        _ROOTS: _take_root_often,
-        _STORES: _move_often,
-    }
+    operations = {name: count(found[rule][name]) for name, rule in _PIECES.items()}
+    for rule, name in _STEPS.items():
+        operations[name] = sum((count(functions) for functions in found[rule].values()), start=Counter())
     timed_rows = [
-        Row(name, "flop/s" if name == _FUSED else "op/s", timed(_yardstick(function, per_lane[name])))
-        for name, function in yardsticks.items()
+        Row(name, "flop/s" if name == _FUSED else "op/s", timed(_yardstick(function, count({function: 1})[work])))
+        for name, (function, work) in _YARDSTICKS.items()
     ]
     timed_rows += [Row(name, "env-steps/s", timed(_piece(found[rule][name], rule))) for name, rule in _PIECES.items()]
     timed_rows += [Row(name, "env-steps/s", timed(_steps(rule))) for rule, name in _STEPS.items()]
     results = measure(timed_rows, repetitions, on_row)
-    operations |= wholes
-    judged = {name: (operations[name], results[name]) for name in (*_INFERENCE.values(), *_STEPS.values())}
     peak = results[_FUSED].median
     claims = [
-        Claim(f"of the multiply-add peak: {name}", 100 * counted.flops * result.median / peak, TARGET_SHARE, unit="%")
-        for name, (counted, result) in judged.items()
+        Claim(
+            f"of the multiply-add peak: {name}",
+            100 * operations[name]["flop"] * results[name].median / peak,
+            TARGET_SHARE,
+            unit="%",
+        )
+        for name in (*_INFERENCE.values(), *_STEPS.values())
     ]
     lines = [_account(name, counted, results) for name, counted in operations.items()]
     notes = [
-        f"Peak: {_FUSED}, {peak / 1e9:.3g} Gflop/s, vectors of {operations[_STEPS['structured']].vector_bits} bits. "
-        f"Operations are counted in the assembly of the compiled functions (benchmarks/assembly.py); a multiply-add is "
-        f"two. {SIZE} environments; steps that only start an episode take place, but do not count.",
+        f"Peak: {_FUSED}, {peak / 1e9:.3g} Gflop/s. Operations are counted in what is given to the compiler; a "
+        f"multiply-add is two. {SIZE} environments; steps that only start an episode take place, but do not count.",
         "Account, ns per env-step: what the operations would take if nothing else had to be done, at the rates of the\n"
-        "yardsticks; `arithmetic` is additions, multiplications and multiply-adds, which share their units. What a\n"
-        "step takes beyond its pieces is copying: beliefs that are kept, outcomes, observations.\n\n"
+        "yardsticks; `arithmetic` is additions and multiplications, as if each stood in a multiply-add. What a step\n"
+        "takes beyond its pieces is copying: beliefs that are kept, outcomes, observations.\n\n"
         f"{'':<28}{'flop':>7}{'div':>6}{'sqrt':>6}{'arithmetic':>12}{'div+sqrt':>10}{'stores':>8}{'sum':>8}"
         f"{'measured':>10}\n" + "\n".join(lines),
     ]
-    data = {name: {**vars(counted), "flops": counted.flops} for name, counted in operations.items()}
-    return Section(title, list(results.values()), claims, notes, {"operations": data})
+    return Section("Roofline, one thread", list(results.values()), claims, notes, {"operations": operations})
 
 
-def _count(functions: dict[Any, int]) -> Operations:
-    return _total([count(function) * times for function, times in functions.items()])
-
-
-def _total(operations: list[Operations]) -> Operations:
-    return sum(operations, start=Operations())
-
-
-def _account(name: str, operations: Operations, results: dict[str, Result]) -> str:
+def _account(name: str, counted: Counter[str], results: dict[str, Result]) -> str:
     """One line: nanoseconds that each kind of operation needs, their sum, and the time that was measured."""
-    arithmetic = 1e9 * 2 * (operations.simple + operations.fused) / results[_FUSED].median
-    slow = 1e9 * operations.divisions / results[_DIVISIONS].median
-    slow += 1e9 * operations.roots / results[_ROOTS].median
-    stores = 1e9 * operations.stores / results[_STORES].median
-    measured = 1e9 / results[name].median
+    slow = counted["division"] + counted["root"]
+    arithmetic = 1e9 * (counted["flop"] - slow) / results[_FUSED].median
+    dividing = 1e9 * (counted["division"] / results[_DIVISIONS].median + counted["root"] / results[_ROOTS].median)
+    storing = 1e9 * counted["store"] / results[_STORES].median
     return (
-        f"{name:<28}{operations.flops:>7.0f}{operations.divisions:>6.0f}{operations.roots:>6.0f}"
-        f"{arithmetic:>12.2f}{slow:>10.2f}{stores:>8.2f}{arithmetic + slow + stores:>8.2f}{measured:>10.2f}"
+        f"{name:<28}{counted['flop']:>7}{counted['division']:>6}{counted['root']:>6}{arithmetic:>12.2f}"
+        f"{dividing:>10.2f}{storing:>8.2f}{arithmetic + dividing + storing:>8.2f}{1e9 / results[name].median:>10.2f}"
     )
 
 
-def _yardstick(function: Any, operations_per_lane: float) -> Callable[[int], float]:
-    values = np.ones(len(_YARDSTICK) * LANES)
+def _yardstick(function: Any, operations_per_lane: int) -> Callable[[int], float]:
+    """One block, again and again."""
+    values, call = np.ones((1, len(_YARDSTICK) * LANES)), _calls({function: REPEATS})
 
     def action(count: int) -> float:
-        function(values, count * REPEATS)
+        for _ in range(count):
+            call(values)
         assert np.isfinite(values).all()
         return count * REPEATS * LANES * operations_per_lane
 
@@ -213,16 +206,8 @@ def _yardstick(function: Any, operations_per_lane: float) -> Callable[[int], flo
 
 def _piece(functions: dict[Any, int], factorisation: str) -> Callable[[int], float]:
     """A piece of the step, again and again on blocks that lie in the nearer caches as those of the step do."""
-    initial = plants(SIZE, factorisation)
+    initial, call = plants(SIZE, factorisation), _calls(functions)
     blocks = initial.copy()
-    piece = _nothing
-    for function, times in functions.items():
-        piece = _then(piece, function, times)
-
-    @jit
-    def call(blocks):
-        for b in range(len(blocks)):
-            piece(blocks[b])
 
     def action(count: int) -> float:
         blocks[:] = initial
@@ -233,13 +218,27 @@ def _piece(functions: dict[Any, int], factorisation: str) -> Callable[[int], flo
     return action
 
 
+def _calls(functions: dict[Any, int]) -> Any:
+    """``call(blocks)``: every lane function, so often on each block. Uniform arguments do not matter to the time."""
+    piece = _nothing
+    for function, times in functions.items():
+        piece = _then(piece, function, times)
+
+    @jit
+    def call(blocks):
+        for b in range(len(blocks)):
+            piece(blocks[b])
+
+    return call
+
+
 @jit
 def _nothing(W):
     pass
 
 
 def _then(before: Any, function: Any, times: int) -> Any:
-    """What was to be done before, and then a lane function. Its uniform arguments do not matter to the time."""
+    """What was to be done before, and then a lane function."""
     arguments = (1e-3,) * (len(inspect.signature(function.py_func).parameters) - 1)
 
     @jit
