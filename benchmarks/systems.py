@@ -165,8 +165,8 @@ def draw(
             physical = np.array(list(SILVERBOX_TWIN.values())) * factors
             known = coefficients_of(difference(), Parameters(zip("mcab", physical.T, strict=True)))
             four = dict(zip(_paper_terms(population), known.T, strict=True))
-            columns = [four.get(t, _std(t) * rng.standard_normal(systems)) for t in PRESETS[population]]
-            truth = np.column_stack(columns)
+            terms = PRESETS[population]
+            truth = np.column_stack([four[t] if t in four else _std(t) * rng.standard_normal(systems) for t in terms])
     shape = (systems, samples)
     if population == "wide":
         u = np.array([_AMPLIFICATION * synthesise_multisine(rng, 1)[500 : 500 + samples] for _ in range(systems)])
