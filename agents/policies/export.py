@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -66,15 +66,7 @@ def draw_signal(
     return max_input * limits.fit(EXCITATIONS[name](max_input)(generator, samples))
 
 
-def export_signal(
-    name: str,
-    path: str | Path,
-    *,
-    samples: int = DEFAULT_SAMPLES,
-    max_input: float = DEFAULT_MAX_INPUT,
-    max_rms: float | None = None,
-    seed: int = 0,
-) -> NDArray[np.float64]:
+def export_signal(name: str, path: str | Path, **limits: Any) -> NDArray[np.float64]:
     """Writes an excitation as CSV, in one piece: columns ``t [s]`` and ``u [V]``, a row for each sample.
 
     Numbers have all their digits, so that reading them gives the very signal.
@@ -82,10 +74,7 @@ def export_signal(
     Args:
         name: As `draw_signal`.
         path: The file. Its folder is made where it is missing; a file of this name is replaced.
-        samples: As `draw_signal`.
-        max_input: As `draw_signal`.
-        max_rms: As `draw_signal`.
-        seed: As `draw_signal`.
+        limits: Further arguments of `draw_signal`.
 
     Returns:
         The input in volts, shape `(samples,)`.
@@ -94,8 +83,8 @@ def export_signal(
         ValueError: As `draw_signal`; nothing is written then.
         OSError: The file cannot be written.
     """
-    volts = draw_signal(name, samples=samples, max_input=max_input, max_rms=max_rms, seed=seed)
-    times = (SAMPLING_STEP * np.arange(samples)).tolist()
+    volts = draw_signal(name, **limits)
+    times = (SAMPLING_STEP * np.arange(len(volts))).tolist()
     rows = [f"{time!r},{value!r}" for time, value in zip(times, volts.tolist(), strict=True)]
     write_atomically(Path(path), "\n".join(["t [s],u [V]", *rows, ""]))
     return volts
@@ -121,14 +110,8 @@ class Config:
 
 def main(config: Config) -> None:
     """Write it, and say what it is."""
-    volts = export_signal(
-        config.name,
-        config.output,
-        samples=config.samples,
-        max_input=config.max_input,
-        max_rms=config.max_rms,
-        seed=config.seed,
-    )
+    limits = {name: value for name, value in vars(config).items() if name not in ("name", "output")}
+    volts = export_signal(config.name, config.output, **limits)
     peak, rms = np.abs(volts).max(), np.sqrt(np.mean(volts**2))
     seconds = volts.size * SAMPLING_STEP
     print(f"{config.output}: {volts.size} samples, {seconds:.4g} s, peak {peak:.4g} V, RMS {rms:.4g} V")

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.planner.motion import places, survey
 from agents.policies.excitations import BAND
-from agents.policies.signals import Limits, limits_of
+from agents.policies.signals import Limits, check_rows, limits_of
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from estimator.parameters import SAMPLING_STEP
 
@@ -50,12 +50,7 @@ class FeedbackPolicy:
     """
 
     def __init__(self, limits: Limits, experiment: Experiment) -> None:
-        """Takes from the experiment what an observed mean, in the prior's standard deviations, stands for.
-
-        Args:
-            limits: What the input keeps to.
-            experiment: That of the environment.
-        """
+        """Takes from the experiment what an observed mean, in the prior's standard deviations, stands for."""
         self.limits = limits
         self._model, self._step = experiment.model, experiment.step
         self._places = places(experiment.model)
@@ -94,14 +89,44 @@ class FeedbackPolicy:
         before = shown - velocities
         return np.sqrt(shown**2 + before**2 - 2.0 * shown * before * np.cos(angles)) / np.sin(angles)
 
-    def _actions(
-        self, observation: ArrayLike, seen: tuple[NDArray[np.float64], ...], signs: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
-        """These signs `(n,)` at full size, or braking where the amplitude is large; in the observation's shape."""
-        signs = np.where(self._amplitude(*seen) > TURN, -np.sign(seen[1]), signs)
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: NDArray[np.float64] | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Gives the next input of each environment, as `agents.policies.Policy`; there is nothing random about it.
+
+        Args:
+            observation: Shape `(n, features)` for n environments, or `(features,)` for one.
+            state: What the last call returned: the phases, shape `(n,)`, in periods. None: all begin at 0.
+            episode_start: Shape `(n,)`: which environments begin an episode, and so at phase 0. None: none does.
+            deterministic: Without effect.
+
+        Returns:
+            Actions, float32 of shape `(n, 1)`, or `(1,)` for one environment; and the state for the next call.
+
+        Raises:
+            ValueError: `observation` is not one of duffing_env, or `state` or `episode_start` is for another number
+                of environments.
+        """
+        rows = self._rows(observation)
+        phase = np.zeros(len(rows)) if state is None else state
+        starts = np.zeros(len(rows), dtype=bool) if episode_start is None else np.atleast_1d(episode_start)
+        check_rows("state", len(phase), len(rows))
+        check_rows("episode_start", len(starts), len(rows))
+        phase = np.where(starts, 0.0, phase)
+        seen = self._look(rows)
+        signs = np.where(self._amplitude(*seen) > TURN, -np.sign(seen[1]), self._signs(seen[1], phase))
         # An input of one magnitude has that magnitude as its RMS.
         size = self.limits.fit(np.array([self.limits.max_input])).item()
-        return (size * signs).astype(np.float32).reshape(*np.shape(observation)[:-1], 1)
+        actions = (size * signs).astype(np.float32).reshape(*np.shape(observation)[:-1], 1)
+        return actions, (phase + self.limits.hold * seen[2]) % 1.0
+
+    def _signs(self, velocities: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The signs `(n,)` of inputs that need not brake, at phases of a wave of the believed resonance."""
+        raise NotImplementedError
 
     def _rows(self, observation: ArrayLike) -> NDArray[np.float64]:
         """The observations as a batch `(n, features)`."""
@@ -122,30 +147,8 @@ class VelocitySign(FeedbackPolicy):
     the velocity there, but for half a sample. Only the brake looks at the model.
     """
 
-    def predict(
-        self,
-        observation: ArrayLike,
-        state: Any = None,
-        episode_start: ArrayLike | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], Any]:
-        """Gives the next input of each environment, as Stable-Baselines3's policies do.
-
-        Args:
-            observation: Shape `(n, features)` for n environments, or `(features,)` for one.
-            state: Not used, and handed back.
-            episode_start: Not used.
-            deterministic: Without effect.
-
-        Returns:
-            Actions, float32 of shape `(n, 1)`, or `(1,)` for one environment; and the state.
-
-        Raises:
-            ValueError: `observation` is not one of duffing_env.
-        """
-        seen = self._look(self._rows(observation))
-        pumping = np.where(seen[1] < 0.0, -1.0, 1.0)
-        return self._actions(observation, seen, pumping), state
+    def _signs(self, velocities: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.where(velocities < 0.0, -1.0, 1.0)
 
 
 class SquareBelieved(FeedbackPolicy):
@@ -154,45 +157,11 @@ class SquareBelieved(FeedbackPolicy):
     The phase goes on as the frequency changes; an episode begins with a positive half-wave.
     """
 
-    def predict(
-        self,
-        observation: ArrayLike,
-        state: NDArray[np.float64] | None = None,
-        episode_start: ArrayLike | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Gives the next input of each environment, as Stable-Baselines3's policies do.
-
-        Args:
-            observation: Shape `(n, features)` for n environments, or `(features,)` for one.
-            state: What the last call returned: the phases, shape `(n,)`, in periods. None: all begin at 0.
-            episode_start: Shape `(n,)`: which environments begin an episode, and so at phase 0. None: none does.
-            deterministic: Without effect.
-
-        Returns:
-            Actions, float32 of shape `(n, 1)`, or `(1,)` for one environment; and the state for the next call.
-
-        Raises:
-            ValueError: `observation` is not one of duffing_env, or `state` or `episode_start` is for another number
-                of environments.
-        """
-        rows = self._rows(observation)
-        phase = np.zeros(len(rows)) if state is None else state
-        starts = np.zeros(len(rows), dtype=bool) if episode_start is None else np.atleast_1d(episode_start)
-        for name, given in (("state", phase), ("episode_start", starts)):
-            if len(given) != len(rows):
-                raise ValueError(
-                    f"{name} is for {len(given)} environments, but observation is for {len(rows)}; pass None when the "
-                    "batch changes"
-                )
-        phase = np.where(starts, 0.0, phase)
-        wave = np.where(phase < 0.5, 1.0, -1.0)
-        seen = self._look(rows)
-        following = (phase + self.limits.hold * seen[2]) % 1.0
-        return self._actions(observation, seen, wave), following
+    def _signs(self, velocities: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.where(phases < 0.5, 1.0, -1.0)
 
 
-def make_feedback(kind: type[VelocitySign] | type[SquareBelieved], env: Any, seed: int) -> Any:
+def make_feedback(kind: type[FeedbackPolicy], env: Any, seed: int) -> FeedbackPolicy:
     """A policy with feedback for an unwrapped environment (or None: the defaults); the seed has no effect.
 
     Raises:
@@ -202,7 +171,7 @@ def make_feedback(kind: type[VelocitySign] | type[SquareBelieved], env: Any, see
     return kind(limits, SimulatedExperiment() if env is None else env.experiment)
 
 
-FEEDBACK: dict[str, Callable[[Any, int], Any]] = {
+FEEDBACK: dict[str, Callable[[Any, int], FeedbackPolicy]] = {
     "square-believed": partial(make_feedback, SquareBelieved),
     "velocity-sign": partial(make_feedback, VelocitySign),
 }

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 WEIGHTS = "policy.safetensors"
 CARD = "policy.json"
-#: Format 1, which is read as well, has no network in its card: it is always that of PPO.
 FORMAT = 2
 
 FloatArray = npt.NDArray[np.float32]
@@ -253,18 +252,9 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
             f"policy folder must hold sound files, but {folder} does not: {error}; copy it anew"
         ) from error
     found = card.get("format") if isinstance(card, dict) else None
-    if found not in (1, FORMAT):
-        raise ValueError(f"policy card must have format 1 or {FORMAT}, but {folder / CARD} has {found!r}; train anew")
+    if found != FORMAT:
+        raise ValueError(f"policy card must have format {FORMAT}, but {folder / CARD} has {found!r}; train anew")
     try:
-        network = _network_of_format_1(tensors) if found == 1 else Network(**card["network"])
-        return LearnedPolicy(network, tensors, card, seed)
+        return LearnedPolicy(Network(**card["network"]), tensors, card, seed)
     except (KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(f"policy must be what its card says, but {folder} is not: {error!r}; copy it anew") from error
-
-
-def _network_of_format_1(tensors: Mapping[str, Any]) -> Network:
-    hidden = sorted(
-        (name for name in tensors if name.startswith("mlp_extractor.policy_net.") and name.endswith(".weight")),
-        key=lambda name: int(name.split(".")[2]),  # by number: layer 10 comes after layer 2
-    )
-    return Network((*(name.removesuffix(".weight") for name in hidden), "action_net"))

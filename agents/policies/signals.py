@@ -146,26 +146,22 @@ class SignalPolicy:
         episode_start: ArrayLike | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], SignalState]:
-        """Gives the next input of each environment, as Stable-Baselines3's policies do.
+        """Gives the next input of each environment, as `agents.policies.Policy`.
 
         Args:
-            observation: Shape `(n, features)` for n environments, or `(features,)` for one. Only
-                its shape matters.
-            state: What the last call returned; None draws a new signal for every environment. A
+            observation: Shape `(n, features)` for n environments, or `(features,)` for one; it is not looked at.
+            state: What the last call returned, which stays as it is; None draws a new signal for every environment. A
                 caller who always passes None gets first samples only.
-            episode_start: Shape `(n,)`: which environments begin an episode with this
-                observation, and so draw a new signal. None means that none does.
-            deterministic: Part of the signature, without effect: a signal is random by its draw,
-                and reproducible by its seed.
+            episode_start: Shape `(n,)`: which environments begin an episode, and so a new signal. None: none does.
+            deterministic: Without effect: a signal is random by its draw, and reproducible by its seed.
 
         Returns:
-            The actions, u / max_input fitted to the limits, as float32 of shape `(n, 1)`, or `(1,)`
-            for one environment; and the state for the next call. The state that was passed in is
-            left as it was.
+            The actions, u / max_input fitted to the limits, as float32 of shape `(n, 1)`, or `(1,)` for one
+            environment; and the state for the next call.
 
         Raises:
-            ValueError: `observation` has neither one nor two dimensions, or `state` or
-                `episode_start` is for another number of environments.
+            ValueError: `observation` has neither one nor two dimensions, or `state` or `episode_start` is for another
+                number of environments.
         """
         observed = np.shape(observation)
         if len(observed) not in (1, 2):
@@ -179,11 +175,11 @@ class SignalPolicy:
             signals = np.empty((rows, self.actions), dtype=np.float32)
         else:
             position, signals = state
-            _check_rows("state", len(position), rows)
+            check_rows("state", len(position), rows)
         due = position == self.actions
         if episode_start is not None:
             starts = np.atleast_1d(np.asarray(episode_start, dtype=bool))
-            _check_rows("episode_start", len(starts), rows)
+            check_rows("episode_start", len(starts), rows)
             due = due | starts
         if due.any():
             position = np.where(due, 0, position)
@@ -201,7 +197,8 @@ class SignalPolicy:
         return self.limits.fit(self._draw(self._generators[row], self.samples))
 
 
-def _check_rows(name: str, given: int, expected: int) -> None:
+def check_rows(name: str, given: int, expected: int) -> None:
+    """Refuse what is for another number of environments than the observation."""
     if given != expected:
         raise ValueError(
             f"{name} is for {given} environments, but observation is for {expected}; pass None when the batch changes"

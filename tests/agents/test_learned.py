@@ -175,16 +175,6 @@ def test_critics_do_not_travel(tmp_path, algo):
     assert all(name.startswith("actor.") for name in load_file(folder / WEIGHTS))
 
 
-def test_format_1_is_read_as_before(tmp_path):
-    """Its card has no network; the layers are found by their numbers, 10 after 2."""
-    folder, model = saved(tmp_path, hidden=(4,) * 7)
-    described = (folder / CARD).read_text()
-    (folder / CARD).write_text('{"format": 1, "algorithm": "ppo"}')
-    policy = load_policy(folder)
-    (folder / CARD).write_text(described)
-    assert_acts_as(policy, model, folder, random_observations())
-
-
 def test_every_weight_is_saved_as_it_is(tmp_path):
     folder, model = saved(tmp_path)
     tensors, expected = load_file(folder / WEIGHTS), model.policy.state_dict()
@@ -277,7 +267,7 @@ def test_pickles_and_archives_are_refused_unopened(tmp_path):
     for path in (folder, folder / "policy.zip", folder / "policy.pkl"):
         with pytest.raises(ValueError, match="must hold"):
             make_policy(str(path))
-    (folder / CARD).write_text('{"format": 1}')
+    (folder / CARD).write_text('{"format": 2}')
     for content in (pickle.dumps(Trap(sprung)), (folder / "policy.zip").read_bytes()):
         (folder / WEIGHTS).write_bytes(content)
         with pytest.raises(ValueError, match=r"must hold sound files, but .*run does not"):
@@ -290,15 +280,15 @@ def test_pickles_and_archives_are_refused_unopened(tmp_path):
 @pytest.mark.parametrize(
     ("card", "message"),
     [
-        ('{"format": 3}', "must have format 1 or 2, but .*policy.json has 3"),
-        ("{}", "must have format 1 or 2, but .*policy.json has None"),
-        ("[1]", "must have format 1 or 2, but .*policy.json has None"),
+        ('{"format": 3}', "must have format 2, but .*policy.json has 3"),
+        ("{}", "must have format 2, but .*policy.json has None"),
+        ("[1]", "must have format 2, but .*policy.json has None"),
         ('{"format": 2}', "must be what its card says, but .* is not: KeyError"),
         ('{"format": 2, "network": {"layers": ["elsewhere"]}}', "KeyError.'elsewhere.weight'"),
         ('{"format": 2, "network": {"layers": []}}', "IndexError"),
         ('{"format": 2, "network": {"layers": ["action_net"], "activation": "swish"}}', "KeyError.'swish'"),
         ('{"format": 2, "network": {"layers": ["action_net"], "depth": 3}}', "TypeError.*depth"),
-        ('{"format": 1', "must hold sound files"),
+        ('{"format": 2', "must hold sound files"),
         ("", "must hold sound files"),
     ],
 )
@@ -318,11 +308,9 @@ def test_cut_off_weights_are_refused(tmp_path):
 
 def test_weights_of_something_else_are_refused(tmp_path):
     folder, _ = saved(tmp_path)
-    for card in ((folder / CARD).read_text(), '{"format": 1}'):
-        (folder / CARD).write_text(card)
-        save_file({"weights": np.zeros(3)}, folder / WEIGHTS)
-        with pytest.raises(ValueError, match=r"must be what its card says, but .*KeyError\('.*weight'\); copy it anew"):
-            load_policy(folder)
+    save_file({"weights": np.zeros(3)}, folder / WEIGHTS)
+    with pytest.raises(ValueError, match=r"must be what its card says, but .*KeyError\('.*weight'\); copy it anew"):
+        load_policy(folder)
 
 
 def test_loading_and_acting_needs_no_torch(tmp_path):
