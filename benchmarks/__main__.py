@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 from agents.cli import run_script
+from agents.results import versions, write_json
 from benchmarks.peer_process import Peers
 from benchmarks.report import Section, print_section, print_verdicts
-from estimator.files import write_atomically
 
 SectionName = Literal["estimators", "environments", "training", "roofline", "scaling", "startup"]
 _PACKAGES = ("duffing-env", "numpy", "numba", "llvmlite", "scipy", "gymnasium", "stable-baselines3", "torch")
@@ -55,8 +53,8 @@ def main(config: Config) -> None:
         samples = Path(folder) / "samples.npz"
         with Peers(samples, config.peers) as peers:
             machine = describe_machine()
-            versions = {"ours": {name: version(name) for name in _PACKAGES}, "peers": peers.versions()}
-            print_head(machine, versions, config.repetitions)
+            used = {"ours": versions(*_PACKAGES), "peers": peers.versions()}
+            print_head(machine, used, config.repetitions)
             with status:
                 on_row: Callable[[str], None] = status.update
                 for name in config.sections:
@@ -65,9 +63,8 @@ def main(config: Config) -> None:
     print_verdicts(list(sections.values()))
     print(f"\n{(time.perf_counter() - started) / 60:.1f} minutes; load at the end: {_load()}")
     if config.json is not None:
-        content = {"machine": machine, "versions": versions, "repetitions": config.repetitions}
-        content["sections"] = {name: section.to_dict() for name, section in sections.items()}
-        write_atomically(config.json, json.dumps(content, indent=2))
+        content = {"machine": machine, "versions": used, "repetitions": config.repetitions}
+        write_json(config.json, content | {"sections": {name: section.to_dict() for name, section in sections.items()}})
         print(config.json)
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from agents.cli import run_script
+from agents.results import show, table
 from benchmarks.__main__ import describe_machine
 
 ROOT = Path(__file__).parents[1]
@@ -178,31 +179,27 @@ class Config:
 def main(config: Config) -> None:
     """Run all settings, printing each when it is finished, and a table at the end."""
     from rich.console import Console
-    from rich.table import Table
 
     if config.workers < 1:
         raise ValueError(f"workers must be at least 1, but is {config.workers}")
     chosen = [s for s in settings() if not config.only or any(word in s.name for word in config.only)]
     if not chosen:
         raise ValueError(f"only must name a setting, but {' '.join(config.only)} is in none of their names")
-    console, features = Console(width=100), processor_features()
-    machine = describe_machine()
-    console.print(f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}", highlight=False)
-    table = Table("Setting", "Passed", "Failed", "Seconds", box=None, pad_edge=False)
-    failed = []
+    features, machine = processor_features(), describe_machine()
+    show(f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}")
+    rows, failed = [], []
     with tempfile.TemporaryDirectory() as folder:
         for setting in chosen:
             if features and not features.issuperset(setting.needs):
-                table.add_row(setting.name, "not on this processor")
+                rows.append((setting.name, "not on this processor"))
                 continue
             with Console(stderr=True).status(setting.name):
                 outcome = run(setting, config.workers, Path(folder))
             failed += [f"{setting.name}: {name}" for name in outcome.failed]
-            table.add_row(setting.name, f"{outcome.passed}", f"{len(outcome.failed)}", f"{outcome.seconds:.0f}")
-            console.print(f"{setting.name}: {outcome.passed} passed, {len(outcome.failed)} failed", highlight=False)
-            for name in outcome.failed:
-                console.print(f"  {name}", highlight=False, markup=False)
-    console.print(table)
+            rows.append((setting.name, f"{outcome.passed}", f"{len(outcome.failed)}", f"{outcome.seconds:.0f}"))
+            show(f"{setting.name}: {outcome.passed} passed, {len(outcome.failed)} failed")
+            show(*(f"  {name}" for name in outcome.failed))
+    show(table(("Setting", "Passed", "Failed", "Seconds"), rows))
     if failed:
         sys.exit(1)
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import gymnasium as gym
 
+from agents.evaluation.figures import new_figure, save
 from benchmarks.environments import TRACK, vector_steps
 from benchmarks.report import Claim, Section, ratio
 from benchmarks.timing import Result, Row, measure, timed
-from estimator.files import write_atomically
 from estimator.inference import DEFAULT_ITERATIONS
 
 UNIT = "ns/env-step"
@@ -81,13 +81,7 @@ def _later(axis: str, value: int, rule: str) -> Callable[[int], tuple[float, flo
 
 def draw(results: dict[str, Result], path: Path) -> None:
     """One panel per axis: median cost, with a band from minimum to maximum."""
-    import io
-
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure((10, 6.4), layout="constrained", dpi=120)
-    FigureCanvasAgg(figure)
+    figure = new_figure(10, 6.4)
     for panel, (axis, values) in zip(figure.subplots(2, 2).flat, AXES.items(), strict=True):
         for rule, colour in _COLOURS.items():
             found = [(value, results[_name(axis, value, rule)]) for value in values]
@@ -111,6 +105,4 @@ def draw(results: dict[str, Result], path: Path) -> None:
         panel.set_ylabel("ns per env-step")
         panel.grid(alpha=0.3)
         panel.legend()
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    write_atomically(path, buffer.getvalue())
+    save(figure, path)

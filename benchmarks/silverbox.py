@@ -11,14 +11,12 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import tyro
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
+from agents.results import finite, show, table
 from agents.studies.silverbox_protocol import (
     GIVEN,
     LENGTHS,
@@ -101,10 +99,10 @@ class Contender:
         if self.reason:
             return {"not_available": self.reason}
         return {
-            "rmse": {test: _finite(error) for test, error in self.errors.items()},
-            "coverage": _finite(self.coverage),
+            "rmse": self.errors,
+            "coverage": self.coverage,
             "samples_until_1_mV": samples_until_close(self.learning),
-            "arrow_rmse_after": {str(samples): _finite(error) for samples, error in self.learning.items()},
+            "arrow_rmse_after": {str(samples): error for samples, error in self.learning.items()},
             "time": self.time.to_dict(),
         }
 
@@ -117,6 +115,8 @@ def compare(sections: Sections, outcomes: Mapping[str, Outcome], wanted: bool = 
         outcomes: Of our settings, in this run.
         wanted: Whether there are to be peers at all; without them every row says so.
     """
+    from rich.console import Console
+
     status = Console(stderr=True).status("Peers")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "given.npz"
@@ -126,12 +126,13 @@ def compare(sections: Sections, outcomes: Mapping[str, Outcome], wanted: bool = 
             versions = peers.versions()
     claims = {title: faster(contenders, title) for title in PEERS if title.startswith("dynamax")}
     report(contenders, claims, versions)
-    return {
+    compared = {
         "rows": {title: contender.to_dict() for title, contender in contenders.items()},
-        "times_as_fast": {title: _finite(claim[0]) for title, claim in claims.items()},
+        "times_as_fast": {title: times for title, (times, _) in claims.items()},
         "timed_samples": TIMED,
         "versions": versions,
     }
+    return cast("dict[str, Any]", finite(compared))
 
 
 def given(sections: Sections, outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
@@ -281,58 +282,49 @@ def report(
     contenders: Mapping[str, Contender], claims: Mapping[str, tuple[float, bool]], versions: Mapping[str, str]
 ) -> None:
     """Prints the table, and how much faster ours is than dynamax's filter with the same model."""
-    console = Console(highlight=False, markup=False)
-    console.width = max(console.width, 100)
-    console.print("\nPeers, and ours with the same model:")
-    console.print(table(contenders))
+    show("\nPeers, and ours with the same model:", as_table(contenders))
     for title, contender in contenders.items():
         if contender.reason:
-            console.print(f"{title}: not available: {contender.reason}")
-    console.print(f"µs per sample: median [least, most] of {REPETITIONS} turns over the first {TIMED:,} samples,")
-    console.print("compiled before; fastcan: of its fit to all samples, once")
+            show(f"{title}: not available: {contender.reason}")
     used = [name for name in ("dynamax", "jax", "filterpy", "padasip", "fastcan", "numpy") if name in versions]
-    console.print(", ".join(f"{name} {versions[name]}" for name in used) or "no peers")
-    console.print("\nSpeed at equal or better error:")
+    show(
+        f"µs per sample: median [least, most] of {REPETITIONS} turns over the first {TIMED:,} samples,",
+        "compiled before; fastcan: of its fit to all samples, once",
+        ", ".join(f"{name} {versions[name]}" for name in used) or "no peers",
+        "\nSpeed at equal or better error:",
+    )
     for title, (times, no_worse) in claims.items():
         ours = MODELS[PEERS[title][1]]
         if np.isnan(times):
-            console.print(f"  not available: {title}")
+            show(f"  not available: {title}")
             continue
         verdict = "PASS" if times >= BAR and no_worse else "MISS"
-        console.print(f"  {verdict}  {ours} is {times:.1f} times as fast as {title}, at least {BAR:g},")
-        console.print(f"        with {_line(contenders[ours])} mV against {_line(contenders[title])} mV")
+        show(f"  {verdict}  {ours} is {times:.1f} times as fast as {title}, at least {BAR:g},")
+        show(f"        with {_line(contenders[ours])} mV against {_line(contenders[title])} mV")
 
 
 def _line(contender: Contender) -> str:
     return submission(1e3 * contender.errors[test] for test in TESTS)
 
 
-def table(contenders: Mapping[str, Contender]) -> Table:
+def as_table(contenders: Mapping[str, Contender]) -> Any:
     """A row for each contender, in 100 characters."""
-    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    shown.add_column("")
     titles = ("multisine\n[mV]", "arrow\n[mV]", "n.e.\n[mV]", "90 %\ncovers", "<1 mV\nafter", "µs per\nsample")
-    for title in (*titles, "[least, most]"):
-        shown.add_column(title, justify="right")
-    for title, contender in contenders.items():
-        if contender.reason:
-            shown.add_row(title, *["-"] * 7)
-            continue
-        low, high = min(contender.time.values), max(contender.time.values)
-        shown.add_row(
-            title,
-            *(f"{1e3 * contender.errors[test]:.3f}" for test in TESTS),
-            "-" if np.isnan(contender.coverage) else f"{contender.coverage:.3f}",
-            str(samples_until_close(contender.learning) or "never"),
-            f"{contender.time.median:.2f}",
-            f"[{low:.2f}, {high:.2f}]" if len(contender.time.values) > 1 else "-",
-        )
-    return shown
+    return table(("", *titles, "[least, most]"), (_row(*entry) for entry in contenders.items()))
 
 
-def _finite(value: float) -> float | None:
-    """A number for JSON, which has no other."""
-    return value if np.isfinite(value) else None
+def _row(title: str, contender: Contender) -> tuple[str, ...]:
+    if contender.reason:
+        return (title, *["-"] * 7)
+    low, high = min(contender.time.values), max(contender.time.values)
+    return (
+        title,
+        *(f"{1e3 * contender.errors[test]:.3f}" for test in TESTS),
+        "-" if np.isnan(contender.coverage) else f"{contender.coverage:.3f}",
+        str(samples_until_close(contender.learning) or "never"),
+        f"{contender.time.median:.2f}",
+        f"[{low:.2f}, {high:.2f}]" if len(contender.time.values) > 1 else "-",
+    )
 
 
 def main(json: Path | None = None, figures: Path = Path("runs/silverbox"), data: Path | None = None) -> None:

@@ -13,7 +13,6 @@ The 4 + 5K parameters lie in one vector, in the order L (3), d, a (K), c (K), b 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,22 +41,7 @@ class PEMNARX:
     Jacobian, on regressors and outputs of zero mean and unit variance. Every restart begins at the least-squares linear
     model, with silent units (a = 0) of random direction and bias; the one with the lowest training error is kept.
 
-    **Against the published row.** Trained on samples 40,101 to 131,072 of the Silverbox record with ``input_delay=0``
-    and validated on the first 40,100 (mean squared errors in V²; the published indexing):
-
-    | model                     | training        | prediction      | simulation     |
-    |---------------------------|-----------------|-----------------|----------------|
-    | linear ARX, ``units=0``   | 5.7393e-5       | 5.8364e-5       | 9.943e-4       |
-    | MATLAB's, as published    | 5.7379e-5       | 5.8308e-5       | 10.014e-4      |
-    | this fit, seeds 0 to 7    | 5.694…5.696e-5  | 5.712…5.716e-5  | 8.84…9.01e-4   |
-
-    This fit is better than the published row in all three, because MATLAB's model is not a minimum of its criterion.
-    The published free run determines that model's network to 1 µV, and with it the training error above: it makes 3 %
-    of the improvement over the linear model that four units can make. The same search, started at MATLAB's network,
-    lowers its training error to 5.697e-5 and its simulation error to 8.90e-4 within 20 evaluations. Nor was it fitted
-    to the simulation error, which on the training samples too is larger than the linear model's (9.63e-4 against
-    9.46e-4). The likely reason is an unfinished search, since MATLAB's ends after 20 iterations by default. So the
-    published row is, to 1 %, that of a linear model. Nothing here was chosen on the validation samples.
+    It is better than the published row, whose network is no minimum of the criterion (docs/reproduction.md).
 
     Args:
         units: number K >= 0 of sigmoid units; with 0 the model is a linear ARX model with an offset.
@@ -102,13 +86,12 @@ class PEMNARX:
         if self.input_delay not in (0, 1):
             raise ValueError(f"input_delay must be 0 or 1, but is {self.input_delay!r}; the published run had 0")
 
-    def fit(self, u: npt.ArrayLike, y: npt.ArrayLike, progress: bool = False) -> PEMNARX:
+    def fit(self, u: npt.ArrayLike, y: npt.ArrayLike) -> PEMNARX:
         """Fits the network to one record. An earlier fit is replaced.
 
         Args:
             u: (T,) inputs [V].
             y: (T,) outputs [V], paired with u by index; T - 2 must exceed the number of parameters 4 + 5K.
-            progress: Show a progress bar over the restarts.
 
         Returns:
             This model.
@@ -137,7 +120,7 @@ class PEMNARX:
         linear = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), standard_target, rcond=None)[0]
         rng = np.random.default_rng(self.seed)
         solutions = []
-        for _ in _restarts(self.restarts, progress):
+        for _ in range(self.restarts):
             start = np.concatenate([linear, np.zeros(self.units), rng.standard_normal(4 * self.units)])
             solution = least_squares(
                 lambda parameters: network(parameters, z) - standard_target,
@@ -273,15 +256,6 @@ def _free_run(parameters, regressor_mean, u, input_delay, y, start):
             y[t:] = np.nan
             return
         y[t] = output
-
-
-def _restarts(number: int, progress: bool) -> Iterable[int]:
-    """The restarts, behind a progress bar if there is to be one."""
-    if not progress:
-        return range(number)
-    from rich.progress import track
-
-    return track(range(number), description="Fitting")
 
 
 def _pair(u: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from agents.evaluation.rollout import Evaluation
-from agents.results import write_json
+from agents.results import show, table, write_json
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -137,48 +137,52 @@ def write_evaluations(path: Path, evaluations: list[Evaluation], settings: dict[
     write_json(path, {"settings": settings, "policies": results})
 
 
+Table = tuple[list[str], list[list[str]]]
+
+
+def leaderboard(evaluations: list[Evaluation]) -> Table:
+    """Heads and rows: a column for each policy, the best log posterior gain first; `cell_of` each metric."""
+    ordered = in_order(evaluations)
+    summaries = [summarise(evaluation) for evaluation in ordered]
+    rows = [
+        [metric.title, *(cell_of(metric, summary.get(name)) for summary in summaries)]
+        for name, metric in METRICS.items()
+        if any(name in summary for summary in summaries)
+    ]
+    return ["", *(evaluation.title for evaluation in ordered)], rows
+
+
+def two_way_table(evaluations: list[Evaluation]) -> Table:
+    """Heads and rows, policies by estimators: who identified what from the same inputs and outputs."""
+    metrics = [METRICS[name] for name in ESTIMATOR_METRICS]
+    rows = []
+    for evaluation in in_order(evaluations):
+        for estimator, values in evaluation.estimators.items():
+            centers = [float(METRICS[name].center[1](values[name])) for name in ESTIMATOR_METRICS]
+            cells = [f"{m.scale * center:.{m.digits}f}" for m, center in zip(metrics, centers, strict=True)]
+            rows.append([evaluation.title, estimator.replace("_", " "), *cells])
+    return ["policy", "estimator", *(metric.title for metric in metrics)], rows
+
+
 def print_table(evaluations: list[Evaluation], title: str) -> None:
-    """Print the leaderboard: a column for each policy, the best log posterior gain first; intervals below."""
-    from rich.console import Console
+    """Print the leaderboard, with the intervals below."""
     from rich.table import Table
 
-    summaries = {evaluation.title: summarise(evaluation) for evaluation in evaluations}
-    order = [evaluation.title for evaluation in in_order(evaluations)]
+    heads, rows = leaderboard(evaluations)
     table = Table(title=title, caption=caption_of(evaluations))
     table.add_column("", no_wrap=True)
-    for policy in order:
+    for policy in heads[1:]:
         table.add_column(policy, justify="right", overflow="fold")
-    for name, metric in METRICS.items():
-        if any(name in summary for summary in summaries.values()):
-            table.add_row(metric.title, *(cell_of(metric, summaries[policy].get(name)) for policy in order))
-    console = Console(markup=False)  # the brackets of the intervals are no markup
-    console.width = max(console.width, 36 + 20 * len(order))
-    console.print(table)
+    for row in rows:
+        table.add_row(*row)
+    show(table, width=36 + 20 * len(evaluations))
 
 
 def print_estimators(evaluations: list[Evaluation]) -> None:
-    """Print the two-way table, policies by estimators: who identified what from the same inputs and outputs."""
-    from rich.console import Console
-    from rich.table import Table
-
-    titles = [METRICS[name].title for name in ESTIMATOR_METRICS]
-    table = Table(title="the same inputs and outputs in other hands")
-    for name in ("policy", "estimator"):
-        table.add_column(name, no_wrap=True)
-    for text in titles:
-        table.add_column(text)
-    for evaluation in evaluations:
-        for estimator, values in evaluation.estimators.items():
-            cells = []
-            for name in ESTIMATOR_METRICS:
-                metric = METRICS[name]
-                cells.append(f"{metric.scale * float(metric.center[1](values[name])):.{metric.digits}f}")
-            table.add_row(evaluation.title, estimator.replace("_", " "), *cells)
-        table.add_section()
-    if table.rows:
-        console = Console(markup=False)
-        console.width = max(console.width, 130)
-        console.print(table)
+    """Print the two-way table, where there is something in it."""
+    heads, rows = two_way_table(evaluations)
+    if rows:
+        show(table(heads, rows, title="the same inputs and outputs in other hands"), width=130)
 
 
 def in_order(evaluations: list[Evaluation]) -> list[Evaluation]:

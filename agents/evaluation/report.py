@@ -5,9 +5,7 @@ from __future__ import annotations
 import html
 import io
 import json
-import platform
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +17,9 @@ from agents.evaluation.figures import (
     figure_of_information,
     figure_of_inputs,
 )
-from agents.evaluation.leaderboard import ESTIMATOR_METRICS, METRICS, caption_of, cell_of, in_order, summarise
+from agents.evaluation.leaderboard import caption_of, leaderboard, two_way_table
 from agents.evaluation.rollout import Evaluation
+from agents.results import versions
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
@@ -102,11 +101,11 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
     for heading, figure, caption in figures:
         if figure is not None:
             parts.append(f"<h2>{heading}</h2><figure>{_svg(figure)}<figcaption>{caption}</figcaption></figure>")
-    versions = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
+    used = ", ".join(f"{name} {number}" for name, number in versions(*_PACKAGES).items())
     parts += [
         "<h2>How this page was made</h2>",
         f"<pre>{html.escape(' '.join(command))}</pre>",
-        f"<p><small>Python {platform.python_version()}, {html.escape(versions)}. "
+        f"<p><small>{html.escape(used)}. "
         '<a href="evaluation.json">evaluation.json</a> beside this page holds all figures.</small></p>',
     ]
     page = (
@@ -118,47 +117,33 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
 
 
 def _leaderboard(evaluations: list[Evaluation]) -> str:
-    """The table of all metrics, a column for each policy, the best first."""
-    ordered = in_order(evaluations)
-    summaries = [summarise(evaluation) for evaluation in ordered]
-    head = "".join(f"<th>{html.escape(evaluation.title)}</th>" for evaluation in ordered)
-    rows = []
-    for name, metric in METRICS.items():
-        if any(name in summary for summary in summaries):
-            cells = (cell_of(metric, summary.get(name)).partition("\n") for summary in summaries)
-            rows.append(
-                f"<tr><td>{html.escape(metric.title)}</td>"
-                + "".join(
-                    f"<td>{center}<br><small>{below.replace(chr(10), '<br>')}</small></td>"
-                    for center, _, below in cells
-                )
-                + "</tr>"
-            )
-    return _table(f"<th></th>{head}", rows)
+    """The table of all metrics, a column for each policy, the best first; intervals below the centres, and smaller."""
+    heads, rows = leaderboard(evaluations)
+    cells = [[title, *map(_with_interval, cells)] for title, *cells in rows]
+    return _table(heads, cells)
+
+
+def _with_interval(cell: str) -> str:
+    center, _, below = cell.partition("\n")
+    return f"{center}<br><small>{below.replace(chr(10), '<br>')}</small>"
 
 
 def _estimators(evaluations: list[Evaluation]) -> str:
     """The two-way table, policies by estimators; nothing where there is one estimator only."""
-    rows = []
-    for evaluation in in_order(evaluations):
-        for estimator, values in evaluation.estimators.items():
-            cells = [html.escape(evaluation.title), html.escape(estimator.replace("_", " "))]
-            for name in ESTIMATOR_METRICS:
-                metric = METRICS[name]
-                cells.append(f"{metric.scale * float(metric.center[1](values[name])):.{metric.digits}f}")
-            rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    heads, rows = two_way_table(evaluations)
     if not rows:
         return ""
-    titles = ["policy", "estimator", *(METRICS[name].title for name in ESTIMATOR_METRICS)]
     return (
         "<h2>The same inputs and outputs in other hands</h2>"
         "<p>The auditor, an offline maximum a posteriori fit that knows the noises, ranks the inputs; the rows of one "
-        "policy rank the estimators.</p>" + _table("".join(f"<th>{html.escape(title)}</th>" for title in titles), rows)
+        "policy rank the estimators.</p>" + _table(heads, [[html.escape(cell) for cell in row] for row in rows])
     )
 
 
-def _table(head: str, rows: list[str]) -> str:
-    body = "\n".join(rows)
+def _table(heads: list[str], rows: list[list[str]]) -> str:
+    """A table of texts and of cells that are HTML already."""
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
+    body = "\n".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import platform
 import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields
-from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,6 +17,7 @@ import numpy as np
 
 from agents.cli import JsonOptions, check_track
 from agents.policies.learned import CARD, save_policy
+from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.checkpoints import (
     Progress,
@@ -30,7 +29,6 @@ from agents.training.checkpoints import (
 )
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import read_settings, settings_of, track_of
-from estimator.files import write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -192,7 +190,7 @@ class _Training:
         from agents.training.callbacks import ContinuedCSV
 
         if not (self._folder / "config.json").exists():
-            write_atomically(self._folder / "config.json", json.dumps(self._description, indent=2))
+            write_json(self._folder / "config.json", self._description)
         logs: list[KVWriter] = [ContinuedCSV(self._folder / "progress.csv", self._progress.steps)]
         if self._config.tensorboard:
             self._board = TensorBoardOutputFormat(str(self._folder))
@@ -306,7 +304,7 @@ def describe(config: TrainConfig) -> dict[str, Any]:
     return {
         "config": resolved,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in packages}},
+        "versions": versions(*packages),
     }
 
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from agents.results import show, table, write_json
 from agents.training.algorithms import as_written
 from agents.training.heldout import SCORE
 from agents.training.hyperparameters import track_of, write_settings
 from agents.training.runs import TrainConfig, describe, train
-from estimator.files import write_atomically
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -101,27 +101,22 @@ def _claim(folder: Path, config: TrainConfig) -> None:
     if any(before["config"][f.name] != described["config"][f.name] for f in fields(TrainConfig)):
         raise ValueError(f"output must be a new folder or that of the same search, but {folder} holds another search")
     if not file.exists():
-        write_atomically(file, json.dumps(described, indent=2))
+        write_json(file, described)
 
 
 def _print_table(study: Study) -> None:
     """The best trials, with what they were given."""
     from optuna.trial import TrialState
-    from rich.console import Console
-    from rich.table import Table
 
     complete = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
     best = sorted(complete, key=lambda trial: -(trial.value or 0.0))[:_SHOWN]
     pruned = len(study.get_trials(deepcopy=False, states=[TrialState.PRUNED]))
-    table = Table(title=f"Log posterior gain: {len(complete)} trials to the end, {pruned} given up")
-    table.add_column("trial", justify="right")
-    table.add_column("nat", justify="right")
-    for name in best[0].params:
-        table.add_column(name, justify="right")
+    rows = []
     for trial in best:
         values = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in trial.params.values())
-        table.add_row(str(trial.number), f"{trial.value:.3f}", *values)
-    Console().print(table)
+        rows.append((str(trial.number), f"{trial.value:.3f}", *values))
+    show(f"Log posterior gain: {len(complete)} trials to the end, {pruned} given up")
+    show(table(("trial", "nat", *best[0].params), rows))
 
 
 def _optuna() -> Any:

@@ -18,6 +18,7 @@ from agents.evaluation.leaderboard import (
     print_estimators,
     print_table,
     summarise,
+    two_way_table,
     write_evaluations,
 )
 from agents.evaluation.rollout import Evaluation
@@ -191,7 +192,11 @@ def test_the_two_way_table_has_a_row_for_each_policy_and_estimator(capsys):
         for policy in ("one", "two")
     ]
     print_estimators(evaluations)
-    rows = _rows(capsys.readouterr().out.splitlines(), "│")
+    printed = capsys.readouterr().out
+    assert "the same inputs and outputs in other hands" in printed
+    heads, rows = two_way_table(evaluations)
+    assert heads[2:] == [METRICS[name].title for name in ESTIMATOR_METRICS]
+    assert all(cell in printed for row in rows for cell in row)
     assert [row[:2] for row in rows] == [[p, e] for p in ("one", "two") for e in ("structured", "mean field")]
     assert {tuple(row[2:]) for row in rows} == {("2.000", "2.00", "2.000", "2.00", "3.0", "0.03")}
     print_estimators([make_evaluation("without")])

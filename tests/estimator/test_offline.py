@@ -142,11 +142,6 @@ def test_keeps_the_best_restart(monkeypatch):
     assert errors[-1] < errors[0]
 
 
-def test_progress_does_not_change_the_fit(fitted):
-    shown = PEMNARX(units=2, restarts=2).fit(*system(seed=0), progress=True)
-    np.testing.assert_array_equal(shown.parameters, fitted.parameters)
-
-
 def test_a_diverging_run_is_nan_from_there_on():
     unstable = np.array([3.0, -1.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.0, 0.0])
     simulated = with_parameters(unstable, mean=np.zeros(3)).simulate(np.zeros(3000), [1.0, 1.0])
