@@ -30,7 +30,7 @@ Run = Callable[[int], dict[str, Any]]
 
 PACKAGES = (
     *("envpool", "gymnax", "jax", "jaxlib", "gymnasium", "filterpy", "dynamax", "padasip", "fastcan", "scikit-learn"),
-    *("numpy", "scipy"),
+    *("pysindy", "numpy", "scipy"),
 )
 EPISODE = 200
 POOL_THREADS = 2
@@ -215,8 +215,8 @@ def padasip_rls() -> Run:
 def row(name: str) -> Run:
     """The row of this name, set up.
 
-    ``filterpy``, ``dynamax``, ``padasip``; a name and a number of environments; or ``silverbox`` and what
-    `benchmarks.silverbox_peers.row` takes.
+    ``filterpy``, ``dynamax``, ``padasip``; a name and a number of environments; ``silverbox`` and what
+    `benchmarks.silverbox_peers.row` takes; or ``rigs`` and what `benchmarks.rigs.peer_rows.row` takes.
     """
     estimators = {"filterpy": filterpy_ukf, "dynamax": dynamax_ekf, "padasip": padasip_rls}
     if name in estimators:
@@ -232,6 +232,11 @@ def row(name: str) -> Run:
         from silverbox_peers import row as silverbox_row
 
         return silverbox_row(samples(), *rest.split())
+    if kind == "rigs":
+        sys.path.append(str(Path(__file__).parent / "rigs"))
+        from peer_rows import row as rigs_row
+
+        return rigs_row(samples(), *rest.split())
     return environments[kind](int(rest))
 
 

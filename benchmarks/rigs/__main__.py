@@ -1,0 +1,119 @@
+"""Run a part: ``python -m benchmarks.rigs accuracy --seeds 200``; also ``faults``, ``peers`` and ``sweep``."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from benchmarks.rigs import accuracy, faults, peers, sweep
+from benchmarks.rigs.catalogue import BENCHES
+from estimator.files import write_atomically
+
+CORES = os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors and coverage on every rig, with guesses off by up to 30 % and with none."""
+
+    seeds: int = 200
+    """Records of each rig and setting."""
+    rigs: tuple[str, ...] = tuple(BENCHES)
+    """Names of rigs."""
+    settings: tuple[str, ...] = accuracy.SETTINGS
+    """With a guess, and without."""
+    workers: int = CORES
+    """Processes."""
+    json: Path | None = None
+    """File for every outcome."""
+
+    def run(self) -> dict[str, Any]:
+        """Run, print, and return what goes into the file."""
+        cells = accuracy.run(self.rigs, self.settings, self.seeds, self.workers)
+        return {"verdict": accuracy.show(cells), "cells": [cell.to_dict() for cell in cells]}
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Deliberate faults on rigs a and e: the share that is named, and of good records the share that is flagged."""
+
+    seeds: int = 100
+    """Records of each rig and fault."""
+    faults: tuple[str, ...] = tuple(faults.EXPECTED)
+    """Names of faults."""
+    workers: int = CORES
+    """Processes."""
+    json: Path | None = None
+    """File for every outcome."""
+
+    def run(self) -> dict[str, Any]:
+        """Run, print, and return what goes into the file."""
+        return faults.show(faults.run(self.faults, self.seeds, self.workers))
+
+
+@dataclass(frozen=True)
+class Against:
+    """Errors, times and statements against dynamax, SciPy and pysindy, in .venv-peers."""
+
+    seeds: int = 20
+    """Records of each rig."""
+    rigs: tuple[str, ...] = tuple(BENCHES)
+    """Names of rigs."""
+    json: Path | None = None
+    """File for all errors and times."""
+
+    def run(self) -> dict[str, Any]:
+        """Run, print, and return what goes into the file."""
+        results = peers.run(self.rigs, self.seeds)
+        return {"verdict": peers.show(results), "results": results}
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """From 6 to 800 samples per period, and from the linear range to the limit."""
+
+    seeds: int = 50
+    """Records of each cell."""
+    workers: int = CORES
+    """Processes."""
+    json: Path | None = None
+    """File for every outcome."""
+
+    def run(self) -> dict[str, Any]:
+        """Run, print, and return what goes into the file."""
+        cells = sweep.run(self.seeds, self.workers)
+        return {"verdict": sweep.show(cells), "cells": [cell.to_dict() for cell in cells]}
+
+
+Part = (
+    Annotated[Accuracy, tyro.conf.subcommand("accuracy")]
+    | Annotated[Faults, tyro.conf.subcommand("faults")]
+    | Annotated[Against, tyro.conf.subcommand("peers")]
+    | Annotated[Sweep, tyro.conf.subcommand("sweep")]
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Judge `estimator.identify` on rigs that are simulated by an integrator of the benchmark's own."""
+
+    part: tyro.conf.OmitSubcommandPrefixes[Part] = field(default_factory=Accuracy)
+
+
+def main(config: Config) -> None:
+    """Run a part, print it, and write its file."""
+    found = config.part.run()
+    if config.part.json is not None:
+        write_atomically(config.part.json, json.dumps(found, indent=1))
+        print(config.part.json)
+
+
+if __name__ == "__main__":
+    from agents.cli import run_script
+
+    run_script(main, Config, __doc__ or "")

@@ -1,0 +1,88 @@
+"""Errors and coverage of `identify` on every rig, from a CSV and a rig file, with a guess and without."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.rigs.catalogue import BENCHES, PARAMETERS
+from benchmarks.rigs.judge import POOLED, Cell, Outcome, calibrated, identified, in_processes
+from benchmarks.rigs.records import guess, record
+
+SETTINGS = ("guess", "no guess")
+
+Task = tuple[str, str, int]
+
+
+def trial(task: Task) -> Outcome:
+    """Simulate and identify one record of a rig, in a setting, of a seed."""
+    name, setting, seed = task
+    bench = BENCHES[name]
+    return identified(record(bench, seed), guess(bench, seed) if setting == "guess" else None)
+
+
+def run(names: Sequence[str], settings: Sequence[str], seeds: int, workers: int) -> list[Cell]:
+    """A cell for each rig and setting."""
+    tasks = [(name, setting, seed) for name in names for setting in settings for seed in range(seeds)]
+    outcomes = in_processes(trial, tasks, workers, "Identifying")
+    return [
+        Cell(BENCHES[name], setting, [outcomes[name, setting, seed] for seed in range(seeds)])
+        for name in names
+        for setting in settings
+    ]
+
+
+def show(cells: Sequence[Cell]) -> dict[str, Any]:
+    """Print the table and the verdict; return the verdict for the JSON file."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=170)
+    table = Table("rig", "", "median error of m, c, a, b, %", "bound (1 σ), %", "coverage of 90 %", "verdict",
+                  "s", "warnings and failures", box=box.MARKDOWN)  # fmt: skip
+    trials = [len(cell.outcomes) for cell in cells for _ in PARAMETERS]
+    hits = [count for cell in cells for count in cell.hits]
+    pooled, meets = calibrated(hits, trials)
+    accurate = [cell.errors <= cell.bars for cell in cells]
+    for place, cell in enumerate(cells):
+        number = len(cell.outcomes)
+        bad = [f"{p}: error" for p, good in zip(PARAMETERS, accurate[place], strict=True) if not good]
+        bad += [
+            f"{p}: coverage" for p, good in zip(PARAMETERS, meets[4 * place : 4 * place + 4], strict=True) if not good
+        ]
+        table.add_row(
+            cell.bench.name, cell.setting, percents(cell.errors), percents(cell.bounds),
+            ", ".join(f"{count / number:.3g}" for count in cell.hits), "; ".join(bad) or "PASS",
+            f"{np.median([outcome.seconds for outcome in cell.outcomes]):.2f}", remarks(cell.outcomes),
+        )  # fmt: skip
+    console.print(table)
+    is_calibrated = POOLED[0] <= pooled <= POOLED[1] and all(meets)
+    verdict = {
+        "accurate": bool(np.all(accurate)),
+        "calibrated": is_calibrated,
+        "pooled coverage": pooled,
+        "cells outside": int(np.size(meets) - np.sum(meets)),
+    }
+    console.print(
+        f"{'PASS' if verdict['accurate'] else 'MISS'}: median errors at most 0.3 %, or 1.2 times the median bound\n"
+        f"{'PASS' if is_calibrated else 'MISS'}: calibrated; pooled coverage {pooled:.3f} "
+        f"({POOLED[0]} to {POOLED[1]}), {verdict['cells outside']} of {len(meets)} cells outside of 0.85 to 0.95"
+    )
+    return verdict
+
+
+def percents(values: Any) -> str:
+    """Numbers as percents, two digits each."""
+    return ", ".join(f"{100 * value:.2g}" for value in values)
+
+
+def remarks(outcomes: Sequence[Outcome]) -> str:
+    """How many of the records met which warnings, and which failures."""
+    counts: dict[str, int] = {}
+    for outcome in outcomes:
+        for name in [*outcome.warnings, *([outcome.failure[:60]] if outcome.failure else [])]:
+            counts[name] = counts.get(name, 0) + 1
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))

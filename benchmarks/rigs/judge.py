@@ -1,0 +1,160 @@
+"""Verdicts: errors against the Cramér-Rao bound, coverage against its bars, and the trials that give them."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from benchmarks.rigs.catalogue import PARAMETERS, Bench
+from benchmarks.rigs.records import Record, write_record, write_rig
+from benchmarks.rigs.simulator import FloatArray
+
+LEVEL, POOLED, CELL = 0.9, (0.87, 0.93), (0.85, 0.95)
+LEAST_BAR, OVER_BOUND = 0.003, 1.2
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What `identify` made of a record.
+
+    Attributes:
+        error: (4,) estimate over truth, less 1; infinite where it failed.
+        deviation: (4,) standard deviations that it states, relative to the truth.
+        inside: (4,) whether its 90 % intervals hold the truth.
+        bound: (4,) Cramér-Rao bound, relative.
+        warnings: name to message.
+        seconds: that it took, with reading the files.
+        failure: what it raised, if anything.
+    """
+
+    error: list[float]
+    deviation: list[float]
+    inside: list[bool]
+    bound: list[float]
+    warnings: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+    failure: str = ""
+
+
+def identified(made: Record, guess: dict[str, tuple[float, float]] | None, **changed: Any) -> Outcome:
+    """Write a record and its rig file, with ``changed`` settings, and identify from these two files."""
+    from estimator import Rig, identify
+
+    truth, bound = np.array(made.bench.truth), made.deviations()
+    with tempfile.TemporaryDirectory() as folder:
+        rig_file, data_file = Path(folder) / "rig.toml", Path(folder) / "data.csv"
+        write_rig(rig_file, made.bench, guess, **changed)
+        write_record(data_file, made)
+        started = time.perf_counter()
+        try:
+            result = identify(Rig.from_file(str(rig_file)), [str(data_file)])
+        except Exception as error:  # whatever a user would meet
+            failed = f"{type(error).__name__}: {error}"
+            return Outcome([np.inf] * 4, [np.nan] * 4, [False] * 4, bound.tolist(), failure=failed)
+        seconds = time.perf_counter() - started
+    mean, std = np.array([result.parameters[name] for name in PARAMETERS]).T
+    low, high = np.array([result.interval(LEVEL)[name] for name in PARAMETERS]).T
+    finite = np.isfinite(mean) & np.isfinite(std)
+    return Outcome(
+        np.where(finite, mean / truth - 1, np.inf).tolist(),
+        (std / np.abs(truth)).tolist(),
+        ((low <= truth) & (truth <= high)).tolist(),
+        bound.tolist(),
+        {warning.name: warning.message for warning in result.warnings},
+        seconds,
+    )
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Outcomes of one rig in one setting, judged by parameter."""
+
+    bench: Bench
+    setting: str
+    outcomes: Sequence[Outcome]
+
+    @property
+    def errors(self) -> FloatArray:
+        """(4,) medians of the relative errors."""
+        return np.asarray(np.median(np.abs([outcome.error for outcome in self.outcomes]), axis=0))
+
+    @property
+    def bars(self) -> FloatArray:
+        """(4,) what the errors may be: 0.3 %, or 1.2 times the median Cramér-Rao deviation where that is more."""
+        return np.maximum(LEAST_BAR, OVER_BOUND * self.bounds)
+
+    @property
+    def bounds(self) -> FloatArray:
+        """(4,) medians of the Cramér-Rao deviations."""
+        return np.asarray(np.median([outcome.bound for outcome in self.outcomes], axis=0))
+
+    @property
+    def hits(self) -> list[int]:
+        """(4,) outcomes whose intervals hold the truth."""
+        return np.sum([outcome.inside for outcome in self.outcomes], axis=0).tolist()
+
+    @property
+    def failures(self) -> list[str]:
+        """What was raised."""
+        return [outcome.failure for outcome in self.outcomes if outcome.failure]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For the JSON file."""
+        return {
+            "rig": self.bench.name,
+            "setting": self.setting,
+            "errors": self.errors.tolist(),
+            "bounds": self.bounds.tolist(),
+            "hits": self.hits,
+            "outcomes": [vars(outcome) for outcome in self.outcomes],
+        }
+
+
+def calibrated(hits: Sequence[int], trials: Sequence[int]) -> tuple[float, list[bool]]:
+    """Pooled coverage, and whether each cell's 99.9 % binomial interval meets 0.85 to 0.95.
+
+    Example:
+        >>> calibrated([180, 190, 120], [200, 200, 200])
+        (0.8166666666666667, [True, True, False])
+    """
+    meets = []
+    for count, number in zip(hits, trials, strict=True):
+        low, high = binomial_interval(count, number)
+        meets.append(bool(low <= CELL[1] and high >= CELL[0]))
+    return sum(hits) / sum(trials), meets
+
+
+def binomial_interval(count: int, number: int, level: float = 0.999) -> tuple[float, float]:
+    """Clopper and Pearson's interval of a share."""
+    from scipy.stats import binomtest
+
+    interval = binomtest(count, number).proportion_ci(level, "exact")
+    return float(interval.low), float(interval.high)
+
+
+Task = TypeVar("Task")
+Answer = TypeVar("Answer")
+
+
+def in_processes(work: Callable[[Task], Answer], tasks: Iterable[Task], workers: int, title: str) -> dict[Task, Answer]:
+    """Task to answer, in the tasks' order, with a bar on stderr; the first task runs alone, because it compiles."""
+    from rich.console import Console
+    from rich.progress import track
+
+    todo = list(tasks)
+    console = Console(stderr=True)
+    answers: dict[Task, Answer] = {}
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        answers[todo[0]] = pool.submit(work, todo[0]).result()
+        futures = {pool.submit(work, task): task for task in todo[1:]}
+        for future in track(as_completed(futures), title, len(futures), console=console):
+            answers[futures[future]] = future.result()
+    return {task: answers[task] for task in todo}

@@ -1,0 +1,144 @@
+"""`identify` against what people use today, on the same records: errors, times, and statements that a user writes."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import tempfile
+import textwrap
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.peer_process import NotAvailable, Peers
+from benchmarks.rigs import peer_rows
+from benchmarks.rigs.catalogue import BENCHES
+from benchmarks.rigs.records import guess, record, write_record, write_rig
+from benchmarks.rigs.simulator import FloatArray
+
+OURS = "identify"
+#: Geometric mean of our error over theirs, at most; and how much slower each must be, at least.
+RATIO_BARS, TIME_BARS, MOST_STATEMENTS = {"dynamax": 1.1, "scipy": 1.0, "pysindy": 1.0}, {"dynamax": 5.0}, 5
+
+
+def ours(rig_file: str, data_file: str) -> dict[str, tuple[float, float]]:
+    """All that a user of `identify` writes."""
+    from estimator import Rig, identify
+
+    return identify(Rig.from_file(rig_file), [data_file]).parameters
+
+
+def statements(*functions: Callable[..., Any]) -> int:
+    """Statements in the bodies of functions, without docstrings.
+
+    Example:
+        >>> statements(ours)
+        2
+    """
+    count = 0
+    for function in functions:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+        nodes = [node for node in ast.walk(tree) if isinstance(node, ast.stmt) and node is not tree]
+        count += sum(not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)) for node in nodes)
+    return count
+
+
+def write_problems(path: Path, names: Sequence[str], seeds: int) -> None:
+    """What the peers get of each rig: records, guesses, and the true noises."""
+    arrays: dict[str, Any] = {}
+    for name in names:
+        bench = BENCHES[name]
+        made = [record(bench, seed) for seed in range(seeds)]
+        # Where a filter has averaged over several samples of a process, its noise is told as it is after that.
+        root = np.sqrt(bench.decimate)
+        fields = {
+            "u": np.stack([one.u for one in made]),
+            "y": np.stack([one.y for one in made]),
+            "guess": np.array([[sum(pair) / 2 for pair in guess(bench, seed).values()] for seed in range(seeds)]),
+            "step": bench.step, "kind": bench.kind, "interpolation": bench.interpolation,
+            "offset": bench.offset != 0, "rest": bench.rest, "process_noise": bench.process_noise / root,
+            "sensor_noise": bench.sensor_noise / root,
+        }  # fmt: skip
+        arrays |= {f"{name}_{field}": np.asarray(value) for field, value in fields.items()}
+    np.savez(path, **arrays)
+
+
+def run(names: Sequence[str], seeds: int) -> dict[str, dict[str, Any]]:
+    """Rig and method to errors (seeds, 4) and seconds (seeds,), or the reason why there are none. In turns."""
+    from rich.console import Console
+    from rich.progress import track
+
+    results: dict[str, dict[str, Any]] = {name: {} for name in names}
+    with tempfile.TemporaryDirectory() as folder:
+        problems = Path(folder) / "problems.npz"
+        write_problems(problems, names, seeds)
+        with Peers(problems) as peers:
+            pairs = [(name, seed) for name in names for seed in range(seeds)]
+            for name, seed in track(pairs, "Identifying in turns", console=Console(stderr=True)):
+                truth = np.array(BENCHES[name].truth)
+                for method in (OURS, *peer_rows.PEERS):
+                    here = results[name].setdefault(method, {"errors": [], "seconds": [], "reasons": []})
+                    try:
+                        found, seconds = _turn(method, name, seed, Path(folder), peers)
+                        here["errors"].append(np.abs(found / truth - 1).tolist())
+                    except (NotAvailable, ValueError, RuntimeError) as error:
+                        here["reasons"].append(str(error))
+                        here["errors"].append([np.nan] * 4)
+                        seconds = np.nan
+                    here["seconds"].append(seconds)
+    return results
+
+
+def _turn(method: str, name: str, seed: int, folder: Path, peers: Peers) -> tuple[FloatArray, float]:
+    if method != OURS:
+        answer = peers.ask(f"rigs {method} {name}", seed)
+        return np.array(answer["parameters"]), answer["seconds"]
+    bench = BENCHES[name]
+    write_rig(folder / "rig.toml", bench, guess(bench, seed))
+    write_record(folder / "data.csv", record(bench, seed))
+    started = time.perf_counter()
+    parameters = ours(str(folder / "rig.toml"), str(folder / "data.csv"))
+    seconds = time.perf_counter() - started
+    return np.array([parameters[key][0] for key in ("m", "c", "a", "b")]), seconds
+
+
+def ratio(mine: Any, theirs: Any) -> float:
+    """Geometric mean, over seeds and parameters, of our errors over theirs; NaN where they have none."""
+    logs = np.log(np.array(mine)) - np.log(np.array(theirs))
+    return float(np.exp(np.mean(logs[np.isfinite(logs)]))) if np.isfinite(logs).any() else float("nan")
+
+
+def show(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Print the table and the verdict; return the verdict for the JSON file."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=170)
+    table = Table("rig", "method", "median error of m, c, a, b, %", "our error over theirs", "s, the first",
+                  "s, others", "their time over ours", "failed", "verdict", box=box.MARKDOWN)  # fmt: skip
+    verdict: dict[str, Any] = {}
+    for name, methods in results.items():
+        mine = methods[OURS]
+        for method, here in methods.items():
+            errors = ", ".join(f"{100 * value:.2g}" for value in np.nanmedian(here["errors"], axis=0))
+            first, others = here["seconds"][0], float(np.nanmedian(here["seconds"][1:] or [np.nan]))
+            failed = f"{len(here['reasons'])}" + (f": {here['reasons'][0][:40]}" if here["reasons"] else "")
+            if method == OURS:
+                table.add_row(name, method, errors, "", f"{first:.2f}", f"{others:.2f}", "", failed, "")
+                continue
+            over, slower = ratio(mine["errors"], here["errors"]), others / np.nanmedian(mine["seconds"][1:] or [np.nan])
+            bars = [over <= RATIO_BARS[method], not slower < TIME_BARS.get(method, 0.0)]
+            word = "not available" if np.isnan(over) else "PASS" if all(bars) else "MISS"
+            verdict[f"{name}, {method}"] = {"ratio": over, "slower": float(slower), "verdict": word}
+            table.add_row(name, method, errors, f"{over:.3g}", f"{first:.2f}", f"{others:.2f}", f"{slower:.3g}", failed,
+                          word)  # fmt: skip
+    console.print(table)
+    counts = {OURS: statements(ours)}
+    counts |= {peer: statements(function, *peer_rows.HELPERS[peer]) for peer, function in peer_rows.PEERS.items()}
+    console.print("Statements of user code: " + ", ".join(f"{name} {count}" for name, count in counts.items()))
+    console.print(f"{'PASS' if counts[OURS] <= MOST_STATEMENTS else 'MISS'}: at most {MOST_STATEMENTS} of ours")
+    return {"statements": counts, "rows": verdict}

@@ -1,0 +1,126 @@
+"""Records of the rigs: what a user's instrument would write, the rig file, and what the record could tell at best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.rigs import bound
+from benchmarks.rigs.catalogue import PARAMETERS, SAMPLES, Bench
+from benchmarks.rigs.simulator import KINDS, FloatArray, paths, sensor, simulate
+
+GUESS_SPREAD = 0.3
+#: Recorded samples that are cut at either end of what a filter has gone over.
+_MARGIN = 16
+_STREAMS = {"input": 0, "noise": 1, "guess": 2, "fault": 3}
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is recorded of a rig, and the path that it went.
+
+    Attributes:
+        bench: of which rig.
+        u, y: (T,) as recorded.
+        states: (N, 2) x and x' at each sample of the integration.
+        force, slope: (N - 1,) what acted.
+        ends: (N,) accelerations; see `simulate`.
+    """
+
+    bench: Bench
+    u: FloatArray
+    y: FloatArray
+    states: FloatArray
+    force: FloatArray
+    slope: FloatArray
+    ends: FloatArray
+
+    def deviations(self) -> FloatArray:
+        """(4,) Cramér-Rao bound of m, c, a and b, relative; a sensor's offset is unknown where there is one.
+
+        Of a rig that decimates, that of the record before its filter.
+        """
+        bench = self.bench
+        parameters = np.array([*bench.truth, bench.quintic])
+        step = bench.step / bench.decimate
+        moved = paths(parameters, self.force, self.slope, self.states[:-1], step, bench.scale)
+        by_state, by_force = sensor(bench.kind, parameters, self.states)
+        direct = np.zeros((len(self.states), 5 if bench.offset else 4))
+        direct[:, 4:] = 1.0
+        if bench.kind == "acceleration":
+            m, c, a, b = bench.truth
+            x, v = self.states.T
+            direct[:, :4] = -np.stack([self.ends, c * v / m, a * x / m, b * x**3 / m], axis=1)
+            by_force[0] = 0.0
+        found = bound.information(
+            moved, by_state, by_force, direct, bench.process_noise**2, bench.sensor_noise**2, bench.scale
+        )
+        return bound.deviations(found)
+
+
+def generator(bench: Bench, seed: int, stream: str) -> np.random.Generator:
+    """Random numbers of a rig and a seed; faults and noises leave the others' as they are."""
+    return np.random.default_rng([seed, _STREAMS[stream], *bench.name.encode()])
+
+
+def record(bench: Bench, seed: int, samples: int = SAMPLES, late: int = 0, interpolation: str = "zero_order") -> Record:
+    """Simulate a record from rest.
+
+    Args:
+        bench: the rig.
+        seed: of input and noises.
+        samples: recorded.
+        late: samples by which the input acts later than is recorded.
+        interpolation: as it is: ``zero_order``, or ``linear``.
+    """
+    margin = _MARGIN if bench.decimate > 1 else 0
+    u = bench.excitation(generator(bench, seed, "input"), samples + 2 * margin)
+    rng = generator(bench, seed, "noise")
+    w, noise = bench.process_noise * rng.standard_normal(len(u) - 1), bench.sensor_noise * rng.standard_normal(len(u))
+    step = bench.step / bench.decimate
+    acting = np.r_[np.zeros(late), u[: len(u) - late]]
+    slope = np.diff(acting) / step if interpolation == "linear" else np.zeros(len(u) - 1)
+    parameters = np.array([*bench.truth, bench.quintic])
+    force = acting[:-1] + w
+    states, ends = simulate(parameters, force, slope, np.array([bench.rest, 0.0]), step, bench.scale)
+    place = KINDS.index(bench.kind)
+    y = (ends if place == 2 else states[:, place]) + bench.offset + noise
+    if np.abs(y).max() > bench.output_range:
+        raise OverflowError(f"rig {bench.name} leaves its range: {np.abs(y).max():.3g} of {bench.output_range}")
+    u, y = (decimated(series, bench.decimate)[margin : margin + samples] for series in (u, y))
+    return Record(bench, u, y, states, force, slope, ends)
+
+
+def decimated(series: FloatArray, by: int) -> FloatArray:
+    """Every ``by``-th sample, behind an anti-alias filter without delay: for inputs and outputs alike."""
+    if by == 1:
+        return series
+    from scipy.signal import decimate
+
+    return np.asarray(decimate(series, by, ftype="fir", zero_phase=True))
+
+
+def guess(bench: Bench, seed: int) -> dict[str, tuple[float, float]]:
+    """Intervals of ±30 % about guesses that are off by up to ±30 %."""
+    off = 1 + generator(bench, seed, "guess").uniform(-GUESS_SPREAD, GUESS_SPREAD, len(PARAMETERS))
+    centers = dict(zip(PARAMETERS, (np.array(bench.truth) * off).tolist(), strict=True))
+    return {name: tuple(sorted((0.7 * center, 1.3 * center))) for name, center in centers.items()}  # type: ignore[misc]
+
+
+def write_record(path: Path, made: Record) -> None:
+    """A CSV file with a header and 10 digits."""
+    np.savetxt(path, np.column_stack([made.u, made.y]), fmt="%.10g", delimiter=",", header="u,y", comments="")
+
+
+def write_rig(path: Path, bench: Bench, intervals: dict[str, tuple[float, float]] | None, **changed: Any) -> None:
+    """The rig file, as a user would write it; ``changed`` replaces step or interpolation."""
+    settings: dict[str, Any] = {"step": bench.step, "interpolation": bench.interpolation, "delay": 0} | changed
+    lines = [f"{name} = {value!r}" for name, value in settings.items()]
+    lines += ["", "[input]", f'unit = "{bench.units[0]}"', f"limit = {bench.limit!r}"]
+    lines += ["", "[output]", f'unit = "{bench.units[1]}"', f'kind = "{bench.kind}"', f"range = {bench.output_range!r}"]
+    if intervals is not None:
+        lines += ["", "[guess]", *(f"{name} = [{low!r}, {high!r}]" for name, (low, high) in intervals.items())]
+    path.write_text("\n".join(lines).replace("'", '"') + "\n", encoding="utf-8")
