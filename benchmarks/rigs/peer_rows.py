@@ -37,11 +37,11 @@ class Problem:
 
 
 def acting(problem: Problem) -> Any:
-    """(T, 2 S + 1) inputs at the ends and middles of S substeps from each sample to the next, 128 to a period."""
+    """(T, 2 S + 1) inputs at the ends and middles of S substeps from each sample to the next, 64 to a period."""
     from scipy.interpolate import make_interp_spline
 
     m, _, a, _ = problem.guess
-    u, substeps = problem.u, int(np.ceil(128 * problem.step * np.sqrt(abs(a) / m) / (2 * np.pi)))
+    u, substeps = problem.u, int(np.ceil(64 * problem.step * np.sqrt(abs(a) / m) / (2 * np.pi)))
     if problem.interpolation == "zero_order":
         return np.repeat(u[:, None], 2 * substeps + 1, axis=1)
     times = np.arange(len(u))[:, None] + np.linspace(0, 1, 2 * substeps + 1)
