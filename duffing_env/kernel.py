@@ -206,7 +206,7 @@ def compiled(kind: Kind) -> Kernel:
             for again in range(2):
                 observe(
                     W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output,
-                    1.0 / setup.max_input, setup.horizon, setup.budget,
+                    1.0 / setup.max_input, setup.horizon, 1.0 / setup.horizon, setup.budget,
                 )  # fmt: skip
                 for j in range(LANES):
                     for k in range(n_observation):

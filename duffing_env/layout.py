@@ -183,6 +183,11 @@ def noise_rows(model: Model) -> dict[str, str]:
     return {"process_noise": "PROCESS_STD", **sensors}
 
 
+def estimated(model: Model) -> Mapping[str, str]:
+    """What is compared with the truth's parameters: name to its expression in the coefficients."""
+    return model.physical or {c: c for c in model.coefficients}
+
+
 @cache
 def layout_of(kind: Kind) -> Mapping[str, int]:
     """Name of a quantity to its row in a block of this kind."""
@@ -194,6 +199,7 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
     wanted += noise_rows(truth).values()  # behind the parameters, see `stages.draw_plant`
     wanted += [f"X_{x}" for x in truth.states]
     wanted += [f"TRUE_{c}" for model in {truth: None, belief: None} for c in model.coefficients]
+    wanted += [f"PER_{p}" for p in estimated(belief)]
     wanted += ["STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d", "NOISE_w", "NOISE_v"]
     wanted += ["INPUT", "LAST_INPUT", "OLDER_INPUT", "RISE", "ASKED", "SPENT", "JUMP_AT", "JUMP_FACTOR"]
     wanted += ["ELAPSED", "WAITING", "RECORDED_u", "RECORDED_y", "LOG_DET", "LOG_DENSITY", "ERROR", "WORK", "EARNED"]

@@ -59,8 +59,9 @@ def normal_pair(first, second):
     angle = (turns - quarter) * 1.5707963267948966
     z = angle * angle
     # Taylor polynomials on [-π/4, π/4]: truncation below 4e-13 of the cosine, 1e-16 of the sine.
-    cosine = 1.0 - z * (0.5 - z * (1 / 24 - z * (1 / 720 - z * (1 / 40320 - z * (1 / 3628800 - z / 479001600)))))
-    sine = 1 / 120 - z * (1 / 5040 - z * (1 / 362880 - z * (1 / 39916800 - z * (1 / 6227020800 - z / 1307674368000))))
+    cosine = 1.0 - z * (0.5 - z * (1 / 24 - z * (1 / 720 - z * (1 / 40320 - z * (1 / 3628800 - z * (1 / 479001600))))))
+    sine = 1 / 39916800 - z * (1 / 6227020800 - z * (1 / 1307674368000))
+    sine = 1 / 120 - z * (1 / 5040 - z * (1 / 362880 - z * sine))
     sine = angle * (1.0 - z * (1 / 6 - z * sine))
     swapped = (quarter & 1) == 1
     along = sine if swapped else cosine

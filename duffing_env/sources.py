@@ -7,7 +7,7 @@ from functools import cache
 from itertools import combinations
 from typing import Any
 
-from duffing_env.layout import Kind, inputs_of, layout_of, noise_rows, observation_bounds, parameter_names
+from duffing_env.layout import Kind, estimated, inputs_of, layout_of, noise_rows, observation_bounds, parameter_names
 from duffing_env.rewards import REWARDS
 from estimator.engine import cache as stored
 from estimator.engine.rows import belief_names
@@ -116,7 +116,10 @@ def _plant(model: Model, degree: int, loop: Any) -> str:
 
 
 def _truth(kind: Kind, loop: Any) -> str:
-    """``settle_truth(W, j, step)``: the coefficients of lane j's plant, in the equations of plant and belief."""
+    """``settle_truth(W, j, step)``: the coefficients of lane j's plant, in the equations of plant and belief.
+
+    And what estimates are multiplied by to be compared with its parameters: every sample would divide otherwise.
+    """
     from estimator.engine import derive
 
     known = {p: derive.symbol(p) for p in parameter_names(kind.truth)}
@@ -130,6 +133,9 @@ def _truth(kind: Kind, loop: Any) -> str:
             own[f"V_{c}"] = derive.renamed([("", value)], {p: f"PARAM_{p}" for p in known})[0][1]
             results[f"TRUE_{c}"] = f"V_{c}"
         lines += derive.shared(own, tag)
+    for p in estimated(kind.belief):
+        lines.append((f"V_PER_{p}", 1 / derive.symbol(f"PARAM_{p}")))
+        results[f"PER_{p}"] = f"V_PER_{p}"
     return loop("settle_truth", "The true coefficients, of the parameters.", lines, results, "step", one=True)
 
 
@@ -163,7 +169,7 @@ def log_det_and_density(
         assert at is not None
         lines.append((f"{tag}Z_{i}", at[name] - sum(found.below[i, m] * whitened[m] for m in range(i))))
         whitened.append(symbol(f"{tag}Z_{i}"))
-        square += whitened[i] ** 2 / found.pivots[i]
+        square += whitened[i] ** 2 * found.inverse[i]
     determinant = symbol(f"{tag}DET")
     lines.append((f"{tag}DET", found.determinant))
     check = sp.Function("positive")
@@ -184,10 +190,9 @@ def _standing(kind: Kind) -> tuple[Any, Any]:
     lines.append(("NEW_LOG_DET", sp.Function("log")(determinant)))
     lines.append(("NEW_LOG_DENSITY", -(symbol("NEW_LOG_DET") + square) / 2))
     known = {c: symbol(c) for c in model.coefficients} | {"step": symbol("step")}
-    estimates = model.physical or {c: c for c in model.coefficients}
     error = sp.Function("capped")
     ratios = {
-        f"RATIO_{p}": derive.parse(text, known, model.name) / symbol(f"PARAM_{p}") for p, text in estimates.items()
+        f"RATIO_{p}": derive.parse(text, known, model.name) * symbol(f"PER_{p}") for p, text in estimated(model).items()
     }
     lines += derive.shared(ratios, "RW")
     lines.append(("NEW_ERROR", sum(error(symbol(r)) for r in ratios) / len(ratios)))
@@ -267,7 +272,8 @@ def _observation(kind: Kind, loop: Any) -> str:
     values["last_input"] = symbol("INPUT") * symbol("per_input")
     for y in model.outputs:
         values[f"last_{y}"] = symbol(f"Y_{y}") * symbol("per_output")
-    values["time_left"] = 1 - symbol("ELAPSED") / symbol("horizon")  # no product: exactly 0 at the end
+    # Of what does not change from lane to lane one division is enough; both are exactly 0 at the end.
+    values["time_left"] = (symbol("horizon") - symbol("ELAPSED")) * symbol("per_horizon")
     values["budget_left"] = 1 - symbol("SPENT") / symbol("budget")
     clip = sp.Function("clip")
     bounds = observation_bounds(model)
@@ -276,7 +282,7 @@ def _observation(kind: Kind, loop: Any) -> str:
         lines += [(f"B_{name}", value), (f"V_{name}", clip(symbol(f"B_{name}"), low, high))]
     uniform = [f"{letter}_{c}" for letter in ("PRIOR", "SCALE") for c in coefficients]
     uniform += ["LOG_gamma", *(f"LOG_xi_{y}" for y in model.outputs)]
-    scales = ["per_output", "per_input", "horizon", "budget"]
+    scales = ["per_output", "per_input", "horizon", "per_horizon", "budget"]
     source = loop(
         "observe_lanes", "The observation, in rows.", lines, {f"OBS_{n}": f"V_{n}" for n in values}, *uniform, *scales
     )

@@ -142,7 +142,7 @@ def exp(x):
     bounded = min(max(x, -700.0), 700.0)
     k = (bounded * 1.4426950408889634 + _ROUNDER) - _ROUNDER
     r = (bounded - k * _LN2_HIGH) - k * _LN2_LOW
-    p = 1 / 5040 + r * (1 / 40320 + r * (1 / 362880 + r * (1 / 3628800 + r * (1 / 39916800 + r / 479001600))))
+    p = 1 / 5040 + r * (1 / 40320 + r * (1 / 362880 + r * (1 / 3628800 + r * (1 / 39916800 + r * (1 / 479001600)))))
     p = 1.0 + r * (1.0 + r * (1 / 2 + r * (1 / 6 + r * (1 / 24 + r * (1 / 120 + r * (1 / 720 + r * p))))))
     scale = (np.int64(k) + np.int64(1023)) << _MANTISSA_BITS
     value = p * np.int64(scale).view(np.float64)

@@ -223,6 +223,9 @@ def _learn(
     count = g.put(f"U{tag}", HALF * seen)
     new_g_shape = g.put(f"F{tag}", g_shape + count) if shown != 0 else g_shape
     new_n_shape = g.put(f"X{tag}", n_shape + count)
+    # Divisions are dear, and every iteration has the same shapes.
+    per_g = g.put(f"V{tag}", 1 / new_g_shape) if shown != 0 else ZERO
+    per_n = g.put(f"A{tag}", 1 / new_n_shape)
     strength = g.put(f"B{tag}_0", g_rate / g_shape) if shown != 0 else ZERO
     r = g.put(f"R{tag}_0", n_rate / n_shape)
     found = []
@@ -236,8 +239,8 @@ def _learn(
             for letter, rate, variance, v in (("G", g_rate, strength, q), ("O", n_rate, r, r))
         )
         found.append(Learned(strength, q, r, weight, step, new_g_shape, new_g_rate, new_n_shape, new_n_rate))
-        strength = g.put(f"B{tag}_{i + 1}", new_g_rate / new_g_shape) if shown != 0 else ZERO
-        r = g.put(f"R{tag}_{i + 1}", new_n_rate / new_n_shape)
+        strength = g.put(f"B{tag}_{i + 1}", new_g_rate * per_g) if shown != 0 else ZERO
+        r = g.put(f"R{tag}_{i + 1}", new_n_rate * per_n)
     return found
 
 

@@ -17,11 +17,13 @@ class Factor(NamedTuple):
         lines: the assignments.
         below: (i, j) with j < i to the symbol of L's entry.
         pivots: the symbols of D.
+        inverse: the symbols of 1/D.
     """
 
     lines: Assignments
     below: Mapping[tuple[int, int], Any]
     pivots: list[Any]
+    inverse: list[Any]
 
     @property
     def determinant(self) -> Any:
@@ -42,6 +44,7 @@ def factorise(entries: Mapping[tuple[int, int], Any], size: int, tag: str, known
     below: dict[tuple[int, int], Any] = {}
     scaled: dict[tuple[int, int], Any] = {}  # L D
     pivots: list[Any] = []
+    inverse: list[Any] = []
     for i in range(size):
         for j in range(i + 1):
             rest = entries[i, j] - sum(below[i, m] * scaled[j, m] for m in range(j))
@@ -53,6 +56,8 @@ def factorise(entries: Mapping[tuple[int, int], Any], size: int, tag: str, known
             lines.append((f"{tag}D_{i}_{j}", rest))
             if j < i:
                 below[i, j] = symbol(f"{tag}L_{i}_{j}")
-                lines.append((f"{tag}L_{i}_{j}", scaled[i, j] / pivots[j]))
+                lines.append((f"{tag}L_{i}_{j}", scaled[i, j] * inverse[j]))
         pivots.append(scaled[i, i])
-    return Factor(lines, below, pivots)
+        inverse.append(symbol(f"{tag}I_{i}"))
+        lines.append((f"{tag}I_{i}", 1 / pivots[i]))
+    return Factor(lines, below, pivots, inverse)
