@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from estimator.engine.feeding import feeder, input_degree
-from estimator.engine.rows import input_rows, path_results
+from estimator.engine.feeding import input_degree
+from estimator.engine.rows import path_results
 from estimator.engine.tasks import path
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
@@ -87,11 +87,10 @@ def fisher_information(
     found = follow(
         model,
         whole(points, model.n_coefficients),
-        whole(inputs, samples),
+        sampled(model, whole(inputs, samples), degree),
         None if outputs is None else whole(outputs, samples, model.n_outputs),
-        noises,
+        np.array(noises),
         covariance,
-        degree,
     )
     k = model.n_coefficients
     return found.information.reshape(*shape, k, k)
@@ -198,62 +197,74 @@ class Followed(NamedTuple):
         loss: (n,) minus the log likelihood, up to a constant; zeros where no outputs are followed.
         slope: (n, K) its slope by the coefficients, likewise.
         information: (n, K, K).
+        misfit: (n,) Σ ν²/S, which is near the number of outputs where the noises are right.
     """
 
     loss: FloatArray
     slope: FloatArray
     information: FloatArray
+    misfit: FloatArray
+
+
+def sampled(model: Model, u: FloatArray, degree: int = 0) -> FloatArray:
+    """(n, T, rows) what a model takes over each sample, of inputs (n, T) before which there were none.
+
+    The taps of a difference equation, newest first; or the polynomial of degree 0 (held) or 1 (from the input before).
+    """
+    before = [np.concatenate([np.zeros((len(u), lag)), u[:, : u.shape[1] - lag]], axis=1) for lag in range(3)]
+    if model.is_continuous and degree == 1:
+        return np.stack([before[1] + 0.0 * u, u - before[1]], axis=2)
+    return np.stack(before[: model.taps], axis=2) + 0.0 * u[..., None]  # not a number beyond the end
 
 
 def follow(
-    model: Model,
-    points: FloatArray,
-    u: FloatArray,
-    y: FloatArray | None,
-    noises: tuple[float, ...],
-    covariance: FloatArray,
-    degree: int = 0,
+    model: Model, points: FloatArray, inputs: FloatArray, y: FloatArray | None, noises: FloatArray, cov: FloatArray
 ) -> Followed:
     """Run the filter over n series from rest.
 
     Args:
         model: the equation.
         points: (n, K) coefficients.
-        u: (n, T) inputs; a series ends before its first NaN.
-        y: (n, T, p) outputs; None for the response without noise.
-        noises: variances, see `variances`.
-        covariance: (n_states, n_states) of the states at the start.
-        degree: of the input's polynomial.
+        inputs: (n, T, rows) inputs of each sample (`sampled`); a series ends before its first NaN.
+        y: (n, T, p) outputs, NaN where one is missing; None for the response without noise.
+        noises: (1 + p,) or (n, 1 + p) variances of the process noise and of each sensor's.
+        cov: (n_states, n_states) of the states at the start.
     """
     k = model.n_coefficients
-    ends = np.isnan(u)
-    lengths = np.where(ends.any(axis=1), ends.argmax(axis=1), u.shape[1])
-    totals = np.zeros((len(u), len(path_results(model))))
-    start = covariance[np.triu_indices(model.n_states)]
+    ends = np.isnan(inputs[:, :, 0])
+    lengths = np.where(ends.any(axis=1), ends.argmax(axis=1), inputs.shape[1])
+    totals = np.zeros((len(inputs), len(path_results(model))))
+    start = cov[np.triu_indices(model.n_states)]
     outputs = np.zeros((0, 0, 0)) if y is None else y
-    follower(model, degree, y is not None)(points, u, outputs, lengths, start, noises, totals)
-    information = np.empty((len(u), k, k))
+    strengths = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs)).copy()
+    degree = inputs.shape[2] - 1 if model.is_continuous else 0
+    follower(model, degree, y is not None)(points, inputs, outputs, lengths, start, strengths, totals)
+    information = np.empty((len(inputs), k, k))
     upper = np.triu_indices(k)
-    information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k :]
-    return Followed(totals[:, 0], totals[:, 1 : 1 + k], information)
+    information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
+    return Followed(totals[:, 0], totals[:, 1 : 1 + k], information, totals[:, -1])
+
+
+#: Variance of what a missing output would have shown, in parts of a sensor's.
+_MISSING = 1e18
 
 
 @cache
 def follower(model: Model, degree: int, observed: bool) -> Any:
-    """The compiled loop of `follow`, with totals (n, 1 + K + K (K + 1)/2) packed."""
+    """The compiled loop of `follow`, with totals (n, 2 + K + K (K + 1)/2) packed."""
     task = path(model, degree, observed=observed)
     sample, at, size = task.sample, task.layout, len(task.layout)
-    feed = feeder(model, degree, [at[row] for row in input_rows(model, degree)], LANES)
     n, k, p = model.n_states, model.n_coefficients, model.n_outputs
     first_total, first_coefficient, live = at["LOSS"], at[next(iter(model.coefficients))], at["LIVE"]
+    first_input, first_noise = at["U_0"], at["Q"]
     shown, n_totals = at[f"Y_{next(iter(model.outputs))}"] if observed else -1, len(path_results(model))
     spreads = n * (n + 1) // 2
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}_{int(observed)}")
-    def run(points, u, y, lengths, start, noises, totals):
+    def run(points, inputs, y, lengths, start, noises, totals):
         W = np.empty(size * LANES)
-        for first in range(0, len(u), LANES):
-            lanes = min(LANES, len(u) - first)
+        for first in range(0, len(inputs), LANES):
+            lanes = min(LANES, len(inputs) - first)
             W[:] = 0.0
             longest = 0
             for j in range(LANES):
@@ -264,17 +275,23 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
                     W[(first_coefficient + c) * LANES + j] = points[i, c]
                 for c in range(spreads):
                     W[(n + c) * LANES + j] = start[c]
+                for c in range(1 + p):
+                    W[(first_noise + c) * LANES + j] = noises[i, c]
             for t in range(longest):
                 for j in range(LANES):
                     i = first + min(j, lanes - 1)
                     runs = t < lengths[i]
-                    now = u[i, t] if runs else 0.0
-                    last = u[i, t - 1] if runs and t > 0 else 0.0
-                    feed(W, j, now, last, u[i, t - 2] if runs and t > 1 else 0.0)
+                    for c in range(inputs.shape[2]):
+                        W[(first_input + c) * LANES + j] = inputs[i, t, c] if runs else 0.0
                     if observed:
+                        whole = True
                         for c in range(p):
-                            W[(shown + c) * LANES + j] = y[i, t, c] if runs else 0.0
-                sample(W, *noises)
+                            seen = runs and not np.isnan(y[i, t, c])
+                            whole = whole and seen
+                            W[(shown + c) * LANES + j] = y[i, t, c] if seen else 0.0
+                            W[(first_noise + 1 + c) * LANES + j] = noises[i, 1 + c] * (1.0 if seen else _MISSING)
+                        W[live * LANES + j] = 1.0 if whole else 0.0
+                sample(W)
                 for j in range(lanes):
                     if t + 1 == lengths[first + j]:
                         for c in range(n_totals):

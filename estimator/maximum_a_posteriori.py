@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.engine.feeding import input_degree
-from estimator.information import follow, outputs_of, variances
+from estimator.information import follow, outputs_of, sampled, variances
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 
@@ -73,7 +73,8 @@ def maximum_a_posteriori(
     if inputs.ndim != 2:
         raise ValueError(f"u must have shape (n, T), but has {inputs.shape}")
     outputs = np.array(outputs_of(model, inputs, y))
-    noises, degree = variances(model, process_noise, measurement_noise), input_degree(model, interpolation)
+    noises = np.array(variances(model, process_noise, measurement_noise))
+    taken = sampled(model, inputs, input_degree(model, interpolation))
     center, cov = prior.coefficients_mean, prior.coefficients_cov
     if center.shape != (model.n_coefficients,):
         raise ValueError(f"prior must be of {list(model.coefficients)}, but its means have shape {center.shape}")
@@ -88,7 +89,7 @@ def maximum_a_posteriori(
         return coefficients
 
     def appraise(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        found = follow(model, at(points), inputs, outputs, noises, prior.state_cov, degree)
+        found = follow(model, at(points), taken, outputs, noises, prior.state_cov)
         pull = points @ precision
         loss = found.loss + 0.5 * (points * pull).sum(axis=1)
         curvature = found.information[:, free[:, None], free] * np.outer(scale, scale) + precision

@@ -19,7 +19,7 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
         V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
 
     Names besides `path_names` and `path_results` of `estimator.engine.rows`: ``Q``, ``R_<sensor>`` and ``LIVE``, 0
-    where the series is over.
+    where the sample is not counted.
 
     Args:
         model: whose equation.
@@ -78,7 +78,9 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
                 totals[f"F_{name}_{other}"] += weighed[name] * told[other]
         error = put(f"E{tag}", symbol(f"Y_{sensor}") - shown) if observed else ZERO
         if observed:
-            totals["LOSS"] += HALF * (counted * error**2 - symbol("LIVE") * sp.log(weight))
+            misfit = put(f"D{tag}", counted * error**2)
+            totals["LOSS"] += HALF * (misfit - symbol("LIVE") * sp.log(weight))
+            totals["MISFIT"] += misfit
             for name in coefficients:
                 totals[f"SLOPE_{name}"] -= weighed[name] * error
         else:

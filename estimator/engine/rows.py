@@ -67,13 +67,13 @@ def path_names(model: Model) -> list[str]:
 
 
 def path_results(model: Model) -> list[str]:
-    """What a path adds up: minus the log likelihood, its slope, and the information (upper triangle)."""
+    """What a path adds up: minus the log likelihood, its slope, the information (upper triangle), and Σ ν²/S."""
     information = [f"F_{c}_{d}" for c, d in combinations_with_replacement(model.coefficients, 2)]
-    return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *information]
+    return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *information, "MISFIT"]
 
 
 def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
     """Rows of a path's block."""
     shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
-    given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE"]
+    given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE", "Q", *(f"R_{y}" for y in model.outputs)]
     return rows(" ".join([*path_names(model), *path_results(model), *given, *carried_names(model)]))

@@ -188,13 +188,13 @@ def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
     )  # fmt: skip
 
 
-def _composed(name: str, model: Model, finish: str = "finish(W)", arguments: str = "W") -> str:
+def _composed(name: str, model: Model) -> str:
     """Source of the whole sample: begin, all steps, finish."""
     if not model.is_continuous:
-        return f"@straight\ndef {name}({arguments}):\n    {finish}\n"
+        return f"@straight\ndef {name}(W):\n    finish(W)\n"
     return (
-        f"@straight\ndef {name}({arguments}):\n    begin(W)\n    for s in range({model.substeps}):\n"
-        f"        move(W, s / {model.substeps})\n    {finish}\n"
+        f"@straight\ndef {name}(W):\n    begin(W)\n    for s in range({model.substeps}):\n"
+        f"        move(W, s / {model.substeps})\n    finish(W)\n"
     )
 
 
@@ -203,8 +203,9 @@ class Path:
     """A path at known coefficients: likelihood and Fisher information; `estimator.engine.gradient` has the gradient.
 
     Attributes:
-        sample: ``sample(W, Q, R_<sensor>...)``: one sample of every lane.
-        layout: rows of the block: the coefficients, the input, outputs, ``LIVE``, the path and what it adds up.
+        sample: ``sample(W)``: one sample of every lane.
+        layout: rows of the block: the coefficients, the input, outputs, ``LIVE``, the variances ``Q`` and
+            ``R_<sensor>`` of the noises, the path and what it adds up.
         lanes: systems in it.
     """
 
@@ -224,7 +225,6 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -
         lanes: systems in a block.
     """
     place = path_layout(model, degree, observed)
-    noises = ("Q", *(f"R_{y}" for y in model.outputs))
 
     def make() -> str:
         from estimator.engine import derive, emit
@@ -234,9 +234,8 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -
         more, results = path_sample(model, moved, degree, observed)
         lines += more
         source = _motion_source(model, degree, place, lanes)
-        source += "@straight\n" + emit.lane_loop("finish", lines, results, place, lanes, noises, doc="Predict and see.")
-        arguments = ", ".join(noises)
-        return source + _composed("sample", model, f"finish(W, {arguments})", f"W, {arguments}")
+        source += "@straight\n" + emit.lane_loop("finish", lines, results, place, lanes, doc="Predict and see.")
+        return source + _composed("sample", model)
 
     key = repr((model.digest, degree, observed, lanes))
     return Path(stored.load(model.name, "path", key, make, NAMES).sample, place, lanes)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior
-from estimator.information import cramer_rao, fisher_information, follow, relative_covariance
+from estimator.information import cramer_rao, fisher_information, follow, relative_covariance, sampled
 from estimator.physical import coefficients_of
 
 sys.path.append(str(Path(__file__).parent))
@@ -203,7 +203,7 @@ def test_the_likelihood_of_any_model_is_that_of_a_filter_with_matrices(case):
     y += r * rng.standard_normal(y.shape)
     degree = int(interpolation == "linear")
     points, rest = np.array([c, c], dtype=np.float64), np.zeros((model.n_states, model.n_states))
-    found = follow(model, points, u, y, (q**2, *[r**2] * model.n_outputs), rest, degree)
+    found = follow(model, points, sampled(model, u, degree), y, np.array([q**2, *[r**2] * model.n_outputs]), rest)
     for row in range(2):
         value = filtering.log_likelihood(model, interpolation, c, u[row], y[row], q**2, r**2)
         assert -found.loss[row] == pytest.approx(value, rel=1e-6)

@@ -30,10 +30,12 @@ def some_walk(case, seed):
     return z, V, c, inputs, R, y
 
 
-def start(case, layout, z, V, c, W, lane=0, lanes=1):
+def start(case, layout, z, V, c, noises, W, lane=0, lanes=1):
+    """``noises``: variances of the process noise and of each sensor's."""
     states = list(case.model.states)
     values = dict(zip((*states, *case.model.coefficients), (*z, *c), strict=True)) | {"LIVE": 1.0}
     values |= {f"V_{i}_{k}": V[a, b] for a, i in enumerate(states) for b, k in enumerate(states) if a <= b}
+    values |= dict(zip(("Q", *(f"R_{s}" for s in case.model.outputs)), noises, strict=True))
     put(W, layout, lanes, lane, values)
 
 
@@ -57,12 +59,12 @@ def walked(case, task, walks, observed):
     """Run lanes over their samples: the block, and what was shown by sample."""
     lanes = task.lanes
     W, shown = block(task.layout, lanes), []
-    for lane, (z, V, c, *_) in enumerate(walks):
-        start(case, task.layout, z, V, c, W, lane, lanes)
+    for lane, (z, V, c, _, R, _) in enumerate(walks):
+        start(case, task.layout, z, V, c, (NOISE, *R), W, lane, lanes)
     for t in range(SAMPLES):
         for lane, (_, _, _, inputs, _, y) in enumerate(walks):
             feed(case, task.layout, inputs[t], y[t] if observed else None, W, lane, lanes)
-        task.sample(W, NOISE, *walks[0][4])
+        task.sample(W)
         if not observed:
             shown.append([W[task.layout[f"SHOWN_{s}"] * lanes] for s in case.model.outputs])
     return W, np.array(shown)
@@ -130,10 +132,10 @@ def test_the_information_is_that_of_the_responses_slopes(name):
     z, V, c, inputs, R, _ = some_walk(case, 2)
     task = tasks.path(case.model, case.degree, observed=False, lanes=1)
     W = block(task.layout, 1)
-    start(case, task.layout, z, 0 * V, c, W)
+    start(case, task.layout, z, 0 * V, c, (0.0, *R), W)
     for taps in inputs:
         feed(case, task.layout, taps, None, W)
-        task.sample(W, 0.0, *R)
+        task.sample(W)
 
     def response(c):
         state, shown = z, []
@@ -197,10 +199,10 @@ def test_a_lane_that_is_over_counts_nothing():
     task = tasks.path(case.model, case.degree, observed=True, lanes=1)
     z, V, c, inputs, R, y = some_walk(case, 5)
     W = block(task.layout, 1)
-    start(case, task.layout, z, V, c, W)
+    start(case, task.layout, z, V, c, (NOISE, *R), W)
     W[task.layout["LIVE"]] = 0.0
     feed(case, task.layout, inputs[0], y[0], W)
-    task.sample(W, NOISE, *R)
+    task.sample(W)
     totals = [W[place] for row, place in task.layout.items() if row == "LOSS" or row[:2] == "F_" or row[:5] == "SLOPE"]
     np.testing.assert_array_equal(totals, 0.0)
 
