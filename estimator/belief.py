@@ -12,10 +12,17 @@ import numpy.typing as npt
 
 from estimator.engine.rows import belief_names
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.parameters import FloatArray
 from estimator.physical import propagate
+from estimator.units import Scales
 
 Self = TypeVar("Self", bound="Belief")
+
+#: The Silverbox's: input and output in volts, as they are.
+_VOLTS = Scales()
+
+#: The Silverbox's: input and output in volts, as they are.
+_VOLTS = Scales()
 
 
 @cache
@@ -45,7 +52,7 @@ class Belief:
         model: whose states and coefficients these are.
         record: (size,) the numbers, as `estimator.engine.rows.belief_names` orders them: means, the upper triangle of
             the covariance row by row, shape and rate of γ, then of each sensor's ξ. Time is counted in samples.
-        step: sampling step [s], for physical parameters.
+        scales: what one inside is worth outside, for physical parameters.
         factorisation: of the inference that made it; ``mean_field`` is the paper's.
 
     Raises:
@@ -55,7 +62,7 @@ class Belief:
 
     model: Model
     record: FloatArray
-    step: float = SAMPLING_STEP
+    scales: Scales = _VOLTS
     factorisation: str = "structured"
 
     def __post_init__(self) -> None:
@@ -71,8 +78,6 @@ class Belief:
         noises = record[-2 - 2 * self.model.n_outputs :]
         if (noises <= 0).any():
             raise ValueError(f"shapes and rates of the noises must be positive, but are {noises.tolist()}")
-        if not 0 < self.step < np.inf:
-            raise ValueError(f"step must be positive and finite, but is {self.step}; give the seconds between samples")
         cov = record[covariance_places(self.model)]
         std = np.sqrt(np.maximum(np.diag(cov), 0.0))
         unit = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
@@ -99,7 +104,7 @@ class Belief:
             cov: (d, d) their covariance.
             gamma: shape and rate of the process precision.
             xi: shape and rate of the measurement precision; one pair for each sensor where there are several.
-            others: ``step`` and ``factorisation``.
+            others: ``scales`` and ``factorisation``.
 
         Raises:
             ValueError: as the class, or for shapes that do not fit.
@@ -133,7 +138,7 @@ class Belief:
 
     @property
     def _kind(self) -> tuple[Any, ...]:
-        return (self.model.digest, self.step, self.factorisation)
+        return (self.model.digest, self.scales, self.factorisation)
 
     def with_records(self: Self, records: FloatArray) -> list[Self]:
         """Beliefs of the same kind with other records (n, size), which must not be written to any more."""
@@ -156,6 +161,11 @@ class Belief:
             record[places[:n, n:]] = 0.0
             record[places[n:-1, -1]] = 0.0
         return replace(self, record=record, factorisation=factorisation)
+
+    @property
+    def step(self) -> float:
+        """Sampling step [s]."""
+        return self.scales.step
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -253,12 +263,19 @@ class Belief:
         return active, cov[np.ix_(active, active)]
 
     def physical(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (p,) and covariance (p, p) of the physical parameters, to first order; the coefficients without any."""
-        return propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.step)
+        """Mean (p,) and covariance (p, p) of the physical parameters, to first order; the coefficients without any.
+
+        In the units of ``scales``.
+        """
+        mean, cov = propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.step)
+        if not self.model.physical:
+            return mean, cov
+        worth = np.array([self.scales.factor(dimension) for dimension in self.model.dimensions.values()])
+        return mean * worth, cov * np.outer(worth, worth)
 
     def parameters(self) -> dict[str, tuple[float, float, str]]:
         """Mean, standard deviation and unit of each physical parameter, by name."""
         mean, cov = self.physical()
-        units = self.model.physical_units or self.model.coefficients
+        units = {name: self.scales.unit(d) for name, d in self.model.dimensions.items()} or self.model.coefficients
         rows = zip(self.model.physical or self.model.coefficients, mean.tolist(), np.sqrt(np.diag(cov)), strict=True)
         return {name: (value, float(std), units[name]) for name, value, std in rows}

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from estimator.belief import Belief, covariance_places
 from estimator.ensemble import LEVELS, NoiseRatio, grid, log_ratio, matched_gamma, ratio_of
 from estimator.inference import samples
-from estimator.inputs import Channel, channel, degree
+from estimator.inputs import Feed, degree, feed
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
@@ -37,7 +37,7 @@ class Filter:
     def __init__(self, prior: Belief, rig: Rig, settings: Settings) -> None:
         self.prior, self.rig, self.settings = prior, rig, settings
         self.model: Model = prior.model
-        self.channel: Channel = channel(self.model, rig)
+        self.feed: Feed = feed(self.model, rig)
         members = 1 if settings.noise_hypotheses == 1 else len(LEVELS) * settings.noise_hypotheses
         self._loop = self._compiled(members)
         size, lanes = len(prior.record), self._loop.lanes
@@ -46,11 +46,11 @@ class Filter:
         self._backup = np.empty((blocks, size * lanes))
         self._weights = np.full(members, 1 / members)
         self._begun = np.zeros(1)
-        self._inputs = np.zeros(self.channel.past + 1)
-        self._outputs = np.zeros((self.channel.waits + 1, self.model.n_outputs))
+        self._inputs = np.zeros(self.feed.past + 1)
+        self._outputs = np.zeros((self.feed.waits + 1, self.model.n_outputs))
         self._walk = settings.drift**2 * np.diag(prior.coefficients_cov)
         self._first = prior.record.copy()
-        shape = [self.channel.stride, self.channel.past, self.channel.waits, self.channel.fills]
+        shape = [self.feed.stride, self.feed.past, self.feed.waits, self.feed.fills]
         self._steps = np.array(shape, dtype=np.int64)
         records = np.repeat(prior.record[None], members, axis=0)
         if members > 1:
@@ -88,7 +88,7 @@ class Filter:
     @property
     def is_waiting(self) -> bool:
         """Whether the next sample only waits for the one after it."""
-        return self.channel.waits and not self._begun[0]
+        return self.feed.waits and not self._begun[0]
 
     def step(self, u: float, y: float, energies: FloatArray, forecasts: FloatArray) -> int:
         """Take one sample of one sensor; see `run`."""
@@ -96,7 +96,7 @@ class Filter:
         self._outputs[-1, 0] = y
         bad: int = self._loop.run(
             self._block, self._backup, self._weights, self._begun, self._inputs, self._outputs,
-            self.channel.stencil, self._steps, self._walk, energies, forecasts,
+            self.feed.stencil, self._steps, self._walk, energies, forecasts,
         )  # fmt: skip
         return bad
 
@@ -112,17 +112,17 @@ class Filter:
         Returns:
             The sample at which the numbers overflowed, or -1. Nothing has changed where they did.
         """
-        at_once = self.channel.at_once
-        inputs = self.channel.pieces(u).reshape(-1) if at_once else np.concatenate([self._inputs[:-1], u])
+        at_once = self.feed.at_once
+        inputs = self.feed.pieces(u).reshape(-1) if at_once else np.concatenate([self._inputs[:-1], u])
         outputs = np.concatenate([self._outputs[:-1], y])
         bad: int = self._loop.run(
             self._block, self._backup, self._weights, self._begun, inputs, outputs,
-            self.channel.stencil, self._steps, self._walk, energies, forecasts,
+            self.feed.stencil, self._steps, self._walk, energies, forecasts,
         )  # fmt: skip
         if bad < 0:
-            self._inputs[:-1] = inputs[: self.channel.past]
-            self._outputs[:-1] = outputs[: self.channel.waits]
-        return max(0, bad - int(self.channel.waits)) if bad >= 0 else -1
+            self._inputs[:-1] = inputs[: self.feed.past]
+            self._outputs[:-1] = outputs[: self.feed.waits]
+        return max(0, bad - int(self.feed.waits)) if bad >= 0 else -1
 
     def rewind(self) -> None:
         """Forget the state and the inputs; keep coefficients, noises and weights."""
@@ -189,7 +189,7 @@ class Filter:
     def predict(self, u: FloatArray, y: FloatArray) -> FloatArray:
         """One-step predictions (T, sensors) with the coefficients fixed at their means."""
         if not self.regresses:
-            return self._known().follow(u, y)
+            return self.known().follow(u, y)[:, :, 0]
         t1, t2, t3, eta = self.belief.coefficients_mean
         predicted, last = y.copy(), y[1:-1, 0]
         acting = np.concatenate([np.zeros(self.rig.delay), u])[2 : len(y)]
@@ -200,17 +200,17 @@ class Filter:
         """Free run (T, sensors) from the first outputs, with the coefficients fixed at their means."""
         given = len(y_init)
         unseen = np.full((len(u) - given, y_init.shape[1]), np.nan)
-        known = self._known(state=y_init[::-1][:2, 0] if self.regresses else None)
+        known = self.known(state=y_init[::-1][:2, 0] if self.regresses else None)
         if self.regresses:
             # The state is measured: what acts from now on are the inputs, with those that the delay holds back.
-            kept = known.channel.past
+            kept = known.feed.past
             known._inputs[:-1] = np.concatenate([np.zeros(kept), u[:given]])[given:]
-            return np.concatenate([y_init, known.follow(u[given:], unseen)]) if len(unseen) else y_init.copy()
-        followed = known.follow(u, np.concatenate([y_init, unseen]))
+            return np.concatenate([y_init, known.follow(u[given:], unseen)[:, :, 0]]) if len(unseen) else y_init.copy()
+        followed = known.follow(u, np.concatenate([y_init, unseen]))[:, :, 0]
         followed[:given] = y_init
         return followed
 
-    def _known(self, state: FloatArray | None = None) -> Filter:
+    def known(self, state: FloatArray | None = None) -> Filter:
         """A filter that knows coefficients and noises, and the state where it is given."""
         n, d = self.model.n_states, len(self.model.names)
         record, places = self._mixture(), covariance_places(self.model)
@@ -231,14 +231,14 @@ class Filter:
         return known
 
     def follow(self, u: FloatArray, y: FloatArray) -> FloatArray:
-        """Forecasts (T, sensors) along a record, whose end may wait for an input that is not there."""
+        """(T, sensors, 2) mean and variance of each output before it is seen; the end may wait for an input in vain."""
         forecasts = np.empty((len(u) + 1, y.shape[1], 2))
         nothing = np.empty((0, 1))
         used = len(u) - int(self.is_waiting)
         self.run(u, y, nothing, forecasts)
-        if self.channel.waits:  # the input after the last is taken as the last
+        if self.feed.waits:  # the input after the last is taken as the last
             self.run(u[-1:], np.full((1, y.shape[1]), np.nan), nothing, forecasts[used:])
-        return forecasts[: len(u), :, 0]
+        return forecasts[: len(u)]
 
     def arrays(self) -> dict[str, FloatArray]:
         """Everything that the future depends on, by name; copies."""

@@ -23,7 +23,7 @@ _DEGREE = INTERPOLATIONS["spline"]
 
 
 @dataclass(frozen=True, eq=False)
-class Channel:
+class Feed:
     """How a window of inputs drives a sample.
 
     Attributes:
@@ -65,17 +65,17 @@ class Channel:
         return pieces
 
 
-def channel(model: Model, rig: Rig) -> Channel:
+def feed(model: Model, rig: Rig) -> Feed:
     """The way of a model's input in a rig."""
     if not model.is_continuous:
-        return _channel(np.eye(model.taps)[::-1], rig.delay)
+        return _feed(np.eye(model.taps)[::-1], rig.delay)
     if rig.interpolation == "zero_order":
-        return _channel(np.ones((1, 1)), rig.delay + 1)
+        return _feed(np.ones((1, 1)), rig.delay + 1)
     if rig.interpolation == "linear":
-        return _channel(np.array([[1.0, 0.0], [-1.0, 1.0]]), rig.delay)
+        return _feed(np.array([[1.0, 0.0], [-1.0, 1.0]]), rig.delay)
     if rig.interpolation == "look_ahead":
-        return _channel(_look_ahead(), rig.delay - 1, fills=True)
-    return Channel(np.eye(_DEGREE + 1), 0, fills=True, at_once=True, delay=rig.delay)
+        return _feed(_look_ahead(), rig.delay - 1, fills=True)
+    return Feed(np.eye(_DEGREE + 1), 0, fills=True, at_once=True, delay=rig.delay)
 
 
 def degree(model: Model, rig: Rig) -> int:
@@ -83,10 +83,10 @@ def degree(model: Model, rig: Rig) -> int:
     return INTERPOLATIONS[rig.interpolation] if model.is_continuous else 0
 
 
-def _channel(stencil: FloatArray, lag: int, fills: bool = False) -> Channel:
+def _feed(stencil: FloatArray, lag: int, fills: bool = False) -> Feed:
     """A window whose newest input for y[k] is u[k - lag]."""
     waits = lag < 0
-    return Channel(np.ascontiguousarray(stencil), stencil.shape[1] - 1 + max(lag, 0), waits, fills)
+    return Feed(np.ascontiguousarray(stencil), stencil.shape[1] - 1 + max(lag, 0), waits, fills)
 
 
 @cache

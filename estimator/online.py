@@ -17,7 +17,8 @@ from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.priors import recorded_prior, silverbox_prior
-from estimator.rig import Rig
+from estimator.rig import Channel, Rig
+from estimator.rig_prior import rig_prior
 from estimator.settings import Settings, settled
 
 _SAMPLES_BETWEEN_REPORTS = 5_000
@@ -34,7 +35,9 @@ class OnlineEstimator:
             other `Model`.
         prior: a `Belief` of the model before the first sample. Where it is None: `silverbox_prior` for the paper's
             model, `recorded_prior` for other difference equations and for `duffing`; others need one.
-        rig: what the inputs do. Where it is None: input linear between samples, or delay 1 for a difference equation.
+        rig: what the inputs do, or the name of a rig file. Where it is None: input linear between samples, or delay 1
+            for a difference equation. A rig with a guess brings model and prior along, and its noises are weighed
+            (``noise_hypotheses`` 9). u, y and parameters are in the prior's units.
         factorisation: ``structured`` (states and coefficients jointly Gaussian) or ``mean_field`` (the paper's, for the
             paper's model).
         iterations: variational iterations per sample, 1 to 100; 3 structured, 10 mean field where it is None.
@@ -44,8 +47,8 @@ class OnlineEstimator:
         expectations: what a step does to the Gaussian belief: ``first_order``, by the derivative at its mean; or
             ``sigma_points``, by points that spread as the belief does, for beliefs that are wide.
         noise_hypotheses: number of ratios σ_w/σ_v to weigh by their evidence (`estimator.ensemble`), structured only.
-            With 1 the ratio stays nearly what the priors of γ and ξ say. 9 resolve it; an odd number has the priors'
-            own ratio among them. Each is there at three levels, so that a sample costs three updates a hypothesis.
+            With 1, the default, the ratio stays nearly what the priors of γ and ξ say. 9 resolve it; an odd number has
+            the priors' own ratio among them. Each is there at three levels: a sample costs three updates a hypothesis.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -72,15 +75,23 @@ class OnlineEstimator:
         self,
         model: Model | None = None,
         prior: Belief | None = None,
-        rig: Rig | None = None,
+        rig: Rig | Mapping[str, object] | str | None = None,
         *,
         factorisation: str = "structured",
         iterations: int | None = None,
         as_published: bool = False,
         drift: float = 0.0,
         expectations: str = "first_order",
-        noise_hypotheses: int = 1,
+        noise_hypotheses: int | None = None,
     ) -> None:
+        rig = None if rig is None else Rig.of(rig)
+        of_rig = rig is not None and rig.guess is not None and model is None and prior is None
+        if of_rig:
+            assert rig is not None
+            prior = rig_prior(rig)
+            model = prior.model
+        if noise_hypotheses is None:
+            noise_hypotheses = 9 if of_rig else 1
         if not isinstance(model, Model | None):
             raise ValueError(f"model must be a Model, but is {model!r:.60}; use difference() or duffing()")
         self.model = difference() if model is None else model
@@ -93,13 +104,12 @@ class OnlineEstimator:
         self._forecasts = np.empty((0, self.model.n_outputs, 2))
         self._spare = np.empty_like(self._free_energies), np.empty((1, self.model.n_outputs, 2))
         prior = _settled_prior(self.model, prior, self.settings)
-        if not isinstance(rig, Rig | None):
-            raise ValueError(f"rig must be a Rig, but is {rig!r:.60}; use Rig(step, interpolation, delay)")
         if rig is None:
-            rig = Rig(prior.step, "linear", 0) if self.model.is_continuous else Rig(prior.step, "zero_order", 1)
+            units = Channel(prior.scales.input_unit), Channel(prior.scales.output_unit)
+            rig = Rig(prior.step, *(("linear", 0) if self.model.is_continuous else ("zero_order", 1)), *units)
         if rig.step != prior.step:
             raise ValueError(f"rig.step must be that of the prior, {prior.step}, but is {rig.step}; make both alike")
-        self.rig = rig
+        self.rig, self.scales = rig, prior.scales
         self._filter = Filter(prior, rig, self.settings)
 
     @property
@@ -123,7 +133,8 @@ class OnlineEstimator:
 
         (T, sensors, 2) for several sensors, each given those before it of the same sample.
         """
-        return self._forecasts[:, 0].copy() if self.model.n_outputs == 1 else self._forecasts.copy()
+        told = self._forecasts * np.array([self.scales.output, self.scales.output**2])
+        return told[:, 0] if self.model.n_outputs == 1 else told
 
     @property
     def noise_ratio(self) -> NoiseRatio:
@@ -139,7 +150,7 @@ class OnlineEstimator:
     @property
     def waits(self) -> int:
         """Samples that are used only when the next input is known: 1 where the rig looks ahead, else 0."""
-        return int(self._filter.channel.waits)
+        return int(self._filter.feed.waits)
 
     def update(self, u: float, y: float | npt.ArrayLike) -> None:
         """Update the posterior with the sample (u, y); y holds a number for each sensor.
@@ -148,7 +159,7 @@ class OnlineEstimator:
             ValueError: if u or y is not a finite number, or drives the belief out of the range of floating-point
                 numbers. The estimator is then as it was before.
         """
-        if self._filter.channel.at_once:
+        if self._filter.feed.at_once:
             raise ValueError("interpolation must not be 'spline' for single samples; use run() or 'look_ahead'")
         if self.model.n_outputs > 1:
             self.run(np.array([scalar("u", u)]), np.reshape(series("y", y), (1, -1)))
@@ -156,10 +167,11 @@ class OnlineEstimator:
         # What is two finite floats needs no further look: this is the inner loop of who takes samples one by one.
         if not (isinstance(u, float) and isinstance(y, float) and math.isfinite(u + y)):
             u, y = float(series("u", [scalar("u", u)])[0]), float(series("y", [scalar("y", y)])[0])
+        u, y = u / self.scales.input, y / self.scales.output
         used = not self._filter.is_waiting
         free_energies, forecasts = self._spare
         if self._filter.step(u, y, free_energies, forecasts) >= 0:
-            raise ValueError(_overflowed(0, u, y))
+            raise ValueError(_overflowed(0, u * self.scales.input, y * self.scales.output))
         if not used:
             self._forecasts = forecasts[:0]
         else:
@@ -198,7 +210,8 @@ class OnlineEstimator:
             bad = memory.run(u[start:stop], outputs[start:stop], free_energies[used:], forecasts[used:])
             if bad >= 0:
                 place = start + bad
-                raise ValueError(_overflowed(place, u[place], outputs[place].tolist()))
+                told = (outputs[place] * self.scales.output).tolist()
+                raise ValueError(_overflowed(place, u[place] * self.scales.input, told))
             used += new
         self._filter = memory
         self._forecasts = forecasts[:used]
@@ -237,6 +250,20 @@ class OnlineEstimator:
         u, outputs = self._record(u, y, False, least=2)
         return self._shown(self._filter.predict(u, outputs))
 
+    def forecast(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Mean and variance of each output before it is seen, with the coefficients and noises fixed at their means.
+
+        Args:
+            u: (T,) inputs.
+            y: (T,) or (T, sensors) outputs, paired with u by index; NaN where one is missing.
+
+        Returns:
+            (T, 2) or (T, sensors, 2).
+        """
+        u, outputs = self._record(u, y, True)
+        told = self._filter.known().follow(u, outputs) * np.array([self.scales.output, self.scales.output**2])
+        return told[:, 0] if self.model.n_outputs == 1 else told
+
     def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:
         """Free run with the coefficients fixed at their means, over all of u.
 
@@ -248,7 +275,7 @@ class OnlineEstimator:
         Returns:
             Simulated outputs (T,) or (T, sensors); inf or NaN from where the model diverges.
         """
-        u = series("u", u)
+        u = series("u", u) / self.scales.input
         outputs = self._outputs("y_init", y_init, False)
         if not 2 <= len(outputs) <= len(u):
             raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(outputs)}")
@@ -264,24 +291,24 @@ class OnlineEstimator:
             raise ValueError(
                 f"u and y must have one length{wish}, but have {len(inputs)} and {len(outputs)}; cut the longer one"
             )
-        return inputs, outputs
+        return inputs / self.scales.input, outputs
 
     def _outputs(self, name: str, y: npt.ArrayLike, missing: bool) -> FloatArray:
         sensors = self.model.n_outputs
         if sensors == 1:
-            return series(name, y, missing)[:, None]
+            return series(name, y, missing)[:, None] / self.scales.output
         shape = np.shape(y)
         if len(shape) != 2 or shape[1] != sensors:
             raise ValueError(f"{name} must have shape (T, {sensors}), a column for each sensor, but has {shape}")
         flat = np.ma.reshape(y, -1) if isinstance(y, np.ma.MaskedArray) else np.reshape(y, -1)
-        return series(name, flat, missing).reshape(shape)
+        return series(name, flat, missing).reshape(shape) / self.scales.output
 
     def _shown(self, outputs: FloatArray) -> FloatArray:
-        return outputs[:, 0] if self.model.n_outputs == 1 else outputs
+        return outputs[:, 0] * self.scales.output if self.model.n_outputs == 1 else outputs * self.scales.output
 
     def _chunks(self, samples: int, progress: bool) -> Iterator[tuple[int, int]]:
         """Ranges that cover all samples; one range without progress, else many with a bar that counts them."""
-        if not progress or self._filter.channel.at_once:
+        if not progress or self._filter.feed.at_once:
             yield 0, samples
             return
         from rich.progress import track

@@ -14,6 +14,7 @@ from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.physical import coefficients_of
+from estimator.units import Scales
 
 #: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
 #: converge to 1e-10 for every spread up to 0.999.
@@ -65,7 +66,7 @@ def _log_uniform_moments(
     for _ in names:
         probabilities = np.outer(probabilities, weights / 2).ravel()  # the weights sum to 2, the length of [-1, 1]
     points = coefficients_of(model, {name: c * row for name, c, row in zip(names, center, grid, strict=True)}, step)
-    return _moments(points, probabilities)
+    return moments(points, probabilities)
 
 
 def gaussian_moments(
@@ -91,10 +92,10 @@ def gaussian_moments(
     for _ in names:
         probabilities = np.outer(probabilities, weights / weights.sum()).ravel()
     drawn = {name: mean[name] + std.get(name, 0.0) * row for name, row in zip(names, grid, strict=True)}
-    return _moments(coefficients_of(model, drawn, step), probabilities)
+    return moments(coefficients_of(model, drawn, step), probabilities)
 
 
-def _moments(points: FloatArray, probabilities: FloatArray) -> tuple[FloatArray, FloatArray]:
+def moments(points: FloatArray, probabilities: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance of weighed points (N, K).
 
     Plain sums, because the last digits of a BLAS product depend on its number of threads.
@@ -145,7 +146,7 @@ def weak_prior(
     joint[:n, :n] = np.diag(np.broadcast_to(np.asarray(state_std, dtype=np.float64) ** 2, n))
     sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
     xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
-    return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, step=step)
+    return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, scales=Scales(step))
 
 
 #: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.twin`` identifies them).

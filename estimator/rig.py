@@ -1,20 +1,74 @@
-"""The rig: how a model stands in the world of the samples."""
+"""The rig: how an oscillator stands in the world. Units, sampling step and scales are here, and nowhere else."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import difflib
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from estimator.models.duffing import KINDS, duffing
+from estimator.models.model import Model
 from estimator.parameters import SAMPLING_STEP
+from estimator.units import Scales
 
 #: How the input goes between samples, and the degree of the polynomial that each takes.
 INTERPOLATIONS = {"zero_order": 0, "linear": 1, "look_ahead": 5, "spline": 5}
 
+#: More samples of delay are a record that was not aligned.
+_LONGEST_DELAY = 1000
+
+#: No rig file is larger [bytes].
+_LARGEST_FILE = 2**20
+
+_PARAMETERS = ("m", "c", "a", "b")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """The input or the output of a rig.
+
+    Attributes:
+        unit: such as ``"N"``, ``"V"``, ``"mm"`` or ``"m/s"``.
+        limit: of an input: never exceeded, in either direction. None: not known.
+        range: of an output: an experiment stops outside of it, in either direction. None: not known.
+        kind: what an output shows: ``displacement``, ``velocity`` or ``acceleration``.
+        noise: standard deviation, per sample: of an output its sensor's, of an input what disturbs the force. A first
+            value of what stays unknown; None: nothing is known of it.
+        offset: first value of the offset, which stays unknown.
+
+    Raises:
+        ValueError: naming the argument, the value and the remedy.
+    """
+
+    unit: str = "1"
+    limit: float | None = None
+    range: float | None = None
+    kind: str = "displacement"
+    noise: float | None = None
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.unit, str) or not self.unit.strip() or len(self.unit) > 40:
+            raise ValueError(f"unit must be a short text such as 'N', but is {self.unit!r:.60}; '1' is a pure number")
+        for name in ("limit", "range", "noise"):
+            value = getattr(self, name)
+            if value is not None and not (_is_number(value) and value > 0):
+                raise ValueError(f"{name} must be a positive, finite number or left out, but is {value!r}")
+        if self.kind not in KINDS:
+            raise ValueError(f"kind must be one of {list(KINDS)}, but is {self.kind!r}")
+        if not _is_number(self.offset):
+            raise ValueError(f"offset must be a finite number, but is {self.offset!r}; 0 where nothing is known")
+
 
 @dataclass(frozen=True)
 class Rig:
-    """Sampling step, and how recorded inputs act between samples. u and y are paired by index.
+    """Sampling step, input and output of an oscillator, and what is guessed of it. u and y are paired by index.
 
     Attributes:
         step: sampling step [s].
@@ -24,38 +78,157 @@ class Rig:
             inputs and the next one, so that a sample is used when the next input is known. ``spline``: the quintic
             spline through all inputs, for recorded data that is given at once. Before their first input it was the
             same.
-        delay: samples by which the input acts later than that, 0 or 1. A difference equation's newest tap acts on y[k]
-            with u[k - delay]: 1 for the paper's in recorded data. -1 is for ``zero_order`` alone, where pairs are those
-            of an environment: u[k] acted before y[k].
+        delay: samples by which the input acts later than that. A difference equation's newest tap acts on y[k] with
+            u[k - delay]: 1 for the paper's in recorded data. -1 is for ``zero_order`` alone, where pairs are those of
+            an environment: u[k] acted before y[k].
+        input: its unit, limit, noise and offset.
+        output: its unit, kind, range, noise and offset.
+        guess: parameter m, c, a, b to the central 90 % interval of what is believed of it, in the units of the
+            channels; of any sign, but m is positive. None: nothing is known.
 
     Raises:
-        ValueError: naming the argument, for a value out of its range.
+        ValueError: naming the argument, the value and the remedy.
 
     Example:
-        >>> from estimator.rig import Rig
-        >>> Rig(step=1e-3, interpolation="zero_order").delay
-        0
+        >>> from estimator import Channel, Rig
+        >>> rig = Rig(step=1e-3, input=Channel("N", limit=20), output=Channel("m", range=0.03))
+        >>> rig.delay, rig.scales.unit((1, -3, 0))
+        (0, 'N/m³')
     """
 
-    step: float = SAMPLING_STEP
-    interpolation: str = "linear"
+    step: float
+    interpolation: str = "zero_order"
     delay: int = 0
+    input: Channel = field(default_factory=Channel)
+    output: Channel = field(default_factory=Channel)
+    guess: Mapping[str, tuple[float, float]] | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.step, int | float) or not 0 < self.step < np.inf:
+        if not _is_number(self.step) or not self.step > 0:
             raise ValueError(
                 f"step must be positive and finite, but is {self.step!r}; give the seconds between samples"
             )
         if self.interpolation not in INTERPOLATIONS:
             raise ValueError(f"interpolation must be one of {list(INTERPOLATIONS)}, but is {self.interpolation!r}")
-        allowed = (-1, 0, 1) if self.interpolation == "zero_order" else (0, 1)
-        if isinstance(self.delay, bool) or self.delay not in allowed:
+        least = -1 if self.interpolation == "zero_order" else 0
+        if isinstance(self.delay, bool) or not isinstance(self.delay, int | np.integer):
+            raise ValueError(f"delay must be a whole number of samples, but is {self.delay!r}; shift u by the rest")
+        if not least <= self.delay <= _LONGEST_DELAY:
             raise ValueError(
-                f"delay must be one of {allowed} for interpolation={self.interpolation!r}, but is {self.delay!r}; "
-                f"shift u by the rest"
+                f"delay must be from {least} to {_LONGEST_DELAY} for interpolation={self.interpolation!r}, but is "
+                f"{self.delay!r}; shift u by the rest"
             )
+        for name, other in (("input", "range"), ("output", "limit")):
+            channel = getattr(self, name)
+            if isinstance(channel, Mapping):
+                channel = _built(Channel, channel, name)
+                object.__setattr__(self, name, channel)
+            if not isinstance(channel, Channel):
+                raise ValueError(f"{name} must be a Channel, but is {channel!r:.60}; use Channel('N', limit=20)")
+            if getattr(channel, other) is not None:
+                right = "limit" if other == "range" else "range"
+                raise ValueError(f"{name} must have no {other}, but has {getattr(channel, other)}; use {right}")
+        if self.input.kind != "displacement":
+            raise ValueError(f"input must have no kind, but has {self.input.kind!r}; kind is of the output")
+        object.__setattr__(self, "guess", _guessed(self.guess))
 
     @classmethod
     def silverbox(cls, interpolation: str = "linear", delay: int = 0) -> Rig:
         """The Silverbox record's: 610.35 Hz, a band-limited input."""
-        return cls(SAMPLING_STEP, interpolation, delay)
+        return cls(SAMPLING_STEP, interpolation, delay, Channel("V"), Channel("V"))
+
+    @classmethod
+    def from_dict(cls, described: Mapping[str, Any]) -> Rig:
+        """From nested dictionaries, as `to_dict` gives them, or a rig file holds them.
+
+        Raises:
+            ValueError: naming the key, for one that is unknown or missing, or a value out of its range.
+        """
+        return _built(cls, described, "rig")
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Rig:
+        """Read a rig file, TOML: ``step``, ``interpolation``, ``delay``, tables ``input``, ``output`` and ``guess``.
+
+        Raises:
+            ValueError: naming the file and what is wrong in it.
+            FileNotFoundError: if there is no such file.
+        """
+        place = Path(path)
+        if not place.exists():
+            raise FileNotFoundError(f"path must be a rig file, but there is no {place}; write one")
+        if not place.is_file() or place.stat().st_size > _LARGEST_FILE:
+            raise ValueError(f"path must be a rig file, a short TOML, but {place} is none; name the file itself")
+        try:
+            return cls.from_dict(tomllib.loads(place.read_text(encoding="utf-8")))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
+            raise ValueError(f"{place}: {error}") from error
+
+    @classmethod
+    def of(cls, rig: Rig | Mapping[str, Any] | str | Path) -> Rig:
+        """A rig from whatever describes one: itself, a dictionary, or the name of its file."""
+        if isinstance(rig, Rig):
+            return rig
+        if isinstance(rig, Mapping):
+            return cls.from_dict(rig)
+        if isinstance(rig, str | Path):
+            return cls.from_file(rig)
+        raise ValueError(f"rig must be a Rig, a dictionary or a file name, but is {rig!r:.60}; use Rig(step=...)")
+
+    def to_dict(self) -> dict[str, Any]:
+        """What JSON and TOML can hold, without what was left out."""
+        described: dict[str, Any] = asdict(self)
+        described["guess"] = None if self.guess is None else {name: list(ends) for name, ends in self.guess.items()}
+        for name in ("input", "output"):
+            described[name] = {key: value for key, value in described[name].items() if value is not None}
+        return {key: value for key, value in described.items() if value is not None}
+
+    @property
+    def scales(self) -> Scales:
+        """The input's limit and the output's range, 1 where they are not known, with step and units."""
+        order = KINDS[self.output.kind]
+        units = self.input.unit, self.output.unit
+        return Scales(float(self.step), self.input.limit or 1.0, self.output.range or 1.0, order, *units)
+
+    @property
+    def model(self) -> Model:
+        """Eq. (1) with offsets, as the rig's sensor shows it."""
+        return duffing(offsets=True, sensor=self.output.kind)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _guessed(guess: object) -> dict[str, tuple[float, float]] | None:
+    """Checked intervals; None where nothing is guessed."""
+    if guess is None:
+        return None
+    if not isinstance(guess, Mapping) or set(guess) != set(_PARAMETERS):
+        named = list(guess) if isinstance(guess, Mapping) else guess
+        raise ValueError(f"guess must have intervals of {list(_PARAMETERS)}, but is of {named!r:.80}; or leave it out")
+    checked = {}
+    for name in _PARAMETERS:
+        given = guess[name]
+        ends = list(given) if isinstance(given, list | tuple | np.ndarray) else [given]
+        if len(ends) != 2 or not all(map(_is_number, ends)) or not ends[0] < ends[1]:
+            raise ValueError(f"guess of {name} must be two finite numbers, low < high, but is {guess[name]!r:.60}")
+        checked[name] = (float(ends[0]), float(ends[1]))
+    if checked["m"][0] <= 0:
+        raise ValueError(f"guess of m must be positive, but begins at {checked['m'][0]}; a mass is above 0")
+    return checked
+
+
+def _built(kind: Any, described: object, where: str) -> Any:
+    """An object of a dataclass, from a dictionary of its arguments."""
+    if not isinstance(described, Mapping):
+        raise ValueError(f"{where} must be a table of names and values, but is {described!r:.60}")
+    known = [one.name for one in fields(kind)]
+    for key in described:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"{where} must have keys of {known}, but has {key!r:.60}{hint}")
+    if kind is Rig and "step" not in described:
+        raise ValueError("rig must have a step, but has none; give the seconds between samples")
+    return kind(**described)

@@ -16,9 +16,10 @@ from estimator.files import write_atomically
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
 from estimator.rig import Rig
+from estimator.units import Scales
 
 #: Raised when the content of the files changes.
-FORMAT = 2
+FORMAT = 3
 
 #: No estimator needs more [bytes]; a file that claims more is refused before it is read.
 _LARGEST = 64 * 2**20
@@ -32,7 +33,8 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
     description = {
         "format": FORMAT,
         "model": estimator.model.to_dict(),
-        "rig": asdict(estimator.rig),
+        "rig": estimator.rig.to_dict(),
+        "scales": asdict(estimator.scales),
         "settings": asdict(estimator.settings),
     }
     text = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
@@ -87,11 +89,11 @@ def _built(arrays: dict[str, Any]) -> OnlineEstimator:
         name: tuple(v) if isinstance(v, list) else v for name, v in description["model"].items()
     }
     model, settings = Model(**declared), description["settings"]
-    rig = Rig(**description["rig"])
+    rig, scales = Rig.from_dict(description["rig"]), Scales(**description["scales"])
     first = arrays.get("first")
     if first is None or first.dtype != np.float64 or first.shape != (record_size(model),):
         raise ValueError("its prior does not fit its model")
-    prior = Belief(model, first, step=rig.step, factorisation=settings["factorisation"])
+    prior = Belief(model, first, scales, factorisation=settings["factorisation"])
     estimator = OnlineEstimator(model, prior, rig, **settings)
     estimator.restore(arrays)
     return estimator

@@ -19,11 +19,11 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
 from estimator.belief import Belief
-from estimator.identify import identify
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
 from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
+from estimator.posteriors import posteriors
 from estimator.rig import Rig
 
 FloatArray = npt.NDArray[np.float64]
@@ -263,7 +263,7 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
             hands |= {f"nlarx_{name}": (experiment.prior_of(difference(), name), earlier) for name in FACTORISATIONS}
     found: dict[str, dict[str, FloatArray]] = {}
     for name, (prior, acting) in hands.items():
-        beliefs = identify(acting, y, prior, rig if prior.model.is_continuous else None)
+        beliefs = posteriors(acting, y, prior, rig if prior.model.is_continuous else None)
         means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
         found[name] = metrics.estimate_metrics(means, covs, truth, prior.model, step)
     fit = maximum_a_posteriori(

@@ -205,7 +205,7 @@ def train_online(setting: Setting, nonlinear: bool, training: Regime) -> FloatAr
     estimator = OnlineEstimator(
         difference(),
         published_run_prior(nonlinear),
-        Rig(interpolation="zero_order", delay=setting.input_delay),
+        Rig.silverbox("zero_order", setting.input_delay),
         factorisation=setting.factorisation,
         as_published=setting.as_published,
     )
@@ -218,8 +218,8 @@ def estimator_at(coefficients: FloatArray, input_delay: int) -> OnlineEstimator:
     prior = published_run_prior()
     record = prior.record.copy()
     record[2:6] = coefficients
-    believed = Belief(difference(), record, prior.step)
-    return OnlineEstimator(difference(), believed, Rig(interpolation="zero_order", delay=input_delay))
+    believed = Belief(difference(), record, prior.scales)
+    return OnlineEstimator(difference(), believed, Rig.silverbox("zero_order", input_delay))
 
 
 def train_through_environment(setting: Setting, nonlinear: bool, data: Path | None) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 from agents.evaluation.figures import new_figure
 from agents.studies.silverbox_protocol import NINETY, WITHOUT_EXTRAPOLATION
 from estimator import duffing
+from estimator.units import Scales
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,7 +81,8 @@ def _learning(outcomes: Mapping[str, Outcome]) -> Figure:
 def _parameters(outcomes: Mapping[str, Outcome]) -> Figure:
     """Posterior means and 90 % intervals of the physical parameters over the number of training samples."""
     figure = new_figure(11, 5.5)
-    units = duffing(offsets=True, cubic_damping=True, feedthrough=True).physical_units
+    dimensions = duffing(offsets=True, cubic_damping=True, feedthrough=True).dimensions
+    units = {name: Scales().unit(dimension) for name, dimension in dimensions.items()}
     panels = dict(zip(units, figure.subplots(2, 4, sharex=True).flat, strict=True))
     limits: dict[str, list[float]] = {parameter: [] for parameter in panels}
     for name, outcome in outcomes.items():

@@ -40,7 +40,7 @@ class Loop:
             - begun: (1,) 0 before the first sample ever.
             - inputs: those that still act, then a new one for each sample; the former are moved on.
             - outputs: (samples, sensors), with the one that waits in front; NaN where missing.
-            - stencil: of `estimator.inputs.Channel`.
+            - stencil: of `estimator.inputs.Feed`.
             - steps: its stride, past, waits and fills, as int64.
             - walk: (K,) variances of the coefficients' random walk per sample.
             - energies: (samples, iterations) receives the free energies [nats]; where it is empty nothing is judged.

@@ -66,7 +66,7 @@ _PHYSICAL = {
     "a": "(1 - theta1 - theta3)/eta",
     "b": "-theta2/eta",
 }
-_UNITS = {"m": "s²", "c": "s", "a": "1", "b": "V⁻²"}
+_DIMENSIONS = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)}
 
 
 @cache
@@ -99,6 +99,6 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
         noise=("1", "0"),
         outputs={"y": "x1"},
         physical=physical,
-        physical_units={p: _UNITS[p] for p in physical},
+        dimensions={p: _DIMENSIONS[p] for p in physical},
         inverse={name: _INVERSE[name] for name in names} if known else {},
     )

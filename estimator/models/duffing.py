@@ -18,49 +18,76 @@ from functools import cache
 
 from estimator.models.model import Model
 
+#: What a sensor may show, and the number of time derivatives.
+KINDS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+
 
 @cache
 def duffing(
-    *, offsets: bool = False, cubic_damping: bool = False, feedthrough: bool = False, noise: str = "white"
+    *,
+    offsets: bool = False,
+    cubic_damping: bool = False,
+    quintic: bool = False,
+    feedthrough: bool = False,
+    noise: str = "white",
+    sensor: str = "displacement",
 ) -> Model:
-    """Eq. (1), with terms that real circuits have.
+    """Eq. (1), with terms that real oscillators have.
 
     Args:
         offsets: of the output (y0) and of the input (as a constant force).
         cubic_damping: a term e x'³ of the damping.
+        quintic: a term q x⁵ of the stiffness.
         feedthrough: d u in the output.
         noise: ``white`` in the acceleration, or ``held``: constant over a sample. Of unit strength it would move x by 1
             within a sample, without spring and damper.
+        sensor: what it shows: ``displacement``, ``velocity`` or ``acceleration``.
 
     Raises:
-        ValueError: for another noise.
+        ValueError: for another noise or sensor.
     """
     if noise not in ("white", "held"):
         raise ValueError(f"noise must be 'white' or 'held', but is {noise!r}")
+    if sensor not in KINDS:
+        raise ValueError(f"sensor must be one of {list(KINDS)}, but is {sensor!r}")
+    order = KINDS[sensor]
+    # The state is the displacement with its offset, where that is what the sensor shows.
+    x = "(x - output_offset)" if offsets and order == 0 else "x"
     coefficients = {"stiffness": "1", "cubic": "V⁻²", "damping": "1", "gain": "1"}
-    acceleration = "gain*u - damping*v - stiffness*x - cubic*x**3"
+    acceleration = f"gain*u - damping*v - stiffness*x - cubic*{x}**3"
     physical = {"m": "step**2/gain", "c": "step*damping/gain", "a": "stiffness/gain", "b": "cubic/gain"}
-    units = {"m": "s²", "c": "s", "a": "1", "b": "V⁻²"}
+    dimensions = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)}
     inverse = {"stiffness": "a*step**2/m", "cubic": "b*step**2/m", "damping": "c*step/m", "gain": "step**2/m"}
+    per_step = ("", "/step", "/step**2")[order]
     if offsets:
         coefficients |= {"force": "V", "output_offset": "V"}
-        acceleration = "gain*u + force - damping*v - stiffness*x - cubic*(x - output_offset)**3"
-        physical |= {"u0": "(stiffness*output_offset - force)/gain", "y0": "output_offset"}
-        units |= {"u0": "V", "y0": "V"}
-        inverse |= {"force": "(a*y0 - u0)*step**2/m", "output_offset": "y0"}
+        acceleration += " + force"
+        static = "stiffness*output_offset - force" if order == 0 else "-force"
+        physical |= {"u0": f"({static})/gain", "y0": f"output_offset{per_step}"}
+        dimensions |= {"u0": (1, 0, 0), "y0": (0, 1, -order)}
+        inverse |= {"force": f"({'a*y0 - u0' if order == 0 else '-u0'})*step**2/m"}
+        inverse |= {"output_offset": f"y0*step**{order}" if order else "y0"}
     if cubic_damping:
         coefficients |= {"cubic_damping": "V⁻²"}
         acceleration += " - cubic_damping*v**3"
         physical |= {"e": "step**3*cubic_damping/gain"}
-        units |= {"e": "V⁻² s³"}
+        dimensions |= {"e": (1, -3, 3)}
         inverse |= {"cubic_damping": "e/(m*step)"}
-    output = "x"
+    if quintic:
+        coefficients |= {"quintic": "V⁻⁴"}
+        acceleration += f" - quintic*{x}**5"
+        physical |= {"q": "quintic/gain"}
+        dimensions |= {"q": (1, -5, 0)}
+        inverse |= {"quintic": "q*step**2/m"}
+    output = ("x", "v", acceleration)[order]
+    if offsets and order:
+        output += " + output_offset"
     if feedthrough:
         coefficients |= {"feedthrough": "1"}
-        output = "x + feedthrough*u"
-        physical |= {"d": "feedthrough"}
-        units |= {"d": "1"}
-        inverse |= {"feedthrough": "d"}
+        output += " + feedthrough*u"
+        physical |= {"d": f"feedthrough{per_step}"}
+        dimensions |= {"d": (-1, 1, -order)}
+        inverse |= {"feedthrough": f"d*step**{order}" if order else "d"}
     return Model(
         name="duffing",
         states={"x": "V", "v": "V"},
@@ -71,6 +98,6 @@ def duffing(
         outputs={"y": output},
         substeps=8,
         physical=physical,
-        physical_units=units,
+        dimensions=dimensions,
         inverse=inverse,
     )

@@ -46,7 +46,7 @@ class Model:
         substeps: Runge-Kutta steps of order 4 per sample: enough that the error of integration stays below a tenth of
             the standard deviation that a long record leaves.
         physical: parameter of the plant to its expression in coefficients and the sampling ``step`` [s]; may be empty.
-        physical_units: their units.
+        dimensions: of these parameters: powers of the units of input and displacement, and of the second.
         inverse: coefficient to its expression in the parameters and ``step``; all of them, where ``physical`` is given.
 
     Raises:
@@ -70,7 +70,7 @@ class Model:
     held: bool = False
     substeps: int = 1
     physical: Mapping[str, str] = field(default_factory=dict)
-    physical_units: Mapping[str, str] = field(default_factory=dict)
+    dimensions: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
     inverse: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -101,6 +101,8 @@ class Model:
             raise ValueError(f"substeps must be a whole number from 1 to 1000, but is {self.substeps!r}")
         if self.held and not self.is_continuous:
             raise ValueError("held must be False for a difference equation, whose noise comes once a sample")
+        if set(self.dimensions) != set(self.physical):
+            raise ValueError(f"dimensions must be of {list(self.physical)}, but are of {list(self.dimensions)}")
         if bool(self.physical) != bool(self.inverse) or (self.inverse and set(self.inverse) != set(self.coefficients)):
             raise ValueError(
                 f"physical and inverse go together, and inverse must give {list(self.coefficients)}, but gives "

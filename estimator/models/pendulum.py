@@ -21,6 +21,6 @@ PENDULUM = Model(
     outputs={"angle": "q", "velocity": "w"},
     substeps=2,
     physical={"p1": "gravity/step**2", "p2": "friction/step", "p3": "torque/step**2"},
-    physical_units={"p1": "s⁻²", "p2": "s⁻¹", "p3": "s⁻²"},
+    dimensions={"p1": (0, 0, -2), "p2": (0, 0, -1), "p3": (-1, 1, -2)},
     inverse={"gravity": "p1*step**2", "friction": "p2*step", "torque": "p3*step**2"},
 )

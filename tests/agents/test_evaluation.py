@@ -355,7 +355,7 @@ def test_the_replay_environment_is_evaluated(record):
     u, y = record.arrow.u, record.arrow.y
     samples = int(np.argmax(np.abs(y[1:]) > limit)) + 1  # the episode ends when y, one sample later, is beyond
     assert samples > 1000
-    estimator = OnlineEstimator(difference(), silverbox_prior(), Rig(interpolation="zero_order", delay=0))
+    estimator = OnlineEstimator(difference(), silverbox_prior(), Rig.silverbox("zero_order"))
     before = entropy(estimator.belief)
     estimator.run(u[:samples], y[1 : samples + 1])
     np.testing.assert_allclose(on_record.metrics["information_gain"], before - entropy(estimator.belief), rtol=1e-9)

@@ -65,7 +65,7 @@ def motion(u, coefficients, interpolation="linear"):
 def pendulum_estimator():
     """One of a model with two sensors."""
     prior = weak_prior(PENDULUM, [14.7 * 0.05**2, 0.0, 3.0 * 0.05**2], np.diag([1e-6, 1e-6, 1e-6]), 1e-3, 1e-3)
-    return OnlineEstimator(PENDULUM, prior, Rig(prior.step))
+    return OnlineEstimator(PENDULUM, prior, Rig(prior.step, "linear"))
 
 
 def assert_same(first, second):

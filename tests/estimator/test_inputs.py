@@ -7,12 +7,12 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 from estimator import Rig, difference, duffing
-from estimator.inputs import channel
+from estimator.inputs import feed
 
 
 def rows(model, rig, u):
     """(T, rows) what a model takes on the way to each sample."""
-    way = channel(model, rig)
+    way = feed(model, rig)
     if way.at_once:
         return way.pieces(u)
     before = np.full(way.past, u[0] if way.fills else 0.0)
@@ -49,7 +49,7 @@ def at(pieces, tau):
 
 
 def test_look_ahead_is_the_quintic_through_its_window():
-    way = channel(duffing(), Rig.silverbox("look_ahead"))
+    way = feed(duffing(), Rig.silverbox("look_ahead"))
     assert (way.waits, way.past, way.stencil.shape) == (True, 9, (6, 10))
     found = rows(duffing(), Rig.silverbox("look_ahead"), U)  # the t-th is on the way to sample t - 1
     for t in range(9, 40):
@@ -58,7 +58,7 @@ def test_look_ahead_is_the_quintic_through_its_window():
             assert at(found[t : t + 1], tau)[0] == pytest.approx(float(spline(7 + tau)), abs=1e-10)
     np.testing.assert_allclose(at(found[9:], 0.0), U[7:38], atol=1e-12)
     np.testing.assert_allclose(at(found[9:], 1.0), U[8:39], atol=1e-12)
-    delayed = channel(duffing(), Rig.silverbox("look_ahead", 1))
+    delayed = feed(duffing(), Rig.silverbox("look_ahead", 1))
     assert not delayed.waits  # the next input but for the delay is known
 
 

@@ -392,15 +392,15 @@ def test_unchanged_after_a_run_that_raised(samples, change, message):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: Rig(delay=2), "delay must be one of (0, 1) for interpolation='linear', but is 2"),
-        (lambda: Rig(delay=-1), "delay must be one of (0, 1) for interpolation='linear', but is -1"),
-        (lambda: Rig(interpolation="cubic"), "interpolation must be one of ['zero_order', 'linear', 'look_ahead'"),
+        (lambda: Rig(1.0, "linear", 2000), "delay must be from 0 to 1000 for interpolation='linear', but is 2000"),
+        (lambda: Rig(1.0, "linear", -1), "delay must be from 0 to 1000 for interpolation='linear', but is -1"),
+        (lambda: Rig(1.0, interpolation="cubic"), "interpolation must be one of ['zero_order', 'linear', 'look_ahead'"),
         (lambda: Rig(step=0.0), "step must be positive and finite, but is 0.0"),
         (lambda: OnlineEstimator("duffing"), "model must be a Model, but is 'duffing'; use difference() or duffing()"),
         (lambda: OnlineEstimator(PENDULUM), "prior must be given for pendulum"),
         (lambda: OnlineEstimator(ODE, silverbox_prior()), "prior must be a Belief of the model, duffing with ('stiff"),
         (lambda: OnlineEstimator(rig=Rig(step=1.0)), "rig.step must be that of the prior, 0.0016384, but is 1.0"),
-        (lambda: OnlineEstimator(rig="linear"), "rig must be a Rig, but is 'linear'"),
+        (lambda: OnlineEstimator(rig=3), "rig must be a Rig, a dictionary or a file name, but is 3"),
         (
             lambda: OnlineEstimator(factorisation="bethe"),
             "factorisation must be one of ['structured', 'mean_field'], but is 'bethe'",

@@ -7,7 +7,7 @@ import pytest
 from estimators import ONE_TAP, OWN_TAPS, pendulum_estimator, record
 
 from estimator import OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
-from estimator.identify import identify
+from estimator.posteriors import posteriors
 
 LENGTHS = [40, 7, 0, 40] + 31 * [25]  # more than a block of lanes
 HELD = Rig.silverbox("zero_order", -1)
@@ -37,7 +37,7 @@ def records():
 def test_beliefs_are_those_of_one_estimator_after_the_other(case, records):
     prior, rig, same = CASES[case]
     u, y = records
-    beliefs = identify(u, y, prior, rig)
+    beliefs = posteriors(u, y, prior, rig)
     assert len(beliefs) == len(LENGTHS)
     for row, (belief, length) in enumerate(zip(beliefs, LENGTHS, strict=True)):
         estimator = OnlineEstimator(prior.model, prior, same, factorisation=prior.factorisation)
@@ -52,7 +52,7 @@ def test_several_sensors(records):
     estimator = pendulum_estimator()
     prior = estimator.belief
     u, y = np.ones((2, 20)), 0.01 * np.random.default_rng(0).standard_normal((2, 20, 2))
-    beliefs = identify(u, y, prior)
+    beliefs = posteriors(u, y, prior)
     estimator.run(u[1], y[1])
     np.testing.assert_allclose(beliefs[1].record, estimator.belief.record, rtol=1e-6, atol=1e-14)
 
@@ -60,12 +60,15 @@ def test_several_sensors(records):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda u: identify(u[0], u[0], silverbox_prior()), "u and y must have one shape (n, T), but have (40,)"),
-        (lambda u: identify(u, u[:, :-1], silverbox_prior()), "u and y must have one shape (n, T), but have (35, 40)"),
-        (lambda u: identify(u, u * np.nan, silverbox_prior()), "but those of record 0 are not"),
-        (lambda u: identify(u, u, 3), "prior must be a Belief, but is 3"),
+        (lambda u: posteriors(u[0], u[0], silverbox_prior()), "u and y must have one shape (n, T), but have (40,)"),
         (
-            lambda u: identify(u, u, silverbox_prior(duffing()), Rig.silverbox("look_ahead")),
+            lambda u: posteriors(u, u[:, :-1], silverbox_prior()),
+            "u and y must have one shape (n, T), but have (35, 40)",
+        ),
+        (lambda u: posteriors(u, u * np.nan, silverbox_prior()), "but those of record 0 are not"),
+        (lambda u: posteriors(u, u, 3), "prior must be a Belief, but is 3"),
+        (
+            lambda u: posteriors(u, u, silverbox_prior(duffing()), Rig.silverbox("look_ahead")),
             "interpolation must be 'zero_order' or 'linear', but is 'look_ahead'",
         ),
     ],

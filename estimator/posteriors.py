@@ -16,13 +16,13 @@ from estimator.belief import Belief
 from estimator.engine import tasks
 from estimator.engine.rows import belief_names
 from estimator.inference import DEFAULT_ITERATIONS, mean_field
-from estimator.inputs import channel, degree
+from estimator.inputs import degree, feed
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
 from estimator.rig import Rig
 
 
-def identify(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | None = None) -> list[Belief]:
+def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | None = None) -> list[Belief]:
     """Identify a system from each of n records, sample by sample.
 
     Args:
@@ -47,8 +47,8 @@ def identify(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | None 
         outputs = outputs[..., None]
     if inputs.ndim != 2 or outputs.shape != (*inputs.shape, sensors):
         raise ValueError(f"u and y must have one shape (n, T), but have {inputs.shape} and {np.shape(y)}")
-    rig = Rig(prior.step) if rig is None else rig
-    way = channel(prior.model, rig)
+    rig = Rig(prior.step, "linear") if rig is None else rig
+    way = feed(prior.model, rig)
     if way.fills:
         raise ValueError(f"interpolation must be 'zero_order' or 'linear', but is {rig.interpolation!r}; or use run()")
     ended = np.isnan(inputs)

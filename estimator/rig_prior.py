@@ -1,0 +1,92 @@
+"""The prior of a rig: what its guess says of the coefficients, before a record that may begin in motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator.belief import Belief
+from estimator.models.duffing import KINDS
+from estimator.parameters import FloatArray
+from estimator.physical import coefficients_of
+from estimator.priors import moments
+from estimator.rig import Rig
+from estimator.units import Scales
+
+#: Standard deviations of an interval's half width: the central 90 % of a Gaussian.
+HALF_WIDTH = 1.6448536269514722
+
+#: Standard deviation of an offset, and of a noise of which nothing is known, in parts of the channel's scale.
+_OFFSET, _NOISE = 0.03, 0.01
+
+#: Of a displacement at the start, in parts of the output's scale.
+_START = 0.3
+
+#: Points of the quadrature along each parameter, and along each offset.
+_NODES, _OFFSET_NODES = 7, 3
+
+
+def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
+    """What is believed of a rig before its first sample.
+
+    c, a and b are Gaussian with the guess as their central 90 %, m is log-normal with the same interval (its inverse
+    must have moments), the offsets Gaussian about those of the channels. The noises' priors are weak, about those of
+    the channels: of the input's noise f, the disturbance of the force, σ_w is what moves the velocity as much as f does
+    when it is held over a sample.
+
+    Args:
+        rig: with a guess.
+        scales: of input and output inside; the rig's own where they are None.
+
+    Raises:
+        ValueError: for a rig without a guess.
+    """
+    if rig.guess is None:
+        raise ValueError("rig must have a guess of m, c, a and b, but has none; add one, or use identify on a record")
+    scales = rig.scales if scales is None else scales
+    model = rig.model
+    names = list(model.physical)
+    axes = {name: _axis(name, *rig.guess[name]) for name in rig.guess}
+    axes["u0"] = _gaussian(rig.input.offset, _OFFSET * scales.input, _OFFSET_NODES)
+    axes["y0"] = _gaussian(rig.output.offset, _OFFSET * scales.output, _OFFSET_NODES)
+    grid = np.meshgrid(*(axes[name][0] for name in names), indexing="ij")
+    probabilities = np.ones(1)
+    for name in names:
+        probabilities = np.outer(probabilities, axes[name][1]).ravel()
+    inside = {
+        name: points.ravel() / scales.factor(model.dimensions[name]) for name, points in zip(names, grid, strict=True)
+    }
+    mean, cov = moments(coefficients_of(model, inside, scales.step), probabilities)
+    return about(rig, scales, mean, cov)
+
+
+def about(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief:
+    """A belief in given moments of the coefficients of the rig's model, before a record that may begin in motion."""
+    model, known = rig.model, dict(zip(rig.model.coefficients, mean, strict=True))
+    frequency = float(np.clip(np.sqrt(abs(known["stiffness"]) + abs(known["cubic"]) * _START**2), 1e-3, 1.0))
+    displacement = _START / frequency ** KINDS[rig.output.kind]
+    n, d = model.n_states, len(model.names)
+    joint_mean, joint = np.concatenate([np.zeros(n), mean]), np.zeros((d, d))
+    joint[:n, :n] = np.diag([displacement**2, (displacement * frequency) ** 2])
+    joint[n:, n:] = cov
+    if KINDS[rig.output.kind] == 0:  # the state is the displacement with its offset
+        place = n + list(model.coefficients).index("output_offset")
+        joint_mean[0] = joint_mean[place]
+        joint[0, :] += joint[place, :]
+        joint[:, 0] += joint[:, place]
+    force = (rig.input.noise or _NOISE * scales.input) / scales.input
+    noises = known["gain"] * force / np.sqrt(3), (rig.output.noise or _NOISE * scales.output) / scales.output
+    gamma, xi = ((2.0, 2.0 * float(noise) ** 2) for noise in noises)
+    return Belief.of(model, joint_mean, joint, gamma, xi, scales=scales)
+
+
+def _axis(name: str, low: float, high: float) -> tuple[FloatArray, FloatArray]:
+    """Points and weights of a parameter."""
+    if name != "m":
+        return _gaussian((low + high) / 2, (high - low) / 2 / HALF_WIDTH, _NODES)
+    points, weights = _gaussian(np.log(low * high) / 2, np.log(high / low) / 2 / HALF_WIDTH, _NODES)
+    return np.exp(points), weights
+
+
+def _gaussian(mean: float, std: float, nodes: int) -> tuple[FloatArray, FloatArray]:
+    points, weights = np.polynomial.hermite_e.hermegauss(nodes)
+    return mean + std * points, weights / weights.sum()

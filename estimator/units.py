@@ -1,0 +1,102 @@
+"""Units and scales: between the world of a rig and the numbers near one that compiled code works with.
+
+Inside, time is counted in samples, the input in parts of its scale U, and the displacement in parts of X. A sensor of
+displacement, velocity or acceleration (``order`` 0, 1, 2) has the scale S = X / step**order: its number inside is per
+sample, or per sample squared.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.parameters import SAMPLING_STEP
+
+#: Powers of the input's unit, the displacement's unit and the second.
+Dimension = tuple[int, int, int]
+
+_SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_DIGITS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+_ATOM = re.compile(r"([^\s·/\d⁰¹²³⁴⁵⁶⁷⁸⁹⁻^-]+)(?:\^?(-?\d+))?")
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What one inside is worth outside.
+
+    Attributes:
+        step: sampling step [s].
+        input: scale U of the input, in its unit.
+        output: scale S of the sensor, in its unit.
+        order: time derivative of the displacement that the sensor shows: 0, 1 or 2.
+        input_unit: such as ``"N"``.
+        output_unit: such as ``"m"``, or ``"m/s"`` for a velocity.
+
+    Example:
+        >>> from estimator.units import Scales
+        >>> scales = Scales(step=1e-3, input=20.0, output=0.03, input_unit="N", output_unit="m")
+        >>> scales.unit((1, -1, 2)), scales.unit((1, -3, 0)), scales.unit((1, -1, 1))
+        ('kg', 'N/m³', 'N s/m')
+    """
+
+    step: float = SAMPLING_STEP
+    input: float = 1.0
+    output: float = 1.0
+    order: int = 0
+    input_unit: str = "V"
+    output_unit: str = "V"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.step < np.inf:
+            raise ValueError(f"step must be positive and finite, but is {self.step}; give the seconds between samples")
+        for name in ("input", "output"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be a positive, finite scale, but is {getattr(self, name)}")
+
+    @property
+    def displacement(self) -> float:
+        """Scale X of the displacement."""
+        return float(self.output * self.step**self.order)
+
+    def factor(self, dimension: Dimension) -> float:
+        """What one inside is worth, of a quantity whose time is in seconds already."""
+        return float(self.input ** dimension[0] * self.displacement ** dimension[1])
+
+    def unit(self, dimension: Dimension) -> str:
+        """Of a quantity, in the units of the rig's channels; ``"1"`` for a pure number."""
+        powers: dict[str, int] = {}
+        displacement = _parsed(self.output_unit)
+        displacement["s"] = displacement.get("s", 0) + self.order
+        parts = ((_parsed(self.input_unit), dimension[0]), (displacement, dimension[1]), ({"s": 1}, dimension[2]))
+        for atoms, power in parts:
+            for atom, own in atoms.items():
+                powers[atom] = powers.get(atom, 0) + own * power
+        return written({atom: power for atom, power in powers.items() if power})
+
+
+def _parsed(unit: str) -> dict[str, int]:
+    """Atoms of a unit such as ``m/s²``, with their powers."""
+    powers: dict[str, int] = {}
+    for k, part in enumerate(unit.translate(_DIGITS).split("/")):
+        for atom, power in _ATOM.findall(part):
+            powers[atom] = powers.get(atom, 0) + (-1 if k else 1) * int(power or 1)
+    return powers
+
+
+def written(powers: Mapping[str, int]) -> str:
+    """A unit from the powers of its atoms."""
+    if dict(powers) == {"N": 1, "m": -1, "s": 2}:
+        return "kg"
+    above = [atom + _power(power) for atom, power in powers.items() if power > 0]
+    below = {atom: -power for atom, power in powers.items() if power < 0}
+    if above and len(below) == 1:
+        ((atom, power),) = below.items()
+        return f"{' '.join(above)}/{atom}{_power(power)}"
+    return " ".join([*above, *(f"{atom}{_power(-power)}" for atom, power in below.items())]) or "1"
+
+
+def _power(power: int) -> str:
+    return "" if power == 1 else str(power).translate(_SUPERSCRIPTS)

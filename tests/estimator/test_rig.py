@@ -1,0 +1,135 @@
+"""Rigs: what describes one, its units and scales, and the prior that its guess makes."""
+
+import json
+import re
+import tomllib
+
+import numpy as np
+import pytest
+
+from estimator import Channel, OnlineEstimator, Rig, load_estimator, save_estimator
+from estimator.rig_prior import rig_prior
+from estimator.units import Scales
+
+GUESS = {"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (-1e8, 1e8)}
+BENCH = Rig(1e-3, input=Channel("N", limit=20.0), output=Channel("m", range=0.03), guess=GUESS)
+TOML = """
+step = 1e-3
+interpolation = "linear"
+[input]
+unit = "N"
+limit = 20
+[output]
+unit = "m"
+range = 0.03
+noise = 5e-6
+[guess]
+m = [0.3, 0.5]
+c = [0.1, 2]
+a = [1e3, 5e3]
+b = [-1e8, 1e8]
+"""
+
+
+def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
+    (tmp_path / "rig.toml").write_text(TOML)
+    rig = Rig.from_file(tmp_path / "rig.toml")
+    assert rig == Rig(
+        1e-3, "linear", 0, Channel("N", limit=20), Channel("m", range=0.03, noise=5e-6), {**GUESS, "c": (0.1, 2)}
+    )
+    assert Rig.of(tomllib.loads(TOML)) == rig == Rig.of(json.loads(json.dumps(rig.to_dict())))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stepp": 1.0}, "rig must have keys of"),
+        ({"stepp": 1.0}, "did you mean 'step'?"),
+        ({"step": -1.0}, "step must be positive and finite, but is -1.0"),
+        ({"step": True}, "step must be positive"),
+        ({"interpolation": "cubic"}, "interpolation must be one of"),
+        ({"delay": 0.5}, "delay must be a whole number of samples, but is 0.5"),
+        ({"input": {"unit": "N", "range": 3.0}}, "input must have no range, but has 3.0; use limit"),
+        ({"output": {"unit": "m", "limit": 3.0}}, "output must have no limit, but has 3.0; use range"),
+        ({"input": {"unit": "N", "kind": "velocity"}}, "input must have no kind"),
+        ({"output": {"kind": "jerk"}}, "kind must be one of ['displacement', 'velocity', 'acceleration']"),
+        ({"output": {"noise": 0}}, "noise must be a positive, finite number or left out, but is 0"),
+        ({"output": {"unit": ""}}, "unit must be a short text"),
+        ({"output": 3}, "output must be a Channel, but is 3"),
+        ({"guess": {"m": [1, 2]}}, "guess must have intervals of ['m', 'c', 'a', 'b'], but is of ['m']"),
+        ({"guess": {**GUESS, "a": [2, 1]}}, "guess of a must be two finite numbers, low < high, but is [2, 1]"),
+        ({"guess": {**GUESS, "m": [-1, 1]}}, "guess of m must be positive, but begins at -1.0"),
+    ],
+)
+def test_errors_name_the_key_and_the_remedy(change, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Rig.from_dict({"step": 1e-3, **change})
+
+
+def test_a_broken_file_is_named(tmp_path):
+    (tmp_path / "rig.toml").write_text("step = ")
+    with pytest.raises(ValueError, match=r"rig\.toml: Invalid"):
+        Rig.from_file(tmp_path / "rig.toml")
+    with pytest.raises(FileNotFoundError, match="there is no"):
+        Rig.from_file(tmp_path / "none.toml")
+    with pytest.raises(ValueError, match="rig must have a step"):
+        Rig.from_dict({})
+
+
+@pytest.mark.parametrize(
+    ("input_unit", "output_unit", "order", "units"),
+    [
+        ("N", "m", 0, ("kg", "N s/m", "N/m", "N/m³")),
+        ("N", "m/s", 1, ("kg", "N s/m", "N/m", "N/m³")),
+        ("N", "m/s^2", 2, ("kg", "N s/m", "N/m", "N/m³")),
+        ("V", "V", 0, ("s²", "s", "1", "V⁻²")),
+        ("V", "mm", 0, ("V s²/mm", "V s/mm", "V/mm", "V/mm³")),
+    ],
+)
+def test_units_of_parameters(input_unit, output_unit, order, units):
+    scales = Scales(1.0, 1.0, 1.0, order, input_unit, output_unit)
+    assert tuple(map(scales.unit, [(1, -1, 2), (1, -1, 1), (1, -1, 0), (1, -3, 0)])) == units
+
+
+def test_a_guess_is_the_prior_s_interval():
+    told = rig_prior(BENCH).parameters()
+    for name in "cab":
+        low, high = GUESS[name]
+        mean, std, _ = told[name]
+        # To first order the prior's moments give back those of the guess, as far as m is sharp: it is known to 15 %.
+        assert mean == pytest.approx((low + high) / 2, abs=0.1 * (high - low))
+        assert std == pytest.approx((high - low) / 2 / 1.645, rel=0.25)
+    assert told["m"][0] == pytest.approx(0.387, abs=0.01)
+
+
+def test_numbers_do_not_depend_on_the_units():
+    """The same bench in newtons and metres, and in millinewtons and micrometres."""
+    small = Rig(
+        1e-3,
+        input=Channel("mN", limit=20e3),
+        output=Channel("um", range=0.03e6),
+        guess={name: tuple(v * (1e-3 if name != "b" else 1e-15) for v in GUESS[name]) for name in GUESS},
+    )
+    rng = np.random.default_rng(0)
+    u, y = rng.choice([-6.0, 6.0], 300), 0.01 * rng.standard_normal(300).cumsum() / 10
+    one, other = OnlineEstimator(rig=BENCH), OnlineEstimator(rig=small)
+    assert one.settings.noise_hypotheses == 9
+    one.run(u, y)
+    other.run(1e3 * u, 1e6 * y)
+    for name, (mean, std, _) in one.belief.parameters().items():
+        factor = {"u0": 1e3, "y0": 1e6, "b": 1e-15}.get(name, 1e-3)
+        assert other.belief.parameters()[name][:2] == pytest.approx((mean * factor, std * factor), rel=1e-6)
+    np.testing.assert_allclose(other.forecasts[:, 0], 1e6 * one.forecasts[:, 0], rtol=1e-6, atol=1e-6)
+
+
+def test_an_estimator_of_a_rig_is_saved_whole(tmp_path):
+    estimator = OnlineEstimator(rig=BENCH)
+    rng = np.random.default_rng(1)
+    u, y = rng.choice([-6.0, 6.0], 40), 1e-3 * rng.standard_normal(40)
+    estimator.run(u[:20], y[:20])
+    save_estimator(estimator, tmp_path / "e.npz")
+    other = load_estimator(tmp_path / "e.npz")
+    assert (other.rig, other.scales) == (BENCH, BENCH.scales)
+    for one in (estimator, other):
+        one.run(u[20:], y[20:])
+    assert other.belief == estimator.belief
