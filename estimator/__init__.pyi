@@ -1,6 +1,8 @@
 # The names of `estimator`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
 from .belief import Belief
 from .ensemble import NoiseRatio
+from .identification import identify
+from .identification.result import Result
 from .information import (
     cramer_rao,
     fisher_information,
@@ -25,7 +27,7 @@ from .priors import (
     silverbox_prior,
     weak_prior,
 )
-from .rig import Rig
+from .rig import Channel, Rig
 from .saving import (
     load_estimator,
     save_estimator,
@@ -37,16 +39,19 @@ __all__ = [
     "SAMPLING_STEP",
     "SILVERBOX_TWIN",
     "Belief",
+    "Channel",
     "Model",
     "NoiseRatio",
     "OnlineEstimator",
     "Parameters",
+    "Result",
     "Rig",
     "coefficients_of",
     "cramer_rao",
     "difference",
     "duffing",
     "fisher_information",
+    "identify",
     "load_estimator",
     "paper_text_prior",
     "published_run_prior",

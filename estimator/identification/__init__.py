@@ -1,0 +1,153 @@
+"""Identification of a user's own oscillator from recorded inputs and outputs: `identify`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimator.belief import Belief
+from estimator.ensemble import matched_gamma
+from estimator.identification.checks import examine
+from estimator.identification.problem import Problem
+from estimator.identification.records import Record, records_of
+from estimator.identification.result import Result
+from estimator.identification.search import Found, search
+from estimator.models.duffing import KINDS
+from estimator.online import OnlineEstimator
+from estimator.parameters import FloatArray
+from estimator.rig import Rig
+from estimator.rig_prior import about
+from estimator.units import Scales
+
+
+def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: bool = False) -> Result:
+    """Identify m, c, a and b of Eq. (1), with offsets and noises, from records.
+
+    The coefficients are the most probable ones under the Kalman filter's likelihood of all records, with a Gaussian
+    about them (variational Laplace: `estimator.identification.fit`). The two noises are unknown: hypotheses about their
+    ratio, each at its best level, are weighed by their free energies, on a grid that is refined. Without a guess in the
+    rig the search begins at the equation tested with smooth bumps (`estimator.identification.start`).
+
+    Args:
+        rig: a `Rig`, a dictionary, or the name of a rig file.
+        records: pairs (u, y) of arrays (T,) in the rig's units, paired by index, or names of CSV or MAT files; one or a
+            list. Before its first sample a record may have been in any motion. An output that is NaN is missing; a
+            record is cut where an input is.
+        progress: tell on stderr what is being done.
+
+    Returns:
+        Parameters with intervals, warnings of the checks, forecasts, and the belief to go on with.
+
+    Raises:
+        ValueError: naming the rig's key or the record (and the line of its file), the value and the remedy.
+        FileNotFoundError: for a file that is not there.
+
+    Example:
+        >>> import numpy as np
+        >>> from estimator import Channel, Rig, identify
+        >>> rng = np.random.default_rng(0)
+        >>> u = 6.0 * np.repeat(rng.choice([-1.0, 1.0], 128), 8)  # N, held by the amplifier
+        >>> y, v = np.zeros(1024), 0.0  # m: a mass of 0.4 kg on a hardening spring, by small explicit steps
+        >>> for k in range(1023):
+        ...     x = y[k]
+        ...     for _ in range(100):
+        ...         v += 1e-5 / 0.4 * (u[k] - 0.6 * v - 2500.0 * x - 4e7 * x**3)
+        ...         x += 1e-5 * v
+        ...     y[k + 1] = x
+        >>> rig = Rig(step=1e-3, input=Channel("N"), output=Channel("m"))
+        >>> result = identify(rig, (u, y + 5e-6 * rng.standard_normal(1024)))
+        >>> m, std = result.parameters["m"]
+        >>> bool(abs(m - 0.4) < 0.004), result.units["m"]
+        (True, 'kg')
+    """
+    rig = Rig.of(rig)
+    read = records_of(records, rig.step)
+    with _teller(progress) as tell:
+        scales = _scales(rig, read)
+        u = tuple(one.u / scales.input for one in read)
+        y = tuple(one.y / scales.output for one in read)
+        problem = Problem(rig, scales, u, y)
+        found = search(problem, tell)
+        belief, noises = _belief(problem, found)
+        tell("checking the result")
+        forecasts = tuple(_forecast(belief, rig, one) for one in read)
+        parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
+        warnings = examine(problem, found, parameters, noises["input"][0], read, forecasts)
+    return Result(rig, belief, warnings, tuple(read), forecasts, noises)
+
+
+def _scales(rig: Rig, records: list[Record]) -> Scales:
+    """The rig's, and the records' largest where the rig has none."""
+    largest = max(float(np.abs(one.u).max()) for one in records)
+    widest = max(float(np.nanmax(np.abs(one.y))) for one in records)
+    scales = rig.scales
+    return replace(
+        scales,
+        input=scales.input if rig.input.limit else largest,
+        output=scales.output if rig.output.range else widest,
+    )
+
+
+def _belief(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[float, float]]]:
+    """The posterior of the rig's own model, and the noises' standard deviations in its units."""
+    rig, scales = problem.rig, problem.scales
+    names = list(problem.model.coefficients)
+    kept = [names.index(name) for name in rig.model.coefficients]
+    belief = about(rig, scales, found.mean[kept], found.cov[np.ix_(kept, kept)])
+    shapes = np.full(len(found.weights), problem.samples / 2)
+    gamma, xi = (matched_gamma(found.weights, shapes, shapes * noise**2) for noise in found.noises)
+    belief = Belief.of(rig.model, belief.mean, _with_start(belief, problem), gamma, xi, scales=scales)
+    gain = dict(zip(names, found.mean, strict=True))["gain"]
+    # What moves the velocity as much when it is held over a sample (`estimator.rig_prior`).
+    worth = scales.input * np.sqrt(3) / abs(gain), scales.output
+    noises = {
+        name: (float(found.weights @ values) * unit, _spread(found.weights, values, shapes) * unit)
+        for name, values, unit in zip(("input", "output"), found.noises, worth, strict=True)
+    }
+    return belief, noises
+
+
+def _with_start(belief: Belief, problem: Problem) -> FloatArray:
+    """The covariance, with a state that may be anywhere in the records' motion."""
+    cov, n = belief.cov, belief.model.n_states
+    cov[:n, :n] = problem.start + (cov[:n, :n] - np.diag(np.diag(cov[:n, :n])))
+    if KINDS[problem.rig.output.kind] == 0:
+        place = n + list(belief.model.coefficients).index("output_offset")
+        cov[0, 0] += cov[place, place]
+    return cov
+
+
+def _spread(weights: FloatArray, values: FloatArray, shapes: FloatArray) -> float:
+    mean = weights @ values
+    return float(np.sqrt(weights @ ((values - mean) ** 2 + values**2 / (4 * shapes))))
+
+
+def _forecast(belief: Belief, rig: Rig, record: Record) -> FloatArray:
+    """(T, 2) mean and variance of each output before it was seen, with coefficients and noises at their means."""
+    estimator = OnlineEstimator(belief.model, belief, rig)
+    return estimator.forecast(record.u, record.y)
+
+
+class _teller:
+    """Tells what is being done, where that is wanted."""
+
+    def __init__(self, progress: bool) -> None:
+        self._status: Any = None
+        if progress:
+            from rich.console import Console
+
+            self._status = Console(stderr=True).status("Identifying")
+
+    def __enter__(self) -> Callable[[str], None]:
+        if self._status is None:
+            return lambda text: None
+        self._status.__enter__()
+        return lambda text: self._status.update(text.capitalize())
+
+    def __exit__(self, *reason: object) -> None:
+        if self._status is not None:
+            self._status.__exit__(*reason)

@@ -1,0 +1,182 @@
+"""Checks of an identification: what would make its intervals wrong, and can be seen in the records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from estimator.identification.fit import Hypothesis
+from estimator.identification.problem import EXTRA, Problem
+from estimator.identification.records import Record, residuals
+from estimator.identification.result import Warning
+from estimator.identification.search import Found, at
+from estimator.parameters import FloatArray
+from estimator.rig import INTERPOLATIONS
+from estimator.rig_prior import HALF_WIDTH
+
+#: Nats by which another hypothesis must be better.
+_EVIDENCE = 7.0
+
+#: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
+_RATIOS = (1.0, 0.1, 0.01)
+
+#: Probability of a false alarm of a test of the residuals.
+_ALARM = 1e-4
+
+#: Largest disturbance of the force in parts of the input, and in parts of what the rig says of it.
+_DISTURBANCE, _BEYOND = 0.02, 3.0
+
+#: Largest relative standard deviation of a parameter that is called identified.
+_VAGUE = 1 / 3
+
+#: Fewest samples in a period.
+_SLOWEST = 5.0
+
+_TERMS = {
+    "cubic_damping": "a damping that grows with the cube of the velocity",
+    "quintic": "a stiffness of fifth order",
+}
+
+
+def examine(
+    problem: Problem,
+    found: Found,
+    parameters: dict[str, tuple[float, float]],
+    disturbance: float,
+    records: Sequence[Record],
+    forecasts: Sequence[FloatArray],
+) -> tuple[Warning, ...]:
+    """All checks.
+
+    Args:
+        problem: the records, scaled.
+        found: the result of the search.
+        parameters: their means and standard deviations, in the rig's units.
+        disturbance: of the force, as a standard deviation in the unit of the input.
+        records: as they were read.
+        forecasts: of their outputs.
+    """
+    return (
+        *_of_records(problem, records),
+        *_of_hypotheses(problem, found),
+        *_of_noise(problem, disturbance),
+        *_of_parameters(problem, parameters),
+        *_of_residuals(records, forecasts),
+    )
+
+
+def _of_records(problem: Problem, records: Sequence[Record]) -> list[Warning]:
+    rig, warnings = problem.rig, []
+    stops = sum(one.clipped for one in records)
+    if stops:
+        message = f"{stops} outputs stand at a stop and were taken as missing; widen the range, or drive it less"
+        warnings.append(Warning("clipped", message))
+    if rig.input.limit and max(np.abs(one.u).max() for one in records) > rig.input.limit * (1 + 1e-6):
+        warnings.append(Warning("limit", f"inputs exceed the rig's limit of {rig.input.limit:g} {rig.input.unit}"))
+    if rig.output.range and max(np.nanmax(np.abs(one.y)) for one in records) > rig.output.range * (1 + 1e-6):
+        warnings.append(Warning("range", f"outputs leave the rig's range of {rig.output.range:g} {rig.output.unit}"))
+    if 2 * np.pi / problem.frequency < _SLOWEST:
+        message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, 6 at least"
+        warnings.append(Warning("sampling_too_slow", message))
+    return warnings
+
+
+def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
+    """The input's way and delay, and further terms, by their evidence."""
+    rig = problem.rig
+    ways = [name for name in ("zero_order", "linear") if INTERPOLATIONS[rig.interpolation] < 2] or [rig.interpolation]
+    others: list[Hypothesis] = []
+    for way in ways:
+        for delay in (rig.delay - 1, rig.delay, rig.delay + 1):
+            if (way, delay) != (rig.interpolation, rig.delay) and delay >= (-1 if way == "zero_order" else 0):
+                others.append(at(found, interpolation=way, delay=delay))
+    terms = [at(found, extra=(name,)) for name in EXTRA]
+    tried = [at(h, ratio=found.best.ratio * part) for h in (found.best, *others, *terms) for part in _RATIOS]
+    fits = found.fitter.fit(tried, found.mean, found.level)
+    energies = fits.free_energy.reshape(-1, len(_RATIOS)).min(axis=1)
+    own = min(energies[0], found.fits.free_energy.min())
+    gains = own - energies[1:]
+    warnings = []
+    best = int(np.argmax(gains[: len(others)])) if others else -1
+    if best >= 0 and gains[best] > _EVIDENCE:
+        better = others[best]
+        name = "interpolation" if better.interpolation != rig.interpolation else "delay"
+        warnings.append(
+            Warning(
+                name,
+                f"the records speak for interpolation '{better.interpolation}' with delay {better.delay}, by "
+                f"{gains[best]:.0f} nats, and not for '{rig.interpolation}' with delay {rig.delay}; try that rig",
+            )
+        )
+        return warnings
+    for term, gain in zip(EXTRA, gains[len(others) :], strict=True):
+        if gain > _EVIDENCE and gain >= gains[len(others) :].max():
+            message = f"the records speak for {_TERMS[term]}, by {gain:.0f} nats; m, c, a and b alone do not hold"
+            warnings.append(Warning(term, message))
+    return warnings
+
+
+def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
+    channel = problem.rig.input
+    strength = problem.strength * problem.scales.input
+    allowed = _BEYOND * channel.noise if channel.noise else _DISTURBANCE * strength
+    if disturbance <= allowed:
+        return []
+    message = (
+        f"the force is disturbed by {disturbance:.3g} {channel.unit} in every sample, "
+        f"{100 * disturbance / strength:.1f} % of the input: is the input measured with noise, or the "
+        f"equation another?"
+    )
+    return [Warning("process_noise", message)]
+
+
+def _of_parameters(problem: Problem, parameters: dict[str, tuple[float, float]]) -> list[Warning]:
+    vague = [name for name in "mcab" if parameters[name][1] > _VAGUE * abs(parameters[name][0])]
+    warnings = []
+    if vague:
+        message = f"{', '.join(vague)}: not identified by this input; the interval is wider than the value allows"
+        warnings.append(Warning("not_identified", message))
+    guess = problem.rig.guess
+    if guess is None:
+        return warnings
+    far = {}
+    for name, (low, high) in guess.items():
+        mean, std = parameters[name]
+        middle, spread = (low + high) / 2, (high - low) / 2 / HALF_WIDTH
+        if abs(mean - middle) > 5 * np.hypot(spread, std):
+            far[name] = mean / middle
+    if not far:
+        return warnings
+    # m goes with the square of the sampling step, c with the step itself.
+    factor = np.sqrt(max(parameters["m"][0], 0.0) / ((guess["m"][0] + guess["m"][1]) / 2))
+    if "m" in far and "a" not in far and not 0.6 < factor < 1.6:
+        message = f"m and c would be those of the guess if the sampling step were {1 / factor:.2f} times the rig's"
+        warnings.append(Warning("step", message))
+    else:
+        message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
+        warnings.append(Warning("guess", message))
+    return warnings
+
+
+def _of_residuals(records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Warning]:
+    """Whether what the forecasts left is white and normal."""
+    from scipy.stats import chi2, norm
+
+    told = [residuals(one.y, forecast)[4:] for one, forecast in zip(records, forecasts, strict=True)]
+    values = np.concatenate(told)
+    n, warnings = len(values), list[Warning]()
+    if n < 100:
+        return warnings
+    lags = 20
+    products = [sum(float(one[k:] @ one[: len(one) - k]) for one in told if len(one) > k) for k in range(lags + 1)]
+    statistic = n * sum((products[k] / products[0]) ** 2 for k in range(1, lags + 1))
+    if statistic > chi2.isf(_ALARM, lags):
+        message = "what the forecasts leave is not white: the equation, the input's way or the noise is another"
+        warnings.append(Warning("residuals_not_white", message))
+    centred = (values - values.mean()) / values.std()
+    kurtosis = (np.mean(centred**4) - 3) * np.sqrt(n / 24)
+    if abs(kurtosis) > 6.0 or np.abs(centred).max() > norm.isf(_ALARM / n / 2):
+        message = "what the forecasts leave is not normal: outliers, or a noise that comes and goes"
+        warnings.append(Warning("residuals_not_normal", message))
+    return warnings

@@ -1,0 +1,129 @@
+"""The records of an identification, as the engine takes them: scaled, with all ways that the input may have gone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from estimator.inputs import feed
+from estimator.models.duffing import KINDS, duffing
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+from estimator.rig import INTERPOLATIONS, Rig
+from estimator.units import Scales
+
+#: Terms that a model may have beside those of Eq. (1) and the offsets: they are known to be 0 until a check frees them.
+EXTRA = ("cubic_damping", "quintic")
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Records to identify a rig from.
+
+    Attributes:
+        rig: as it was given.
+        scales: that the records are in.
+        u: inputs of each record, in parts of their scale.
+        y: outputs of each record, in parts of theirs, NaN where one is missing.
+    """
+
+    rig: Rig
+    scales: Scales
+    u: tuple[FloatArray, ...]
+    y: tuple[FloatArray, ...]
+
+    @cached_property
+    def model(self) -> Model:
+        """Eq. (1) with all terms that are looked at."""
+        return duffing(offsets=True, cubic_damping=True, quintic=True, sensor=self.rig.output.kind)
+
+    @property
+    def samples(self) -> int:
+        """Outputs that were seen."""
+        return int(sum(np.isfinite(y).sum() for y in self.y))
+
+    @cached_property
+    def outputs(self) -> FloatArray:
+        """(records, T, 1) outputs; a shorter record ends with NaN."""
+        return _stacked([y[:, None] for y in self.y])
+
+    def inputs(self, interpolation: str, delay: int) -> FloatArray:
+        """(records, T, rows) what acts over each sample, if the input went so; a shorter record ends with NaN."""
+        rows = 1 + INTERPOLATIONS["spline" if INTERPOLATIONS[self.rig.interpolation] > 1 else "linear"]
+        # A record's first output comes before its first input acts, however the input goes.
+        rig = replace(self.rig, interpolation=interpolation, delay=delay)
+        return _stacked([_widened(driven(self.model, rig, u), rows) for u in self.u])
+
+    def shortened(self, samples: int) -> Problem:
+        """The same with the first samples of each record only."""
+        return replace(self, u=tuple(u[:samples] for u in self.u), y=tuple(y[:samples] for y in self.y))
+
+    @cached_property
+    def size(self) -> float:
+        """Root mean square of the outputs about their mean."""
+        seen = np.concatenate([y[np.isfinite(y)] for y in self.y])
+        return float(max(seen.std(), 1e-12))
+
+    @cached_property
+    def strength(self) -> float:
+        """Root mean square of the inputs."""
+        return float(max(np.sqrt(np.mean(np.concatenate(self.u) ** 2)), 1e-12))
+
+    @cached_property
+    def frequency(self) -> float:
+        """Where the outputs have their power: the mean angular frequency [rad per sample], robust to white noise."""
+        power = total = 0.0
+        for y in self.y:
+            whole = np.where(np.isfinite(y), y, np.nanmean(y))
+            spectrum = np.abs(np.fft.rfft(whole - whole.mean())) ** 2
+            floor = 2 * np.median(spectrum)
+            spectrum = np.where(spectrum > 20 * floor, spectrum, 0.0)
+            power += float(spectrum.sum())
+            total += float(spectrum @ np.linspace(0, np.pi, len(spectrum)))
+        return float(np.clip(total / power if power > 0 else 0.1, 2e-3, 2.5))
+
+    @cached_property
+    def displacement(self) -> float:
+        """Root mean square of the displacement inside, as far as the frequency tells."""
+        return self.size / self.frequency ** KINDS[self.rig.output.kind]
+
+    @cached_property
+    def start(self) -> FloatArray:
+        """(2, 2) covariance of the state before a record: it may begin in any motion."""
+        largest = max(float(np.nanmax(np.abs(y))) for y in self.y) / self.frequency ** KINDS[self.rig.output.kind]
+        return np.diag([(3 * largest) ** 2, (3 * largest * max(self.frequency, 0.1)) ** 2])
+
+    def natural(self) -> dict[str, float]:
+        """Sizes of the coefficients at which each term is as large as the others."""
+        w, x = self.frequency, self.displacement
+        sizes = {"stiffness": w**2, "cubic": w**2 / x**2, "damping": w, "gain": w**2 * x / self.strength}
+        sizes |= {"force": w**2 * x, "output_offset": self.size}
+        return sizes | {"cubic_damping": w / (w * x) ** 2, "quintic": w**2 / x**4}
+
+
+def driven(model: Model, rig: Rig, u: FloatArray) -> FloatArray:
+    """(T, rows) what a model takes over the sample before each output; after the last input it stays the same."""
+    way = feed(model, rig)
+    if way.at_once:
+        return way.pieces(u)
+    window = way.stencil.shape[1]
+    lag = -1 if way.waits else way.past - (window - 1)
+    places = np.arange(len(u))[:, None] - lag - (window - 1) + np.arange(window)
+    acting = u[np.clip(places, 0, len(u) - 1)]
+    if not way.fills:
+        acting = np.where(places < 0, 0.0, acting)
+    return np.asarray(acting @ way.stencil.T)
+
+
+def _widened(inputs: FloatArray, rows: int) -> FloatArray:
+    return np.concatenate([inputs, np.zeros((len(inputs), rows - inputs.shape[1]))], axis=1)
+
+
+def _stacked(series: list[FloatArray]) -> FloatArray:
+    longest = max(len(one) for one in series)
+    stacked = np.full((len(series), longest, series[0].shape[1]), np.nan)
+    for row, one in zip(stacked, series, strict=True):
+        row[: len(one)] = one
+    return stacked

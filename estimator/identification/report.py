@@ -1,0 +1,131 @@
+"""The report of an identification: one page of HTML that opens without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from estimator.files import write_atomically
+from estimator.identification.records import Record, residuals
+from estimator.page import page, svg, table
+from estimator.parameters import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from estimator.identification.result import Result
+
+#: Samples of a record that a figure shows at most, and outputs that start a free run.
+_SHOWN, _GIVEN = 1500, 20
+
+
+def write(result: Result, path: Path, commands: Sequence[str] = ()) -> Path:
+    """Write the page; see `Result.report`."""
+    parts = ["<h1>Identification</h1>", _checks(result), _parameters(result)]
+    for record, forecast in zip(result.records, result.forecasts, strict=True):
+        parts.append(f"<h2>{escape(record.name)}</h2>")
+        for figure in (_draw_fit(result, record, forecast), _draw_residuals(record, forecast)):
+            parts.append(f"<figure>{svg(figure)}</figure>")
+    if commands:
+        parts.append(f"<h2>How this page was made</h2><pre>{escape(chr(10).join(commands))}</pre>")
+    write_atomically(path, page("Identification", parts))
+    return path
+
+
+def _checks(result: Result) -> str:
+    if not result.warnings:
+        return "<p class='fine'>No check speaks against this result.</p>"
+    return "".join(
+        f"<p class='warning'><b>{escape(warning.name)}</b>: {escape(warning.message)}</p>"
+        for warning in result.warnings
+    )
+
+
+def _parameters(result: Result) -> str:
+    rows = []
+    intervals = result.interval(0.9)
+    for name, (mean, std) in result.parameters.items():
+        low, high = intervals[name]
+        cells = (f"{mean:.6g}", f"{std:.2g}", f"{low:.6g} to {high:.6g}", escape(result.units[name]))
+        rows.append(f"<tr><td>{name}</td>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    for name, channel in (("input", result.rig.input), ("output", result.rig.output)):
+        mean, std = result.noises[name]
+        what = "disturbance of the force" if name == "input" else "noise of the sensor"
+        interval = f"{max(mean - 1.645 * std, 0):.3g} to {mean + 1.645 * std:.3g}"
+        cells = (f"{mean:.3g}", f"{std:.1g}", interval, escape(channel.unit))
+        rows.append(f"<tr><td>{what}</td>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    head = "<th></th><th>mean</th><th>standard deviation</th><th>90 % interval</th><th>unit</th>"
+    equation = "<p>m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0 and noise.</p>"
+    return f"<h2>Parameters</h2>{equation}{table(head, rows)}"
+
+
+def _figure(rows: int, columns: int, height: float) -> tuple[Figure, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _draw_fit(result: Result, record: Record, forecast: FloatArray) -> Figure:
+    """Input; measured, forecast and free run; and the errors of both, over the first samples."""
+    figure, axes = _figure(4, 1, 8.5)
+    count = min(len(record.u), _SHOWN)
+    seconds, measured = np.arange(count) * result.rig.step, record.y[:count]
+    output, given = result.rig.output, record.y[:_GIVEN]
+    run = np.full(count, np.nan)
+    if np.isfinite(given).all() and len(given) == _GIVEN:
+        run = result.simulate(record.u[:count], given)
+    driven, shown, far, near = axes[:, 0]
+    driven.step(seconds, record.u[:count], where="post", color="#555", linewidth=0.8)
+    driven.set_ylabel(_plain(f"input [{result.rig.input.unit}]"))
+    shown.plot(seconds, measured, color="#222", linewidth=1.4, label="measured")
+    shown.plot(seconds, forecast[:count, 0], color="#06c", linewidth=0.8, label="forecast, one sample ahead")
+    shown.plot(seconds, run, color="#c40", linewidth=0.8, linestyle="--", label=f"free run after {_GIVEN} samples")
+    shown.set_ylabel(_plain(f"{output.kind} [{output.unit}]"))
+    shown.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8)
+    far.plot(seconds, measured - run, color="#c40", linewidth=0.8)
+    far.set_ylabel(_plain(f"free run's error [{output.unit}]"))
+    near.plot(seconds, measured - forecast[:count, 0], color="#06c", linewidth=0.8)
+    std = np.sqrt(forecast[:count, 1])
+    near.fill_between(seconds, -1.645 * std, 1.645 * std, color="#06c", alpha=0.2, label="90 % of the forecast")
+    near.set_ylim(*(6 * float(np.nanmedian(std)) * np.array([-1, 1])))
+    near.set_ylabel(_plain(f"forecast's error [{output.unit}]"))
+    near.set_xlabel("time [s]")
+    near.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8)
+    return figure
+
+
+def _draw_residuals(record: Record, forecast: FloatArray) -> Figure:
+    """Histogram and autocorrelation of the standardised innovations."""
+    from scipy.stats import norm
+
+    figure, axes = _figure(1, 2, 3.0)
+    values = residuals(record.y, forecast)[4:]
+    left, right = axes[0]
+    bins = np.linspace(-5, 5, 61)
+    left.hist(np.clip(values, -5, 5), bins, density=True, color="#06c", alpha=0.5, label="residuals")
+    left.plot(bins, norm.pdf(bins), color="#222", linewidth=1, label="normal")
+    left.set_xlabel("residual [standard deviations]")
+    left.set_ylabel("density")
+    left.legend(fontsize=8)
+    lags = np.arange(1, min(41, len(values)))
+    power = float(values @ values)
+    correlation = [float(values[k:] @ values[:-k]) / power for k in lags]
+    right.bar(lags, correlation, color="#06c", alpha=0.6)
+    bound = 1.96 / np.sqrt(max(len(values), 1))
+    for level in (-bound, bound):
+        right.axhline(level, color="#222", linewidth=0.8, linestyle="--")
+    right.set_xlabel("lag [samples]; between the dashed lines 95 % if white")
+    right.set_ylabel("autocorrelation")
+    return figure
+
+
+def _plain(text: str) -> str:
+    """Text that matplotlib takes as it is: a unit may hold a dollar sign."""
+    return text.replace("$", r"\$")

@@ -1,0 +1,109 @@
+"""`Result`: what records tell of an oscillator, in the units of its rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy.typing as npt
+
+from estimator.belief import Belief
+from estimator.identification.records import Record
+from estimator.online import OnlineEstimator
+from estimator.parameters import FloatArray
+from estimator.rig import Rig
+
+
+@dataclass(frozen=True)
+class Warning:
+    """What a check found.
+
+    Attributes:
+        name: of the check, such as ``"delay"``.
+        message: what was found, and what to do, in plain words.
+    """
+
+    name: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.message}"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What `identify` found.
+
+    Attributes:
+        rig: as it was given.
+        belief: the posterior, before a further record: its coefficients and noises, with the state at any place.
+        warnings: what the checks found; empty where nothing speaks against the result.
+        records: the records, with clipped samples taken out.
+        forecasts: per record, (T, 2) mean and variance of each output before it was seen.
+        noises: name to mean and standard deviation: of ``input``, the disturbance of the force as a standard deviation
+            per sample, and of ``output``, the sensor's.
+    """
+
+    rig: Rig
+    belief: Belief
+    warnings: tuple[Warning, ...]
+    records: tuple[Record, ...]
+    forecasts: tuple[FloatArray, ...]
+    noises: Mapping[str, tuple[float, float]]
+
+    @property
+    def parameters(self) -> dict[str, tuple[float, float]]:
+        """Parameter to mean and standard deviation, in the rig's units: m, c, a, b and the offsets u0 and y0."""
+        return {name: (mean, std) for name, (mean, std, _) in self.belief.parameters().items()}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Parameter to its unit."""
+        return {name: unit for name, (_, _, unit) in self.belief.parameters().items()}
+
+    def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
+        """Parameter to the central interval that holds it with a probability.
+
+        Raises:
+            ValueError: for a probability that is not between 0 and 1.
+        """
+        if not 0 < probability < 1:
+            raise ValueError(f"probability must be between 0 and 1, but is {probability!r}; 0.9 is usual")
+        from scipy.stats import norm
+
+        half = float(norm.ppf(0.5 + probability / 2))
+        return {name: (mean - half * std, mean + half * std) for name, (mean, std) in self.parameters.items()}
+
+    @property
+    def estimator(self) -> OnlineEstimator:
+        """A new estimator that begins with what is believed now, for further records."""
+        return OnlineEstimator(self.belief.model, self.belief, self.rig)
+
+    def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:
+        """Free run of the mean parameters over inputs (T,) in the rig's units, started by the first outputs.
+
+        Raises:
+            ValueError: as `OnlineEstimator.simulate`.
+        """
+        return self.estimator.simulate(u, y_init)
+
+    def report(self, path: str | Path, commands: Sequence[str] = ()) -> Path:
+        """Write one page of HTML that opens without a network: parameters, fits, residuals, and the checks.
+
+        Args:
+            path: of the page; its folder is made.
+            commands: that made it, to be shown.
+        """
+        from estimator.identification.report import write
+
+        return write(self, Path(path), commands)
+
+    def __str__(self) -> str:
+        intervals, units = self.interval(0.9), self.units
+        rows = [
+            f"{name:>3} = {mean:.6g} {units[name]}, 90 % in [{low:.6g}, {high:.6g}]"
+            for (name, (mean, _)), (low, high) in zip(self.parameters.items(), intervals.values(), strict=True)
+        ]
+        told = [f"WARNING {warning}" for warning in self.warnings] or ["no check speaks against it"]
+        return "\n".join([*rows, *told])

@@ -1,0 +1,116 @@
+"""Where a search begins, when nothing is guessed: the equation, tested with smooth bumps.
+
+Integrated against a bump φ that vanishes with its derivatives at both ends, x'' becomes ∫φ'' x: no derivative of a
+noisy record is taken. What is left is linear in the coefficients,
+
+    ∫φ'' x = gain ∫φ u - damping ∫φ v - stiffness ∫φ x - cubic ∫φ x³ + force ∫φ,
+
+an equation for each place of the bump, solved by least squares. Narrow bumps are noisy, wide ones forget the fast part
+of the motion, so several widths are tried (Messenger and Bortz 2021 name this weak-form identification).
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from estimator.identification.problem import Problem
+from estimator.models.duffing import KINDS
+from estimator.parameters import FloatArray
+
+#: Half widths of the bumps, in parts of the period of the mean frequency.
+_WIDTHS = (0.12, 0.25, 0.5, 1.0)
+
+#: (1 - s²)^n has n - 1 derivatives that vanish at the ends.
+_POWER = 6
+
+#: Periods over which an integrated signal loses its drift.
+_PERIODS = (3.0, 10.0, 30.0)
+
+
+def starts(problem: Problem) -> list[FloatArray]:
+    """Coefficients (K,) to begin with: one set for each width of the bumps, and each way to lose the drift.
+
+    None where the records are too short.
+    """
+    names = list(problem.model.coefficients)
+    inputs = problem.inputs(problem.rig.interpolation, problem.rig.delay)
+    found = []
+    integrates = KINDS[problem.rig.output.kind] > 0
+    for part, periods in product(_WIDTHS[:2] if integrates else _WIDTHS, _PERIODS if integrates else (0.0,)):
+        half = max(3, round(part * 2 * np.pi / problem.frequency))
+        rows = [_equations(problem, u, y, half, periods) for u, y in zip(inputs, problem.y, strict=True)]
+        kept = [row for row in rows if row is not None]
+        if not kept:
+            continue
+        equations = np.concatenate(kept)
+        if len(equations) < 4 * equations.shape[1]:
+            continue
+        scale = np.sqrt(np.mean(equations**2, axis=0))
+        scale[scale == 0] = 1.0
+        unit = equations / scale
+        solution = np.linalg.lstsq(unit[:, 1:], unit[:, 0], rcond=1e-8)[0] * scale[0] / scale[1:]
+        gain, damping, stiffness, cubic, force, square = solution
+        values = dict.fromkeys(names, 0.0) | {"gain": gain, "damping": damping, "cubic": cubic}
+        # An integrated signal may be displaced: stiffness x + square x² + cubic x³ is a cubic about another middle.
+        middle = square / (3 * cubic) if abs(cubic) > 0 else 0.0
+        inside = abs(middle) < 3 * problem.displacement and integrates
+        values["stiffness"] = stiffness - (3 * cubic * middle**2 if inside else 0.0)
+        values["force"] = force
+        if np.isfinite(list(values.values())).all() and gain != 0:
+            found.append(np.array([values[name] for name in names]))
+    return found
+
+
+def _equations(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, periods: float) -> FloatArray | None:
+    """(n, 7) columns x'', u, -x', -x, -x³, 1 and -x², integrated against bumps; None for a record that is too short."""
+    count = len(y)
+    if count < 4 * half:
+        return None
+    s = np.arange(-half, half + 1) / half
+    base = np.clip(1 - s**2, 0, None)
+    bump = base**_POWER
+    first = -2 * _POWER * s * base ** (_POWER - 1) / half
+    second = (-2 * _POWER * base ** (_POWER - 1) + 4 * _POWER * (_POWER - 1) * s**2 * base ** (_POWER - 2)) / half**2
+    over = lambda test, values: np.convolve(values, test[::-1], mode="valid")  # noqa: E731
+    missing = ~np.isfinite(y)
+    seen = np.where(missing, np.nanmean(y), y)
+    order = KINDS[problem.rig.output.kind]
+    shown, x = seen, seen
+    for _ in range(order):
+        x = _integrated(x, problem.frequency / periods)
+    # The input's mean over the sample before each output belongs to the middle of that sample.
+    powers = np.arange(inputs.shape[1])
+    mean = np.nan_to_num(inputs[:count]) @ (1.0 / (1 + powers))
+    acting = 0.5 * (mean + np.append(mean[1:], mean[-1]))
+    acceleration, velocity = (
+        (over(second, x), -over(first, x)),
+        (-over(first, shown), over(bump, shown)),
+        (over(bump, shown), -over(first, x)),
+    )[order]
+    square = over(bump, x**2) if order else np.zeros(count - 2 * half)
+    ones = np.ones(count)
+    columns = (
+        acceleration,
+        over(bump, acting),
+        -velocity,
+        -over(bump, x),
+        -over(bump, x**3),
+        over(bump, ones),
+        -square,
+    )
+    clean = over(np.ones(2 * half + 1), missing.astype(float)) < 0.5
+    clean &= np.arange(len(clean)) >= min(2 * np.pi * periods / problem.frequency, count / 4)
+    stride = max(1, half // 4)
+    return np.stack(columns, axis=1)[clean][::stride]
+
+
+def _integrated(values: FloatArray, lowest: float) -> FloatArray:
+    """The integral by the sample, without what is slower than an angular frequency."""
+    from scipy.signal import butter, sosfiltfilt
+
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]))])
+    return np.asarray(
+        sosfiltfilt(butter(2, min(lowest / np.pi, 0.9), btype="high", output="sos"), total - total.mean())
+    )

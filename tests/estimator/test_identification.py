@@ -1,0 +1,189 @@
+"""`identify`: from records to parameters with intervals, and to warnings. benchmarks/rigs judges it on many rigs."""
+
+import re
+
+import numpy as np
+import pytest
+
+from estimator import Channel, Rig, identify
+from estimator.free_run import free_run
+from estimator.identification.records import clipped, records_of
+from estimator.models.duffing import KINDS, duffing
+from estimator.physical import coefficients_of
+from estimator.units import Scales
+
+#: A bench of 0.4 kg at 1 kHz, and a softening oscillator at 100 Hz: truth, step, amplitude, sensor noise, and samples
+#: that the input is held for.
+BENCH = ({"m": 0.4, "c": 0.6, "a": 2500.0, "b": 4e7}, 1e-3, 6.0, 5e-6, 8)
+SOFT = ({"m": 1.0, "c": 0.5, "a": 400.0, "b": -4000.0}, 1e-2, 6.0, 1e-4, 4)
+
+
+def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3):
+    """Input and output of a record that begins at rest, with the force disturbed by so many parts of the input.
+
+    The plant is the engine's, without what the benchmark's own integrator is for.
+    """
+    truth, step, amplitude, noise, hold = case
+    rng = np.random.default_rng(seed)
+    u = amplitude * np.repeat(rng.choice([-1.0, 1.0], samples // hold), hold)
+    model = duffing(offsets=True, sensor=kind)
+    scales = Scales(step, amplitude, 1e-2, KINDS[kind])
+    inside = {p: truth.get(p, 0.0) / scales.factor(model.dimensions[p]) for p in model.physical}
+    disturbed = u / amplitude + force * rng.standard_normal(samples)
+    y = scales.output * free_run(model, coefficients_of(model, inside, step), disturbed)
+    y = np.concatenate([[0.0], y[:-1]])
+    sensor = noise if kind == "displacement" else 2e-3 * y.std()
+    return u, y + sensor * rng.standard_normal(samples)
+
+
+def rig_of(case, kind="displacement", **others):
+    unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}[kind]
+    return Rig(case[1], input=Channel("N"), output=Channel(unit, kind=kind), **others)
+
+
+def deviations(result, truth):
+    return np.array([(result.parameters[p][0] - truth[p]) / result.parameters[p][1] for p in truth])
+
+
+@pytest.mark.parametrize(("case", "kind"), [(BENCH, "displacement"), (SOFT, "displacement"), (SOFT, "velocity")])
+def test_nothing_but_a_record_and_a_step_is_needed(case, kind):
+    result = identify(rig_of(case, kind), simulated(case, kind=kind))
+    assert np.abs(deviations(result, case[0])).max() < 4.5
+    assert all(std < 0.01 * abs(case[0][name]) for name, (_, std) in list(result.parameters.items())[:4])
+    assert result.warnings == ()
+    assert result.units["m"] == "kg"
+    low, high = result.interval(0.9)["m"]
+    mean, std = result.parameters["m"]
+    assert (low, high) == pytest.approx((mean - 1.645 * std, mean + 1.645 * std), rel=1e-3)
+
+
+def test_a_guess_changes_nothing_that_the_record_tells():
+    u, y = simulated(BENCH)
+    guess = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
+    guessed, alone = identify(rig_of(BENCH, guess=guess), (u, y)), identify(rig_of(BENCH), (u, y))
+    for name in BENCH[0]:
+        assert guessed.parameters[name][0] == pytest.approx(alone.parameters[name][0], abs=alone.parameters[name][1])
+
+
+def test_noises_are_found():
+    result = identify(rig_of(BENCH), simulated(BENCH))
+    for name, truth in (("output", 5e-6), ("input", 3e-3 * 6.0)):
+        mean, std = result.noises[name]
+        assert abs(mean - truth) < 5 * std + 0.1 * truth
+
+
+def test_gaps_clipped_samples_and_several_records():
+    u, y = simulated(BENCH)
+    holes = y.copy()
+    holes[300:330] = np.nan
+    driven = u.copy()
+    driven[1000] = np.nan
+    stop = 0.7 * np.abs(y).max()
+    result = identify(rig_of(BENCH), [(u, holes), (driven, y), (u, np.clip(y, -stop, stop))])
+    assert [one.missing for one in result.records] == [30, 0, 0, 0]
+    assert [len(one.y) for one in result.records] == [2048, 1000, 1047, 2048]
+    assert result.records[3].clipped == (np.abs(y) >= stop).sum()
+    assert [warning.name for warning in result.warnings] == ["clipped"]
+    assert np.abs(deviations(result, BENCH[0])).max() < 5
+
+
+def test_a_converter_s_levels_are_no_stop():
+    _, y = simulated(BENCH)
+    level = np.abs(y).max() / 100
+    assert not clipped(level * np.round(y / level)).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (lambda u, y: (np.roll(u, -1), y), "delay"),
+        (lambda u, y: (np.convolve(u, [0.5, 0.5])[: len(u)], y), "interpolation"),
+        (lambda u, y: (u * (1 + 0.07 * np.random.default_rng(0).standard_normal(len(u))), y), "process_noise"),
+    ],
+)
+def test_faults_are_named(change, name):
+    result = identify(rig_of(BENCH), change(*simulated(BENCH)))
+    assert name in [warning.name for warning in result.warnings]
+
+
+def test_a_wrong_step_and_a_parameter_that_does_nothing_are_named():
+    u, y = simulated(BENCH)
+    guess = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
+    wrong = Rig(2 * BENCH[1], input=Channel("N"), output=Channel("m"), guess=guess)
+    assert "step" in [warning.name for warning in identify(wrong, (u, y)).warnings]
+    weak = (BENCH[0], BENCH[1], 0.05, 5e-6, 8)
+    told = [warning for warning in identify(rig_of(weak), simulated(weak)).warnings if warning.name == "not_identified"]
+    assert told
+    assert told[0].message.startswith("b")
+
+
+def test_the_result_goes_on(tmp_path):
+    u, y = simulated(BENCH)
+    result = identify(rig_of(BENCH), (u, y))
+    run = result.simulate(u, y[:20])
+    assert np.abs(run - y)[:200].max() < 0.02 * np.abs(y).max()
+    forecast = result.forecasts[0]
+    inside = np.abs(y - forecast[:, 0])[5:] < 1.645 * np.sqrt(forecast[5:, 1])
+    assert 0.87 < inside.mean() < 0.93
+    before = result.parameters["m"][1]
+    estimator = result.estimator
+    estimator.run(*simulated(BENCH, seed=1))
+    assert estimator.belief.parameters()["m"][1] < before
+    page = result.report(tmp_path / "folder" / "page.html", ["made <by> this"]).read_text()
+    assert "made &lt;by&gt; this" in page
+    assert "No check speaks against" in page
+    assert "http" not in page.replace("http://www.w3.org", "").replace("https://matplotlib.org", "").replace(
+        "http://purl.org", ""
+    ).replace("http://creativecommons.org", "")
+
+
+def test_files(tmp_path):
+    u, y = simulated(SOFT, samples=400)
+    lines = [f"{k * 0.01:.6f},{a},{b}" for k, (a, b) in enumerate(zip(u, y, strict=True))]
+    plain, named = tmp_path / "plain.csv", tmp_path / "named.csv"
+    plain.write_text("\n".join(lines))
+    lines[7] = lines[7].rsplit(",", 1)[0] + ","
+    named.write_text("# a comment\nTime [s],Force [N],Displacement [m]\n" + "\n".join(lines) + "\n")
+    one, other = records_of([plain, str(named)], 0.01)
+    np.testing.assert_array_equal(one.u, u)
+    assert (one.missing, other.missing) == (0, 1)
+    from scipy.io import savemat
+
+    savemat(tmp_path / "r.mat", {"u": u, "y": y})
+    np.testing.assert_array_equal(records_of(tmp_path / "r.mat", 0.01)[0].y, y)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("u,y\n1,2\n3", "line 3: must have 2 columns, but has 1"),
+        ("u,y\n1,2\n3,x4", "line 3: 'x4' must be a number"),
+        ("a_column,b_column\n1,2", "must have one column of inputs and one of outputs"),
+        ("1,2,3,4\n1,2,3,4", "must have two columns, u and y"),
+        ("t,u,y\n0,1,2\n0.5,1,3\n1.0,2,3\n", "times are 0.5 s apart, but the rig's step is 0.01 s"),
+        ("t,u,y\n0,1,2\n0.01,1,3\n0.5,2,3\n", "samples must be evenly spaced"),
+        ("", "must hold numbers, but holds none"),
+    ],
+)
+def test_errors_of_files_name_the_line(tmp_path, text, message):
+    (tmp_path / "r.csv").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        records_of(tmp_path / "r.csv", 0.01)
+    assert "r.csv" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("records", "message"),
+    [
+        ([], "records must hold at least one pair"),
+        (3, "records must be a list of pairs"),
+        ([3], "record 0 must be a pair (u, y) or a file name, but is 3"),
+        ([(np.ones(100), np.ones(99))], "u and y of record 0 must have one length, but have 100 and 99"),
+        ([(np.ones(20), np.arange(20.0))], "records must have at least 50 outputs"),
+        ([(np.ones(100), np.arange(100.0))], "u must vary, but is constant"),
+        ([(np.full(100, np.inf), np.arange(100.0))], "u of record 0 must be finite"),
+    ],
+)
+def test_errors_name_the_record(records, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        identify(rig_of(BENCH), records)
