@@ -46,21 +46,17 @@ def _checks(result: Result) -> str:
 
 
 def _parameters(result: Result) -> str:
-    rows = []
-    intervals = result.interval(0.9)
+    intervals, rows = result.interval(0.9), []
     for name, (mean, std) in result.parameters.items():
         low, high = intervals[name]
-        cells = (f"{mean:.6g}", f"{std:.2g}", f"{low:.6g} to {high:.6g}", escape(result.units[name]))
-        rows.append(f"<tr><td>{name}</td>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    for name, channel in (("input", result.rig.input), ("output", result.rig.output)):
+        rows.append([name, f"{mean:.6g}", f"{std:.2g}", f"{low:.6g} to {high:.6g}", escape(result.units[name])])
+    for name, what in (("input", "disturbance of the force"), ("output", "noise of the sensor")):
         mean, std = result.noises[name]
-        what = "disturbance of the force" if name == "input" else "noise of the sensor"
         interval = f"{max(mean - 1.645 * std, 0):.3g} to {mean + 1.645 * std:.3g}"
-        cells = (f"{mean:.3g}", f"{std:.1g}", interval, escape(channel.unit))
-        rows.append(f"<tr><td>{what}</td>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    head = "<th></th><th>mean</th><th>standard deviation</th><th>90 % interval</th><th>unit</th>"
+        rows.append([what, f"{mean:.3g}", f"{std:.1g}", interval, escape(getattr(result.rig, name).unit)])
     equation = "<p>m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0 and noise.</p>"
-    return f"<h2>Parameters</h2>{equation}{table(head, rows)}"
+    heads = ["", "mean", "standard deviation", "90 % interval", "unit"]
+    return f"<h2>Parameters</h2>{equation}{table(heads, rows)}"
 
 
 def _figure(rows: int, columns: int, height: float) -> tuple[Figure, Any]:

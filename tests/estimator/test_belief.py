@@ -116,7 +116,6 @@ def test_nothing_can_be_written_into_it():
         ({"gamma": (0.0, 1.0)}, "shapes and rates of the noises must be positive, but are [0.0, 1.0"),
         ({"xi": (1.0, -1.0)}, "shapes and rates of the noises must be positive"),
         ({"xi": [(1.0, 1.0), (1.0, 1.0)]}, "xi must have a pair for each of ['y']"),
-        ({"step": 0.0}, "step must be positive and finite, but is 0.0"),
     ],
 )
 def test_errors_name_the_field(changes, message):
