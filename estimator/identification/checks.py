@@ -21,6 +21,9 @@ _EVIDENCE = 7.0
 #: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
 _RATIOS = (1.0, 0.1, 0.01)
 
+#: Steps of a fit of another hypothesis, at most.
+_STEPS = 12
+
 #: Probability of a false alarm of a test of the residuals.
 _ALARM = 1e-4
 
@@ -93,7 +96,7 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
                 others.append(at(found, interpolation=way, delay=delay))
     terms = [at(found, extra=(name,)) for name in EXTRA]
     tried = [at(h, ratio=found.best.ratio * part) for h in (found.best, *others, *terms) for part in _RATIOS]
-    fits = found.fitter.fit(tried, found.mean, found.level)
+    fits = found.fitter.fit(tried, found.mean, found.level, _STEPS)
     energies = fits.free_energy.reshape(-1, len(_RATIOS)).min(axis=1)
     own = min(energies[0], found.fits.free_energy.min())
     gains = own - energies[1:]

@@ -24,9 +24,11 @@ from estimator.parameters import FloatArray
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
-#: Damping at the start of a fit, its change after a step that fails or succeeds, and where a fit is given up.
-_DAMPING, _UP, _DOWN, _STUCK = 1e-3, 8.0, 0.15, 1e10
-#: A step that lowers the loss by less ends a fit [nats].
+#: Damping at the start of a fit, its change after a step that fails or succeeds, and where a fit is given up: the slope
+#: leaves out what S and the gain tell, so at the minimum no step of any length succeeds.
+_DAMPING, _UP, _DOWN, _STUCK = 1e-3, 10.0, 0.1, 1e2
+
+#: A step that promises to lower the loss by less ends a fit [nats]; it is a fraction of a standard deviation.
 _SMALL = 1e-3
 
 
@@ -65,7 +67,6 @@ class Fits:
         cov: (H, K, K) their covariance; 0 for terms that a hypothesis does not have.
         level: (H,) σ_v.
         free_energy: (H,) in nats, up to a constant that all share; inf where the numbers ran away.
-        converged: (H,) whether the last step was small.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -73,7 +74,6 @@ class Fits:
     cov: FloatArray
     level: FloatArray
     free_energy: FloatArray
-    converged: Flags
 
     @property
     def best(self) -> int:
@@ -83,8 +83,7 @@ class Fits:
     def where(self, chosen: Flags) -> Fits:
         """Those of some hypotheses."""
         kept = tuple(h for h, keep in zip(self.hypotheses, chosen, strict=True) if keep)
-        moments = self.mean[chosen], self.cov[chosen], self.level[chosen]
-        return Fits(kept, *moments, self.free_energy[chosen], self.converged[chosen])
+        return Fits(kept, self.mean[chosen], self.cov[chosen], self.level[chosen], self.free_energy[chosen])
 
 
 class Fitter:
@@ -133,23 +132,21 @@ class Fitter:
             damped = curvature + (damping[:, None] * diagonal)[:, :, None] * np.eye(len(names))
             step = -_solved(damped, slope)
             step[done] = 0.0
-            new_loss, new_slope, new_curvature, new_levels = self._appraise(
-                points + scale * step, inputs, ratios, levels, free
-            )
+            promised = -0.5 * np.einsum("hk,hk->h", slope, step)
+            trial = points + scale * step
+            new_loss, new_slope, new_curvature, new_levels = self._appraise(trial, inputs, ratios, levels, free)
             better = (new_loss <= loss) & ~done  # False for what is not finite
-            done |= better & (loss < new_loss + _SMALL) & (damping <= _DAMPING)
-            points[better] += (scale * step)[better]
-            loss = np.where(better, new_loss, loss)
-            levels = np.where(better, new_levels, levels)
+            points = np.where(better[:, None], trial, points)
+            loss, levels = np.where(better, new_loss, loss), np.where(better, new_levels, levels)
             slope = np.where(better[:, None], new_slope, slope)
             curvature = np.where(better[:, None, None], new_curvature, curvature)
             damping = np.where(better, np.maximum(_DOWN * damping, 1e-9), _UP * damping)
-            done |= damping > _STUCK
+            done |= (promised < _SMALL) | (damping > _STUCK)
         inverse = _inverted(curvature)
         cov = np.where(free[:, :, None] & free[:, None, :], inverse, 0.0) * np.outer(scale, scale)
         log_det = np.linalg.slogdet(curvature)[1] - np.array([self._prior_log_det(row, scale) for row in free])
         energy = np.where(np.isfinite(loss + log_det), loss + 0.5 * log_det, np.inf)
-        return Fits(tuple(hypotheses), points, cov, levels, energy, done & (damping <= _STUCK) & np.isfinite(energy))
+        return Fits(tuple(hypotheses), points, cov, levels, energy)
 
     def _driven(self, hypothesis: Hypothesis) -> FloatArray:
         key = hypothesis.interpolation, hypothesis.delay
