@@ -9,7 +9,7 @@ the right one the sequence tells, by the evidence. So members with displaced pri
 and each is weighed by its free energies, F_m of a sample standing for -log p(y_t | y_1 ... y_{t-1}, m):
 
     w_m <- (1 - ε) w_m + ε/M                       a hypothesis may become true again, in one sample of 1/ε
-    F = -log Σ_m w_m exp(-F_m),   w_m <- w_m exp(F - F_m)        (`estimator.inference.samples.weigh`)
+    F = -log Σ_m w_m exp(-F_m),   w_m <- w_m exp(F - F_m)        (`estimator.inference.mixture.weigh`)
 
 The belief has the mixture's mean and covariance of states and coefficients, and its mean and variance of the noises'
 variances: those are what acts in a prediction, and a hypothesis of no noise at all must not make a precision infinite.
@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
 
 #: Furthest displacement of σ_w/σ_v from that of the prior, either way.
@@ -58,6 +59,23 @@ def grid(noises: FloatArray, ratios: int) -> FloatArray:
     return np.array([displaced(noises, factor, level) for level in LEVELS for factor in factors])
 
 
+def priors(prior: Belief, hypotheses: int) -> FloatArray:
+    """(members, size) the records that the members begin with; the prior's own where there is one hypothesis."""
+    if hypotheses == 1:
+        return prior.record[None].copy()
+    noises = grid(prior.noises, hypotheses)
+    records = np.repeat(prior.record[None], len(noises), axis=0)
+    records[:, -4:] = noises
+    return records
+
+
+def side_by_side(records: FloatArray, lanes: int) -> FloatArray:
+    """(blocks, size * lanes) records (n, size) in adjacent lanes of blocks; a spare lane repeats the last."""
+    blocks = -(-len(records) // lanes)
+    spare = records[np.minimum(np.arange(blocks * lanes), len(records) - 1)]
+    return spare.reshape(blocks, lanes, -1).transpose(0, 2, 1).reshape(blocks, -1)
+
+
 def displaced(noises: FloatArray, factor: float, level: float) -> FloatArray:
     """Shapes and rates (4,) with σ_w/σ_v multiplied by ``factor``, σ_w² + σ_v² by ``level``², and the shapes kept."""
     q, r = noises[1] / noises[0], noises[3] / noises[2]
@@ -79,14 +97,3 @@ def ratio_of(weights: FloatArray, ratios: FloatArray, size: int) -> NoiseRatio:
     step = 2 * np.log(FARTHEST) / (size - 1)
     std = np.sqrt(weights @ (ratios - mean) ** 2 + step**2 / 12)
     return NoiseRatio(float(mean), float(std), float(size * step / np.sqrt(12)))
-
-
-def matched_gamma(weights: FloatArray, shapes: FloatArray, rates: FloatArray) -> tuple[float, float]:
-    """Shape and rate of a Gamma density for a mixture of them, by mean and variance of the noise's variance.
-
-    That of a density is taken as 1/E[g], as it acts in an update, with the relative variance 1/shape.
-    """
-    variances = rates / shapes
-    mean = weights @ variances
-    spread = weights @ ((variances / mean) ** 2 / shapes + (variances / mean - 1) ** 2)
-    return float(1 / spread), float(mean / spread)

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief, covariance_places
-from estimator.ensemble import LEVELS, NoiseRatio, grid, log_ratio, matched_gamma, ratio_of
+from estimator.ensemble import NoiseRatio, log_ratio, priors, ratio_of, side_by_side
 from estimator.inference import samples
+from estimator.inference.mixture import mixture
 from estimator.inputs import Feed, degree, feed
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -38,7 +39,8 @@ class Filter:
         self.prior, self.rig, self.settings = prior, rig, settings
         self.model: Model = prior.model
         self.feed: Feed = feed(self.model, rig)
-        members = 1 if settings.noise_hypotheses == 1 else len(LEVELS) * settings.noise_hypotheses
+        records = priors(prior, settings.noise_hypotheses)
+        members = len(records)
         self._loop = self._compiled(members)
         size, lanes = len(prior.record), self._loop.lanes
         blocks = -(-members // lanes)
@@ -52,9 +54,6 @@ class Filter:
         self._first = prior.record.copy()
         shape = [self.feed.stride, self.feed.past, self.feed.waits, self.feed.fills]
         self._steps = np.array(shape, dtype=np.int64)
-        records = np.repeat(prior.record[None], members, axis=0)
-        if members > 1:
-            records[:, -4:] = grid(prior.noises, settings.noise_hypotheses)
         self._put(records)
 
     def _compiled(self, members: int) -> samples.Loop:
@@ -142,9 +141,8 @@ class Filter:
         return rows.transpose(0, 2, 1).reshape(blocks * lanes, size)[: self.members].copy()
 
     def _put(self, records: FloatArray) -> None:
-        blocks, lanes, size = len(self._block), self._loop.lanes, len(self._first)
-        spare = records[np.minimum(np.arange(blocks * lanes), len(records) - 1)]  # a spare lane repeats the last
-        self._block[:, : size * lanes] = spare.reshape(blocks, lanes, size).transpose(0, 2, 1).reshape(blocks, -1)
+        size, lanes = len(self._first), self._loop.lanes
+        self._block[:, : size * lanes] = side_by_side(records, lanes)
 
     @property
     def belief(self) -> Belief:
@@ -154,32 +152,16 @@ class Filter:
     @property
     def noise_ratio(self) -> NoiseRatio:
         """What the weights say, at the precisions that each member has learned."""
-        weights = self._finite_weights()
+        weights, _ = mixture(self._block, self._weights, len(self.model.names))
         ratios = np.array([log_ratio(record[-4:]) for record in self.records[weights > 0]])
         return ratio_of(weights[weights > 0], ratios, self.settings.noise_hypotheses)
 
-    def _finite_weights(self) -> FloatArray:
-        """(members,) weights that sum to 1, 0 where a member overflowed."""
-        weights = np.where(np.isfinite(self.records).all(axis=1), self._weights, 0.0)
-        return weights / weights.sum()
-
     def _mixture(self) -> FloatArray:
         """(size,) a record with the mixture's moments."""
-        records = self.records
-        if len(records) == 1:
-            return records[0]
-        weights = self._finite_weights()
-        records, share = records[weights > 0], weights[weights > 0]
-        d, places = len(self.model.names), covariance_places(self.model)
-        about = records[int(np.argmax(share))]  # so that what all members know stays as it is, to the last bit
-        mean = about[:d] + share @ (records[:, :d] - about[:d])
-        deviations = records[:, :d] - mean
-        mixture = about.copy()
-        mixture[places] = np.tensordot(share, records[:, places], 1) + (deviations.T * share) @ deviations
-        mixture[:d] = mean
-        mixture[-4:-2] = matched_gamma(share, records[:, -4], records[:, -3])
-        mixture[-2:] = matched_gamma(share, records[:, -2], records[:, -1])
-        return mixture
+        if self.members == 1:
+            return self.records[0]
+        record: FloatArray = mixture(self._block, self._weights, len(self.model.names))[1]
+        return record
 
     @property
     def regresses(self) -> bool:

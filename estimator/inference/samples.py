@@ -18,12 +18,10 @@ from estimator.engine.cache import digest_of
 from estimator.engine.free_energy import free_energies
 from estimator.engine.rows import belief_names
 from estimator.inference import mean_field
-from estimator.lanes import LANES, jit, kernel, part
+from estimator.inference.mixture import weigh
+from estimator.lanes import LANES, kernel, part
 from estimator.models.difference import difference
 from estimator.models.model import Model
-
-#: Probability per sample that the hypothesis is drawn anew: no weight stays below it for good.
-SWITCHING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -63,13 +61,7 @@ def structured(model: Model, degree: int, iterations: int, expectations: str = "
     )
     place, update = task.layout, task.update
     energies_of = free_energies(model, iterations, lanes, place)
-    sensors = model.n_outputs
     kind = f"{model.name}_{digest_of(model.digest, degree, iterations, lanes, expectations)}"
-    means = tuple(place[f"TRACE_{k}_mean"] * lanes for k in range(sensors))
-    parts = tuple(
-        tuple(place[f"TRACE_{k}_{what}"] * lanes for what in ("variance", f"q_{iterations - 1}", f"r_{iterations - 1}"))
-        for k in range(sensors)
-    )
     unsound = place.get("UNSOUND", -1) * lanes
 
     @part(kind)
@@ -79,17 +71,35 @@ def structured(model: Model, degree: int, iterations: int, expectations: str = "
                 W[unsound + j] = 0.0
         update(W)
 
+    look = forecaster(kind, model, iterations, lanes, place)
+
     @part(kind)
     def judge(W, j, before, values, forecasts):
         energies_of(W, j, values)
         if unsound >= 0 and W[unsound + j] > 0.0:
             for i in range(iterations):
                 values[i] = np.nan
+        look(W, j, forecasts)
+
+    return Loop(_loop(kind, model, place, lanes, iterations, take, judge), place, lanes)
+
+
+def forecaster(kind: str, model: Model, iterations: int, lanes: int, place: Mapping[str, int]) -> Any:
+    """``look(W, j, forecasts)``: mean and variance (sensors, 2) of lane j's outputs before they were seen."""
+    sensors = model.n_outputs
+    means = tuple(place[f"TRACE_{k}_mean"] * lanes for k in range(sensors))
+    parts = tuple(
+        tuple(place[f"TRACE_{k}_{what}"] * lanes for what in ("variance", f"q_{iterations - 1}", f"r_{iterations - 1}"))
+        for k in range(sensors)
+    )
+
+    @part(kind)
+    def look(W, j, forecasts):
         for k in range(sensors):
             forecasts[k, 0] = W[means[k] + j]
             forecasts[k, 1] = W[parts[k][0] + j] + W[parts[k][1] + j] + W[parts[k][2] + j]
 
-    return Loop(_loop(kind, model, place, lanes, iterations, take, judge), place, lanes)
+    return look
 
 
 @cache
@@ -115,57 +125,6 @@ def published(iterations: int, as_published: bool) -> Loop:
         forecasts[0, 0] = forecasts[0, 1] = np.nan
 
     return Loop(_loop(kind, model, place, 1, iterations, take, judge), place, 1)
-
-
-@jit
-def weigh(weights, each, predictions, energies, forecasts):
-    """Weigh the members by their free energies of one sample.
-
-    Args:
-        weights: (M,) before it; overwritten with those after it.
-        each: (M, iterations) free energies of the members [nats].
-        predictions: (M, sensors, 2) mean and variance of each output before it was seen.
-        energies: (iterations,) receives those of the mixture, from the weights before.
-        forecasts: (sensors, 2) receives mean and variance of the mixture before the output was seen.
-
-    A member whose numbers are not finite has no weight. Where none is left, all results are NaN.
-    """
-    members, iterations = each.shape
-    before = np.zeros(members)
-    total = 0.0
-    for m in range(members):
-        told = each[m, iterations - 1]
-        for k in range(len(forecasts)):
-            told += predictions[m, k, 0] + predictions[m, k, 1]
-        if np.isfinite(told):
-            before[m] = (1.0 - SWITCHING) * weights[m] + SWITCHING / members
-        total += before[m]
-    for m in range(members):
-        before[m] /= total
-    for k in range(len(forecasts)):
-        mean, variance = 0.0, 0.0
-        for m in range(members):
-            if before[m] > 0.0:
-                mean += before[m] * predictions[m, k, 0]
-        for m in range(members):
-            if before[m] > 0.0:
-                variance += before[m] * (predictions[m, k, 1] + (predictions[m, k, 0] - mean) ** 2)
-        forecasts[k, 0] = mean if total > 0.0 else np.nan
-        forecasts[k, 1] = variance if total > 0.0 else np.nan
-    for i in range(iterations):
-        least = np.inf
-        for m in range(members):
-            if before[m] > 0.0:
-                least = min(least, each[m, i])
-        evidence = 0.0
-        for m in range(members):
-            weights[m] = 0.0
-            if before[m] > 0.0:
-                weights[m] = before[m] * np.exp(least - each[m, i])
-                evidence += weights[m]
-        for m in range(members):
-            weights[m] /= evidence
-        energies[i] = least - np.log(evidence)
 
 
 def _loop(kind: str, model: Model, place: Mapping[str, int], lanes: int, scratch: int, take: Any, judge: Any) -> Any:
