@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.experiment import Experiment
+from duffing_env.hypotheses import member_layout
 from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, noise_rows, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
@@ -47,11 +48,14 @@ class Batch:
         self._truth = {name: f"PARAM_{name}" for name in parameter_names(model)} | (noise_rows(model) if drawn else {})
         n_rows, n_observation = max(self._place.values()) + 1, len(observation_bounds(experiment.model))
         # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
-        self._recorded = tuple(series.copy() for series in experiment.recorded)
+        self._recorded = np.stack(experiment.recorded)
         n_blocks = -(-size // LANES)
         padded = n_blocks * LANES
         self._blocks = np.zeros((n_blocks, n_rows, LANES))
         self._flat_blocks = self._blocks.reshape(n_blocks, -1)
+        count = len(experiment.setup.hypotheses) // 4 * size
+        n_member_rows = max(member_layout(self._kind).values()) + 1 if count else 0
+        self._members = np.zeros((-(-count // LANES), n_member_rows * LANES))
         self._ended = np.zeros_like(self._blocks)
         self._flat_ended = self._ended.reshape(n_blocks, -1)
         self._saved = np.zeros((threads, 2 * n_rows * LANES))
@@ -99,21 +103,20 @@ class Batch:
 
     def _call(self, reset_mode: int) -> None:
         told = (
-            self._actions, self._packed, *self._recorded, reset_mode, self._mask, self._observations, self._outcomes,
+            self._actions, self._packed, self._recorded, reset_mode, self._mask, self._observations, self._outcomes,
             self._final_observations, self._flat_ended,
         )  # fmt: skip
         if self._threads > 1:
             import numba
 
             numba.set_num_threads(self._threads)
-            self._kernel.step_parallel(self._flat_blocks, self._saved, *told)
+            self._kernel.step_parallel(self._flat_blocks, self._members, self._saved, *told)
         else:
-            self._kernel.step(0, len(self._flat_blocks), self._flat_blocks, self._saved[0], *told)
+            self._kernel.step(0, len(self._blocks), self._flat_blocks, self._members, self._saved[0], *told)
 
     def measure(self, u: float, y: float) -> None:
         """Let the next step play this input and output [V], of an experiment that replays a record of one sample."""
-        recorded_u, recorded_y = self._recorded
-        recorded_u[0], recorded_y[0] = u, y
+        self._recorded[:, 0] = u, y
 
     def outcome(self, index: int) -> dict[str, float]:
         """What the last step left behind for one environment, by its names in lower case."""

@@ -155,6 +155,7 @@ class ContinuousEnv(DuffingEnv):
     | ``noise_range`` | 1 | both noises are drawn for every episode, as `DuffingEnv` |
     | ``process_noise_guess``, ``measurement_noise_guess`` | None | as `DuffingEnv` |
     | ``noise_shape`` | 2 | shape of the Gamma priors of γ and ξ |
+    | ``noise_hypotheses`` | 1 | as `DuffingEnv` |
     | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
 

@@ -100,6 +100,11 @@ class DuffingEnv(gym.Env[Any, Any]):
     ``measurement_noise``, over a range of that factor: 10 is a decade, from 1/√10 to √10 times. The prior is then about
     the middle of the range, and ``truth`` has ``process_noise`` and ``measurement_noise``, too.
 
+    An estimator alone hardly learns how the two noises share what an output shows. With ``noise_hypotheses`` above 1 (9
+    resolve it) it weighs as many ratios by their evidence, as `estimator.OnlineEstimator` does, each at three levels:
+    three updates a hypothesis and sample. Observation, ``belief``, rewards and information are then those of the
+    mixture's mean and covariance; ``free_energy`` is the mixture's own. It is for ``structured`` and one sensor.
+
     ## Episode end
 
     - Termination: \|y\| > ``max_output`` (0.6 V); or a number that is not finite (``info["diverged"]``), which leaves
@@ -132,6 +137,7 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``process_noise_guess`` | None | where the prior of γ is centred [V]; None: at ``process_noise`` |
     | ``measurement_noise_guess`` | None | where that of ξ is centred [V]; None: at ``measurement_noise`` |
     | ``noise_shape`` | 2 | shape of these Gamma priors |
+    | ``noise_hypotheses`` | 1 | ratios of the noises to weigh by their evidence; see below |
     | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
     | ``max_rms`` | None | largest RMS input over a whole episode [V]; see `PowerEnv` |
     | ``max_slew`` | None | largest change of the input between samples [V]; a larger one is cut |

@@ -15,11 +15,16 @@ import numpy as np
 from duffing_env.layout import Kind, Setup, parameter_names
 from duffing_env.rewards import REWARDS, check_reward
 from estimator.belief import Belief
+from estimator.ensemble import priors, start
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
+from estimator.settings import check_hypotheses
+
+#: More ratios of the noises than are worth their time: each is three updates a sample.
+MOST_HYPOTHESES = 99
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,8 @@ class Experiment:
         hold: samples that an action is applied for; a step's reward is the sum of theirs. An episode may end within.
         terminal: whether the episode's whole reward is paid in its last step, and 0 before.
         terminated_return: what an episode that is terminated returns, whatever it gained. None keeps what it gained.
+        noise_hypotheses: ratios of the noises that the estimator weighs by their evidence, as
+            `estimator.OnlineEstimator` does; structured and for one sensor. 1: the ratio stays nearly the prior's.
     """
 
     factorisation: str = "structured"
@@ -45,6 +52,7 @@ class Experiment:
     hold: int = 1
     terminal: bool = False
     terminated_return: float | None = None
+    noise_hypotheses: int = 1
 
     def __post_init__(self) -> None:
         if self.factorisation not in list(DEFAULT_ITERATIONS):
@@ -59,6 +67,7 @@ class Experiment:
         worth = self.terminated_return
         if worth is not None and not (_is_number(worth) and np.isfinite(worth)):
             raise ValueError(f"terminated_return must be a finite number, but is {worth!r}; None keeps what was gained")
+        check_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MOST_HYPOTHESES)
 
     def _check_positive(self, name: str) -> None:
         value = getattr(self, name)
@@ -135,12 +144,18 @@ class Experiment:
             self.model, self.plant, self.degree, self.factorisation,
             self._iterations if self.factorisation == "structured" else 0,
             self.reward if REWARDS[self.reward].hooks is not None else "",
+            self.noise_hypotheses > 1,
         )  # fmt: skip
 
     @property
     def setup(self) -> Setup:
         """The experiment as the kernel is told of it."""
         prior, model = self.believed, self.model
+        first, noises = prior.record.copy(), np.empty(0)
+        if self.noise_hypotheses > 1:
+            members = priors(prior, self.noise_hypotheses)
+            first, noises = start(members, len(model.names)), members[:, -4:].ravel()
+        precisions = first[-2 - 2 * model.n_outputs :]
         names = parameter_names(self.truth_model)
         values: dict[str, Any] = {
             "max_input": float(self.max_input),
@@ -167,9 +182,10 @@ class Experiment:
             "terminated_return": float(self.terminated_return or 0.0),
             "as_published": False,
             "delay": 0,
-            "prior": prior.record.copy(),
+            "prior": first,
             "inverse_std": 1.0 / np.sqrt(np.diag(prior.coefficients_cov)),
-            "log_precisions": np.log(prior.noises[::2] / prior.noises[1::2]),
+            "log_precisions": np.log(precisions[::2] / precisions[1::2]),
+            "hypotheses": noises,
             **self.plant_setup,
         }
         return Setup(**values)

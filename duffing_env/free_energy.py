@@ -35,6 +35,14 @@ def _free_energy_of(kind: Kind) -> Any:
     place = layout_of(kind)
     if kind.factorisation == "mean_field":
         return mean_field.pieces(place).free_energy
+    if kind.weighs:
+        told = place["FREE_ENERGY"] * LANES
+
+        @part(kind.name)
+        def of_the_mixture(W, j):
+            return W[told + j]
+
+        return of_the_mixture
     traced, last = free_energies(kind.belief, kind.iterations, LANES, place), kind.iterations - 1
 
     @part(kind.name)

@@ -15,6 +15,7 @@ import numpy as np
 from numba import prange
 
 from duffing_env import sources, stages
+from duffing_env.hypotheses import NONE, members_of
 from duffing_env.inference import updater
 from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, observation_bounds, parameter_names, unpacker
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
@@ -29,18 +30,19 @@ RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP, RESET_NOW = 0, 1, 2, 3
 class Kernel:
     """The entry points of one kind of experiment.
 
-    They work on ``blocks`` (n_blocks, rows * LANES), the environments, of which there are n = n_blocks * LANES, and are
-    told ``packed``, the `duffing_env.layout.Setup` as one array.
+    They work on ``blocks`` (n_blocks, rows * LANES), the environments, of which there are n = n_blocks * LANES, and on
+    the ``members`` (`duffing_env.hypotheses`) of those that are in use. They are told ``packed``, the
+    `duffing_env.layout.Setup` as one array.
 
     Attributes:
-        step: ``step(first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask,
-            observations, outcomes, final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the
-            calling thread. ``saved`` (2 rows * LANES,) is work space, ``actions`` (n,) are inputs in parts of the
-            largest, ``recorded_u`` and ``recorded_y`` (T,) the record that is replayed and one sample elsewhere,
-            ``reset_mode`` says how finished environments are reset; RESET_NOW does nothing but start episodes in those
-            of ``mask`` (n,). It writes ``observations`` (n, entries) float32, and ``outcomes`` (len(OUTCOME), n).
-            Where environments were reset in this very step, it writes ``final_observations``, like ``observations``,
-            and ``ended`` (n_blocks, rows * LANES), their rows as the episode left them.
+        step: ``step(first, stop, blocks, members, saved, actions, packed, recorded, reset_mode, mask, observations,
+            outcomes, final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the calling thread.
+            ``saved`` (2 rows * LANES,) is work space, ``actions`` (n,) are inputs in parts of the largest, ``recorded``
+            (2, T) inputs and outputs of the record that is replayed, and of one sample elsewhere. ``reset_mode`` says
+            how finished environments are reset; RESET_NOW does nothing but start episodes in those of ``mask`` (n,).
+            It writes ``observations`` (n, entries) float32, and ``outcomes`` (len(OUTCOME), n). Where environments
+            were reset in this very step, it writes ``final_observations``, like ``observations``, and ``ended``
+            (n_blocks, rows * LANES), their rows as the episode left them.
         step_parallel: all blocks on Numba's threads, as many as ``saved`` (threads, 2 rows * LANES) has rows.
     """
 
@@ -81,6 +83,8 @@ def compiled(kind: Kind) -> Kernel:
     simulated = kind.plant is not None
     move: Any = _plant_of(kind, code, draw_noise) if simulated else None
     infer = updater(kind)
+    weighs = kind.weighs
+    begin_members, learn = members_of(kind) if weighs else NONE
     make_hooks = REWARDS[kind.work].hooks if kind.work else None
     idle_hooks = Hooks(nothing_in_lane, nothing, nothing, nothing)
     begin_work, before, expect, after = make_hooks(kind, code) if make_hooks else idle_hooks
@@ -99,10 +103,12 @@ def compiled(kind: Kind) -> Kernel:
             begin_work(W, j, setup)
 
     @inner
-    def reset_lane(W, j, setup):
-        """Start an episode in lane j: draw its plant, put it at rest, and put the belief to the prior."""
+    def reset_lane(W, members, b, j, setup):
+        """Start an episode in lane j of block b: draw its plant, put it at rest, and put the belief to the prior."""
         for i in range(n_record):
             W[i * LANES + j] = setup.prior[i]
+        if weighs:
+            begin_members(members, b * LANES + j, setup)
         # Variables, because a function is compiled anew for every constant.
         stages.draw_plant(W, j, setup, np.int64(stream), np.int64(drawn))
         W[jump_at + j] = -1.0
@@ -113,7 +119,7 @@ def compiled(kind: Kind) -> Kernel:
         meet_truth(W, j, setup)
 
     def step_blocks(
-        first, stop, blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations, outcomes,
+        first, stop, blocks, members, saved, actions, packed, recorded, reset_mode, mask, observations, outcomes,
         final_observations, ended,
     ):  # fmt: skip
         """Step some blocks, or start episodes in them.
@@ -146,11 +152,11 @@ def compiled(kind: Kind) -> Kernel:
                 if simulated:
                     move(W)
                 else:
-                    last = len(recorded_y) - 1
+                    last = recorded.shape[1] - 1
                     for j in range(LANES):
                         t = np.int64(W[elapsed + j])
-                        W[recorded_u_row + j] = recorded_u[min(t, last)]
-                        W[recorded_y_row + j] = recorded_y[min(t + setup.delay, last)]
+                        W[recorded_u_row + j] = recorded[0, min(t, last)]
+                        W[recorded_y_row + j] = recorded[1, min(t + setup.delay, last)]
                     play_record(W, setup.max_input)
                 # What to return to if the update breaks the belief.
                 for i in range(n_saved):
@@ -159,7 +165,9 @@ def compiled(kind: Kind) -> Kernel:
                     walk(W, setup.walk)
                 if is_worked:
                     expect(W, setup)
-                if is_structured:
+                if weighs:
+                    learn(W, members, b, setup)
+                elif is_structured:
                     infer(W)
                 else:
                     infer(W, setup.iterations, setup.as_published)
@@ -194,7 +202,7 @@ def compiled(kind: Kind) -> Kernel:
                     if reset_mode == RESET_NOW
                     else W[waiting + j] != 0.0 and reset_mode == RESET_NEXT_STEP
                 ):
-                    reset_lane(W, j, setup)
+                    reset_lane(W, members, b, j, setup)
                     for k in range(n_outcome):
                         W[outcome + k * LANES + j] = 0.0
                 elif reset_mode != RESET_NOW and W[terminated + j] + W[truncated + j] != 0.0:
@@ -219,20 +227,20 @@ def compiled(kind: Kind) -> Kernel:
                             final_observations[lane + j, k] = observations[lane + j, k]
                         for i in range(n_rows):
                             ended[b, i * LANES + j] = W[i * LANES + j]
-                        reset_lane(W, j, setup)
+                        reset_lane(W, members, b, j, setup)
 
     step, inner_step = entry(step_blocks), inner(step_blocks)
 
     @entry(parallel=True)
     def step_parallel(
-        blocks, saved, actions, packed, recorded_u, recorded_y, reset_mode, mask, observations, outcomes,
+        blocks, members, saved, actions, packed, recorded, reset_mode, mask, observations, outcomes,
         final_observations, ended,
     ):  # fmt: skip
         n = len(saved)
         for t in prange(n):
             inner_step(
-                t * len(blocks) // n, (t + 1) * len(blocks) // n, blocks, saved[t], actions, packed, recorded_u,
-                recorded_y, reset_mode, mask, observations, outcomes, final_observations, ended,
+                t * len(blocks) // n, (t + 1) * len(blocks) // n, blocks, members, saved[t], actions, packed, recorded,
+                reset_mode, mask, observations, outcomes, final_observations, ended,
             )  # fmt: skip
 
     return Kernel(step, step_parallel)

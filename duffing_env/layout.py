@@ -41,6 +41,7 @@ class Kind(NamedTuple):
         iterations: variational iterations per sample of the structured belief, whose update is generated with them; 0
             for mean field, which is told.
         work: name of the reward, if it has hooks (`duffing_env.rewards`); the others are weights that a kernel is told.
+        weighs: whether several beliefs are weighed (`duffing_env.hypotheses`); how many is told.
     """
 
     belief: Model
@@ -49,6 +50,7 @@ class Kind(NamedTuple):
     factorisation: str = "structured"
     iterations: int = 3
     work: str = ""
+    weighs: bool = False
 
     @property
     def name(self) -> str:
@@ -93,6 +95,7 @@ class Setup(NamedTuple):
         prior: (size,) record that episodes start from.
         inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
         log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
+        hypotheses: (4 members,) shape and rate of γ and of ξ that each of several beliefs starts from; () for one.
     """
 
     max_input: float
@@ -122,6 +125,7 @@ class Setup(NamedTuple):
     prior: npt.NDArray[np.float64]
     inverse_std: npt.NDArray[np.float64]
     log_precisions: npt.NDArray[np.float64]
+    hypotheses: npt.NDArray[np.float64]
 
 
 def pack(setup: Setup) -> npt.NDArray[np.float64]:
@@ -139,6 +143,8 @@ def unpacker(kind: Kind) -> Any:
     for name, kind_of_value in get_type_hints(Setup).items():
         size = sizes.get(name)
         place = f"packed[{at}]" if size is None else f"packed[{at}:{at + size}]"
+        if name == "hypotheses":  # the last
+            place = f"packed[{at}:]"
         told.append({int: f"int({place})", bool: f"{place} != 0.0"}.get(kind_of_value, place))
         at += 1 if size is None else size
     return _unpacker(", ".join(told))
@@ -216,7 +222,7 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
         wanted += [*mean_field.SCRATCH, *left_out(kind)]
     wanted += [name for name in carried_names(belief) if name not in place]
     if kind.work == "free_energy" and kind.factorisation == "structured":
-        wanted += trace_names(belief, kind.iterations)
+        wanted += ["FREE_ENERGY"] if kind.weighs else trace_names(belief, kind.iterations)
     missing = [name for name in dict.fromkeys(wanted) if name not in place]
     place |= rows(" ".join(missing), start=len(place))
     return place | inputs_of(kind, belief, place)

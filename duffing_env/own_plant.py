@@ -42,6 +42,8 @@ class PlantExperiment(Experiment):
     prior: Belief | None = None
 
     def __post_init__(self) -> None:
+        if self.prior is not None and not isinstance(self.prior, Belief):
+            raise ValueError(f"prior must be an estimator.Belief or None, but is {self.prior!r:.60}")
         super().__post_init__()
         self._check_count("horizon")
         if REWARDS[self.reward].needs_truth:
@@ -49,8 +51,6 @@ class PlantExperiment(Experiment):
                 f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "
                 "use 'information_gain', 'expected_free_energy' or 'free_energy'"
             )
-        if self.prior is not None and not isinstance(self.prior, Belief):
-            raise ValueError(f"prior must be an estimator.Belief or None, but is {self.prior!r:.60}")
         if self.model.n_outputs != 1:
             raise ValueError(
                 f"prior must be of a model with one sensor, but {self.model.name!r} has {self.model.n_outputs}; "
@@ -127,8 +127,9 @@ class PlantEnv(DuffingEnv):
 
     ## Arguments
 
-    ``factorisation``, ``iterations``, ``max_input``, ``max_output``, ``hold``, ``terminal``, ``terminated_return`` and
-    ``render_mode`` as `DuffingEnv`. With ``hold`` the plant's ``step`` is called for every sample, with the same input.
+    ``factorisation``, ``iterations``, ``noise_hypotheses``, ``max_input``, ``max_output``, ``hold``, ``terminal``,
+    ``terminated_return`` and ``render_mode`` as `DuffingEnv`. With ``hold`` the plant's ``step`` is called for every
+    sample, with the same input.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|

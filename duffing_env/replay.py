@@ -128,8 +128,9 @@ class SilverboxReplayEnv(DuffingEnv):
 
     ## Arguments
 
-    ``factorisation``, ``iterations``, ``reward``, ``terminal``, ``terminated_return``, ``max_input``, ``max_output``
-    and ``render_mode`` as `DuffingEnv`. There is no ``hold``: a record is answered sample by sample.
+    ``factorisation``, ``iterations``, ``noise_hypotheses``, ``reward``, ``terminal``, ``terminated_return``,
+    ``max_input``, ``max_output`` and ``render_mode`` as `DuffingEnv`. There is no ``hold``: a record is answered sample
+    by sample.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.belief import Belief
+from estimator.inference.mixture import mixture
+from estimator.lanes import LANES
 from estimator.parameters import FloatArray
 
 #: Furthest displacement of σ_w/σ_v from that of the prior, either way.
@@ -69,6 +71,13 @@ def priors(prior: Belief, hypotheses: int) -> FloatArray:
     return records
 
 
+def start(records: FloatArray, names: int) -> FloatArray:
+    """(size,) the record of the mixture of equally weighed members (M, size), of so many states and coefficients."""
+    weights = np.full(len(records), 1 / len(records))
+    record: FloatArray = mixture(side_by_side(records, LANES), weights, names)[1]
+    return record
+
+
 def side_by_side(records: FloatArray, lanes: int) -> FloatArray:
     """(blocks, size * lanes) records (n, size) in adjacent lanes of blocks; a spare lane repeats the last."""
     blocks = -(-len(records) // lanes)
@@ -97,3 +106,15 @@ def ratio_of(weights: FloatArray, ratios: FloatArray, size: int) -> NoiseRatio:
     step = 2 * np.log(FARTHEST) / (size - 1)
     std = np.sqrt(weights @ (ratios - mean) ** 2 + step**2 / 12)
     return NoiseRatio(float(mean), float(std), float(size * step / np.sqrt(12)))
+
+
+def matched_gamma(weights: FloatArray, shapes: FloatArray, rates: FloatArray) -> tuple[float, float]:
+    """Shape and rate of a Gamma density for a mixture of them, by mean and variance of the noise's variance.
+
+    That of a density is taken as 1/E[g], as it acts in an update, with the relative variance 1/shape
+    (`estimator.inference.mixture.mix` does so in compiled code).
+    """
+    variances = rates / shapes
+    mean = weights @ variances
+    spread = weights @ ((variances / mean) ** 2 / shapes + (variances / mean - 1) ** 2)
+    return float(1 / spread), float(mean / spread)

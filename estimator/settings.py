@@ -55,7 +55,6 @@ def settled(model: Model, given: Settings) -> Settings:
             f"factorisation must be 'structured' for {model.name}, but is 'mean_field'; that is for the paper's model"
         )
     _whole("iterations", given.iterations, _MOST_ITERATIONS)
-    _whole("noise_hypotheses", given.noise_hypotheses, _MOST_HYPOTHESES)
     if given.as_published and not published:
         raise ValueError(
             f"as_published goes with factorisation='mean_field', but factorisation is {given.factorisation!r}; the "
@@ -69,12 +68,7 @@ def settled(model: Model, given: Settings) -> Settings:
         raise ValueError(f"drift must be at least 0 and finite, but is {drift!r}; 0 is a system that stays")
     if drift and published:
         raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {drift!r}; use structured")
-    if given.noise_hypotheses > 1 and (published or model.n_outputs > 1):
-        what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"
-        raise ValueError(
-            f"noise_hypotheses must be 1 for {what}, but is {given.noise_hypotheses}; use factorisation='structured' "
-            f"and one sensor"
-        )
+    check_hypotheses(given.noise_hypotheses, given.factorisation, model)
     return replace(
         given,
         iterations=int(given.iterations),
@@ -82,6 +76,21 @@ def settled(model: Model, given: Settings) -> Settings:
         drift=float(drift),
         noise_hypotheses=int(given.noise_hypotheses),
     )
+
+
+def check_hypotheses(count: object, factorisation: str, model: Model, most: int = _MOST_HYPOTHESES) -> None:
+    """A number of noise hypotheses that fits factorisation and model, and is at most ``most``.
+
+    Raises:
+        ValueError: naming the option, the value and the remedy.
+    """
+    _whole("noise_hypotheses", count, most)
+    published = factorisation == "mean_field"
+    if count != 1 and (published or model.n_outputs > 1):
+        what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"
+        raise ValueError(
+            f"noise_hypotheses must be 1 for {what}, but is {count}; use factorisation='structured' and one sensor"
+        )
 
 
 def _whole(name: str, value: object, most: int) -> None:

@@ -7,7 +7,7 @@ from scipy.special import logsumexp
 
 from estimator import OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
 from estimator.belief import Belief
-from estimator.ensemble import FARTHEST, LEVELS, displaced, side_by_side
+from estimator.ensemble import FARTHEST, LEVELS, displaced, matched_gamma, side_by_side
 from estimator.inference.mixture import SWITCHING, mixture, weigh
 from estimator.lanes import LANES
 
@@ -109,12 +109,6 @@ def test_displacement_keeps_the_shapes_and_says_ratio_and_sum():
 
 
 def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
-    def matched_gamma(weights, shapes, rates):
-        records = np.column_stack([np.zeros((len(weights), 2)), shapes, rates, shapes, 2 * rates])
-        _, record = mixture(side_by_side(records, LANES), weights, 1)
-        assert record[4:] == pytest.approx(record[2:4] * [1, 2], rel=1e-12)
-        return tuple(record[2:4])
-
     assert matched_gamma(np.ones(1), np.array([3.0]), np.array([2e-6])) == pytest.approx((3.0, 2e-6), rel=1e-12)
     # Of shapes this large 1/g is normal about rate/shape, with the relative variance 1/shape.
     rng = np.random.default_rng(1)
@@ -124,6 +118,9 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
     shape, rate = matched_gamma(weights, shapes, rates)
     assert rate / shape == pytest.approx(variances.mean(), rel=0.003)
     assert 1 / shape == pytest.approx(variances.var() / variances.mean() ** 2, rel=0.01)
+    # The same in compiled code, of two noises.
+    records = np.column_stack([np.zeros((2, 2)), shapes, rates, shapes, 2 * rates])
+    np.testing.assert_allclose(mixture(side_by_side(records, LANES), weights, 1)[1][2:], [shape, rate, shape, 2 * rate])
 
 
 # --- The estimator -------------------------------------------------------------------------------------------------
