@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
 import platform
 import tempfile
@@ -69,31 +71,18 @@ def main(config: Config) -> None:
 
 
 def _run(name: str, config: Config, peers: Peers, samples: Path, on_row: Callable[[str], None]) -> Section:
-    """One section; its modules are imported only now, so that none of them weighs on the others' memory and threads."""
+    """One section; its module is imported only now, so that none of them weighs on the others' memory and threads."""
+    module = importlib.import_module(f"benchmarks.{name}")
     if name == "estimators":
-        from benchmarks import estimators
-
-        estimators.write_samples(samples)
-        return estimators.run(peers, config.repetitions, on_row)
-    if name == "environments":
-        from benchmarks import environments
-
-        return environments.run(peers, config.repetitions, on_row)
-    if name == "training":
-        from benchmarks import training
-
-        return training.run(config.repetitions, on_row)
-    if name == "roofline":
-        from benchmarks import roofline
-
-        return roofline.run(config.repetitions, on_row)
-    if name == "scaling":
-        from benchmarks import scaling
-
-        return scaling.run(config.repetitions, on_row, config.figure)
-    from benchmarks import startup
-
-    return startup.run(config.repetitions, on_row)
+        module.write_samples(samples)
+    told: dict[str, Any] = {
+        "peers": peers,
+        "repetitions": config.repetitions,
+        "on_row": on_row,
+        "figure": config.figure,
+    }
+    section: Section = module.run(**{each: told[each] for each in inspect.signature(module.run).parameters})
+    return section
 
 
 def describe_machine() -> dict[str, Any]:

@@ -91,7 +91,7 @@ def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatA
 def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatArray | None:
     """(n,) D-efficiency of the systems that the track's stored `Oracle` has; None without one."""
     from agents.evaluation.oracle import Oracle
-    from agents.evaluation.oracle_task import Systems
+    from agents.evaluation.systems import Systems
 
     try:
         oracle = Oracle.of(Systems.of(env_id, evaluation.inputs.shape[1], options))

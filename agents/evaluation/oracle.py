@@ -7,14 +7,14 @@ lower bound of the highest. So whoever finds a better input puts it in its place
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from agents.evaluation.oracle_task import Systems
+from agents.evaluation.systems import Systems
 from estimator.files import write_atomically
 from estimator.information import fisher_information
 from estimator.parameters import FloatArray
@@ -39,21 +39,20 @@ class Oracle:
         """The stored oracle, of as many of the systems as it has.
 
         Raises:
-            FileNotFoundError: if none is stored for this task, saying which command makes one.
+            FileNotFoundError: if none is stored for them, saying which command makes one.
             ValueError: if it is for other systems.
         """
-        path = systems.task.path
+        path = systems.path
         if not path.is_file():
-            raise FileNotFoundError(
-                f"no oracle is stored for {systems.task}; run python -m agents.evaluation.oracle_search --env ..."
-            )
+            command = "python -m agents.evaluation.oracle_search --env ..."
+            raise FileNotFoundError(f"no oracle is stored for {systems.description}; run {command}")
         with np.load(path, allow_pickle=False) as stored:
             scaled, theta = stored["inputs"], stored["theta"]
         n = min(len(theta), len(systems.theta))
         if not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
             raise ValueError(f"oracle must be for the systems at hand, but {path.name} is not; make it anew")
-        chosen = Systems(systems.task, systems.theta[:n], systems.precision)
-        inputs = systems.task.max_input * scaled[:n].astype(np.float64)
+        chosen = replace(systems, theta=systems.theta[:n])
+        inputs = systems.limits.amplitude * scaled[:n].astype(np.float64)
         return cls(chosen, inputs, chosen.worth(inputs)[0])
 
     def save(self) -> Path:
@@ -61,13 +60,13 @@ class Oracle:
         content = BytesIO()
         np.savez_compressed(
             content,
-            inputs=as_stored(self.inputs / self.systems.task.max_input),
+            inputs=as_stored(self.inputs / self.systems.limits.amplitude),
             theta=self.systems.theta,
             values=self.values,
-            task=np.array(json.dumps(self.systems.task.description)),
+            task=np.array(json.dumps(self.systems.description)),
         )
-        write_atomically(self.systems.task.path, content.getvalue())
-        return self.systems.task.path
+        write_atomically(self.systems.path, content.getvalue())
+        return self.systems.path
 
     def efficiency(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike) -> FloatArray:
         """D-efficiency (n,) of an episode: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / K] for K coefficients.
@@ -87,13 +86,13 @@ class Oracle:
         u = np.asarray(inputs, dtype=np.float64)
         if u.ndim != 2 or len(u) > len(self.values):
             raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
-        task = self.systems.task
+        plant, e = self.systems.plant, self.systems.experiment
         information = fisher_information(
-            task.model, self.systems.theta[: len(u)], u, task.process_noise, task.measurement_noise, y=outputs,
-            interpolation=task.interpolation,
+            plant.model, self.systems.theta[: len(u)], u, e.process_noise, e.measurement_noise, y=outputs,
+            interpolation=plant.interpolation,
         )  # fmt: skip
         values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]
-        efficiency: FloatArray = np.exp(2 * (values - self.values[: len(u)]) / task.model.n_coefficients)
+        efficiency: FloatArray = np.exp(2 * (values - self.values[: len(u)]) / plant.model.n_coefficients)
         return efficiency
 
 

@@ -15,17 +15,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from agents.cli import JsonOptions, run_script
 from agents.evaluation.oracle import Oracle, as_stored
-from agents.evaluation.oracle_task import Systems, Task
 from agents.evaluation.rollout import evaluate
+from agents.evaluation.systems import Systems
 from agents.planner import search as planning
-from agents.planner.ascent import Limits, climber
+from agents.planner.ascent import climber
 from agents.planner.imagination import Terms
 from agents.planner.motion import View, scales
 from agents.planner.pursuit import pursuit
@@ -47,7 +47,7 @@ def search(
     which finds more than the gradient.
 
     Args:
-        systems: of a task.
+        systems: of a track.
         row: the system.
         given: (k, samples) inputs to start from besides [V].
         rng: of the random starts and changes.
@@ -56,82 +56,80 @@ def search(
     Returns:
         The best input (samples,) [V] that keeps all limits also as it is stored, and its worth [nats]; -inf if none.
     """
-    task = systems.task
-    one = Systems(task, np.repeat(systems.theta[row : row + 1], len(given) + _STARTS, axis=0), systems.precision)
-    is_planned = task.max_rms is None and task.model == difference()
-    best, best_value = np.zeros(task.samples), -np.inf
+    one = replace(systems, theta=np.repeat(systems.theta[row : row + 1], len(given) + _STARTS, axis=0))
+    model, limits = systems.plant.model, systems.limits
+    is_frugal = bool(np.isfinite(limits.energy))
+    is_planned = not is_frugal and model == difference()
+    best, best_value = np.zeros(systems.samples), -np.inf
     words = rng.integers(0, 2**64, 4, dtype=np.uint64)
-    pool = np.empty((_STARTS, task.samples))
-    if task.max_rms is None:
-        pool[:] = _signals(task, _STARTS, rng)
+    if is_frugal:
+        pool = np.empty((_STARTS, systems.samples))
+        pursuit(model, systems.degree).swings(one.known(0), limits.output, limits.energy, pool, words)
     else:
-        swings = pursuit(task.model, task.degree).swings
-        swings(one.known(0), task.max_output, task.energy, pool, words)
+        pool = _signals(_STARTS, systems.samples, limits.amplitude, rng)
     pool = np.concatenate([given, pool])
     for k in range(rounds + 1):
         if k == 0 or not is_planned:
             _climb(one, pool, 0.3 if k == 0 else 0.1)
         # What is stored is rounded; only what keeps the limits as stored counts.
-        pool = task.max_input * as_stored(pool / task.max_input).astype(np.float64)
+        pool = limits.amplitude * as_stored(pool / limits.amplitude).astype(np.float64)
         values, peaks = one.worth(pool)
-        values[~(peaks <= task.max_output)] = -np.inf
+        values[~(peaks <= limits.output)] = -np.inf
         if values.max() > best_value:
             best, best_value = pool[values.argmax()].copy(), float(values.max())
         if is_planned:
             pool = np.stack([_planned(best, one, rng, words) for _ in range(_COPIES)])
         else:
-            pool = np.stack([_changed(best, task, rng) for _ in range(_COPIES)])
+            pool = np.stack([_changed(best, rng) for _ in range(_COPIES)])
     return best, best_value
 
 
 def _climb(one: Systems, pool: FloatArray, rate: float) -> None:
     """Gradient ascent from every input of a pool (k, samples), in place."""
-    task = one.task
-    limits = Limits(task.max_output, task.max_output, task.max_input, task.energy)
-    improve = climber(task.model, task.degree).improve
-    improve(one.known(0), limits, rate, _ITERATIONS, pool, np.empty(len(pool)))
+    improve = climber(one.plant.model, one.degree).improve
+    improve(one.known(0), one.limits, rate, _ITERATIONS, pool, np.empty(len(pool)))
 
 
 def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.NDArray[np.uint64]) -> FloatArray:
     """A copy that the planner, who knows the system, plans anew from a random sample on."""
-    task = one.task
     planned = u.copy()
-    model, n = task.model, task.model.n_states
+    model, limits = one.plant.model, one.limits
+    n = model.n_states
     mean, cov = np.zeros(len(model.names)), np.zeros((len(model.names), len(model.names)))
     mean[n:], cov[n:, n:] = one.theta[0], np.linalg.inv(one.precision)
-    noises = [(1.0, variance) for variance in task.noises]
+    noises = [(1.0, variance) for variance in one.noises]
     record = Belief.of(model, mean, cov, noises[0], noises[1:]).record.copy()
-    first = int(rng.integers(-task.samples // 8, task.samples - 1))
+    first = int(rng.integers(-one.samples // 8, one.samples - 1))
     horizon, rounds = int(rng.integers(8, 25)), int(rng.integers(1, 9))
-    limit = 0.9999 * task.max_output  # leaves room for the rounding of what is stored
-    view = View(model, task.degree)
-    sizes = scales(view, one.theta[0], task.max_input, limit)
-    terms = Terms(task.max_input, np.inf, limit, 0.0, np.zeros(model.n_coefficients), sizes)
+    limit = 0.9999 * limits.output  # leaves room for the rounding of what is stored
+    view = View(model, one.degree)
+    sizes = scales(view, one.theta[0], limits.amplitude, limit)
+    terms = Terms(limits.amplitude, np.inf, limit, 0.0, np.zeros(model.n_coefficients), sizes)
     planning.search(*view).play(record, first, horizon, rounds, terms, planned, words)
     return planned
 
 
-def _signals(task: Task, count: int, rng: np.random.Generator) -> FloatArray:
+def _signals(count: int, samples: int, amplitude: float, rng: np.random.Generator) -> FloatArray:
     """(count, samples) random binary signals of several holds, and square waves about resonance."""
-    signals = np.empty((count, task.samples))
-    t = np.arange(task.samples)
+    signals = np.empty((count, samples))
+    t = np.arange(samples)
     for i in range(count):
         if i % 2:
             half_period = rng.uniform(2.5, 6.0)  # of 610 Hz: 50 to 120 Hz
             signals[i] = np.where(((t + rng.uniform(0, 12)) // half_period) % 2 == 0, 1.0, -1.0)
         else:
             hold = rng.integers(1, 9)
-            signals[i] = np.repeat(rng.choice([-1.0, 1.0], -(-task.samples // hold)), hold)[: task.samples]
+            signals[i] = np.repeat(rng.choice([-1.0, 1.0], -(-samples // hold)), hold)[:samples]
         # Weak ones too, because strong ones may begin far beyond the displacement limit.
-        signals[i] *= task.max_input * rng.choice([0.3, 0.6, 1.0])
+        signals[i] *= amplitude * rng.choice([0.3, 0.6, 1.0])
     return signals
 
 
-def _changed(u: FloatArray, task: Task, rng: np.random.Generator) -> FloatArray:
+def _changed(u: FloatArray, rng: np.random.Generator) -> FloatArray:
     """A copy with a stretch turned over, shifted, or drawn anew."""
     changed = u.copy()
-    length = int(rng.integers(4, max(5, task.samples // 4)))
-    first = int(rng.integers(0, task.samples - length + 1))
+    length = int(rng.integers(4, max(5, len(u) // 4)))
+    first = int(rng.integers(0, len(u) - length + 1))
     stretch = slice(first, first + length)
     kind = rng.integers(3)
     if kind == 0:
@@ -154,14 +152,14 @@ def design(
     """Search all systems; what is stored is a start, so the result is never worse.
 
     Args:
-        systems: of a task.
+        systems: of a track.
         given: (k, n, samples) inputs to start from besides [V].
         rounds: see `search`.
         seed: of the search.
         on_row: called with each row and its value.
     """
     n = len(systems.theta)
-    inputs, values = np.zeros((n, systems.task.samples)), np.full(n, -np.inf)
+    inputs, values = np.zeros((n, systems.samples)), np.full(n, -np.inf)
     try:
         stored = Oracle.of(systems)
         inputs[: len(stored.values)], values[: len(stored.values)] = stored.inputs, stored.values
@@ -201,7 +199,7 @@ class Config:
 def main(config: Config) -> None:
     """Search, store, and say how far it is."""
     systems = Systems.of(config.env, config.systems, config.options)
-    given = np.empty((0, config.systems, systems.task.samples))
+    given = np.empty((0, config.systems, systems.samples))
     if config.policies:
         played = evaluate(config.policies, config.env, config.systems, options=config.options)
         given = np.stack([evaluation.inputs.T for evaluation in played])

@@ -82,51 +82,77 @@ def places(model: Model) -> Places:
     )  # fmt: skip
 
 
+class Survey(NamedTuple):
+    """What n systems do by themselves, at given states.
+
+    Attributes:
+        shown: (n,) what the first sensor shows.
+        velocities: (n,) its velocity.
+        gains: (n,) the gain (`estimator.engine.motion`).
+        slopes: (n, states, states) of the linear part.
+        regressors: (n, K) derivatives of a sample's moves by the coefficients, under an input that is on.
+    """
+
+    shown: FloatArray
+    velocities: FloatArray
+    gains: FloatArray
+    slopes: FloatArray
+    regressors: FloatArray
+
+
 @cache
 def _surveyor(model: Model) -> Any:
-    """``survey(means, states, shown, velocities, slopes)`` fills in what n systems show, and their linear parts."""
-    found = motion(model)
-    at, sense, linearise = found.layout, found.sense, found.linearise
-    n, k, size, first = model.n_states, model.n_coefficients, len(at), at["INPUT"]
-    now, velocity = at["NOW"], at["VELOCITY"]
-    state = next(iter(model.states))
-    linear = at[f"A_{state}_{state}"]
+    """``survey(means, states, inputs, found)`` fills in a `Survey`."""
+    moving = motion(model)
+    at, sense, linearise, regress = moving.layout, moving.sense, moving.linearise, moving.regress
+    n, k, size, u = model.n_states, model.n_coefficients, len(at), at["INPUT"]
+    now, velocity, gain = at["NOW"], at["VELOCITY"], at["GAIN"]
+    state, coefficient = next(iter(model.states)), next(iter(model.coefficients))
+    linear, first = at[f"A_{state}_{state}"], at[f"E_{coefficient}"]
 
     @kernel(kind=f"{model.name}_{model.digest}")
-    def survey(means, states, shown, velocities, slopes):
+    def survey(means, states, inputs, found):
         W = np.zeros(size)
         for i in range(len(means)):
             copy(W, 0, states[i], n)
             copy(W, n, means[i], k)
+            W[u] = inputs
             sense(W)
             linearise(W)
-            shown[i], velocities[i] = W[now], W[velocity]
+            regress(W)
+            found.shown[i], found.velocities[i], found.gains[i] = W[now], W[velocity], W[gain]
             for a in range(n):
                 for b in range(n):
-                    slopes[i, a, b] = W[linear + a * n + b]
+                    found.slopes[i, a, b] = W[linear + a * n + b]
+            copy(found.regressors[i], 0, W[first:], k)
 
-    assert first == n + k
     return survey
 
 
-def survey(model: Model, means: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What systems do by themselves.
+def survey(model: Model, means: npt.ArrayLike, states: npt.ArrayLike, u: float = 0.0) -> Survey:
+    """What systems do, at states and under an input.
 
     Args:
         model: of all.
         means: (n, K) their coefficients.
         states: (n, states) where they are.
-
-    Returns:
-        What the first sensor shows (n,), its velocity (n,), and the frequency (n,) in cycles per sample at which the
-        linear part rings: the highest, or 0 where it does not ring.
+        u: the input.
     """
-    count, size = len(means), model.n_states
-    shown, velocities, slopes = np.empty(count), np.empty(count), np.empty((count, size, size))
-    _surveyor(model)(np.ascontiguousarray(means), np.ascontiguousarray(states), shown, velocities, slopes)
+    points = np.ascontiguousarray(np.atleast_2d(means), dtype=np.float64)
+    where = np.ascontiguousarray(np.atleast_2d(states), dtype=np.float64)
+    count, n, k = len(points), model.n_states, model.n_coefficients
+    shown, velocities, gains = np.empty((3, count))
+    found = Survey(shown, velocities, gains, np.empty((count, n, n)), np.empty((count, k)))
+    _surveyor(model)(points, where, float(u), found)
+    return found
+
+
+def resonances(model: Model, slopes: FloatArray) -> FloatArray:
+    """(n,) the frequencies in cycles per sample at which linear parts ring: the highest, or 0 where one does not."""
     poles = np.linalg.eigvals(slopes)
     angles = np.abs(poles.imag if model.is_continuous else np.where(poles.imag != 0, np.angle(poles), 0.0))
-    return shown, velocities, angles.max(axis=-1) / (2.0 * np.pi)
+    highest: FloatArray = angles.max(axis=-1) / (2.0 * np.pi)
+    return highest
 
 
 #: Samples of the motion by which states are measured, and where it turns, in parts of the limit.
@@ -184,38 +210,3 @@ def scales(view: View, prior_means: npt.ArrayLike, max_input: float, limit: floa
     keeps = np.array([x == sensor or (not model.is_continuous and move == sensor) for x, move in moves])
     keeps |= (peaks[:-1] <= 0) | (peaks[-1] <= 0)
     return limit * np.divide(peaks[:-1], peaks[-1], out=np.ones(model.n_states), where=~keeps)
-
-
-@cache
-def _describer(model: Model) -> Any:
-    """``describe(means, states, u, made)``: fills in the regressors, and gives the gain."""
-    found = motion(model)
-    at, sense, regress = found.layout, found.sense, found.regress
-    n, k, size, gain = model.n_states, model.n_coefficients, len(at), at["GAIN"]
-    first, u = at[f"E_{next(iter(model.coefficients))}"], at["INPUT"]
-
-    @kernel(kind=f"{model.name}_{model.digest}")
-    def describe(means, states, u_now, made):
-        W = np.zeros(size)
-        copy(W, 0, states, n)
-        copy(W, n, means, k)
-        W[u] = u_now
-        sense(W)
-        regress(W)
-        copy(made, 0, W[first:], k)
-        return W[gain]
-
-    return describe
-
-
-def regressors(model: Model, means: FloatArray, states: FloatArray, u: float) -> FloatArray:
-    """(K,) derivatives of a sample's moves by the coefficients, at states (n,) and an input that is on."""
-    made = np.empty(model.n_coefficients)
-    _describer(model)(means, states, float(u), made)
-    return made
-
-
-def typical_gain(model: Model, means: FloatArray) -> float:
-    """The gain (`estimator.engine.motion`) at rest, without its sign."""
-    made = np.empty(model.n_coefficients)
-    return abs(float(_describer(model)(means, np.zeros(model.n_states), 0.0, made)))

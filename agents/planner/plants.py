@@ -30,13 +30,6 @@ class Plant(NamedTuple):
 
 def plant_of(experiment: Any) -> Plant:
     """The plant of an experiment that simulates one."""
-    return Plant(experiment.plant, _interpolation(experiment, experiment.plant), experiment.prior_of(experiment.plant))
-
-
-def believed_of(experiment: Any) -> tuple[Model, str]:
-    """The model whose coefficients an experiment's estimator believes in, and the interpolation of the input."""
-    return experiment.model, _interpolation(experiment, experiment.model)
-
-
-def _interpolation(experiment: Any, model: Model) -> str:
-    return "linear" if experiment.degree and model.is_continuous else "zero_order"
+    model = experiment.plant
+    interpolation = "linear" if experiment.degree and model.is_continuous else "zero_order"
+    return Plant(model, interpolation, experiment.prior_of(model))

@@ -38,10 +38,8 @@ from scipy.special import ndtri
 
 from agents.planner.imagination import Terms
 from agents.planner.motion import View, places, scales
-from agents.planner.plants import believed_of
 from agents.planner.pursuit import Rule, pursuit
 from agents.planner.search import search
-from estimator.engine.feeding import input_degree
 from estimator.parameters import FloatArray
 
 #: The last plans (n, horizon) in V, what plans taught per sample (n, K, K), the streams of random numbers (n, 4), and
@@ -119,8 +117,7 @@ class Planner:
         horizon = env.horizon if whole else min(horizon or _HORIZON, env.horizon)
         self._energy = setup.budget if whole else None
         if whole:
-            model, interpolation = believed_of(experiment)
-            self._pursue = pursuit(model, input_degree(model, interpolation)).pursue
+            self._pursue = pursuit(self._view.model, self._view.degree).pursue
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)

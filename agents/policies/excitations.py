@@ -2,27 +2,8 @@
 
 `EXCITATIONS` makes a `Draw` from an amplitude limit. Every draw is new: what is not random about a signal (its band,
 its levels) is fixed, and its phase, order or start is drawn. The sampling rate is 610.35 Hz (δ = 1.6384 ms); an input
-is held for a sample. `agents.policies.signals.SignalPolicy` plays them, within a track's limits.
-
-| Name | Signal | Frequency content |
-|------|--------|-------------------|
-| ``silverbox-multisine`` | stretch of the record's multisine, 22.3 mV RMS | odd lines every 0.15 Hz up to 200 Hz |
-| ``silverbox-arrow`` | stretch of the record's arrow, up to 39 mV RMS | flat to 200 Hz |
-| ``uniform`` | independent, uniform in ±limit | white |
-| ``gaussian`` | independent, normal, clipped; standard deviation a third of the limit | white |
-| ``prbs`` | ±limit by a fair coin at every sample | white |
-| ``prbs-2``, ``-4``, ``-8`` | the same, each value held for 2, 4, 8 samples | sinc² with nulls at 305, 153, 76 Hz |
-| ``multilevel-prbs`` | one of five levels, -1, -½, 0, ½, 1 of the limit, held for 4 samples | as ``prbs-4`` |
-| ``multisine`` | all lines of the draw, equal amplitudes, random phases, peak at the limit | flat, 10 to 150 Hz |
-| ``schroeder`` | the same with Schroeder's phases, from a random place of its period | flat, 10 to 150 Hz |
-| ``chirp-linear`` | sine at the limit; frequency linear in time, 10 to 150 Hz in a draw | flat, 10 to 150 Hz |
-| ``chirp-log`` | the same, exponential in time: equal time in every octave | falling by 3 dB an octave, 10 to 150 Hz |
-| ``square`` | ±limit at the resonance of the twin, 68.1 Hz | a line and its odd harmonics |
-
-Why 10 to 150 Hz: the linear resonances of oscillators within ±30 % of the twin lie between 49 and 95 Hz, and the cubic
-term lifts them as the displacement grows. Below the resonance an oscillator answers with its stiffness, at it with
-its damping, and above it with its mass: a band with room on both sides tells the three apart. Above 150 Hz the
-response is less than a third of the static one, and what is spent there is hardly seen by the sensor.
+is held for a sample. `agents.policies.signals.SignalPolicy` plays them, within a track's limits. docs/policies.md has a
+table of them, with their frequency content.
 """
 
 from __future__ import annotations
@@ -41,7 +22,11 @@ from estimator.physical import coefficients_of
 Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
 
 BAND = (10.0, 150.0)
-"""Of multisines and chirps [Hz]."""
+"""Of multisines and chirps [Hz].
+
+The linear resonances of oscillators within ±30 % of the twin lie between 49 and 95 Hz. Below the resonance one answers
+with its stiffness, at it with its damping, above it with its mass: a band with room on both sides tells the three apart.
+"""
 
 LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Of ``multilevel-prbs``, in parts of the limit; the small ones show the linear term, the large ones the cubic one."""

@@ -1,10 +1,5 @@
 """Classical policies with feedback: they read the believed resonance, or the believed velocity, off the observation.
 
-| Name | Input | Frequency content |
-|------|-------|-------------------|
-| ``square-believed`` | square wave at the linear resonance of the posterior's mean | a moving line, odd harmonics |
-| ``velocity-sign`` | ±limit with the sign of the believed velocity | the resonance of that amplitude |
-
 Velocity and resonance are those of any model (`agents.planner.motion`): of Eq. (2) x_t - x_{t-1} and the angle of the
 poles, of Eq. (1) x' and the square root of the stiffness over the mass, but for the damping.
 
@@ -24,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.planner.motion import places, survey
+from agents.planner.motion import places, resonances, survey
 from agents.policies.excitations import BAND
 from agents.policies.signals import Limits, check_rows, limits_of
 from duffing_env.experiment import Experiment, SimulatedExperiment
@@ -71,8 +66,9 @@ class FeedbackPolicy:
         at, k, n = self._places, self._model.n_coefficients, self._model.n_states
         means = self._centers + self._stds * rows[:, at.mean : at.mean + k]
         states = self._limit * rows[:, at.state : at.state + n]
-        shown, velocities, cycles = survey(self._model, means, states)
-        return shown / self._limit, velocities / self._limit, np.clip(cycles, *_BAND)
+        found = survey(self._model, means, states)
+        cycles = np.clip(resonances(self._model, found.slopes), *_BAND)
+        return found.shown / self._limit, found.velocities / self._limit, cycles
 
     def _amplitude(
         self, shown: NDArray[np.float64], velocities: NDArray[np.float64], cycles: NDArray[np.float64]

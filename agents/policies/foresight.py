@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.planner.motion import View, places, regressors, scales, typical_gain
+from agents.planner.motion import View, places, scales, survey
 from agents.policies.prospects import Outlook, look_at
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
@@ -113,7 +113,8 @@ class Foresight:
         here, there = self._outlook, _outlook_of(env.experiment, self._outlook.rate)
         if np.isfinite(here.energy) != np.isfinite(there.energy):
             return self
-        made, made_there = (regressors(self._view.model, here.center, o.scales, o.max_input) for o in (here, there))
+        at_limits = (survey(self._view.model, here.center, o.scales, o.max_input) for o in (here, there))
+        made, made_there = (found.regressors[0] for found in at_limits)
         growth = np.abs(np.divide(made_there, made, out=np.ones_like(made), where=made != 0))
         growth *= np.sqrt(here.variance / there.variance)
         return Foresight(there._replace(rate=here.rate * np.outer(growth, growth)), self._view)
@@ -142,7 +143,8 @@ class Foresight:
             sizes = (outlook.scales / outlook.max_output).astype(np.float32)
             states = view.features[:, first : first + self._view.model.n_states] / sizes
             at_rest = np.abs(states).max(axis=1) < _REST
-            nudge = _NUDGE * outlook.max_output / typical_gain(self._view.model, outlook.center)
+            at_rest_gain = survey(self._view.model, outlook.center, np.zeros(self._view.model.n_states)).gains[0]
+            nudge = _NUDGE * outlook.max_output / abs(at_rest_gain)
             motions = np.where(at_rest, nudge, view.motions)
             chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / outlook.max_input, -1.0, 1.0)
         up, none, down = view.safe.T

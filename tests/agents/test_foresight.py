@@ -417,15 +417,14 @@ def test_rewards_that_count_no_information_stay_as_they_are():
 def test_the_example_brings_about_as_much_as_the_oracle():
     """In the volume of what a sample tells, within a factor of two."""
     from agents.evaluation.oracle import Oracle
-    from agents.evaluation.oracle_task import Systems
+    from agents.evaluation.systems import Systems
     from estimator import fisher_information
 
     systems = Systems.of(AMPLITUDE, 32)
-    task = systems.task
-    told = fisher_information(
-        task.model, systems.theta, Oracle.of(systems).inputs[:32], task.process_noise, task.measurement_noise
-    )
-    best = told.mean(axis=0) / task.samples
+    model, experiment = systems.plant.model, systems.experiment
+    noises = experiment.process_noise, experiment.measurement_noise
+    told = fisher_information(model, systems.theta, Oracle.of(systems).inputs[:32], *noises)
+    best = told.mean(axis=0) / systems.samples
     example = example_rate(AMPLITUDE, {}, seed=0)
     ratio = np.exp((np.linalg.slogdet(example)[1] - np.linalg.slogdet(best)[1]) / 4)
     assert 0.5 < ratio < 1.1

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from agents.evaluation import oracle_search as module
-from agents.evaluation import oracle_task
+from agents.evaluation import systems as module_of_systems
 from agents.evaluation.oracle import Oracle, as_stored
 from agents.evaluation.oracle_search import Config, design, main, search
-from agents.evaluation.oracle_task import Systems
 from agents.evaluation.rollout import evaluate
+from agents.evaluation.systems import Systems
 
 SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Continuous-v0"
 STORED = [SHORT, POWER, "duffing_env/Amplitude-v0", "duffing_env/Output-v0"]
@@ -16,7 +16,7 @@ STORED = [SHORT, POWER, "duffing_env/Amplitude-v0", "duffing_env/Output-v0"]
 
 @pytest.fixture
 def empty_folder(monkeypatch, tmp_path):
-    monkeypatch.setattr(oracle_task, "FOLDER", tmp_path)
+    monkeypatch.setattr(module_of_systems, "FOLDER", tmp_path)
     return tmp_path
 
 
@@ -38,8 +38,8 @@ def gains(systems, values):
 def test_rows_do_not_depend_on_their_number():
     few, many = Systems.of(SHORT, 2), Systems.of(SHORT, 5)
     np.testing.assert_array_equal(few.theta, many.theta[:2])
-    assert few.task == many.task
-    assert few.task.path == many.task.path
+    assert few.description == many.description
+    assert few.path == many.path
 
 
 @pytest.mark.slow  # a search
@@ -59,7 +59,7 @@ def test_the_search_keeps_the_limits_and_beats_a_random_signal():
 def test_under_a_budget_the_search_spends_it_in_a_burst():
     systems = Systems.of(POWER, 1)
     u, value = search(systems, 0, np.empty((0, 256)), np.random.default_rng(0), rounds=1)
-    energy = (u**2).sum() / systems.task.energy
+    energy = (u**2).sum() / systems.limits.energy
     assert 0.99 < energy <= 1
     # Spread evenly over the episode, the same energy tells 3 nats less.
     square = 0.0222 * np.sign(np.sin(2 * np.pi * 68 / 610.35 * np.arange(256) + 0.1))
@@ -71,11 +71,11 @@ def test_under_a_budget_the_search_spends_it_in_a_burst():
 def test_the_search_serves_the_differential_equation_too(options, empty_folder):
     systems = Systems.of(CONTINUOUS, 1, {"horizon": 48, **options})
     rng = np.random.default_rng(0)
-    given = 0.03 * rng.choice([-1.0, 1.0], (1, systems.task.samples))
+    given = 0.03 * rng.choice([-1.0, 1.0], (1, systems.samples))
     u, value = search(systems, 0, given, rng, rounds=1)
     values, peaks = systems.worth(u[None])
     assert np.abs(u).max() <= 0.15
-    assert (u**2).sum() <= systems.task.energy
+    assert (u**2).sum() <= systems.limits.energy
     assert peaks[0] <= 0.6
     assert value == values[0]
     assert value > systems.worth(given)[0][0] + 2.0
@@ -135,7 +135,7 @@ def test_a_search_that_starts_from_better_inputs_ends_no_worse(monkeypatch):
 def test_the_command_stores_and_says_where(empty_folder, capsys):
     main(Config(env=SHORT, systems=2, policies=("prbs",), rounds=0))
     assert "2 systems in" in capsys.readouterr().out
-    assert [path.name for path in empty_folder.iterdir()] == [Systems.of(SHORT, 1).task.path.name]
+    assert [path.name for path in empty_folder.iterdir()] == [Systems.of(SHORT, 1).path.name]
 
 
 def test_efficiency_is_one_for_the_oracle_itself_and_counts_until_the_end():
@@ -163,11 +163,11 @@ def test_what_is_stored_is_never_larger_and_stays():
 @pytest.mark.parametrize("track", STORED)
 def test_stored_oracles_keep_the_limits_of_their_tracks(track):
     oracle = Oracle.of(Systems.of(track, 256))
-    task = oracle.systems.task
+    limits = oracle.systems.limits
     assert len(oracle.values) == 256
-    assert np.abs(oracle.inputs).max() <= task.max_input
-    assert oracle.systems.worth(oracle.inputs)[1].max() <= task.max_output
-    assert np.all((oracle.inputs**2).sum(axis=1) <= task.energy * (1 + 1e-9))
+    assert np.abs(oracle.inputs).max() <= limits.amplitude
+    assert oracle.systems.worth(oracle.inputs)[1].max() <= limits.output
+    assert np.all((oracle.inputs**2).sum(axis=1) <= limits.energy * (1 + 1e-9))
     assert gains(oracle.systems, oracle.values).min() > (15.0 if track == POWER else 18.0)
 
 

@@ -1,0 +1,119 @@
+"""The systems of a track that input is designed for, and what its worth and its limits depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from agents.evaluation.batch import make
+from agents.planner.ascent import Limits, climber
+from agents.planner.design import Known
+from agents.planner.plants import Plant, plant_of
+from duffing_env.experiment import SimulatedExperiment
+from estimator.engine.feeding import input_degree
+from estimator.information import variances
+from estimator.models.difference import difference
+from estimator.parameters import FloatArray
+
+FOLDER = Path(__file__).parents[1] / "oracles"
+
+
+@dataclass(frozen=True)
+class Systems:
+    """The first systems of a track, by row.
+
+    Attributes:
+        experiment: what they are drawn for.
+        theta: (n, K) their coefficients.
+        precision: (K, K) Λ0.
+    """
+
+    experiment: SimulatedExperiment
+    theta: FloatArray
+    precision: FloatArray
+
+    @classmethod
+    def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None) -> Systems:
+        """The first systems of a track, as they are evaluated with seed 0.
+
+        Raises:
+            ValueError: where its plant is none that is simulated and stays as it is.
+        """
+        envs = make(env_id, count, options)
+        envs.reset(seed=0)
+        e = envs.experiment
+        if not isinstance(e, SimulatedExperiment) or e.jump or e.max_slew is not None:
+            raise ValueError(f"env must simulate a plant without jump and slew limit, but is {e}; choose another track")
+        plant = plant_of(e)
+        precision = np.linalg.inv(plant.prior.coefficients_cov).astype(np.float64)
+        return cls(e, plant.coefficients_of(envs.truth), precision)
+
+    @property
+    def plant(self) -> Plant:
+        """What they obey."""
+        return plant_of(self.experiment)
+
+    @property
+    def samples(self) -> int:
+        """Of an episode."""
+        return self.experiment.samples
+
+    @property
+    def limits(self) -> Limits:
+        """What inputs must keep, over an episode."""
+        e = self.experiment
+        energy = np.inf if e.max_rms is None else e.max_rms**2 * e.samples
+        return Limits(e.max_output, e.max_output, e.max_input, energy)
+
+    @property
+    def noises(self) -> tuple[float, ...]:
+        """Variances of the process noise and of each sensor's."""
+        return variances(self.plant.model, self.experiment.process_noise, self.experiment.measurement_noise)
+
+    @property
+    def degree(self) -> int:
+        """Of the input's polynomial over a sample."""
+        return input_degree(self.plant.model, self.plant.interpolation)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Everything that the worth of an input, and which inputs are allowed, depend on.
+
+        The paper's equation goes without saying, as it does in what was stored first.
+        """
+        e, plant = self.experiment, self.plant
+        names = ("max_input", "max_output", "samples", "process_noise", "measurement_noise", "spread")
+        told = {name: getattr(e, name) for name in names}
+        told |= {"plant_spread": e.spread if e.plant_spread is None else e.plant_spread, "max_rms": e.max_rms}
+        if plant.model == difference():
+            return told
+        return told | {"model": plant.model.digest, "interpolation": plant.interpolation}
+
+    @property
+    def path(self) -> Path:
+        """The file in the package that holds their oracle."""
+        digest = hashlib.sha256(json.dumps(self.description).encode()).hexdigest()[:12]
+        return FOLDER / f"{self.samples}-samples-{digest}.npz"
+
+    def known(self, row: int) -> Known:
+        """What the worth of an input to one system is taken at."""
+        return Known(self.theta[row].copy(), self.precision, self.noises)
+
+    def worth(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Worth ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
+
+        Each (n,). Inputs that are not finite, as after the end of an episode, tell nothing from there on.
+        """
+        u = np.array(inputs, dtype=np.float64)
+        if u.ndim != 2 or len(u) > len(self.theta):
+            raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.theta)}, but have {u.shape}")
+        values, peaks = np.empty((2, len(u)))
+        appraise = climber(self.plant.model, self.degree).appraise
+        appraise(self.theta, self.precision, self.noises, self.limits.output, u, values, peaks)
+        return values, peaks
