@@ -75,12 +75,7 @@ def _run(name: str, config: Config, peers: Peers, samples: Path, on_row: Callabl
     module = importlib.import_module(f"benchmarks.{name}")
     if name == "estimators":
         module.write_samples(samples)
-    told: dict[str, Any] = {
-        "peers": peers,
-        "repetitions": config.repetitions,
-        "on_row": on_row,
-        "figure": config.figure,
-    }
+    told: dict[str, Any] = {**vars(config), "peers": peers, "on_row": on_row}
     section: Section = module.run(**{each: told[each] for each in inspect.signature(module.run).parameters})
     return section
 

@@ -25,7 +25,7 @@ BAND = (10.0, 150.0)
 """Of multisines and chirps [Hz].
 
 The linear resonances of oscillators within ±30 % of the twin lie between 49 and 95 Hz. Below the resonance one answers
-with its stiffness, at it with its damping, above it with its mass: a band with room on both sides tells the three apart.
+with its stiffness, at it with its damping, above it with its mass: a band with room on both sides tells them apart.
 """
 
 LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)

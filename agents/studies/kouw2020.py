@@ -62,37 +62,22 @@ class Setting:
     models: tuple[str, ...] = ("FEM-LARX", "FEM-NLARX")
 
 
+_ALL = ("PEM-NARX", "FEM-LARX", "FEM-NLARX")
+
 SETTINGS = {
     "as_published": Setting(
-        "mean field, input delay 0, with the two departures",
-        factorisation="mean_field",
-        input_delay=0,
-        as_published=True,
-        models=("PEM-NARX", "FEM-LARX", "FEM-NLARX"),
+        "mean field, input delay 0, with the two departures", "mean_field", 0, as_published=True, models=_ALL
     ),
     "through_environment": Setting(
         "the same, each sample a step of SilverboxReplay-v0",
-        factorisation="mean_field",
-        input_delay=0,
+        "mean_field",
+        0,
         as_published=True,
         through_environment=True,
     ),
-    "corrected_messages": Setting(
-        "mean field, input delay 0, messages as derived",
-        factorisation="mean_field",
-        input_delay=0,
-    ),
-    "as_derived": Setting(
-        "mean field, input delay 1, messages as derived",
-        factorisation="mean_field",
-        input_delay=1,
-        models=("PEM-NARX", "FEM-LARX", "FEM-NLARX"),
-    ),
-    "structured": Setting(
-        "states and coefficients jointly Gaussian, input delay 1",
-        factorisation="structured",
-        input_delay=1,
-    ),
+    "corrected_messages": Setting("mean field, input delay 0, messages as derived", "mean_field", 0),
+    "as_derived": Setting("mean field, input delay 1, messages as derived", "mean_field", 1, models=_ALL),
+    "structured": Setting("states and coefficients jointly Gaussian, input delay 1", "structured", 1),
 }
 
 
