@@ -1,10 +1,10 @@
 """Compare policies on common random numbers: a table, JSON and figures.
 
-python evaluate.py                                        the reference and baseline policies
-python evaluate.py --policies runs/demo prbs              a trained policy beside PRBS
-python evaluate.py --policies "ppo=runs/ppo-*-[0-4]"      five training seeds as one entry
-python evaluate.py --report runs/report                   all of it on one HTML page
-python evaluate.py --options '{"max_output": 0.3}'        under another limit
+$ python evaluate.py                                        the reference and baseline policies
+$ python evaluate.py --policies runs/demo prbs              a trained policy beside PRBS
+$ python evaluate.py --policies "ppo=runs/ppo-*-[0-4]"      five training seeds as one entry
+$ python evaluate.py --report runs/report                   all of it on one HTML page
+$ python evaluate.py --options '{"max_output": 0.3}'        under another limit
 """
 
 from __future__ import annotations

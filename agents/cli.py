@@ -1,17 +1,15 @@
-"""What the command lines of the scripts share."""
+"""What the command lines share: those of the scripts, and of ``duffing-env``."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import gymnasium as gym
 import tyro
-from gymnasium.envs.registration import load_env_creator
-from gymnasium.error import Error as GymnasiumError
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from tyro.constructors import PrimitiveConstructorSpec
@@ -53,6 +51,9 @@ def check_track(env_id: str) -> None:
         ValueError: for an environment of another package, or one that cannot be imported.
         gymnasium.error.Error: for an id that is not registered.
     """
+    import gymnasium as gym
+    from gymnasium.envs.registration import load_env_creator
+
     from duffing_env.vector_env import DuffingVectorEnv
 
     try:
@@ -69,28 +70,46 @@ def check_track(env_id: str) -> None:
         )
 
 
+@contextmanager
+def told_in_one_line(name: str) -> Iterator[None]:
+    """End the process where the user can mend what went wrong, with one message and no traceback.
+
+    The exit status is 2 for a bad value or file, and 130 after Ctrl-C.
+
+    Args:
+        name: of the command, which stands before the message.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"{name}: stopped", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:
+        from gymnasium.error import Error as GymnasiumError
+
+        if not isinstance(error, ValueError | OSError | GymnasiumError):
+            raise
+        print(f"{name}: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
 def run_script(
     main: Callable[[Config], None],
     config: type[Config],
     description: str,
     default: Callable[[], Config] | None = None,
 ) -> None:
-    """Parse the command line into ``config`` and call ``main`` with it.
-
-    An error that the user can mend is printed as one message, with exit status 2 and no traceback.
+    """Parse the command line into ``config`` and call ``main`` with it, `told_in_one_line` where that fails.
 
     Args:
         main: what the script does.
         config: its settings, a dataclass.
-        description: stands above the list of settings in the help.
+        description: stands above the list of settings in the help; lines that begin with $ stay so.
         default: makes the settings that the command line changes, where they are not those of the class.
     """
-    try:
+    with told_in_one_line(Path(sys.argv[0]).name):
         if default is None:
             main(tyro.cli(config, description=description))
         else:
             start = default()
             main(tyro.cli(type(start), description=description, default=start))
-    except (ValueError, OSError, GymnasiumError) as error:
-        print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
-        sys.exit(2)

@@ -1,7 +1,7 @@
 """Write an excitation as CSV, for a real signal generator.
 
-python -m agents.policies.export prbs-4 --samples 1024 --output prbs.csv
-python -m agents.policies.export multisine --max-rms 0.0222 --output multisine.csv
+$ python -m agents.policies.export prbs-4 --samples 1024 --output prbs.csv
+$ python -m agents.policies.export multisine --max-rms 0.0222 --output multisine.csv
 
 The file has the columns ``t [s]`` and ``u [V]``; each input is held for a sample of 1.6384 ms (610.35 Hz).
 """

@@ -1,0 +1,4 @@
+# The names of `agents`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
+from .policies import POLICIES, Policy, make_policy
+
+__all__ = ["POLICIES", "Policy", "make_policy"]

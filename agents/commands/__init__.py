@@ -1,0 +1,47 @@
+"""``duffing-env``: the command for a user's own oscillator.
+
+Each command is a module here: a dataclass of what it takes, whose docstring is its help, with a method ``run`` that
+imports what is heavy. To add one, put it into `Command`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import tyro
+
+from agents.cli import told_in_one_line
+from agents.commands.identify import Identify
+from agents.commands.rig import Init, List
+
+NAME = "duffing-env"
+
+_subcommand = tyro.conf.subcommand
+
+#: What the command line chooses from: a name for each command, and commands of a group under one name.
+Command = (
+    Annotated[Identify, _subcommand("identify")]
+    | Annotated[
+        Annotated[Init, _subcommand("init")] | Annotated[List, _subcommand("list")],
+        _subcommand("rig", description="Describe your rig in a file; list the rigs that ship."),
+    ]
+)
+
+
+def main(words: list[str] | None = None) -> None:
+    """Run a command.
+
+    Args:
+        words: of the command line; those of this process where they are None.
+
+    Raises:
+        SystemExit: with status 2 where a value or a file is bad, and 130 after Ctrl-C.
+    """
+    with told_in_one_line(NAME):
+        tyro.cli(
+            Command,
+            prog=NAME,
+            description="Identify an oscillator of your own. Each command has its own --help.",
+            args=words,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        ).run()

@@ -1,0 +1,91 @@
+"""``duffing-env identify``: parameters of a user's own oscillator, from records."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from estimator import Result
+
+
+@dataclass(frozen=True)
+class Identify:
+    """Identify m, c, a and b from records, with intervals, and warn where these do not hold.
+
+    $ duffing-env identify rig.toml data.csv
+    $ duffing-env identify rig.toml monday.csv tuesday.csv --report out.html
+    $ duffing-env identify rig.toml data.csv --json > out.json
+    """
+
+    rig: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RIG")]
+    """Rig file, or the name of a rig that ships."""
+    data: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DATA", help_behavior_hint="(one or more)")
+    ]
+    """CSV or MAT files with the columns or variables u and y."""
+    report: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Write a page with figures here, which opens without a network."""
+    json: bool = False
+    """Print JSON instead of the table."""
+
+    def run(self) -> None:
+        """Identify, print, and write the page."""
+        from estimator import identify
+
+        if not self.data:
+            raise ValueError("data must name at least one CSV or MAT file; add it after the rig file")
+        result = identify(self.rig, list(self.data), progress=sys.stderr.isatty())
+        if self.report is not None:
+            result.report(self.report, [shlex.join(["duffing-env", *sys.argv[1:]])])
+        if self.json:
+            print(json.dumps(described(result), indent=1))
+            return
+        show(result)
+        if self.report is not None:
+            print(f"The page is {self.report}")
+
+
+def described(result: Result) -> dict[str, Any]:
+    """What the JSON holds."""
+    units, intervals = result.units, result.interval(0.9)
+    return {
+        "parameters": {
+            name: {"mean": mean, "std": std, "low": intervals[name][0], "high": intervals[name][1], "unit": units[name]}
+            for name, (mean, std) in result.parameters.items()
+        },
+        "noises": {name: {"mean": mean, "std": std} for name, (mean, std) in result.noises.items()},
+        "warnings": [{"name": warning.name, "message": warning.message} for warning in result.warnings],
+        "records": [
+            {"name": one.name, "samples": len(one.u), "missing": one.missing, "clipped": one.clipped}
+            for one in result.records
+        ],
+        "rig": result.rig.to_dict(),
+    }
+
+
+def show(result: Result) -> None:
+    """Print a table, and the warnings under it."""
+    from rich import box
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    units, intervals = result.units, result.interval(0.9)
+    table = Table("", "mean", "90 % interval", "unit", box=box.SIMPLE_HEAD)
+    for name, (mean, _) in result.parameters.items():
+        low, high = intervals[name]
+        table.add_row(name, f"{mean:.5g}", f"{low:.5g} to {high:.5g}", escape(units[name]))
+    console.print("m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0", highlight=False)
+    console.print(table)
+    for warning in result.warnings:
+        console.print(f"[bold red]{warning.name}[/]: {escape(warning.message)}", highlight=False)
+    if not result.warnings:
+        console.print("[green]No check speaks against this result.[/]")
