@@ -221,7 +221,7 @@ def _identify_in_track(case: Case, systems: int, seed: int) -> Identified:
     physical = {name: np.asarray(getattr(envs.truth, name)) for name in duffing().physical}
     truth = {}
     if case.estimator == "ode":
-        columns = coefficients_of(duffing(), physical, beliefs[0].step).T
+        columns = coefficients_of(duffing(), physical, beliefs[0].scales).T
         truth = dict(zip(duffing().coefficients, columns, strict=True))
     return beliefs, truth, physical, []
 

@@ -97,7 +97,7 @@ def plants(num_envs: int, factorisation: str = "structured") -> npt.NDArray[np.f
     place, prior = layout_of(experiment.kind), experiment.believed.record
     n_blocks = -(-num_envs // LANES)
     blocks = np.zeros((n_blocks, max(place.values()) + 1, LANES))
-    coefficients = coefficients_of(experiment.plant, experiment.center, experiment.step)
+    coefficients = coefficients_of(experiment.plant, experiment.center, experiment.scales)
     truth = {f"TRUE_{name}": value for name, value in zip(experiment.plant.coefficients, coefficients, strict=True)}
     truth |= {f"PARAM_{name}": value for name, value in experiment.center.items()}
     truth |= dict.fromkeys(noise_rows(experiment.plant).values(), NOISE)

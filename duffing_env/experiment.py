@@ -22,6 +22,7 @@ from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
 from estimator.settings import check_hypotheses
+from estimator.units import Scales
 
 #: More ratios of the noises than are worth their time: each is three updates a sample.
 MOST_HYPOTHESES = 99
@@ -112,6 +113,11 @@ class Experiment:
     def step(self) -> float:
         """Sampling step [s]."""
         return SAMPLING_STEP
+
+    @property
+    def scales(self) -> Scales:
+        """What one inside is worth outside."""
+        return Scales(self.step)
 
     @property
     def believed(self) -> Belief:
@@ -272,9 +278,9 @@ class SimulatedExperiment(Experiment):
 
     def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
         """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
-        mean, cov = log_uniform_moments(model, self.center, self.spread, self.step)
+        mean, cov = log_uniform_moments(model, self.center, self.spread, self.scales)
         noises = *self.noise_guesses, self.noise_shape
-        return weak_prior(model, mean, cov, *noises, step=self.step).factorised(factorisation)
+        return weak_prior(model, mean, cov, *noises, scales=self.scales).factorised(factorisation)
 
     @property
     def noise_guesses(self) -> tuple[float, float]:

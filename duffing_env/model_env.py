@@ -109,10 +109,10 @@ class ModelExperiment(SimulatedExperiment):
         """The prior of plants so drawn."""
         if self.std is None and model.n_outputs == 1:
             return super().prior_of(model, factorisation)
-        moments = gaussian_moments(model, self.center, dict(self.std or {}), self.step)
+        moments = gaussian_moments(model, self.center, dict(self.std or {}), self.scales)
         process, first = self.noise_guesses
         sensors = [first / self.measurement_noise * std for std in self.noises]  # all as far off as the first
-        return weak_prior(model, *moments, process, sensors, self.noise_shape, step=self.step)
+        return weak_prior(model, *moments, process, sensors, self.noise_shape, scales=self.scales)
 
     @property
     def plant_setup(self) -> dict[str, Any]:

@@ -122,13 +122,13 @@ def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray
     NaN where a model has no such parameter, or a belief none: the map divides by the gain (η), whose mean is about 0.4
     but may pass 0 on the way.
     """
-    model, step = beliefs[0].model, beliefs[0].step
+    model, scales = beliefs[0].model, beliefs[0].scales
     mean = np.array([belief.coefficients_mean for belief in beliefs])
     cov = np.array([belief.coefficients_cov for belief in beliefs])
     known = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2)) & (np.abs(mean[:, -1]) > 1e-9)
     means, stds = np.full((2, len(NAMES), len(beliefs)), np.nan)
     with np.errstate(all="ignore"):
-        physical, physical_cov = propagate(model, mean[known], cov[known], step)
+        physical, physical_cov = propagate(model, mean[known], cov[known], scales)
         variances = np.diagonal(physical_cov, axis1=-2, axis2=-1)
     for place, name in enumerate(model.physical):
         if name in NAMES:

@@ -14,12 +14,9 @@ from estimator.engine.rows import belief_names
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
-from estimator.units import Scales
+from estimator.units import VOLTS, Scales
 
 Self = TypeVar("Self", bound="Belief")
-
-#: The Silverbox's: input and output in volts, as they are.
-_VOLTS = Scales()
 
 #: The Silverbox's: input and output in volts, as they are.
 _VOLTS = Scales()
@@ -62,7 +59,7 @@ class Belief:
 
     model: Model
     record: FloatArray
-    scales: Scales = _VOLTS
+    scales: Scales = VOLTS
     factorisation: str = "structured"
 
     def __post_init__(self) -> None:
@@ -267,11 +264,7 @@ class Belief:
 
         In the units of ``scales``.
         """
-        mean, cov = propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.step)
-        if not self.model.physical:
-            return mean, cov
-        worth = np.array([self.scales.factor(dimension) for dimension in self.model.dimensions.values()])
-        return mean * worth, cov * np.outer(worth, worth)
+        return propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
 
     def parameters(self) -> dict[str, tuple[float, float, str]]:
         """Mean, standard deviation and unit of each physical parameter, by name."""

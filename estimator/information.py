@@ -23,8 +23,9 @@ from estimator.engine.rows import path_results
 from estimator.engine.tasks import path
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.parameters import FloatArray
 from estimator.physical import physical_slopes, to_physical
+from estimator.units import VOLTS, Scales
 
 
 def fisher_information(
@@ -171,7 +172,7 @@ def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = Non
 
 
 def relative_covariance(
-    model: Model, coefficients: npt.ArrayLike, covariance: FloatArray, step: float = SAMPLING_STEP
+    model: Model, coefficients: npt.ArrayLike, covariance: FloatArray, scales: Scales = VOLTS
 ) -> FloatArray:
     """Covariance of the relative errors of the physical parameters, to first order, from one of the coefficients.
 
@@ -179,13 +180,13 @@ def relative_covariance(
         model: whose parameters; of one without any, the coefficients themselves.
         coefficients: (..., K).
         covariance: (..., K, K).
-        step: sampling step [s].
+        scales: what one inside is worth.
 
     Returns:
         (..., p, p): the roots of its diagonal are coefficients of variation.
     """
     points = np.asarray(coefficients, dtype=np.float64)
-    slopes = physical_slopes(model, points, step) / to_physical(model, points, step)[..., :, None]
+    slopes = physical_slopes(model, points, scales) / to_physical(model, points, scales)[..., :, None]
     relative: FloatArray = slopes @ covariance @ np.swapaxes(slopes, -1, -2)
     return relative
 

@@ -9,52 +9,48 @@ from typing import Any
 import numpy as np
 
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP, FloatArray
+from estimator.parameters import FloatArray
+from estimator.units import VOLTS, Scales
 
 
-def to_physical(model: Model, coefficients: FloatArray, step: float = SAMPLING_STEP) -> FloatArray:
+def to_physical(model: Model, coefficients: FloatArray, scales: Scales = VOLTS) -> FloatArray:
     """Physical parameters (..., p) of coefficients (..., K); the coefficients themselves, for a model without any.
 
     Args:
         model: whose `Model.physical`.
         coefficients: (..., K), time counted in samples.
-        step: sampling step [s].
-
-    Raises:
-        ValueError: for a step that is not positive and finite.
+        scales: what one inside is worth.
     """
     if not model.physical:
         return np.array(coefficients, dtype=np.float64)
-    return _evaluate(_code(model, "physical")[0], coefficients, step)
+    return _evaluate(_code(model, "physical")[0], coefficients, scales.step) * _worth(model, scales)
 
 
-def physical_slopes(model: Model, coefficients: FloatArray, step: float = SAMPLING_STEP) -> FloatArray:
+def physical_slopes(model: Model, coefficients: FloatArray, scales: Scales = VOLTS) -> FloatArray:
     """Slopes (..., p, K) of the physical parameters by the coefficients; arguments as `to_physical`."""
     k = model.n_coefficients
     if not model.physical:
         return np.broadcast_to(np.eye(k), (*np.shape(coefficients), k)).copy()
-    flat = _evaluate(_code(model, "physical")[1], coefficients, step)
-    return flat.reshape(*flat.shape[:-1], len(model.physical), k)
+    flat = _evaluate(_code(model, "physical")[1], coefficients, scales.step)
+    return flat.reshape(*flat.shape[:-1], len(model.physical), k) * _worth(model, scales)[:, None]
 
 
-def propagate(
-    model: Model, mean: FloatArray, cov: FloatArray, step: float = SAMPLING_STEP
-) -> tuple[FloatArray, FloatArray]:
+def propagate(model: Model, mean: FloatArray, cov: FloatArray, scales: Scales = VOLTS) -> tuple[FloatArray, FloatArray]:
     """Moments (..., p) and (..., p, p) of the physical parameters from those of the coefficients, to first order."""
-    slopes = physical_slopes(model, mean, step)
-    return to_physical(model, mean, step), slopes @ cov @ np.swapaxes(slopes, -1, -2)
+    slopes = physical_slopes(model, mean, scales)
+    return to_physical(model, mean, scales), slopes @ cov @ np.swapaxes(slopes, -1, -2)
 
 
-def coefficients_of(model: Model, parameters: Mapping[str, Any], step: float = SAMPLING_STEP) -> FloatArray:
+def coefficients_of(model: Model, parameters: Mapping[str, Any], scales: Scales = VOLTS) -> FloatArray:
     """Coefficients (..., K) of physical parameters of shape (...), by name; themselves, for a model without any.
 
     Args:
         model: whose `Model.inverse`.
         parameters: name to value, such as `estimator.Parameters`; others than the model's are not looked at.
-        step: sampling step [s].
+        scales: what one inside is worth.
 
     Raises:
-        ValueError: for a parameter that is missing, or a step that is not positive and finite.
+        ValueError: for a parameter that is missing.
     """
     names = list(model.physical if model.inverse else model.coefficients)
     missing = [name for name in names if name not in parameters]
@@ -62,13 +58,19 @@ def coefficients_of(model: Model, parameters: Mapping[str, Any], step: float = S
         raise ValueError(f"parameters must have {names}, but {missing} are missing from {list(parameters)}; add them")
     columns = [np.asarray(parameters[name], dtype=np.float64) for name in names]
     points = np.stack(np.broadcast_arrays(*columns), axis=-1)
-    return _evaluate(_code(model, "inverse")[0], points, step) if model.inverse else points
+    if not model.inverse:
+        return points
+    return _evaluate(_code(model, "inverse")[0], points / _worth(model, scales), scales.step)
+
+
+@cache
+def _worth(model: Model, scales: Scales) -> FloatArray:
+    """(p,) what one inside is worth, of each physical parameter."""
+    return np.array([scales.factor(dimension) for dimension in model.dimensions.values()])
 
 
 def _evaluate(function: Any, given: FloatArray, step: float) -> FloatArray:
     """Its results, stacked along the last axis, at given numbers along the last axis."""
-    if not 0 < step < np.inf:
-        raise ValueError(f"step must be positive and finite, but is {step}; give the seconds between two samples")
     columns = np.moveaxis(np.asarray(given, dtype=np.float64), -1, 0)
     found = [np.broadcast_to(value, columns.shape[1:]) for value in function(*columns, step)]
     return np.stack(found, axis=-1).astype(np.float64)

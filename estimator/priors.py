@@ -12,9 +12,9 @@ from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
-from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.parameters import CONTINUOUS_TWIN, SILVERBOX_TWIN, FloatArray
 from estimator.physical import coefficients_of
-from estimator.units import Scales
+from estimator.units import VOLTS, Scales
 
 #: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
 #: converge to 1e-10 for every spread up to 0.999.
@@ -22,7 +22,7 @@ _NODES, _POINTS = 20, 160_000
 
 
 def log_uniform_moments(
-    model: Model, center: Mapping[str, float], spread: float, step: float = SAMPLING_STEP
+    model: Model, center: Mapping[str, float], spread: float, scales: Scales = VOLTS
 ) -> tuple[FloatArray, FloatArray]:
     """Moments of the coefficients of a plant known only up to a factor.
 
@@ -33,7 +33,7 @@ def log_uniform_moments(
         model: whose coefficients.
         center: parameter to its middle; of any sign, but not 0.
         spread: relative half-width of the intervals, in [0, 1).
-        step: sampling step [s].
+        scales: what one inside is worth.
 
     Returns:
         Mean (K,) and covariance (K, K).
@@ -47,13 +47,13 @@ def log_uniform_moments(
     for name in names:
         if name not in center or not np.isfinite(center[name]) or center[name] == 0:
             raise ValueError(f"center must have a finite {name} other than 0, but is {dict(center)}")
-    mean, cov = _log_uniform_moments(model, tuple(float(center[name]) for name in names), float(spread), float(step))
+    mean, cov = _log_uniform_moments(model, tuple(float(center[name]) for name in names), float(spread), scales)
     return mean.copy(), cov.copy()
 
 
 @lru_cache(maxsize=256)  # every environment, and every evaluation of one, asks for the same
 def _log_uniform_moments(
-    model: Model, center: tuple[float, ...], spread: float, step: float
+    model: Model, center: tuple[float, ...], spread: float, scales: Scales
 ) -> tuple[FloatArray, FloatArray]:
     """The integral of `log_uniform_moments`, with the parameters in their order."""
     names = list(model.physical or model.coefficients)
@@ -65,12 +65,12 @@ def _log_uniform_moments(
     probabilities = np.ones(1)
     for _ in names:
         probabilities = np.outer(probabilities, weights / 2).ravel()  # the weights sum to 2, the length of [-1, 1]
-    points = coefficients_of(model, {name: c * row for name, c, row in zip(names, center, grid, strict=True)}, step)
+    points = coefficients_of(model, {name: c * row for name, c, row in zip(names, center, grid, strict=True)}, scales)
     return moments(points, probabilities)
 
 
 def gaussian_moments(
-    model: Model, mean: Mapping[str, float], std: Mapping[str, float], step: float = SAMPLING_STEP
+    model: Model, mean: Mapping[str, float], std: Mapping[str, float], scales: Scales = VOLTS
 ) -> tuple[FloatArray, FloatArray]:
     """Moments of the coefficients of a plant whose parameters are independent and Gaussian.
 
@@ -80,7 +80,7 @@ def gaussian_moments(
         model: whose coefficients.
         mean: parameter to its mean.
         std: parameter to its standard deviation; 0 for one that is known.
-        step: sampling step [s].
+        scales: what one inside is worth.
 
     Returns:
         Mean (K,) and covariance (K, K).
@@ -92,7 +92,7 @@ def gaussian_moments(
     for _ in names:
         probabilities = np.outer(probabilities, weights / weights.sum()).ravel()
     drawn = {name: mean[name] + std.get(name, 0.0) * row for name, row in zip(names, grid, strict=True)}
-    return moments(coefficients_of(model, drawn, step), probabilities)
+    return moments(coefficients_of(model, drawn, scales), probabilities)
 
 
 def moments(points: FloatArray, probabilities: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -114,7 +114,7 @@ def weak_prior(
     measurement_noise: float | Sequence[float] = 5e-4,
     noise_shape: float = 2.0,
     state_std: float | Sequence[float] = 1e-3,
-    step: float = SAMPLING_STEP,
+    scales: Scales = VOLTS,
 ) -> Belief:
     """A prior of given coefficients, with weak Gamma priors of the noises and the plant near rest.
 
@@ -127,7 +127,7 @@ def weak_prior(
         noise_shape: shape of the Gamma priors: 2 is worth four noises seen one by one. They never are, so that even
             such a prior binds for thousands of samples (docs/coverage.md): centre it with care.
         state_std: standard deviation of the states about 0: one number, or one for each.
-        step: sampling step [s].
+        scales: what one inside is worth.
 
     Raises:
         ValueError: for a value out of its range, or as `Belief`.
@@ -146,7 +146,7 @@ def weak_prior(
     joint[:n, :n] = np.diag(np.broadcast_to(np.asarray(state_std, dtype=np.float64) ** 2, n))
     sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
     xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
-    return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, scales=Scales(step))
+    return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, scales=scales)
 
 
 #: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.twin`` identifies them).

@@ -52,10 +52,8 @@ def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
     probabilities = np.ones(1)
     for name in names:
         probabilities = np.outer(probabilities, axes[name][1]).ravel()
-    inside = {
-        name: points.ravel() / scales.factor(model.dimensions[name]) for name, points in zip(names, grid, strict=True)
-    }
-    mean, cov = moments(coefficients_of(model, inside, scales.step), probabilities)
+    points = {name: column.ravel() for name, column in zip(names, grid, strict=True)}
+    mean, cov = moments(coefficients_of(model, points, scales), probabilities)
     return about(rig, scales, mean, cov)
 
 

@@ -77,6 +77,10 @@ class Scales:
         return written({atom: power for atom, power in powers.items() if power})
 
 
+#: The Silverbox's: input and output in volts, as they are.
+VOLTS = Scales()
+
+
 def _parsed(unit: str) -> dict[str, int]:
     """Atoms of a unit such as ``m/s²``, with their powers."""
     powers: dict[str, int] = {}

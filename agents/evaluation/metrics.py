@@ -16,6 +16,7 @@ from estimator.information import fisher_information
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.physical import coefficients_of, to_physical
+from estimator.units import Scales
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,7 +30,7 @@ _LENGTHS = np.unique(np.round(2 ** np.arange(4, 15.6, 0.5)).astype(int))
 
 
 def estimate_metrics(
-    means: FloatArray, covs: FloatArray, truth: Any, model: Model, step: float
+    means: FloatArray, covs: FloatArray, truth: Any, model: Model, scales: Scales
 ) -> dict[str, FloatArray]:
     """Posteriors of coefficients beside the truth.
 
@@ -38,7 +39,7 @@ def estimate_metrics(
         covs: (n, K, K).
         truth: the systems.
         model: whose coefficients they are.
-        step: sampling step [s].
+        scales: what one inside is worth outside.
 
     Returns:
         Relative errors ``error_<parameter>``; the share of the coefficients that their intervals hold, at each of
@@ -46,9 +47,9 @@ def estimate_metrics(
         posterior is calibrated.
     """
     true = {name: truth[name] for name in parameter_names(model)}
-    errors = np.abs(to_physical(model, means, step) / np.stack(list(true.values()), axis=-1) - 1)
+    errors = np.abs(to_physical(model, means, scales) / np.stack(list(true.values()), axis=-1) - 1)
     free = np.flatnonzero(np.diagonal(covs, axis1=1, axis2=2).all(axis=0))  # without those that are known, as θ2 = 0
-    deviations, covs = (means - coefficients_of(model, true, step))[:, free], covs[:, free][:, :, free]
+    deviations, covs = (means - coefficients_of(model, true, scales))[:, free], covs[:, free][:, :, free]
     stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
     units = covs / (stds[:, :, None] * stds[:, None, :])  # better conditioned than the covariances themselves
     scaled = deviations / stds

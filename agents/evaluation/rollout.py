@@ -227,15 +227,15 @@ def roll_out(
     # The environment does not count what a jump of the truth takes away: what lacks at the end was lost there.
     jumped = np.flatnonzero(jumped_at < horizon)
     if len(jumped):
-        model, step = prior.model, prior.step
-        before, after = (coefficients_of(model, t, step) for t in (began, truth))
+        model, scales = prior.model, prior.scales
+        before, after = (coefficients_of(model, t, scales) for t in (began, truth))
         for row in jumped:
             gain = beliefs[row].log_prob(after[row]) - prior.log_prob(before[row])
             curve[jumped_at[row] + 1 :, row] += gain - curve[-1, row]
     values = {
         "information_gain": np.array([prior.entropy() - belief.entropy() for belief in beliefs]),
         "log_posterior_gain": curve[-1],
-        **metrics.estimate_metrics(means, covs, truth, prior.model, prior.step),
+        **metrics.estimate_metrics(means, covs, truth, prior.model, prior.scales),
         "ended_early": ended_early,
         **metrics.input_metrics(inputs),
         # Processor time. The first call may compile, and counts where there is no other.
@@ -265,9 +265,9 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
     for name, (prior, acting) in hands.items():
         beliefs = posteriors(acting, y, prior, rig if prior.model.is_continuous else None)
         means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
-        found[name] = metrics.estimate_metrics(means, covs, truth, prior.model, step)
+        found[name] = metrics.estimate_metrics(means, covs, truth, prior.model, prior.scales)
     fit = maximum_a_posteriori(
         plant, u, y, experiment.prior_of(plant), experiment.process_noise, experiment.measurement_noise, interpolation
     )
-    found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, plant, step)
+    found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, plant, experiment.scales)
     return found

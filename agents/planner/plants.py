@@ -25,7 +25,7 @@ class Plant(NamedTuple):
 
     def coefficients_of(self, truth: Parameters) -> FloatArray:
         """(..., K) the coefficients of one plant or a batch."""
-        return coefficients_of(self.model, truth, self.prior.step)
+        return coefficients_of(self.model, truth, self.prior.scales)
 
 
 def plant_of(experiment: Any) -> Plant:

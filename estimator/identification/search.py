@@ -162,8 +162,7 @@ def _middle(problem: Problem) -> FloatArray:
     assert problem.rig.guess is not None
     model = problem.model
     told = {name: (low + high) / 2 for name, (low, high) in problem.rig.guess.items()}
-    inside = {name: told.get(name, 0.0) / problem.scales.factor(d) for name, d in model.dimensions.items()}
-    return coefficients_of(model, inside, problem.scales.step)
+    return coefficients_of(model, {name: told.get(name, 0.0) for name in model.physical}, problem.scales)
 
 
 def _order(problem: Problem) -> int:

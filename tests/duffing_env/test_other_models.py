@@ -15,6 +15,7 @@ from duffing_env.vector_env import DuffingVectorEnv
 from estimator.models.pendulum import PENDULUM, STEP
 from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
+from estimator.units import Scales
 
 # Random inputs end some such episodes at the limit, the others at the horizon.
 BOTH_ENDS = {"max_input": 5.0, "max_output": 0.5, "horizon": 30}
@@ -82,7 +83,7 @@ def test_its_beliefs_are_calibrated():
     # 200 episodes: the squared distance of the truth from the mean, in standard deviations, is 3 on average.
     envs = PendulumVectorEnv(200, max_input=5.0, max_output=100.0, process_noise=1e-3, measurement_noise=1e-2)
     envs.reset(seed=0)
-    truth = coefficients_of(PENDULUM, envs.truth, STEP)
+    truth = coefficients_of(PENDULUM, envs.truth, Scales(STEP))
     start = envs.belief(0)
     for actions in np.clip(random_actions(200, 200), -1, 1):
         envs.step(actions)

@@ -28,9 +28,9 @@ def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3):
     u = amplitude * np.repeat(rng.choice([-1.0, 1.0], samples // hold), hold)
     model = duffing(offsets=True, sensor=kind)
     scales = Scales(step, amplitude, 1e-2, KINDS[kind])
-    inside = {p: truth.get(p, 0.0) / scales.factor(model.dimensions[p]) for p in model.physical}
+    known = {p: truth.get(p, 0.0) for p in model.physical}
     disturbed = u / amplitude + force * rng.standard_normal(samples)
-    y = scales.output * free_run(model, coefficients_of(model, inside, step), disturbed)
+    y = scales.output * free_run(model, coefficients_of(model, known, scales), disturbed)
     y = np.concatenate([[0.0], y[:-1]])
     sensor = noise if kind == "displacement" else 2e-3 * y.std()
     return u, y + sensor * rng.standard_normal(samples)

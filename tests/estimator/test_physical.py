@@ -14,6 +14,7 @@ from estimator.models.duffing import duffing
 from estimator.models.pendulum import PENDULUM
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, Parameters
 from estimator.physical import coefficients_of, physical_slopes, propagate, to_physical
+from estimator.units import Scales
 
 EPS = np.finfo(float).eps
 PAPER = difference()
@@ -48,9 +49,9 @@ def test_sampling_step_is_that_of_the_record():
 
 def test_hand_computed_example():
     # m + cδ = 2 and δ² = 1/4, so every number is exact in binary.
-    found = coefficients_of(PAPER, {"m": 1.0, "c": 2.0, "a": 4.0, "b": 8.0}, step=0.5)
+    found = coefficients_of(PAPER, {"m": 1.0, "c": 2.0, "a": 4.0, "b": 8.0}, Scales(0.5))
     assert found.tolist() == [1.0, -1.0, -0.5, 0.125]
-    assert to_physical(PAPER, found, step=0.5).tolist() == [1.0, 2.0, 4.0, 8.0]
+    assert to_physical(PAPER, found, Scales(0.5)).tolist() == [1.0, 2.0, 4.0, 8.0]
 
 
 def test_coefficients_solve_the_difference_equation():
@@ -70,7 +71,8 @@ def test_the_continuous_twin_is_what_it_was_identified_as():
 @repeatable
 @given(m=scale, c=scale, a=signed, b=signed, step=steps)
 def test_physical_round_trip(m, c, a, b, step):
-    back = to_physical(PAPER, coefficients_of(PAPER, {"m": m, "c": c, "a": a, "b": b}, step), step)
+    scales = Scales(step)
+    back = to_physical(PAPER, coefficients_of(PAPER, {"m": m, "c": c, "a": a, "b": b}, scales), scales)
     # Each error is some roundings of the largest term in the sum that forms the parameter.
     divisor = m + c * step
     assert abs(back[0] - m) <= 20 * EPS * m
@@ -85,8 +87,8 @@ def test_physical_round_trip(m, c, a, b, step):
     step=steps,
 )  # fmt: skip
 def test_coefficients_round_trip(theta1, theta2, theta3, eta, sign, step):
-    physical = to_physical(PAPER, np.array([theta1, theta2, theta3, sign * eta]), step)
-    back = coefficients_of(PAPER, dict(zip("mcab", physical, strict=True)), step)
+    physical = to_physical(PAPER, np.array([theta1, theta2, theta3, sign * eta]), Scales(step))
+    back = coefficients_of(PAPER, dict(zip("mcab", physical, strict=True)), Scales(step))
     # (m + c δ) η / δ² is 1, formed as -θ3 + (1 + θ3): hence the factor 1 + |θ3| throughout.
     rounding = 40 * EPS * (1 + abs(theta3))
     assert abs(back[0] - theta1) <= rounding * (1 + abs(theta1) + abs(theta3))
@@ -154,9 +156,18 @@ def test_a_model_without_parameters_has_its_coefficients():
 def test_a_step_that_is_none_is_named(step):
     message = f"step must be positive and finite, but is {step}; give the seconds"
     with pytest.raises(ValueError, match=re.escape(message)):
-        coefficients_of(PAPER, OSCILLATOR, step)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        to_physical(PAPER, np.ones(4), step)
+        Scales(step)
+
+
+def test_scales_multiply_the_parameters_by_their_dimensions():
+    """A force in units of 20 N and a displacement in units of 3 cm: m, c and a go with 20/0.03, b with 20/0.03³."""
+    scales = Scales(1e-3, input=20.0, output=0.03, input_unit="N", output_unit="m")
+    inside = coefficients_of(PAPER, {"m": 0.4, "c": 0.6, "a": 2500.0, "b": 4e7}, scales)
+    plain = to_physical(PAPER, inside, Scales(1e-3))
+    np.testing.assert_allclose(plain * 20.0 / 0.03 ** np.array([1, 1, 1, 3]), [0.4, 0.6, 2500.0, 4e7], rtol=1e-12)
+    np.testing.assert_allclose(to_physical(PAPER, inside, scales), [0.4, 0.6, 2500.0, 4e7], rtol=1e-12)
+    slopes = physical_slopes(PAPER, inside, Scales(1e-3))[0] * 20.0 / 0.03
+    np.testing.assert_allclose(physical_slopes(PAPER, inside, scales)[0], slopes, rtol=1e-12)
 
 
 def test_a_parameter_that_is_missing_is_named():
