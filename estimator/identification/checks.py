@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from estimator.identification.records import Record, residuals
 from estimator.identification.result import Warning
 from estimator.identification.search import Found, at
 from estimator.parameters import FloatArray
+from estimator.physical import propagate
 from estimator.rig import INTERPOLATIONS
 from estimator.rig_prior import HALF_WIDTH
 
@@ -32,6 +33,10 @@ _DISTURBANCE, _BEYOND = 0.02, 3.0
 
 #: Largest relative standard deviation of a parameter that is called identified.
 _VAGUE = 1 / 3
+
+#: Standard deviations from the guess that are far. A step is called wrong that is nearer to a factor of 2, either way,
+#: than to 1, where the guess of m and c together has less than 1 % of a chance.
+_FAR, _FACTOR, _UNLIKELY = 5.0, 0.5 * np.log(2), 9.2
 
 #: Fewest samples in a period.
 _SLOWEST = 5.0
@@ -64,7 +69,7 @@ def examine(
         *_of_records(problem, records),
         *_of_hypotheses(problem, found),
         *_of_noise(problem, disturbance),
-        *_of_parameters(problem, parameters),
+        *_of_parameters(problem, found, parameters),
         *_of_residuals(records, forecasts),
     )
 
@@ -134,32 +139,58 @@ def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
     return [Warning("process_noise", message)]
 
 
-def _of_parameters(problem: Problem, parameters: dict[str, tuple[float, float]]) -> list[Warning]:
-    vague = [name for name in "mcab" if parameters[name][1] > _VAGUE * abs(parameters[name][0])]
+def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[float, float]]) -> list[Warning]:
+    vague = [name for name, deviation in _told(problem, found).items() if deviation > _VAGUE]
     warnings = []
     if vague:
-        message = f"{', '.join(vague)}: not identified by this input; the interval is wider than the value allows"
+        message = f"{', '.join(vague)}: not identified by this input; what is said of it is hardly from the records"
         warnings.append(Warning("not_identified", message))
-    guess = problem.rig.guess
-    if guess is None:
+    if problem.rig.guess is None:
         return warnings
-    far = {}
-    for name, (low, high) in guess.items():
-        mean, std = parameters[name]
-        middle, spread = (low + high) / 2, (high - low) / 2 / HALF_WIDTH
-        if abs(mean - middle) > 5 * np.hypot(spread, std):
-            far[name] = mean / middle
-    if not far:
-        return warnings
-    # m goes with the square of the sampling step, c with the step itself.
-    factor = np.sqrt(max(parameters["m"][0], 0.0) / ((guess["m"][0] + guess["m"][1]) / 2))
-    if "m" in far and "a" not in far and not 0.6 < factor < 1.6:
+    far = {name: off for name, off in _surprise(problem.rig.guess, parameters).items() if off > _FAR}
+    # m goes with the square of the sampling step, c with the step itself; a and b do not.
+    middle = sum(problem.rig.guess["m"]) / 2
+    factor = float(np.sqrt(max(parameters["m"][0] / middle, 1e-12)))
+    told = {"m": parameters["m"], "c": parameters["c"]}
+    mended = {"m": _times(told["m"], factor**-2), "c": _times(told["c"], 1 / factor)}
+    before, after = (sum(o**2 for o in _surprise(problem.rig.guess, p).values()) for p in (told, mended))
+    if "a" not in far and abs(np.log(factor)) > _FACTOR and before > max(after, _UNLIKELY):
         message = f"m and c would be those of the guess if the sampling step were {1 / factor:.2f} times the rig's"
         warnings.append(Warning("step", message))
-    else:
+    elif far:
         message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
         warnings.append(Warning("guess", message))
     return warnings
+
+
+def _told(problem: Problem, found: Found) -> dict[str, float]:
+    """Relative standard deviations that the records alone would leave of m, c, a and b."""
+    model = problem.rig.model
+    kept = [list(problem.model.coefficients).index(name) for name in model.coefficients]
+    mean, cov = found.mean[kept], found.cov[np.ix_(kept, kept)]
+    scale = np.sqrt(np.diag(cov))
+    unit = np.outer(scale, scale)
+    known = np.linalg.inv(cov / unit) - found.fitter.prior.precision[np.ix_(kept, kept)] * unit
+    values, ways = np.linalg.eigh(known)
+    alone = (ways / np.maximum(values, 1e-9)) @ ways.T * unit
+    parameters, spread = propagate(model, mean, alone)
+    deviations = np.sqrt(np.diag(spread)) / np.maximum(np.abs(parameters), 1e-300)
+    return {name: float(value) for name, value in zip(model.physical, deviations, strict=True) if name in "mcab"}
+
+
+def _surprise(
+    guess: Mapping[str, tuple[float, float]], parameters: Mapping[str, tuple[float, float]]
+) -> dict[str, float]:
+    """Standard deviations between what is guessed of parameters and what was found."""
+    spreads = {name: (guess[name][1] - guess[name][0]) / 2 / HALF_WIDTH for name in parameters if name in guess}
+    return {
+        name: float(abs(parameters[name][0] - sum(guess[name]) / 2) / np.hypot(spread, parameters[name][1]))
+        for name, spread in spreads.items()
+    }
+
+
+def _times(parameter: tuple[float, float], factor: float) -> tuple[float, float]:
+    return parameter[0] * factor, parameter[1] * factor
 
 
 def _of_residuals(records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Warning]:

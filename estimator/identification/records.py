@@ -23,8 +23,8 @@ _TIMES = ("t", "time")
 #: No file of a record is larger [bytes].
 _LARGEST_FILE = 2**30
 
-#: A level of the output is a stop where the signal stays on it for this many samples in a row, this often.
-_STAYS, _OFTEN = 3, 2
+#: A level of the output is a stop where the signal comes to it this often, and so many times as often as to the next.
+_OFTEN, _MORE = 3, 4
 
 #: Fewer outputs identify nothing.
 _FEWEST = 50
@@ -115,26 +115,20 @@ def _cut(record: Record) -> list[Record]:
 
 
 def clipped(y: FloatArray) -> npt.NDArray[np.bool_]:
-    """(T,) whether an output stands at a stop: the largest or smallest value, kept for several samples, several times.
+    """(T,) whether an output stands at a stop: the largest or smallest value, which several outputs have exactly.
 
-    A converter's coarse levels are no stop: the signal does not stay on the next level as often.
+    Few samples in a period leave one in a row there. A converter's coarse levels are no stop: the next level is met
+    almost as often. Nor is a start at rest: the signal comes to a stop again.
     """
     found = np.zeros(len(y), dtype=np.bool_)
     levels = np.unique(_seen(y))
     if len(levels) < 10:
         return found
     for at, beside in ((levels[-1], levels[-2]), (levels[0], levels[1])):
-        stays, others = _runs(y == at), _runs(y == beside)
-        if len(stays) >= _OFTEN and sum(stays) > 4 * max(1, sum(others)):
+        visits = np.count_nonzero(np.diff(np.concatenate([[False], y == at]).astype(np.int8)) == 1)
+        if visits >= _OFTEN and np.count_nonzero(y == at) > _MORE * np.count_nonzero(y == beside):
             found |= y == at
     return found
-
-
-def _runs(on: npt.NDArray[np.bool_]) -> list[int]:
-    """Lengths of the runs of at least `_STAYS` samples."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
-    lengths = edges[1::2] - edges[::2]
-    return [int(length) for length in lengths if length >= _STAYS]
 
 
 def read(path: str | Path, step: float) -> tuple[FloatArray, FloatArray]:

@@ -91,6 +91,15 @@ def test_a_converter_s_levels_are_no_stop():
     _, y = simulated(BENCH)
     level = np.abs(y).max() / 100
     assert not clipped(level * np.round(y / level)).any()
+    assert not clipped(np.concatenate([np.full(100, y.min()), y])).any()
+
+
+def test_a_stop_that_single_samples_meet_is_found():
+    rng = np.random.default_rng(0)
+    y = np.sin(2.2 * np.arange(500)) + 0.01 * rng.standard_normal(500)
+    assert np.array_equal(clipped(np.minimum(y, 0.98)), y >= 0.98)
+    assert np.diff(np.flatnonzero(y >= 0.98)).min() > 1
+    assert not clipped(y).any()
 
 
 @pytest.mark.parametrize(
@@ -109,12 +118,14 @@ def test_faults_are_named(change, name):
 def test_a_wrong_step_and_a_parameter_that_does_nothing_are_named():
     u, y = simulated(BENCH)
     guess = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
-    wrong = Rig(2 * BENCH[1], input=Channel("N"), output=Channel("m"), guess=guess)
-    assert "step" in [warning.name for warning in identify(wrong, (u, y)).warnings]
+    for factor in (0.5, 2):
+        wrong = Rig(factor * BENCH[1], input=Channel("N"), output=Channel("m"), guess=guess)
+        assert "step" in [warning.name for warning in identify(wrong, (u, y)).warnings]
     weak = (BENCH[0], BENCH[1], 0.05, 5e-6, 8)
-    told = [warning for warning in identify(rig_of(weak), simulated(weak)).warnings if warning.name == "not_identified"]
-    assert told
-    assert told[0].message.startswith("b")
+    for known in (None, guess):
+        warnings = identify(rig_of(weak, guess=known), simulated(weak)).warnings
+        told = [warning.message for warning in warnings if warning.name == "not_identified"]
+        assert [message.split(":")[0] for message in told] == ["b"]
 
 
 def test_the_result_goes_on(tmp_path):
