@@ -107,19 +107,19 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
 
 
 def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
-    """Mean relative error of m, c, a, b against the information in the outputs, system by system."""
+    """Mean relative error of the parameters against the information in the outputs, system by system."""
     if not all("fisher_gain" in evaluation.metrics for evaluation in evaluations):
         return None
     figure = new_figure(7.5, 4.5)
     axes = figure.add_subplot()
     for evaluation, colour in zip(evaluations, cycle(_COLOURS), strict=False):
-        errors = np.mean([evaluation.metrics[f"error_{name}"] for name in "mcab"], axis=0)
+        errors = np.mean([v for name, v in evaluation.metrics.items() if name.startswith("error_")], axis=0)
         axes.semilogy(
             evaluation.metrics["fisher_gain"], 100 * errors, ".", color=colour, alpha=0.5, markersize=4,
             label=evaluation.title,
         )  # fmt: skip
     axes.set_xlabel("Fisher information / nat")
-    axes.set_ylabel("mean error of m, c, a, b / %")
+    axes.set_ylabel("mean error of the parameters / %")
     axes.grid(alpha=0.3)
     axes.legend()
     return figure

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -76,14 +76,19 @@ METRICS = {
     "arrow_rmse": Metric("RMSE on the real arrow / mV", 2, 1e3, MEDIAN),
 }
 
-#: What the table of estimators shows.
-ESTIMATOR_METRICS = ("error_m", "error_c", "error_a", "error_b", "coverage", "nees")
+
+def metrics_of(found: Iterable[str]) -> dict[str, Metric]:
+    """The columns of the metrics that were found, in their order; errors of other parameters than m, c, a, b first."""
+    others = {name for name in found if name not in METRICS}
+    errors = {name: Metric(f"error of {name.removeprefix('error_')} / %", 2, 100, MEDIAN) for name in sorted(others)}
+    return errors | {name: metric for name, metric in METRICS.items() if name in found}
 
 
 def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, Any]]:
     """The centre of each metric over systems, with its 95 % interval: `center_and_interval` by name."""
+    columns = metrics_of(evaluation.metrics)
     return {
-        name: center_and_interval(values.reshape(evaluation.seeds, -1), METRICS[name], seed)
+        name: center_and_interval(values.reshape(evaluation.seeds, -1), columns[name], seed)
         for name, values in evaluation.metrics.items()
     }
 
@@ -146,22 +151,22 @@ def leaderboard(evaluations: list[Evaluation]) -> Table:
     summaries = [summarise(evaluation) for evaluation in ordered]
     rows = [
         [metric.title, *(cell_of(metric, summary.get(name)) for summary in summaries)]
-        for name, metric in METRICS.items()
-        if any(name in summary for summary in summaries)
+        for name, metric in metrics_of([name for summary in summaries for name in summary]).items()
     ]
     return ["", *(evaluation.title for evaluation in ordered)], rows
 
 
 def two_way_table(evaluations: list[Evaluation]) -> Table:
     """Heads and rows, policies by estimators: who identified what from the same inputs and outputs."""
-    metrics = [METRICS[name] for name in ESTIMATOR_METRICS]
+    found = [name for e in evaluations for values in e.estimators.values() for name in values]
+    columns = {name: m for name, m in metrics_of(found).items() if name not in ("coverage_50", "coverage_95")}
     rows = []
     for evaluation in in_order(evaluations):
         for estimator, values in evaluation.estimators.items():
-            centers = [float(METRICS[name].center[1](values[name])) for name in ESTIMATOR_METRICS]
-            cells = [f"{m.scale * center:.{m.digits}f}" for m, center in zip(metrics, centers, strict=True)]
+            centers = {name: float(metric.center[1](values[name])) for name, metric in columns.items()}
+            cells = [f"{m.scale * centers[name]:.{m.digits}f}" for name, m in columns.items()]
             rows.append([evaluation.title, estimator.replace("_", " "), *cells])
-    return ["policy", "estimator", *(metric.title for metric in metrics)], rows
+    return ["policy", "estimator", *(metric.title for metric in columns.values())], rows
 
 
 def print_table(evaluations: list[Evaluation], title: str) -> None:

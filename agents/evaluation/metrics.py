@@ -74,14 +74,14 @@ def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
 def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatArray | None = None) -> FloatArray:
     """(n,) ½ log det(Λ0 + F) - ½ log det Λ0 [nats] of inputs (T, n): what an efficient estimator gains from them.
 
-    F is the Fisher information at the true coefficients of the plant's equation, along the outputs (T, n) that were
-    seen, or along the response without noise; Λ0 is the inverse covariance of the prior of plants so drawn.
+    F is the Fisher information at the true coefficients of the plant's equation, along the outputs (T, n) or
+    (T, n, sensors) that were seen, or along the response without noise; Λ0 is the inverse covariance of the prior of
+    plants so drawn.
     """
-    noises = experiment.process_noise, experiment.measurement_noise
     plant = plant_of(experiment)
     F = fisher_information(
-        plant.model, plant.coefficients_of(truth), inputs.T, *noises, interpolation=plant.interpolation,
-        y=None if outputs is None else outputs.T,
+        plant.model, plant.coefficients_of(truth), inputs.T, plant.process_noise, plant.sensor_noises,
+        interpolation=plant.interpolation, y=None if outputs is None else np.swapaxes(outputs, 0, 1),
     )  # fmt: skip
     cov = plant.prior.coefficients_cov
     std = np.sqrt(np.diag(cov))
@@ -99,7 +99,7 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatAr
     except FileNotFoundError:
         return None
     n = len(oracle.values)
-    return oracle.efficiency(evaluation.inputs.T[:n], evaluation.outputs.T[:n])
+    return oracle.efficiency(evaluation.inputs.T[:n], np.swapaxes(evaluation.outputs, 0, 1)[:n])
 
 
 def regime_information(truth: Any, experiment: Any, seed: int, scale: float = 1.0) -> FloatArray:

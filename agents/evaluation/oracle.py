@@ -78,7 +78,7 @@ class Oracle:
 
         Args:
             inputs: (n, samples) [V]; NaN from the end of an episode on.
-            outputs: (n, samples) [V] that followed them.
+            outputs: (n, samples) [V] that followed them; (n, samples, sensors) of several.
 
         Raises:
             ValueError: for more rows than the oracle has systems, or as `estimator.fisher_information`.
@@ -86,9 +86,9 @@ class Oracle:
         u = np.asarray(inputs, dtype=np.float64)
         if u.ndim != 2 or len(u) > len(self.values):
             raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
-        plant, e = self.systems.plant, self.systems.experiment
+        plant = self.systems.plant
         information = fisher_information(
-            plant.model, self.systems.theta[: len(u)], u, e.process_noise, e.measurement_noise, y=outputs,
+            plant.model, self.systems.theta[: len(u)], u, plant.process_noise, plant.sensor_noises, y=outputs,
             interpolation=plant.interpolation,
         )  # fmt: skip
         values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]

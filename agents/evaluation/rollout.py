@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from agents.evaluation import metrics
 from agents.evaluation.batch import make
+from agents.planner.plants import plant_of
 from agents.policies import make_policy
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
@@ -45,7 +46,7 @@ class Evaluation:
         curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats]; what a jump of the
             truth takes away is in it.
         inputs: (horizon, systems) inputs that the plant was given [V], NaN after the end of an episode.
-        outputs: (horizon, systems) outputs [V], likewise.
+        outputs: (horizon, systems) outputs [V], likewise; (horizon, systems, sensors) of several sensors.
         step: sampling step [s].
         estimators: what others make of the same inputs and outputs: name of an estimator to its `metrics`.
         seeds: number of policies.
@@ -187,12 +188,13 @@ def roll_out(
     if hold > 1:  # applied sample by sample instead, which is the same, so that every sample is seen
         envs = make(env_id, systems, {**options, "hold": 1})
     entries = list(observation_bounds(envs.experiment.model))
-    last_input, last_output = entries.index("last_input"), entries.index("last_input") + 1
+    sensors, last_input = envs.experiment.model.n_outputs, entries.index("last_input")
+    last_outputs = slice(last_input + 1, last_input + 1 + sensors)
     first = parameter_names(envs.experiment.truth_model)[0]
     observations, _ = envs.reset(seed=seed)
     prior, horizon = envs.belief(0), envs.horizon
     began, curve = envs.truth, np.zeros((horizon + 1, systems))
-    inputs, outputs = np.full((2, horizon, systems), np.nan)
+    inputs, outputs = np.full((horizon, systems), np.nan), np.full((horizon, systems, sensors), np.nan)
     beliefs: list[Belief] = [prior] * systems
     truths = [began] * systems
     ended_early, jumped_at = np.zeros(systems), np.full(systems, horizon)
@@ -209,7 +211,7 @@ def roll_out(
         curve[t + 1] = curve[t] + np.where(running, infos["log_posterior_gain"], 0.0)
         jumped_at[running & (jumped_at == horizon) & (getattr(envs.truth, first) != getattr(began, first))] = t
         inputs[t, running] = envs.max_input * observations[running, last_input]
-        outputs[t, running] = envs.experiment.max_output * observations[running, last_output]
+        outputs[t, running] = envs.experiment.max_output * observations[running, last_outputs]
         finished = running & (terminated | truncated)
         for row in np.flatnonzero(finished):
             beliefs[row], truths[row] = infos["belief"][row], infos["truth"][row]
@@ -241,7 +243,8 @@ def roll_out(
         # Processor time. The first call may compile, and counts where there is no other.
         "decision_time": np.full(systems, np.mean(deciding[1:] or deciding) / systems),
     }
-    return Evaluation(name, values, curve, inputs, outputs, prior.step), beliefs, truth, envs.experiment
+    seen = outputs[..., 0] if sensors == 1 else outputs
+    return Evaluation(name, values, curve, inputs, seen, prior.step), beliefs, truth, envs.experiment
 
 
 def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:
@@ -250,14 +253,15 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
     The auditor fits the plant's own equation. That of the paper, on another plant whose input goes linearly from one
     action to the next, takes as an environment does the input at the sample before.
     """
-    u, y, plant, step = evaluation.inputs.T, evaluation.outputs.T, experiment.plant, experiment.step
-    interpolation = "linear" if plant.is_continuous and experiment.degree else "zero_order"
-    rig = Rig(step, interpolation=interpolation)
+    u, y = evaluation.inputs.T, np.swapaxes(evaluation.outputs, 0, 1)
+    plant, interpolation, own_prior, process_noise, sensor_noises = plant_of(experiment)
+    step = experiment.step
+    rig = Rig(step, interpolation=interpolation, delay=0 if interpolation == "linear" else -1)
     hands: dict[str, tuple[Belief, FloatArray]] = {}
     if plant == difference():
         hands = {name: (experiment.prior_of(plant, name), u) for name in FACTORISATIONS}
     else:
-        hands["ode" if plant.is_continuous else "structured"] = experiment.prior_of(plant), u
+        hands["ode" if plant.is_continuous else "structured"] = own_prior, u
         if set(parameter_names(plant)) == set(parameter_names(difference())):
             earlier = u if not experiment.degree else np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
             hands |= {f"nlarx_{name}": (experiment.prior_of(difference(), name), earlier) for name in FACTORISATIONS}
@@ -266,8 +270,6 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
         beliefs = posteriors(acting, y, prior, rig if prior.model.is_continuous else None)
         means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
         found[name] = metrics.estimate_metrics(means, covs, truth, prior.model, prior.scales)
-    fit = maximum_a_posteriori(
-        plant, u, y, experiment.prior_of(plant), experiment.process_noise, experiment.measurement_noise, interpolation
-    )
+    fit = maximum_a_posteriori(plant, u, y, own_prior, process_noise, sensor_noises, interpolation)
     found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, plant, experiment.scales)
     return found

@@ -74,7 +74,7 @@ class Systems:
     @property
     def noises(self) -> tuple[float, ...]:
         """Variances of the process noise and of each sensor's."""
-        return variances(self.plant.model, self.experiment.process_noise, self.experiment.measurement_noise)
+        return variances(self.plant.model, self.plant.process_noise, self.plant.sensor_noises)
 
     @property
     def degree(self) -> int:

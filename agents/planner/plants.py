@@ -17,11 +17,15 @@ class Plant(NamedTuple):
         model: its equation.
         interpolation: of the input between samples.
         prior: of its coefficients.
+        process_noise: standard deviation.
+        sensor_noises: standard deviations, one for each sensor.
     """
 
     model: Model
     interpolation: str
     prior: Belief
+    process_noise: float
+    sensor_noises: list[float]
 
     def coefficients_of(self, truth: Parameters) -> FloatArray:
         """(..., K) the coefficients of one plant or a batch."""
@@ -32,4 +36,5 @@ def plant_of(experiment: Any) -> Plant:
     """The plant of an experiment that simulates one."""
     model = experiment.plant
     interpolation = "linear" if experiment.degree and model.is_continuous else "zero_order"
-    return Plant(model, interpolation, experiment.prior_of(model))
+    sensors = getattr(experiment, "noises", [experiment.measurement_noise])
+    return Plant(model, interpolation, experiment.prior_of(model), experiment.process_noise, sensors)

@@ -7,7 +7,7 @@ batches, few gradient steps. `agents/hyperparameters/ALGORITHM.toml` has what di
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -20,6 +20,11 @@ _POSITIVE = ("learning_rate", "entropy_weight")
 _SHARES = ("gamma", "gae_lambda", "tau")
 
 
+def _searched(default: Any, low: Any, high: Any, **how: Any) -> Any:
+    """A hyperparameter that a search varies: its default, its range, and how Optuna is to draw from that."""
+    return field(default=default, metadata={"low": low, "high": high, **how})
+
+
 @dataclass(frozen=True)
 class AlgorithmSettings(ABC):
     """Hyperparameters that every algorithm has."""
@@ -28,9 +33,9 @@ class AlgorithmSettings(ABC):
     """Environments that are stepped together."""
     batch_size: int = 8192
     """Samples of a gradient step."""
-    learning_rate: float = 1e-3
+    learning_rate: float = _searched(1e-3, 2e-4, 5e-3, log=True)
     """Step size at the start; it falls linearly to 0."""
-    gamma: float = 0.99
+    gamma: float = _searched(0.99, 0.95, 0.999)
     """Discount factor."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
@@ -59,9 +64,11 @@ class AlgorithmSettings(ABC):
         """A model with these hyperparameters; ValueError where its package is not installed."""
 
     @classmethod
-    @abstractmethod
     def suggest(cls, trial: Any) -> dict[str, Any]:
         """Hyperparameters that Optuna's ``trial`` chooses from the search space of this algorithm."""
+        varied = [f for f in fields(cls) if f.metadata]
+        suggest = {int: trial.suggest_int, float: trial.suggest_float}
+        return {f.name: suggest[type(f.default)](f.name, **f.metadata) for f in varied}
 
     def _common(self, envs: VecEnv, seed: int) -> dict[str, Any]:
         """Arguments that every model takes."""
@@ -81,13 +88,13 @@ class AlgorithmSettings(ABC):
 class OnPolicySettings(AlgorithmSettings):
     """Hyperparameters of algorithms that learn from the samples of the present policy only."""
 
-    n_steps: int = 64
+    n_steps: int = _searched(64, 16, 128, step=16)
     """Samples that each environment collects between two updates."""
-    n_epochs: int = 4
+    n_epochs: int = _searched(4, 2, 10)
     """Passes over the collected samples in an update."""
-    gae_lambda: float = 0.95
+    gae_lambda: float = _searched(0.95, 0.85, 1.0)
     """Trade-off of bias and variance in the advantage (generalised advantage estimation)."""
-    log_std_init: float = -0.5
+    log_std_init: float = _searched(-0.5, -1.5, 0.0)
     """Log standard deviation of the action at the start, where it is not one of some levels."""
     entropy_bonus: float = 0.0
     """Weight of the action's entropy at the start; it falls linearly to 0."""
@@ -105,18 +112,6 @@ class OnPolicySettings(AlgorithmSettings):
     def log_interval(self) -> int:
         """Every update."""
         return 1
-
-    @classmethod
-    def suggest(cls, trial: Any) -> dict[str, Any]:
-        """Step size, horizon and exploration, and how much is made of a sample."""
-        return {
-            "n_steps": trial.suggest_int("n_steps", 16, 128, step=16),
-            "n_epochs": trial.suggest_int("n_epochs", 2, 10),
-            "learning_rate": trial.suggest_float("learning_rate", 2e-4, 5e-3, log=True),
-            "gamma": trial.suggest_float("gamma", 0.95, 0.999),
-            "gae_lambda": trial.suggest_float("gae_lambda", 0.85, 1.0),
-            "log_std_init": trial.suggest_float("log_std_init", -1.5, 0.0),
-        }
 
     def _on_policy(self, envs: VecEnv, seed: int) -> dict[str, Any]:
         return self._common(envs, seed) | {
@@ -163,7 +158,7 @@ class OffPolicySettings(AlgorithmSettings):
 
     num_envs: int = 64
     """Environments that are stepped together."""
-    batch_size: int = 256
+    batch_size: int = _searched(256, 128, 1024, log=True)
     """Samples of a gradient step."""
     buffer_size: int = 200_000
     """Samples that are kept, over all environments."""
@@ -171,26 +166,15 @@ class OffPolicySettings(AlgorithmSettings):
     """Samples with random inputs at the start, over all environments."""
     train_freq: int = 4
     """Samples that each environment collects between two updates."""
-    gradient_steps: int = 32
+    gradient_steps: int = _searched(32, 8, 64, log=True)
     """Gradient steps in an update."""
-    tau: float = 0.005
+    tau: float = _searched(0.005, 2e-3, 2e-2, log=True)
     """How far the target networks follow in a gradient step."""
 
     @property
     def log_interval(self) -> int:
         """About every time that all environments have ended an episode."""
         return self.num_envs
-
-    @classmethod
-    def suggest(cls, trial: Any) -> dict[str, Any]:
-        """Step size, horizon, and how much is made of a sample."""
-        return {
-            "batch_size": trial.suggest_int("batch_size", 128, 1024, log=True),
-            "gradient_steps": trial.suggest_int("gradient_steps", 8, 64, log=True),
-            "learning_rate": trial.suggest_float("learning_rate", 2e-4, 5e-3, log=True),
-            "gamma": trial.suggest_float("gamma", 0.95, 0.999),
-            "tau": trial.suggest_float("tau", 2e-3, 2e-2, log=True),
-        }
 
     def _off_policy(self, envs: VecEnv, seed: int) -> dict[str, Any]:
         names = ("buffer_size", "learning_starts", "train_freq", "gradient_steps", "tau")
@@ -218,7 +202,7 @@ class SACSettings(OffPolicySettings):
 class TQCSettings(SACSettings):
     """Hyperparameters of TQC: SAC with critics of the return's distribution, without its upper end."""
 
-    dropped_quantiles: int = 2
+    dropped_quantiles: int = _searched(2, 0, 5)
     """Upper quantiles of 25 that each critic drops, against overestimation."""
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
@@ -230,17 +214,12 @@ class TQCSettings(SACSettings):
             **self._off_policy(envs, seed),
         )
 
-    @classmethod
-    def suggest(cls, trial: Any) -> dict[str, Any]:
-        """As for SAC, and the quantiles."""
-        return super().suggest(trial) | {"dropped_quantiles": trial.suggest_int("dropped_quantiles", 0, 5)}
-
 
 @dataclass(frozen=True)
 class TD3Settings(OffPolicySettings):
     """Hyperparameters of TD3."""
 
-    exploration_noise: float = 0.2
+    exploration_noise: float = _searched(0.2, 0.05, 0.5)
     """Standard deviation of the noise on the action while samples are collected."""
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
@@ -251,11 +230,6 @@ class TD3Settings(OffPolicySettings):
 
         noise = NormalActionNoise(np.zeros(1), np.full(1, self.exploration_noise))
         return TD3("MlpPolicy", action_noise=noise, **self._off_policy(envs, seed))
-
-    @classmethod
-    def suggest(cls, trial: Any) -> dict[str, Any]:
-        """As for all off-policy algorithms, and the exploration."""
-        return super().suggest(trial) | {"exploration_noise": trial.suggest_float("exploration_noise", 0.05, 0.5)}
 
 
 #: Name of an algorithm to the class of its hyperparameters.

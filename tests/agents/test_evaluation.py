@@ -14,6 +14,7 @@ import agents.evaluation.metrics
 import agents.evaluation.rollout
 from agents import make_policy
 from agents.evaluation.batch import make
+from agents.evaluation.comparison import compare
 from agents.evaluation.rollout import evaluate
 from agents.policies.learned import WEIGHTS, load_policy, save_policy
 from agents.vec_env import DuffingVecEnv
@@ -422,6 +423,20 @@ def test_on_the_continuous_track_others_identify_too():
             by_ode.metrics["information_gain"].mean(), abs=0.3
         )
     assert by_paper.metrics["coverage"].mean() < 0.4
+
+
+@pytest.mark.parametrize("track", ["Pendulum", "WienerHammerstein"])
+def test_tracks_of_other_models_are_evaluated_and_shown(track, tmp_path):
+    (evaluation,) = compare(["uniform"], f"duffing_env/{track}-v0", 6, {}, tmp_path, seed=SEED, report=True)
+    assert list(evaluation.estimators) == ["ode", "auditor"]
+    for name in [name for name in evaluation.metrics if name.startswith("error_")]:
+        # The environment's own estimator, but for the float32 of its inputs and outputs, which some errors amplify.
+        own = np.median(evaluation.metrics[name])
+        assert np.median(evaluation.estimators["ode"][name]) == pytest.approx(own, rel=0.05), name
+    assert evaluation.metrics["fisher_gain"].mean() == pytest.approx(
+        evaluation.metrics["information_gain"].mean(), abs=1.0
+    )
+    assert (tmp_path / "report.html").is_file()
 
 
 def test_policies_of_several_seeds_are_one_entry(tmp_path, without_record):
