@@ -255,8 +255,7 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
     """
     u, y = evaluation.inputs.T, np.swapaxes(evaluation.outputs, 0, 1)
     plant, interpolation, own_prior, process_noise, sensor_noises = plant_of(experiment)
-    step = experiment.step
-    rig = Rig(step, interpolation=interpolation, delay=0 if interpolation == "linear" else -1)
+    rig = Rig(experiment.step, interpolation=interpolation, delay=0 if interpolation == "linear" else -1)
     hands: dict[str, tuple[Belief, FloatArray]] = {}
     if plant == difference():
         hands = {name: (experiment.prior_of(plant, name), u) for name in FACTORISATIONS}
