@@ -46,6 +46,7 @@ class Batch:
         self._prior = experiment.believed
         model, drawn = experiment.truth_model, experiment.setup.noise_range > 1
         self._truth = {name: f"PARAM_{name}" for name in parameter_names(model)} | (noise_rows(model) if drawn else {})
+        self._worth = np.array([worth_of(experiment, name) for name in self._truth])
         n_rows, n_observation = max(self._place.values()) + 1, len(observation_bounds(experiment.model))
         # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
         self._recorded = np.stack(experiment.recorded)
@@ -149,7 +150,8 @@ class Batch:
 
         With the standard deviations of their noises, where those are drawn.
         """
-        return Parameters({name: self.quantity(row) for name, row in self._truth.items()})
+        values = (worth * self.quantity(row) for worth, row in zip(self._worth, self._truth.values(), strict=True))
+        return Parameters(zip(self._truth, values, strict=True))
 
     def true_of(self, index: int) -> Parameters:
         """The true plant of environment ``index``."""
@@ -158,7 +160,7 @@ class Batch:
     def truths(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[Parameters]:
         """The true plants of some environments; ``final``: those of their last episodes, if reset since."""
         first = self._place[next(iter(self._truth.values()))]
-        rows = self._adjacent(indices, first, len(self._truth), final=final).tolist()
+        rows = (self._worth * self._adjacent(indices, first, len(self._truth), final=final)).tolist()
         return [Parameters(zip(self._truth, values, strict=True)) for values in rows]
 
     def _adjacent(self, indices: npt.NDArray[np.intp], first: int, count: int, *, final: bool) -> FloatArray:
@@ -183,6 +185,14 @@ class Batch:
         self.observations = self._observations[: self.size]
         self.final_observations = self._final_observations[: self.size]
         self.outcomes = self._outcomes[:, : self.size]
+
+
+def worth_of(experiment: Experiment, name: str) -> float:
+    """What one inside is worth outside, of a parameter of the truth, or of a noise as the first sensor shows it."""
+    scales, model = experiment.scales, experiment.truth_model
+    if name in model.dimensions:
+        return scales.factor(model.dimensions[name])
+    return 1.0 if name in parameter_names(model) else scales.output
 
 
 def spawn_seeds(seed: int | None, count: int) -> list[int]:

@@ -78,7 +78,8 @@ class Setup(NamedTuple):
         noise_range: largest over smallest of what is drawn for an episode about each of them; 1 leaves them.
         step: sampling step [s].
         center: (p,) parameters in the middle of the range, or their means.
-        width: (p,) standard deviations of those that are drawn from a Gaussian; 0 for the others.
+        width: (p,) standard deviations of those that are drawn from a Gaussian; minus that of the logarithm of those
+            that are log-normal; 0 for those that are log-uniform.
         spread: relative half width of the range.
         budget: of the energy Σ u²; inf for none.
         max_slew: largest change of the input; inf for none.

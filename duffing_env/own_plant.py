@@ -198,10 +198,11 @@ class PlantEnv(DuffingEnv):
         return super().reset(seed=seed, options=options)
 
     def _apply(self, action: float) -> None:
+        scales = self.experiment.scales
         u = self.max_input * float(np.float32(action))
         self._plant_error = None
         try:
-            y = float(self.plant.step(u))
+            y = float(self.plant.step(scales.input * u)) / scales.output
         except Exception as error:  # whatever it is: the episode ends in order, and its belief is told
             self._plant_error = f"{type(error).__name__}: {error}"
             y = np.nan

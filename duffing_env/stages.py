@@ -10,6 +10,7 @@ import numpy as np
 
 from duffing_env.noise import as_bits, as_word, draw, normal_pair, to_unit
 from estimator.lanes import LANES, jit, lanewise
+from estimator.rig_prior import HALF_WIDTH
 
 # A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).
 _FLOAT32_ROUNDING = 2.0**-22
@@ -73,7 +74,7 @@ def draw_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
 
 @jit
 def draw_plant(W, j, setup, stream, drawn):
-    """The parameters of lane j's plant, each log-uniform about its centre, or from a Gaussian; then its noises.
+    """The parameters of lane j's plant, each log-uniform about its centre, Gaussian or log-normal; then its noises.
 
     ``stream`` and ``drawn`` say where the first word of the stream and the first parameter stand.
     """
@@ -83,10 +84,15 @@ def draw_plant(W, j, setup, stream, drawn):
     width = math.log(1.0 + setup.spread) - low
     for p in range(len(setup.center)):
         first, a, b, c, d = draw(a, b, c, d)
-        if setup.width[p] > 0.0:
+        if setup.width[p] != 0.0:
             second, a, b, c, d = draw(a, b, c, d)
             deviation, _ = normal_pair(to_unit(first), to_unit(second))
-            W[drawn + p * LANES + j] = setup.center[p] + setup.width[p] * deviation
+            value = setup.center[p] + setup.width[p] * deviation
+            if setup.width[p] < 0.0:
+                value = setup.center[p] * math.exp(setup.width[p] * deviation)
+            elif abs(setup.center[p]) > HALF_WIDTH * setup.width[p] and value * setup.center[p] < 0.0:
+                value = -value  # what is believed to have one sign keeps it
+            W[drawn + p * LANES + j] = value
         else:
             W[drawn + p * LANES + j] = setup.center[p] * math.exp(low + width * to_unit(first))
     noises, decades = drawn + len(setup.center) * LANES, math.log(setup.noise_range)

@@ -68,6 +68,11 @@ TRACKS: dict[str, dict[str, Any]] = {
             "max_output": 20.0,
         },
     },
+    "duffing_env/Rig-v0": {
+        "entry_point": "duffing_env.rig_env:make_rig",
+        "vector_entry_point": "duffing_env.rig_env:RigVectorEnv",
+        "kwargs": {"horizon": 256},
+    },
     "duffing_env/SilverboxReplay-v0": {
         "entry_point": "duffing_env.replay:SilverboxReplayEnv",
         "vector_entry_point": "duffing_env.vector_env:SilverboxReplayVectorEnv",

@@ -16,7 +16,7 @@ from estimator.units import Scales
 HALF_WIDTH = 1.6448536269514722
 
 #: Standard deviation of an offset, and of a noise of which nothing is known, in parts of the channel's scale.
-_OFFSET, _NOISE = 0.03, 0.01
+OFFSET, NOISE = 0.03, 0.01
 
 #: Of a displacement at the start, in parts of the output's scale.
 _START = 0.3
@@ -46,8 +46,8 @@ def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
     model = rig.model
     names = list(model.physical)
     axes = {name: _axis(name, *rig.guess[name]) for name in rig.guess}
-    axes["u0"] = _gaussian(rig.input.offset, _OFFSET * scales.input, _OFFSET_NODES)
-    axes["y0"] = _gaussian(rig.output.offset, _OFFSET * scales.output, _OFFSET_NODES)
+    axes["u0"] = _gaussian(rig.input.offset, OFFSET * scales.input, _OFFSET_NODES)
+    axes["y0"] = _gaussian(rig.output.offset, OFFSET * scales.output, _OFFSET_NODES)
     grid = np.meshgrid(*(axes[name][0] for name in names), indexing="ij")
     probabilities = np.ones(1)
     for name in names:
@@ -71,8 +71,8 @@ def about(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief
         joint_mean[0] = joint_mean[place]
         joint[0, :] += joint[place, :]
         joint[:, 0] += joint[:, place]
-    force = (rig.input.noise or _NOISE * scales.input) / scales.input
-    noises = known["gain"] * force / np.sqrt(3), (rig.output.noise or _NOISE * scales.output) / scales.output
+    force = (rig.input.noise or NOISE * scales.input) / scales.input
+    noises = known["gain"] * force / np.sqrt(3), (rig.output.noise or NOISE * scales.output) / scales.output
     gamma, xi = ((2.0, 2.0 * float(noise) ** 2) for noise in noises)
     return Belief.of(model, joint_mean, joint, gamma, xi, scales=scales)
 

@@ -1,0 +1,331 @@
+"""A rig as the environment: simulated, or around the plant itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from duffing_env.env import DuffingEnv
+from duffing_env.experiment import Experiment, SimulatedExperiment
+from duffing_env.own_plant import Plant, PlantEnv, PlantExperiment
+from duffing_env.vector_env import DuffingVectorEnv
+from estimator.belief import Belief
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+from estimator.rig import Rig
+from estimator.rig_prior import HALF_WIDTH, NOISE, OFFSET, rig_prior
+from estimator.units import Scales
+
+AnyRig = Rig | Mapping[str, Any] | str | Path
+
+
+def _checked(rig: AnyRig | None) -> Rig:
+    """The rig of an environment.
+
+    Raises:
+        ValueError: for none, one without limit, range or guess, or with an input that is not known sample by sample.
+    """
+    if rig is None:
+        raise ValueError("rig must be a Rig, a dictionary or a file name, but is None; pass rig='rig.toml'")
+    rig = Rig.of(rig)
+    for missing, where in (("limit", rig.input.limit), ("range", rig.output.range), ("guess", rig.guess)):
+        if where is None:
+            raise ValueError(f"rig must have a {missing} for an environment, but has none; add it to the rig")
+    if rig.interpolation not in ("zero_order", "linear"):
+        raise ValueError(
+            f"rig must have interpolation 'zero_order' or 'linear' for an environment, but has {rig.interpolation!r}, "
+            f"which needs inputs of the future"
+        )
+    if rig.delay > 0:
+        raise ValueError(
+            f"rig must have no delay for an environment, but has {rig.delay}; the plant waits for its input"
+        )
+    return rig
+
+
+@dataclass(frozen=True)
+class RigExperiment(SimulatedExperiment):
+    """An experiment on oscillators that are drawn from a rig's guess. All numbers are in parts of its limit and range.
+
+    The fields of `SimulatedExperiment` are the same, but for these; ``spread``, ``plant_spread`` and ``jump`` are not
+    used, because the guess says what may be.
+
+    Attributes:
+        rig: a `Rig`, a dictionary, or the name of a rig file; with limit, range and guess.
+        max_input: input of the action 1, in parts of the input's limit; at most 1.
+        max_output: largest output, in parts of the output's range; at most 1.
+        process_noise: disturbance of the force, as a standard deviation per sample, in parts of the input's limit; the
+            rig's, or 1 % where it has none.
+        measurement_noise: of the sensor, in parts of the output's range; the rig's, or 1 % where it has none.
+        noise_range: both are drawn for every episode, over a range of this factor.
+        noise_hypotheses: of the estimator.
+    """
+
+    rig: AnyRig | None = None
+    max_input: float = 1.0
+    max_output: float = 1.0
+    process_noise: float | None = None  # type: ignore[assignment]
+    measurement_noise: float | None = None  # type: ignore[assignment]
+    noise_range: float = 10.0
+    noise_hypotheses: int = 9
+
+    def __post_init__(self) -> None:
+        rig = _checked(self.rig)
+        object.__setattr__(self, "rig", rig)
+        for name, channel, scale in (
+            ("process_noise", rig.input, rig.scales.input),
+            ("measurement_noise", rig.output, rig.scales.output),
+        ):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, NOISE if channel.noise is None else channel.noise / scale)
+        super().__post_init__()
+        for name in ("max_input", "max_output"):
+            if getattr(self, name) > 1:
+                raise ValueError(f"{name} must be at most 1, the rig's own limit, but is {getattr(self, name)!r}")
+        if self.factorisation != "structured":
+            raise ValueError(f"factorisation must be 'structured' for a rig, but is {self.factorisation!r}")
+        for name, usual in (("spread", 0.3), ("plant_spread", None), ("jump", 0.0)):
+            if getattr(self, name) != usual:
+                raise ValueError(f"{name} must be left out for a rig, whose guess says the range")
+
+    @property
+    def described(self) -> Rig:
+        """The rig."""
+        assert isinstance(self.rig, Rig)
+        return self.rig
+
+    @property
+    def plant(self) -> Model:
+        """Eq. (1) with offsets, as the rig's sensor shows it."""
+        return self.described.model
+
+    @property
+    def model(self) -> Model:
+        """The plant's own."""
+        return self.plant
+
+    @property
+    def degree(self) -> int:
+        """Of the input over a sample."""
+        return int(self.described.interpolation == "linear")
+
+    @property
+    def step(self) -> float:
+        """The rig's."""
+        return float(self.described.step)
+
+    @property
+    def scales(self) -> Scales:
+        """The rig's."""
+        return self.described.scales
+
+    @property
+    def center(self) -> dict[str, float]:
+        """The guess's middle, inside."""
+        return {name: mean for name, (mean, _) in self._drawn.items()}
+
+    @cached_property
+    def _drawn(self) -> dict[str, tuple[float, float]]:
+        """Parameter to middle and standard deviation, inside; of m, which is log-normal, minus its logarithm's."""
+        rig, model, scales = self.described, self.plant, self.scales
+        assert rig.guess is not None
+        drawn = {}
+        for name, (low, high) in rig.guess.items():
+            drawn[name] = (low + high) / 2, (high - low) / 2 / HALF_WIDTH
+        low, high = rig.guess["m"]
+        drawn |= {"u0": (rig.input.offset, OFFSET * scales.input), "y0": (rig.output.offset, OFFSET * scales.output)}
+        inside = {}
+        for name in model.physical:
+            worth = scales.factor(model.dimensions[name])
+            inside[name] = drawn[name][0] / worth, drawn[name][1] / worth
+        worth = scales.factor(model.dimensions["m"])
+        inside["m"] = float(np.sqrt(low * high)) / worth, -float(np.log(high / low)) / 2 / HALF_WIDTH
+        return inside
+
+    @cached_property
+    def believed(self) -> Belief:
+        """The prior that the guess makes, with the noises where they are guessed to be."""
+        return self._with_noises(rig_prior(self.described))
+
+    def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
+        """The prior of the rig's model; there is no other that knows its offsets.
+
+        Raises:
+            ValueError: for another model.
+        """
+        if model != self.model:
+            raise ValueError(f"model must be the rig's, but is {model.name!r}")
+        return self.believed.factorised(factorisation)
+
+    def _with_noises(self, prior: Belief) -> Belief:
+        process, sensor = self.noise_guesses
+        gain = prior.coefficients()["gain"][0]
+        shape = float(self.noise_shape)
+        gamma, xi = ((shape, shape * std**2) for std in (_moved(process, gain), sensor))
+        return Belief.of(prior.model, prior.mean, prior.cov, gamma, xi, scales=prior.scales)
+
+    @property
+    def noise_levels(self) -> tuple[float, float]:
+        """The disturbance of the force and the sensor's noise, in parts of limit and range."""
+        assert self.process_noise is not None
+        assert self.measurement_noise is not None
+        return float(self.process_noise), float(self.measurement_noise)
+
+    @property
+    def plant_setup(self) -> dict[str, Any]:
+        """The noises and the range of the plants, inside."""
+        gain = self.believed.coefficients()["gain"][0]
+        width: FloatArray = np.array([std for _, std in self._drawn.values()])
+        return {**super().plant_setup, "process_noise": _moved(self.noise_levels[0], gain), "width": width}
+
+
+def _moved(disturbance: float, gain: float) -> float:
+    """σ_w of a disturbance of the force (`estimator.rig_prior`)."""
+    return float(disturbance * gain / np.sqrt(3))
+
+
+@dataclass(frozen=True)
+class RigPlantExperiment(PlantExperiment):
+    """An experiment on a rig's plant itself, whose parameters nobody knows.
+
+    Attributes:
+        rig: see `RigExperiment`.
+        max_input: see `RigExperiment`.
+        max_output: see `RigExperiment`.
+        noise_hypotheses: of the estimator.
+    """
+
+    rig: AnyRig | None = None
+    max_input: float = 1.0
+    max_output: float = 1.0
+    noise_hypotheses: int = 9
+
+    def __post_init__(self) -> None:
+        rig = _checked(self.rig)
+        object.__setattr__(self, "rig", rig)
+        if self.prior is None:
+            object.__setattr__(self, "prior", rig_prior(rig))
+        super().__post_init__()
+        for name in ("max_input", "max_output"):
+            if getattr(self, name) > 1:
+                raise ValueError(f"{name} must be at most 1, the rig's own limit, but is {getattr(self, name)!r}")
+
+    @property
+    def degree(self) -> int:
+        """Of the input over a sample."""
+        assert isinstance(self.rig, Rig)
+        return int(self.rig.interpolation == "linear")
+
+    @property
+    def scales(self) -> Scales:
+        """The rig's."""
+        assert isinstance(self.rig, Rig)
+        return self.rig.scales
+
+
+class RigEnv(DuffingEnv):
+    r"""Choose the input of an oscillator of one's own so that its parameters are identified.
+
+    ## Description
+
+    A `estimator.Rig` says how an oscillator m x'' + c x' + a x + b x³ = u + w stands in the world: sampling step,
+    units, the limit of the input, the range and kind of the sensor, and what is guessed of m, c, a and b. The
+    environment draws oscillators from the guess, with offsets of input and output and noises that neither estimator nor
+    policy is told, and steps them with the differential equation. With ``plant=`` the plant itself takes their place
+    (`duffing_env.own_plant`).
+
+    Inside, everything is in parts of the input's limit and the output's range; ``belief`` and ``truth`` are in the
+    rig's units.
+
+    ## Action space
+
+    `Box(-1, 1, (1,), float32)`, the input in parts of ``max_input`` times the rig's limit.
+
+    ## Observation space
+
+    `Box(35, float32)`, every entry clipped to its bounds: for the six coefficients of Eq. (1) with offsets, posterior
+    means (deviation from the prior's, in its standard deviations), logarithms of their standard deviations relative to
+    the prior's, 15 correlations, log E[γ] and log E[ξ] relative to the prior's, two states, the last input and output,
+    the time and the energy that are left, in the order of `duffing_env.layout.observation_bounds`.
+
+    ## Reward
+
+    As `DuffingEnv`; with ``plant=`` those that do not need the truth.
+
+    ## Starting state
+
+    Simulated: m is drawn log-normally, c, a and b from a Gaussian whose central 90 % are the guess (those that are
+    guessed to have one sign keep it), offsets of 3 % and noises over a decade; the oscillator is at rest. With
+    ``plant=``: what ``plant.reset()`` leaves.
+
+    ## Episode end
+
+    Terminated when the output leaves the range (times ``max_output``), or at a number that is not finite; truncated
+    after ``horizon`` samples.
+
+    ## Information
+
+    As `DuffingEnv`; with ``plant=`` as `duffing_env.own_plant.PlantEnv`.
+
+    ## Arguments
+
+    Those of `DuffingEnv` but for ``spread``, ``plant_spread`` and ``jump``, and:
+
+    | Argument | Default | Meaning |
+    |----------|---------|---------|
+    | ``rig`` | | a `Rig`, a dictionary (which is JSON-able), or the name of a rig file; with limit, range and guess |
+    | ``plant`` | None | the plant itself: an object with ``reset()`` and ``step(u)``, in the rig's units |
+    | ``max_input`` | 1 | input of the action 1, in parts of the rig's limit |
+    | ``max_output`` | 1 | largest output, in parts of the rig's range |
+    | ``process_noise`` | the rig's, or 0.01 | disturbance of the force, in parts of the input's limit |
+    | ``measurement_noise`` | the rig's, or 0.01 | noise of the sensor, in parts of the output's range |
+    | ``noise_range`` | 10 | both are drawn for every episode, over a range of this factor |
+    | ``noise_hypotheses`` | 9 | of the estimator |
+
+    >>> import gymnasium as gym
+    >>> import duffing_env
+    >>> from estimator import Channel, Rig
+    >>> guess = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
+    >>> rig = Rig(1e-3, input=Channel("N", limit=6), output=Channel("m", range=0.03, noise=5e-6), guess=guess)
+    >>> env = gym.make("duffing_env/Rig-v0", rig=rig)
+    >>> observation, info = env.reset(seed=0)
+    >>> done = False
+    >>> while not done:
+    ...     action = [1.0 if observation[32] <= 0 else -1.0]
+    ...     observation, reward, terminated, truncated, info = env.step(action)
+    ...     done = terminated or truncated
+    >>> m, std, unit = info["belief"].parameters()["m"]
+    >>> bool(abs(m - info["truth"].m) < 4 * std), unit
+    (True, 'kg')
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    experiment_kind: ClassVar[type[Experiment]] = RigExperiment
+
+
+class RigPlantEnv(PlantEnv):
+    """A rig around its plant; what ``Rig-v0`` is with ``plant=``."""
+
+    experiment_kind: ClassVar[type[Experiment]] = RigPlantExperiment
+
+
+class RigVectorEnv(DuffingVectorEnv):
+    """Many `RigEnv` at once."""
+
+    single: ClassVar[type[DuffingEnv]] = RigEnv
+
+
+def make_rig(plant: Plant | None = None, **options: Any) -> DuffingEnv:
+    """``Rig-v0``: simulated, or around a plant."""
+    return RigEnv(**options) if plant is None else RigPlantEnv(plant, **options)
+
+
+make_rig.metadata = RigEnv.metadata  # type: ignore[attr-defined]
