@@ -75,6 +75,8 @@ class RigExperiment(SimulatedExperiment):
     noise_hypotheses: int = 9
 
     def __post_init__(self) -> None:
+        if self.factorisation != "structured":
+            raise ValueError(f"factorisation must be 'structured' for a rig, but is {self.factorisation!r}")
         rig = _checked(self.rig)
         object.__setattr__(self, "rig", rig)
         for name, channel, scale in (
@@ -87,8 +89,6 @@ class RigExperiment(SimulatedExperiment):
         for name in ("max_input", "max_output"):
             if getattr(self, name) > 1:
                 raise ValueError(f"{name} must be at most 1, the rig's own limit, but is {getattr(self, name)!r}")
-        if self.factorisation != "structured":
-            raise ValueError(f"factorisation must be 'structured' for a rig, but is {self.factorisation!r}")
         for name, usual in (("spread", 0.3), ("plant_spread", None), ("jump", 0.0)):
             if getattr(self, name) != usual:
                 raise ValueError(f"{name} must be left out for a rig, whose guess says the range")
@@ -310,6 +310,10 @@ class RigEnv(DuffingEnv):
 
     experiment_kind: ClassVar[type[Experiment]] = RigExperiment
 
+    def __new__(cls, plant: Plant | None = None, **options: Any) -> Any:
+        """Itself; or, around a plant, a `RigPlantEnv`."""
+        return super().__new__(cls) if plant is None else RigPlantEnv(plant, **options)
+
 
 class RigPlantEnv(PlantEnv):
     """A rig around its plant; what ``Rig-v0`` is with ``plant=``."""
@@ -321,11 +325,3 @@ class RigVectorEnv(DuffingVectorEnv):
     """Many `RigEnv` at once."""
 
     single: ClassVar[type[DuffingEnv]] = RigEnv
-
-
-def make_rig(plant: Plant | None = None, **options: Any) -> DuffingEnv:
-    """``Rig-v0``: simulated, or around a plant."""
-    return RigEnv(**options) if plant is None else RigPlantEnv(plant, **options)
-
-
-make_rig.metadata = RigEnv.metadata  # type: ignore[attr-defined]

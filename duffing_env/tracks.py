@@ -69,7 +69,7 @@ TRACKS: dict[str, dict[str, Any]] = {
         },
     },
     "duffing_env/Rig-v0": {
-        "entry_point": "duffing_env.rig_env:make_rig",
+        "entry_point": "duffing_env.rig_env:RigEnv",
         "vector_entry_point": "duffing_env.rig_env:RigVectorEnv",
         "kwargs": {"horizon": 256},
     },

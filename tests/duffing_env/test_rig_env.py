@@ -1,0 +1,152 @@
+"""Rig-v0: a rig of one's own as the environment, simulated and around its plant."""
+
+import json
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from agents import make_policy
+from duffing_env.batch import spawn_seeds
+from duffing_env.rig_env import RigExperiment
+from estimator import Channel, OnlineEstimator, Rig
+from estimator.free_run import free_run
+from estimator.physical import coefficients_of
+
+GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
+RIG = Rig(1e-3, input=Channel("N", limit=6, noise=0.02), output=Channel("m", range=0.03, noise=5e-6), guess=GUESS)
+ID = "duffing_env/Rig-v0"
+
+
+def make_vec(envs, rig=RIG, **options):
+    return gym.make_vec(ID, num_envs=envs, vectorization_mode="vector_entry_point", rig=rig, **options)
+
+
+def played(envs, steps=256, seed=1):
+    """Endings (belief, truth, terminated) of one episode of each, under a binary input that is held for six samples."""
+    rng, n = np.random.default_rng(0), envs.num_envs
+    envs.reset(seed=seed)
+    endings = [None] * n
+    for t in range(steps):
+        if t % 6 == 0:
+            actions = rng.choice([-1.0, 1.0], (n, 1)).astype(np.float32)
+        _, _, terminated, truncated, infos = envs.step(actions)
+        for row in np.flatnonzero(terminated | truncated):
+            endings[row] = endings[row] or (infos["belief"][row], infos["truth"][row], bool(terminated[row]))
+    return endings
+
+
+def test_gymnasium_s_checker_takes_a_rig_as_json():
+    env = gym.make(ID, rig=json.loads(json.dumps(RIG.to_dict())))
+    check_env(env.unwrapped, skip_render_check=True)
+    assert gym.make(gym.spec(ID), rig=RIG.to_dict()).unwrapped.experiment == env.unwrapped.experiment
+
+
+def test_single_equals_vector_to_the_bit():
+    single, many = gym.make(ID, rig=RIG).unwrapped, make_vec(33)
+    together, _ = many.reset(seed=5)
+    row = 32
+    alone, _ = single.reset(seed=spawn_seeds(5, 33)[row])
+    np.testing.assert_array_equal(alone, together[row])
+    rng = np.random.default_rng(2)
+    for _ in range(40):
+        actions = rng.uniform(-1, 1, (33, 1)).astype(np.float32)
+        together, rewards, *_ = many.step(actions)
+        alone, reward, *_ = single.step(actions[row])
+        np.testing.assert_array_equal(alone, together[row])
+        assert reward == rewards[row]
+    assert single.belief == many.unwrapped.belief(row)
+
+
+def test_truth_is_drawn_from_the_guess_in_the_rig_s_units():
+    endings = played(make_vec(256, horizon=1), steps=1)
+    truths = {name: np.array([truth[name] for _, truth, _ in endings]) for name in "mcab"}
+    for name, (low, high) in GUESS.items():
+        inside = ((truths[name] > low) & (truths[name] < high)).mean()
+        assert abs(inside - 0.9) < 4 * np.sqrt(0.09 / 256)
+        assert (truths[name] > 0).all()
+    noises = np.array([endings[k][1]["measurement_noise"] for k in range(256)])
+    assert 5e-6 / np.sqrt(10) <= noises.min() < 2.5e-6
+    assert 1e-5 < noises.max() <= 5e-6 * np.sqrt(10)
+
+
+def test_intervals_hold_the_truth_with_noises_unknown():
+    endings = played(make_vec(256))
+    assert not any(terminated for *_, terminated in endings)
+    scaled = np.array(
+        [
+            (belief.coefficients_mean - coefficients_of(belief.model, truth, belief.scales))
+            / np.sqrt(np.diag(belief.coefficients_cov))
+            for belief, truth, _ in endings
+        ]
+    )
+    # The pooled share of six coefficients, which are not independent: as uncertain as one.
+    assert abs((np.abs(scaled) < 1.645).mean() - 0.9) < 4 * np.sqrt(0.09 / 256)
+    errors = [abs(belief.parameters()["m"][0] / truth.m - 1) for belief, truth, _ in endings]
+    assert np.median(errors) < 0.003
+
+
+class Bench:
+    """The bench itself, in newtons and metres; the engine's equation without noise."""
+
+    def __init__(self):
+        model = RIG.model
+        self.coefficients = coefficients_of(
+            model, {"m": 0.42, "c": 0.5, "a": 2400.0, "b": 4e7, "u0": 0.0, "y0": 0.0}, RIG.scales
+        )
+        self.told = []
+
+    def reset(self):
+        self.told = []
+
+    def step(self, u):
+        self.told.append(u)
+        return RIG.scales.output * free_run(RIG.model, self.coefficients, np.array(self.told) / RIG.scales.input)[-1]
+
+
+def test_around_the_plant_inputs_and_outputs_are_in_its_units():
+    bench = Bench()
+    env = gym.make(ID, rig=RIG, plant=bench, horizon=60).unwrapped
+    env.reset(seed=0)
+    actions = np.repeat(np.random.default_rng(3).choice([-1.0, 1.0], 10), 6)
+    for action in actions:
+        _, _, terminated, truncated, info = env.step([action])
+    assert truncated
+    assert not terminated
+    assert set(np.abs(bench.told)) == {6.0}
+    outputs = RIG.scales.output * free_run(RIG.model, bench.coefficients, np.array(bench.told) / RIG.scales.input)
+    mean, std, unit = info["belief"].parameters()["m"]
+    assert abs(mean - 0.42) < 5 * std
+    assert unit == "kg"
+    # What the estimator of the same rig makes of the same pairs: those of an environment.
+    estimator = OnlineEstimator(rig=Rig.from_dict(RIG.to_dict() | {"delay": -1}))
+    estimator.run(bench.told, outputs)
+    np.testing.assert_allclose(
+        info["belief"].coefficients_mean, estimator.belief.coefficients_mean, rtol=1e-6, atol=1e-9
+    )
+
+
+def test_the_planner_plays_it():
+    envs = make_vec(2, horizon=8)
+    observations, _ = envs.reset(seed=0)
+    actions, _ = make_policy("efe", envs).predict(observations, deterministic=True)
+    assert np.abs(actions).max() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "rig must be a Rig, a dictionary or a file name, but is None"),
+        ({"rig": Rig(1.0, guess=GUESS)}, "rig must have a limit for an environment, but has none"),
+        ({"rig": {**RIG.to_dict(), "interpolation": "spline"}}, "rig must have interpolation 'zero_order' or 'linear'"),
+        ({"rig": {**RIG.to_dict(), "delay": 1}}, "rig must have no delay for an environment, but has 1"),
+        ({"rig": RIG, "max_input": 1.5}, "max_input must be at most 1, the rig's own limit, but is 1.5"),
+        ({"rig": RIG, "spread": 0.2}, "spread must be left out for a rig"),
+        ({"rig": RIG, "factorisation": "mean_field"}, "factorisation must be 'structured' for a rig"),
+    ],
+)
+def test_errors_name_the_option(options, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        RigExperiment(**options)
