@@ -96,7 +96,7 @@ def describe_machine() -> dict[str, Any]:
 def print_head(machine: dict[str, Any], versions: dict[str, dict[str, str]], repetitions: int) -> None:
     """Print the machine, the versions, and how to read what follows."""
     settings = ", ".join(f"{name}={value}" for name, value in machine["settings"].items()) or "none set"
-    print(f"{machine['processor']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']}")
+    print(f"{machine['processor']}, {machine['cores']} cores, {machine['system']}")
     print(f"Load before: {machine['load_before']}. Thread settings: {settings}")
     for name, found in versions.items():
         print(f"{name}: " + (", ".join(f"{package} {number}" for package, number in found.items()) or "none"))
