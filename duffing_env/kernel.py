@@ -62,7 +62,7 @@ def compiled(kind: Kind) -> Kernel:
     stream, drawn = row["STREAM_a"], row[f"PARAM_{parameter_names(kind.truth)[0]}"]
     asked, elapsed, waiting = row["ASKED"], row["ELAPSED"], row["WAITING"]
     terminated, truncated, diverged, off_record = (row[name] for name in OUTCOME[3:])
-    outcome, observed = row["REWARD"], row[f"OBS_{next(iter(observation_bounds(kind.belief)))}"]
+    outcome = row["REWARD"]
     recorded_u_row, recorded_y_row = row["RECORDED_u"], row["RECORDED_y"]
     jump_at, jump_factor = row["JUMP_AT"], row["JUMP_FACTOR"]
     summed = tuple(row[name] for name in SUMMED)
@@ -211,14 +211,15 @@ def compiled(kind: Kind) -> Kernel:
             for k in range(n_outcome):
                 for j in range(LANES):
                     outcomes[k, lane + j] = W[outcome + k * LANES + j]
+            # What was saved is not needed any more, and rows that all blocks share stay in the nearest cache.
             for again in range(2):
                 observe(
-                    W, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output,
+                    W, saved, setup.prior, setup.inverse_std, setup.log_precisions, 1.0 / setup.max_output,
                     1.0 / setup.max_input, setup.horizon, 1.0 / setup.horizon, setup.budget,
                 )  # fmt: skip
                 for j in range(LANES):
                     for k in range(n_observation):
-                        observations[lane + j, k] = W[observed + k * LANES + j]
+                        observations[lane + j, k] = saved[k * LANES + j]
                 if again or reset_mode != RESET_SAME_STEP or not finished:
                     break
                 for j in range(LANES):

@@ -211,7 +211,6 @@ def layout_of(kind: Kind) -> Mapping[str, int]:
     wanted += ["INPUT", "LAST_INPUT", "OLDER_INPUT", "RISE", "ASKED", "SPENT", "JUMP_AT", "JUMP_FACTOR"]
     wanted += ["ELAPSED", "WAITING", "RECORDED_u", "RECORDED_y", "LOG_DET", "LOG_DENSITY", "ERROR", "WORK", "EARNED"]
     wanted += OUTCOME
-    wanted += [f"OBS_{name}" for name in observation_bounds(belief)]
     if kind.work == "fisher":
         wanted += [f"I_{name}" for name in belief_names(belief) if name.startswith("P_")]
     if kind.work == "simulation_error":

@@ -52,7 +52,7 @@ def _source(kind: Kind) -> str:
         within = {**place, **inputs_of(kind, kind.truth, place), **noises}
         return "@straight\n" + lane_loop(name, lines, results, within, LANES, uniform, doc=doc)
 
-    source = _truth(kind, loop) + _judgement(kind, loop) + _observation(kind, loop)
+    source = _truth(kind, loop) + _judgement(kind, loop) + _observation(kind)
     if kind.plant is not None:
         source += _plant(kind.plant, kind.degree, plant_loop)
     source += _walk(kind.belief, loop)
@@ -247,11 +247,12 @@ def _doubled(model: Model) -> set[str]:
     return {f"{name}_{name}" for name in model.names}
 
 
-def _observation(kind: Kind, loop: Any) -> str:
-    """``observe(W, ...)``: the observation into the rows ``OBS_<name>``; its prior is told entry by entry."""
+def _observation(kind: Kind) -> str:
+    """``observe(W, B, ...)``: the observation into the rows of a block ``B``; its prior is told entry by entry."""
     import sympy as sp
 
     from estimator.engine.derive import pair, symbol
+    from estimator.engine.emit import lane_loop
 
     model = kind.belief
     coefficients, order = list(model.coefficients), list(model.names)
@@ -283,12 +284,14 @@ def _observation(kind: Kind, loop: Any) -> str:
     uniform = [f"{letter}_{c}" for letter in ("PRIOR", "SCALE") for c in coefficients]
     uniform += ["LOG_gamma", *(f"LOG_xi_{y}" for y in model.outputs)]
     scales = ["per_output", "per_input", "horizon", "per_horizon", "budget"]
-    source = loop(
-        "observe_lanes", "The observation, in rows.", lines, {f"OBS_{n}": f"V_{n}" for n in values}, *uniform, *scales
-    )
+    rows = {f"OBS_{name}": row for row, name in enumerate(values)}
+    source = "@straight\n" + lane_loop(
+        "observe_lanes", lines, {f"OBS_{name}": f"V_{name}" for name in values}, layout_of(kind), LANES,
+        (*uniform, *scales), doc="The observation, in rows.", beside=rows,
+    )  # fmt: skip
     n, k = model.n_states, model.n_coefficients
     told = [*(f"prior[{n + i}]" for i in range(k)), *(f"inverse_std[{i}]" for i in range(k))]
     told += [f"log_precisions[{i}]" for i in range(1 + model.n_outputs)]
-    arguments = ", ".join(["W", *told, *scales])
-    signature = ", ".join(["W", "prior", "inverse_std", "log_precisions", *scales])
+    arguments = ", ".join(["W", "B", *told, *scales])
+    signature = ", ".join(["W", "B", "prior", "inverse_std", "log_precisions", *scales])
     return source + f"@straight\ndef observe({signature}):\n    observe_lanes({arguments})\n"

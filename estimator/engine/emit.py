@@ -76,6 +76,7 @@ def lane_loop(
     uniform: Sequence[str] = (),
     doc: str = "",
     one: bool = False,
+    beside: Mapping[str, int] | None = None,
 ) -> str:
     """Source of ``name(W, *uniform)``, which executes assignments in every lane of a block.
 
@@ -89,6 +90,7 @@ def lane_loop(
         uniform: names that are the same in all lanes, and become arguments.
         doc: a line for the reader.
         one: write ``name(W, j, *uniform)``, for lane j alone.
+        beside: rows of another block ``B``, the second argument, whose memory many blocks may share.
 
     Raises:
         ValueError: for a name that is neither assigned, nor a row, nor uniform.
@@ -106,6 +108,8 @@ def lane_loop(
 
     def place(row: str) -> str:
         """Where a row lies; the adjoint of a row, ``G_<row>``, lies in the same place of the block ``A``."""
+        if beside and row in beside:
+            return f"B[{beside[row] * lanes}{' + LANE' if lanes > 1 else ''}]"
         block, bare = ("W", row) if row in layout else ("A", row.removeprefix("G_"))
         if bare not in layout:
             raise ValueError(f"{name} uses {row}, which no line assigns, no row holds and no argument brings")
@@ -116,7 +120,7 @@ def lane_loop(
     body = [f"{row} = {place(row)}" for row in read]
     body += [f"{target} = {text_of(e)}" for target, e in kept]
     body += [f"{place(row)} = {value}" for row, value in results.items()]
-    blocks = ["W", *(["A"] if adjoint else []), *(["LANE"] if one else [])]
+    blocks = ["W", *(["A"] if adjoint else []), *(["B"] if beside else []), *(["LANE"] if one else [])]
     source = [f"def {name}({', '.join([*blocks, *uniform])}):", f'    """{doc}"""']
     if lanes > 1 and not one:
         source.append(f"    for LANE in range({lanes}):")
