@@ -17,6 +17,8 @@ from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, Parameters
 
+_OUTCOME = tuple(name.lower() for name in OUTCOME)
+
 
 class Batch:
     """n experiments of one kind, stepped together.
@@ -121,8 +123,7 @@ class Batch:
 
     def outcome(self, index: int) -> dict[str, float]:
         """What the last step left behind for one environment, by its names in lower case."""
-        names = (name.lower() for name in OUTCOME)
-        return dict(zip(names, self._outcomes[:, index].tolist(), strict=True))
+        return dict(zip(_OUTCOME, self._outcomes[:, index].tolist(), strict=True))
 
     def quantity(self, name: str) -> FloatArray:
         """(n,) current values of a row, such as what the last step left behind; a copy."""

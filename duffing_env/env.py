@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -235,7 +236,8 @@ class DuffingEnv(gym.Env[Any, Any]):
         outcome = self._play(_one_number(action))
         terminated, truncated = bool(outcome["terminated"]), bool(outcome["truncated"])
         info: dict[str, Any] = {name: outcome[name] for name in self._reported}
-        info |= {flag: bool(outcome[flag]) for flag in self._flags}
+        for flag in self._flags:
+            info[flag] = bool(outcome[flag])
         if terminated or truncated:
             self._running = False
             info |= self._final_info()
@@ -297,7 +299,8 @@ class DuffingEnv(gym.Env[Any, Any]):
 
 
 def _one_number(action: npt.ArrayLike) -> float:
-    value = np.asarray(action, dtype=np.float64)
-    if value.size != 1 or not np.isfinite(value).all():
+    given = action if isinstance(action, np.ndarray) else np.asarray(action, dtype=np.float64)
+    value = float(given.item()) if given.size == 1 else math.nan
+    if not math.isfinite(value):
         raise ValueError(f"action must be one finite number in [-1, 1], but is {action!r}")
-    return min(max(value.item(), -1.0), 1.0)
+    return min(max(value, -1.0), 1.0)
