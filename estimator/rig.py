@@ -6,7 +6,8 @@ import difflib
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
-from estimator.parameters import SAMPLING_STEP
 from estimator.units import Scales
 
 #: How the input goes between samples, and the degree of the polynomial that each takes.
@@ -25,6 +25,9 @@ _LONGEST_DELAY = 1000
 
 #: No rig file is larger [bytes].
 _LARGEST_FILE = 2**20
+
+#: Rigs that come with the package: name to file.
+SHIPPED = {path.stem: path for path in sorted((Path(__file__).parent / "rigs").glob("*.toml"), key=lambda p: p.stem)}
 
 _PARAMETERS = ("m", "c", "a", "b")
 
@@ -133,9 +136,23 @@ class Rig:
         object.__setattr__(self, "guess", _guessed(self.guess))
 
     @classmethod
-    def silverbox(cls, interpolation: str = "linear", delay: int = 0) -> Rig:
-        """The Silverbox record's: 610.35 Hz, a band-limited input."""
-        return cls(SAMPLING_STEP, interpolation, delay, Channel("V"), Channel("V"))
+    def silverbox(cls, interpolation: str = "spline", delay: int = 0) -> Rig:
+        """The Silverbox record's, which ships: its input is band-limited. Online take ``linear`` or ``look_ahead``."""
+        return replace(cls.shipped("silverbox"), interpolation=interpolation, delay=delay)
+
+    @classmethod
+    def shipped(cls, name: str) -> Rig:
+        """A rig that comes with the package.
+
+        Raises:
+            ValueError: for another name.
+
+        Example:
+            >>> from estimator import Rig
+            >>> Rig.shipped("beam").output.unit
+            'mm'
+        """
+        return _read_shipped(name)
 
     @classmethod
     def from_dict(cls, described: Mapping[str, Any]) -> Rig:
@@ -156,7 +173,10 @@ class Rig:
         """
         place = Path(path)
         if not place.exists():
-            raise FileNotFoundError(f"path must be a rig file, but there is no {place}; write one")
+            raise FileNotFoundError(
+                f"rig must be a file or one of {', '.join(SHIPPED)}, but there is no {place}; write it by hand, or by "
+                f"duffing-env rig init"
+            )
         if not place.is_file() or place.stat().st_size > _LARGEST_FILE:
             raise ValueError(f"path must be a rig file, a short TOML, but {place} is none; name the file itself")
         try:
@@ -166,13 +186,16 @@ class Rig:
 
     @classmethod
     def of(cls, rig: Rig | Mapping[str, Any] | str | Path) -> Rig:
-        """A rig from whatever describes one: itself, a dictionary, or the name of its file."""
+        """A rig from whatever describes one: itself, a dictionary, the name of its file, or that of one that ships.
+
+        Where a file has the name of a rig that ships, write ``./beam``.
+        """
         if isinstance(rig, Rig):
             return rig
         if isinstance(rig, Mapping):
             return cls.from_dict(rig)
         if isinstance(rig, str | Path):
-            return cls.from_file(rig)
+            return cls.shipped(rig) if isinstance(rig, str) and rig in SHIPPED else cls.from_file(rig)
         raise ValueError(f"rig must be a Rig, a dictionary or a file name, but is {rig!r:.60}; use Rig(step=...)")
 
     def to_dict(self) -> dict[str, Any]:
@@ -194,6 +217,15 @@ class Rig:
     def model(self) -> Model:
         """Eq. (1) with offsets, as the rig's sensor shows it."""
         return duffing(offsets=True, sensor=self.output.kind)
+
+
+@cache
+def _read_shipped(name: str) -> Rig:
+    if name not in SHIPPED:
+        near = difflib.get_close_matches(str(name), SHIPPED, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"name must be one of {', '.join(SHIPPED)}, but is {name!r:.60}{hint}")
+    return Rig.from_file(SHIPPED[name])
 
 
 def _is_number(value: object) -> bool:

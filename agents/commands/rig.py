@@ -1,4 +1,4 @@
-"""``duffing-env rig``: describe a rig in a file."""
+"""``duffing-env rig``: describe a rig in a file, or list those that ship."""
 
 from __future__ import annotations
 
@@ -11,30 +11,57 @@ import tyro
 
 @dataclass(frozen=True)
 class Init:
-    """Write a rig file: ask, or take what a record tells.
+    """Write a rig file. It asks, or takes what a record tells, or copies a rig that ships.
 
     $ duffing-env rig init
     $ duffing-env rig init rig.toml --from data.csv
+    $ duffing-env rig init rig.toml --from data.csv --step 1e-3
+    $ duffing-env rig init rig.toml --from beam
     """
 
     path: Annotated[Path, tyro.conf.Positional] = Path("rig.toml")
     """The file that is written."""
-    source: Annotated[str | None, tyro.conf.arg(name="from", metavar="SOURCE")] = None
-    """CSV file of a record."""
+    source: Annotated[str | None, tyro.conf.arg(name="from", metavar="DATA|NAME")] = None
+    """CSV file of a record, or the name of a rig that ships."""
+    step: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    """Sampling step, for a record without a column of times."""
     force: bool = False
     """Replace the file where there is one."""
 
     def run(self) -> None:
-        """Ask, and write."""
-        raise ValueError("not yet")
+        """Write it."""
+        from agents.commands.rig_file import ask, from_record, text_of
+        from estimator.files import write_atomically
+        from estimator.rig import SHIPPED
+
+        if self.path.exists() and not self.force:
+            raise ValueError(f"path must be a new file, but there is {self.path}; name another, or add --force")
+        if self.step is not None and (self.source is None or self.source in SHIPPED):
+            raise ValueError("step goes with a record; add --from data.csv, or leave it out")
+        if self.source is None:
+            text = text_of(ask())
+        elif self.source in SHIPPED:
+            text = SHIPPED[self.source].read_text(encoding="utf-8")
+        else:
+            text = from_record(Path(self.source), self.step)
+        write_atomically(self.path, text)
+        print(f"Wrote {self.path}: read it, and correct what is not so.")
+        data = "data.csv" if self.source is None or self.source in SHIPPED else self.source
+        print(f"Next: duffing-env identify {self.path} {data}")
 
 
 @dataclass(frozen=True)
 class List:
-    """List the rigs that ship."""
+    """List the rigs that ship; each name stands for its file.
+
+    $ duffing-env rig list
+    """
 
     def run(self) -> None:
         """Print them."""
+        from estimator.rig import SHIPPED
 
-
-RigCommand = Annotated[Init, tyro.conf.subcommand("init")] | Annotated[List, tyro.conf.subcommand("list")]
+        width = max(map(len, SHIPPED))
+        for name, path in SHIPPED.items():
+            first = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+            print(f"{name:<{width}}  {first.split('. See')[0].rstrip('.')}")

@@ -117,8 +117,8 @@ E = Bench("e", "the Silverbox circuit, its input held",
 # The parameters that its documentation reports as identified; see the page of the board's own.
 BOARD = Bench("board", "electronic-duffing, one well", (1.0461e-4, 1.4231e-4, 1.8099, 1.0077), 1e-3, ("V", "V"), 1.0,
               0.5, 12, 10.0, 5e-3, 5e-3)  # fmt: skip
-BOARD_V = replace(BOARD, name="board-v", about="the same, its velocity seen", kind="velocity", output_range=1500.0,
-                  sensor_noise=0.5)  # fmt: skip
+BOARD_V = replace(BOARD, name="board-v", about="the same, its velocity seen", kind="velocity", units=("V", "V/s"),
+                  output_range=1500.0, sensor_noise=0.5)  # fmt: skip
 WELLS = replace(BOARD, name="wells", about="electronic-duffing, two wells",
                 truth=(1.0461e-4, 1.4231e-4, -1.8099, 1.0077), amplitude=0.8)  # fmt: skip
 BEAM = Bench("beam", "8 Hz in V and mm, 8 kHz filtered and decimated", (8e-4, 1.6e-3, 2.0, 3e-2), 1 / 400,

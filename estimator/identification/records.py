@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.checks import series
+from estimator.identification.tables import read_table
 from estimator.parameters import FloatArray
-
-#: Names of columns, in lower case, up to the first character that is no letter.
-_INPUTS = ("u", "input", "force", "f", "in", "drive", "excitation")
-_OUTPUTS = ("y", "output", "x", "displacement", "position", "velocity", "v", "acceleration", "a", "out", "response")
-_TIMES = ("t", "time")
 
 #: No file of a record is larger [bytes].
 _LARGEST_FILE = 2**30
@@ -134,8 +127,7 @@ def clipped(y: FloatArray) -> npt.NDArray[np.bool_]:
 def read(path: str | Path, step: float) -> tuple[FloatArray, FloatArray]:
     """Inputs and outputs of a CSV or MAT file.
 
-    A CSV has a line of names, such as ``u,y`` or ``time,force,displacement``, or numbers alone: u and y, or time, u and
-    y. An empty field is missing. A MAT file holds the variables ``u`` and ``y``.
+    A CSV is as `estimator.identification.tables.read_table` says. A MAT file holds the variables ``u`` and ``y``.
 
     Raises:
         ValueError: naming the file, the line and what is wrong.
@@ -162,78 +154,11 @@ def _read_mat(path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def _read_csv(path: Path, step: float) -> tuple[FloatArray, FloatArray]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} must be text in UTF-8, but is not: {error}; save it as CSV again") from error
-    lines = text.splitlines()
-    separator = max(",;\t", key=lines[0].count) if lines else ","
-    rows: list[list[float]] = []
-    names: list[str] | None = None
-    width = 0
-    for number, words in enumerate(csv.reader(lines, delimiter=separator), 1):
-        if not any(word.strip() for word in words) or words[0].startswith("#"):
-            continue
-        if not rows and names is None and any(_number(word) is None for word in words):
-            names, width = [word.strip() for word in words], len(words)
-            continue
-        width = width or len(words)
-        if len(words) != width:
-            raise ValueError(f"{path}, line {number}: must have {width} columns, but has {len(words)}; mend the line")
-        values = [_number(word) for word in words]
-        if None in values:
-            bad = words[values.index(None)]
-            raise ValueError(f"{path}, line {number}: {bad!r:.40} must be a number; leave it empty where it is missing")
-        rows.append([value for value in values if value is not None])
-    if not rows:
-        raise ValueError(f"{path} must hold numbers, but holds none")
-    columns = np.array(rows).T
-    time, u, y = _chosen(path, names, columns)
-    if time is not None:
-        _check_time(path, columns[time], step)
-    return columns[u], columns[y]
-
-
-def _number(word: str) -> float | None:
-    """The number that a field holds, NaN where it is empty; None where it is no finite number."""
-    if not word.strip():
-        return math.nan
-    try:
-        value = float(word)
-    except ValueError:
-        return None
-    return None if math.isinf(value) else value
-
-
-def _chosen(path: Path, names: Sequence[str] | None, columns: FloatArray) -> tuple[int | None, int, int]:
-    """Places of time (or None), input and output."""
-    if names is None:
-        if len(columns) not in (2, 3):
-            raise ValueError(f"{path} must have two columns, u and y, or three with the time, but has {len(columns)}")
-        return (None, 0, 1) if len(columns) == 2 else (0, 1, 2)
-    words = ["".join(c if c.isalpha() else " " for c in name.lower()).split()[:1] for name in names]
-    place = lambda known: [k for k, word in enumerate(words) if word and word[0] in known]  # noqa: E731
-    time, u, y = place(_TIMES), place(_INPUTS), place(_OUTPUTS)
-    if len(u) != 1 or len(y) != 1 or len(time) > 1:
-        raise ValueError(
-            f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename"
-        )
-    return (time[0] if time else None), u[0], y[0]
-
-
-def _check_time(path: Path, time: FloatArray, step: float) -> None:
-    steps = np.diff(time)
-    if not np.isfinite(steps).all() or (steps <= 0).any():
-        raise ValueError(f"{path}: times must be there and grow, but do not; mend the column, or remove it")
-    median = float(np.median(steps))
-    if (np.abs(steps - median) > 0.2 * median).any():
-        raise ValueError(
-            f"{path}: samples must be evenly spaced, but steps are {steps.min():.6g} to {steps.max():.6g} s"
-        )
-    if abs(median / step - 1) > 0.01:
-        raise ValueError(
-            f"{path}: times are {median:.6g} s apart, but the rig's step is {step:.6g} s; mend one of them"
-        )
+    table = read_table(path)
+    own = table.step()
+    if own is not None and abs(own / step - 1) > 0.01:
+        raise ValueError(f"{path}: times are {own:.6g} s apart, but the rig's step is {step:.6g} s; mend one of them")
+    return table.columns[table.u], table.columns[table.y]
 
 
 def residuals(y: FloatArray, forecast: FloatArray) -> FloatArray:

@@ -17,7 +17,8 @@ def test_the_estimator_alone_is_the_estimator(factorisation: str, iterations: in
     for t in range(SAMPLES):
         alone.step(t)
     row, experiment = LANES + 5, experiment_of(factorisation)
-    reference = OnlineEstimator(experiment.model, experiment.believed, Rig.silverbox(), factorisation=factorisation)
+    rig = Rig.silverbox("linear")
+    reference = OnlineEstimator(experiment.model, experiment.believed, rig, factorisation=factorisation)
     reference.run(data.inputs[:, row], data.outputs[:, row])
     np.testing.assert_allclose(alone.records()[row], reference.belief.record, rtol=1e-9, atol=1e-15)
 

@@ -14,6 +14,7 @@ from benchmarks.rigs.catalogue import BENCHES, A, Bench
 from benchmarks.rigs.judge import Cell, Outcome, binomial_interval, calibrated
 from benchmarks.rigs.records import Record, guess, record, write_record, write_rig
 from benchmarks.rigs.simulator import DIRECTIONS, KINDS, paths, simulate
+from estimator import Rig
 
 ALL = pytest.mark.parametrize("bench", BENCHES.values(), ids=list(BENCHES))
 
@@ -235,3 +236,24 @@ def test_ratios_are_geometric_means() -> None:
 
 def test_what_a_user_of_ours_writes_is_short() -> None:
     assert peers.statements(peers.ours) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "shipped"),
+    [
+        ("board", "electronic-duffing"),
+        ("board-v", "electronic-duffing-velocity"),
+        ("wells", "electronic-duffing-two-wells"),
+        ("beam", "beam"),
+    ],
+)
+def test_it_simulates_the_rigs_that_ship(name: str, shipped: str) -> None:
+    bench, rig = BENCHES[name], Rig.shipped(shipped)
+    assert (rig.step, rig.interpolation, rig.input.limit) == (bench.step, bench.interpolation, bench.limit)
+    assert (rig.input.unit, rig.output.unit, rig.output.kind) == (*bench.units, bench.kind)
+    assert rig.output.range is not None
+    assert rig.output.range >= bench.output_range
+    assert rig.guess is not None
+    for parameter, truth in zip("mcab", bench.truth, strict=True):
+        low, high = rig.guess[parameter]
+        assert low < truth < high

@@ -7,7 +7,7 @@ import pytest
 
 from estimator import Channel, Rig, identify
 from estimator.free_run import free_run
-from estimator.identification.records import clipped, records_of
+from estimator.identification.records import clipped, read, records_of
 from estimator.models.duffing import KINDS, duffing
 from estimator.physical import coefficients_of
 from estimator.units import Scales
@@ -165,6 +165,22 @@ def test_files(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "u;y\n0,5;1\n1,5;-2e-1\n;3\n",
+        "\ufeffu\ty\n0.5\t1\n\n1.5\t-0.2\n\t3\n",
+        "# written by a tool, with; signs\n0.5 1\n  1.5   -0.2 \nnan 3\n",
+        "response [mm], time [ms], force [N]\n1, 10, 0.5\n-0.2, 20, 1.5\n3, 30, \n",
+    ],
+)
+def test_tables_as_programs_write_them(tmp_path, text):
+    (tmp_path / "r.csv").write_text(text, encoding="utf-8")
+    u, y = read(tmp_path / "r.csv", 0.01)
+    np.testing.assert_array_equal(u, [0.5, 1.5, np.nan])
+    np.testing.assert_array_equal(y, [1.0, -0.2, 3.0])
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("u,y\n1,2\n3", "line 3: must have 2 columns, but has 1"),
@@ -173,6 +189,7 @@ def test_files(tmp_path):
         ("1,2,3,4\n1,2,3,4", "must have two columns, u and y"),
         ("t,u,y\n0,1,2\n0.5,1,3\n1.0,2,3\n", "times are 0.5 s apart, but the rig's step is 0.01 s"),
         ("t,u,y\n0,1,2\n0.01,1,3\n0.5,2,3\n", "samples must be evenly spaced"),
+        ("t [days],u,y\n0,1,2\n1,1,3\n", "times must be in one of s, ms, us,"),
         ("", "must hold numbers, but holds none"),
     ],
 )

@@ -3,11 +3,15 @@
 import json
 import re
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from estimator import Channel, OnlineEstimator, Rig, load_estimator, save_estimator
+from estimator.electronic_duffing import electronic_duffing
+from estimator.parameters import SAMPLING_STEP
+from estimator.rig import SHIPPED
 from estimator.rig_prior import rig_prior
 from estimator.units import Scales
 
@@ -74,6 +78,61 @@ def test_a_broken_file_is_named(tmp_path):
         Rig.from_file(tmp_path / "none.toml")
     with pytest.raises(ValueError, match="rig must have a step"):
         Rig.from_dict({})
+
+
+def test_rigs_that_ship():
+    assert set(SHIPPED) == {
+        "silverbox",
+        "beam",
+        "electronic-duffing",
+        "electronic-duffing-two-wells",
+        "electronic-duffing-velocity",
+    }
+    assert Rig.silverbox() == Rig.shipped("silverbox") == Rig(SAMPLING_STEP, "spline", 0, Channel("V"), Channel("V"))
+    assert Rig.silverbox("zero_order", 1) == Rig(SAMPLING_STEP, "zero_order", 1, Channel("V"), Channel("V"))
+    with pytest.raises(ValueError, match=r"name must be one of beam, .*, but is 'bea'; did you mean 'beam'\?"):
+        Rig.shipped("bea")
+
+
+def test_a_file_that_is_named_like_a_rig_that_ships_is_found(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "beam").write_text("step = 3")
+    assert Rig.of("beam") == Rig.shipped("beam")
+    assert Rig.of("./beam") == Rig(3)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("electronic-duffing", {}),
+        ("electronic-duffing-two-wells", {"wells": 2}),
+        ("electronic-duffing-velocity", {"kind": "velocity"}),
+    ],
+)
+def test_the_board_s_files_are_those_of_its_potentiometers(name, settings):
+    shipped, made = Rig.shipped(name), electronic_duffing(**settings)
+    assert replace(shipped, guess=None) == replace(made, guess=None)
+    for parameter in "mcab":
+        assert shipped.guess[parameter] == pytest.approx(made.guess[parameter], rel=1e-9)
+    # What its documentation identifies lies inside.
+    identified = (1.0461e-4, 1.4231e-4, 1.8099 if made.guess["a"][0] > 0 else -1.8099, 1.0077)
+    for parameter, value in zip("mcab", identified, strict=True):
+        low, high = made.guess[parameter]
+        assert low < value < high
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"p1": 0.0}, "p1 must be above 0 and at most 1, but is 0.0"),
+        ({"p3": 2}, "p3 must be above 0 and at most 1, but is 2"),
+        ({"wells": 3}, "wells must be 1 or 2, but is 3"),
+        ({"kind": "acceleration"}, "kind must be displacement or velocity, but is 'acceleration'"),
+    ],
+)
+def test_potentiometers_are_checked(change, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        electronic_duffing(**change)
 
 
 @pytest.mark.parametrize(

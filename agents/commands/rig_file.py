@@ -1,0 +1,192 @@
+"""Rig files for people: from a record, or from answers, with comments."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from estimator.identification.tables import Table, read_table
+from estimator.models.duffing import KINDS
+from estimator.rig import INTERPOLATIONS, Channel, Rig
+
+_EQUATION = "#   m x'' + c x' + a x + b x³ = u - u0 + w,   seen: {seen} + y0 + noise"
+_SEEN = {"displacement": "x", "velocity": "x'", "acceleration": "x''"}
+_INTERPOLATION = '# Of the input between samples: "zero_order": held, as by a converter; "linear"; "spline": smooth.'
+_UNKNOWN = "not known"
+_UNITS = '  # such as "N", "V", "mm" or "m/s"; "1" is a pure number'
+
+
+def text_of(rig: Rig, told: str = "") -> str:
+    """The file of a rig, with comments; what is not known stands there as a comment to be filled in.
+
+    Args:
+        rig: the rig.
+        told: where its numbers are from.
+    """
+    source, sink = rig.input, rig.output
+    lines = [
+        f"# A rig{told}. Read by: duffing-env identify, and Rig.from_file.",
+        _EQUATION.format(seen=_SEEN[sink.kind]),
+        "",
+        f"step = {rig.step!r}  # s between samples",
+        _INTERPOLATION,
+        f"interpolation = {_quoted(rig.interpolation)}",
+        f"delay = {rig.delay}  # samples by which the input acts later",
+        "",
+        "[input]",
+        f"unit = {_quoted(source.unit)}{_UNITS if source.unit == '1' else ''}",
+        _known("limit", source.limit, "never exceeded, in either direction"),
+        "",
+        "[output]",
+        f"unit = {_quoted(sink.unit)}{_UNITS if sink.unit == '1' else ''}",
+        f"kind = {_quoted(sink.kind)}  # displacement, velocity or acceleration",
+        _known("range", sink.range, "an experiment stops outside of it, in either direction"),
+        _known("noise", sink.noise, "standard deviation of the sensor's noise, where you know it"),
+        "",
+        "# What you believe before any record: a low and a high end for each, which hold it with 90 %. identify does",
+        "# without.",
+    ]
+    units = {name: rig.scales.unit(rig.model.dimensions[name]) for name in "mcab"}
+    if rig.guess is None:
+        lines += ["# [guess]", *(f"# {name} = [low, high]  # {units[name]}" for name in units)]
+    else:
+        lines.append("[guess]")
+        lines += [f"{name} = [{low!r}, {high!r}]  # {units[name]}" for name, (low, high) in rig.guess.items()]
+    return "\n".join([*lines, ""])
+
+
+def _known(name: str, value: float | None, meaning: str) -> str:
+    return f"# {name} = ...  # {meaning}" if value is None else f"{name} = {value!r}  # {meaning}"
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
+
+
+def from_record(path: Path, step: float | None = None) -> str:
+    """The file for a record: step from its column of times, units and kind from the names of its columns.
+
+    Args:
+        path: of a CSV file.
+        step: sampling step [s]; None: that of the times.
+
+    Raises:
+        ValueError: where the step is neither given nor told, or the file is not as it must be.
+        FileNotFoundError: if there is no such file.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"from must be a CSV file or the name of a rig that ships, but there is no {path}")
+    if path.suffix.lower() == ".mat" or not path.is_file():
+        raise ValueError(f"from must be a CSV file, but is {path}; leave --from away, and answer the questions")
+    table = read_table(path)
+    own = table.step()
+    if step is None and own is None:
+        raise ValueError(f"{path} must have a column of times, such as 'time [s]', but has none; add --step SECONDS")
+    if step is None:
+        # Times are written with some digits, and their mean difference is off by the last of them.
+        step = float(f"{own:.6g}")
+    rig = Rig(step, input=Channel(table.unit(table.u) or "1"), output=_output(table))
+    return text_of(rig, f", from {path.name}")
+
+
+def _output(table: Table) -> Channel:
+    word, unit = table.word(table.y), table.unit(table.y) or "1"
+    kind = {"v": "velocity", "a": "acceleration"}.get(word, word)
+    if kind not in KINDS:
+        ends = {"velocity": ("/s",), "acceleration": ("/s²", "/s^2", "/s2", "g")}
+        kind = next((kind for kind, known in ends.items() if unit.endswith(known)), "displacement")
+    return Channel(unit, kind=kind)
+
+
+def ask() -> Rig:
+    """A rig from answers to questions on the terminal.
+
+    Raises:
+        ValueError: where nobody answers.
+    """
+    print("An empty answer takes what stands in parentheses; Ctrl-C ends it.")
+    try:
+        step = _answer("Sampling step in seconds, or rate such as 1000 Hz", None, _step)
+        interpolation = _answer(
+            f"Input between samples: {', '.join(INTERPOLATIONS)}", "zero_order", _of(INTERPOLATIONS)
+        )
+        source = Channel(_answer("Unit of the input", "N", lambda words: Channel(words).unit))
+        limit = _answer("Largest input, in either direction", _UNKNOWN, _positive)
+        kind = _answer(f"Output: {', '.join(KINDS)}", "displacement", _of(KINDS))
+        unit = _answer("Unit of the output", ("m", "m/s", "m/s²")[KINDS[kind]], lambda words: Channel(words).unit)
+        widest = _answer("Largest output before an experiment must stop", _UNKNOWN, _positive)
+        rig = Rig(step, interpolation, 0, Channel(source.unit, limit=limit), Channel(unit, kind=kind, range=widest))
+        print("What you believe of m, c, a and b: two numbers, which hold it with 90 %.")
+        guess = {}
+        for name in "mcab":
+            ends = _answer(
+                f"{name} [{rig.scales.unit(rig.model.dimensions[name])}]", _UNKNOWN, _mass if name == "m" else _interval
+            )
+            if ends is None:
+                return rig
+            guess[name] = ends
+    except EOFError:
+        raise ValueError("rig init asks, but nobody answers; run it in a terminal, or add --from data.csv") from None
+    return Rig.from_dict({**rig.to_dict(), "guess": guess})
+
+
+def _answer(question: str, default: str | None, taken: Callable[[str], Any]) -> Any:
+    """Ask until the answer can be taken."""
+    shown = f"{question} ({default}): " if default is not None else f"{question}: "
+    while True:
+        words = input(shown).strip() or default
+        try:
+            if words:
+                return taken(words)
+        except ValueError as error:
+            print(f"  {error}")
+
+
+def _number(words: str) -> float:
+    try:
+        return float(words)
+    except ValueError:
+        raise ValueError(f"must be a number, but is {words!r:.40}") from None
+
+
+def _step(words: str) -> float:
+    per_second = words.lower().endswith("hz")
+    value = _positive(words[:-2] if per_second else words) or 0.0
+    return 1 / value if per_second else value
+
+
+def _positive(words: str) -> float | None:
+    if words == _UNKNOWN:
+        return None
+    value = _number(words)
+    if not 0 < value < math.inf:
+        raise ValueError(f"must be positive, but is {words}")
+    return value
+
+
+def _interval(words: str) -> list[float] | None:
+    if words == _UNKNOWN:
+        return None
+    ends = [_number(word) for word in words.replace(",", " ").split()]
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        raise ValueError(f"must be two numbers, the lower one first, but is {words}")
+    return ends
+
+
+def _mass(words: str) -> list[float] | None:
+    ends = _interval(words)
+    if ends is not None and ends[0] <= 0:
+        raise ValueError(f"must be positive, but begins at {ends[0]:g}")
+    return ends
+
+
+def _of(known: dict[str, int]) -> Callable[[str], str]:
+    def taken(words: str) -> str:
+        if words not in known:
+            raise ValueError(f"must be one of {', '.join(known)}, but is {words}")
+        return words
+
+    return taken

@@ -1,0 +1,50 @@
+"""The open-hardware board GhislainRaze/Electronic-Duffing: what its potentiometers make of m, c, a and b."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from estimator.rig import Rig
+
+#: Relative half widths of the guess: capacitors are within 5 %, and the integrators add to the damping.
+_SPREADS = {"m": 0.2, "c": 0.5, "a": 0.2, "b": 0.2}
+
+
+def electronic_duffing(
+    p1: float = 0.1311, p2: float = 0.1923, p3: float = 0.9887, wells: int = 1, kind: str = "displacement"
+) -> Rig:
+    """The board's rig, for its potentiometers.
+
+    Its documentation's equation (5) gives, with the parts of its table 1, m = 1e-4 s², c = 1e-3 p1 s, a = ±10 p2 and
+    b = p3 V⁻², input and displacement in volts. The guess is ±20 % about these, ±50 % for c.
+
+    Args:
+        p1: division ratio of the potentiometer of the damping, above 0 and at most 1.
+        p2: of the linear stiffness.
+        p3: of the cubic stiffness.
+        wells: 1 or 2, as the board's switch stands.
+        kind: what is recorded: ``displacement`` in volts, or ``velocity`` in volts per second: 1000 of them for each
+            volt at the board's output.
+
+    Raises:
+        ValueError: naming the argument that is out of its range.
+
+    Example:
+        >>> from estimator.electronic_duffing import electronic_duffing
+        >>> [round(end, 3) for end in electronic_duffing(p2=0.5, wells=2).guess["a"]]
+        [-6.0, -4.0]
+    """
+    for name, ratio in (("p1", p1), ("p2", p2), ("p3", p3)):
+        if not 0 < ratio <= 1:
+            raise ValueError(f"{name} must be above 0 and at most 1, but is {ratio!r}; give its division ratio")
+    if wells not in (1, 2):
+        raise ValueError(f"wells must be 1 or 2, but is {wells!r}; see the board's switch")
+    if kind not in ("displacement", "velocity"):
+        raise ValueError(f"kind must be displacement or velocity, but is {kind!r}; the board shows these")
+    centers = {"m": 1e-4, "c": 1e-3 * p1, "a": (10 if wells == 1 else -10) * p2, "b": p3}
+    guess = {}
+    for name, center in centers.items():
+        low, high = sorted((center * (1 - _SPREADS[name]), center * (1 + _SPREADS[name])))
+        guess[name] = (low, high)
+    base = Rig.shipped("electronic-duffing" if kind == "displacement" else "electronic-duffing-velocity")
+    return replace(base, guess=guess)

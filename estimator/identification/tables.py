@@ -1,0 +1,154 @@
+"""CSV files: columns of time, input and output, found by the names in the first line."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from estimator.parameters import FloatArray
+
+#: Names of columns, in lower case, up to the first character that is no letter.
+_INPUTS = ("u", "input", "force", "f", "in", "drive", "excitation")
+_OUTPUTS = ("y", "output", "x", "displacement", "position", "velocity", "v", "acceleration", "a", "out", "response")
+_TIMES = ("t", "time")
+
+#: What a time column may be in [s].
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+
+#: Steps of a time column may be uneven by so much, which rounding does.
+_UNEVEN = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A CSV file.
+
+    Attributes:
+        path: of the file.
+        names: of its columns, as they stand there; empty where it has numbers alone.
+        columns: (C, T) numbers; NaN where a field is empty.
+        time: which column is the time; None where there is none.
+        u: which column is the input.
+        y: which column is the output.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    columns: FloatArray
+    time: int | None
+    u: int
+    y: int
+
+    def step(self) -> float | None:
+        """Sampling step [s], of the time column; None where there is none.
+
+        Raises:
+            ValueError: for times that are missing, do not grow, are unevenly spaced, or in a unit that is unknown.
+        """
+        if self.time is None:
+            return None
+        unit = self.unit(self.time) or "s"
+        if unit not in _SECONDS:
+            raise ValueError(f"{self.path}: times must be in one of {', '.join(_SECONDS)}, but are in {unit!r:.40}")
+        time = self.columns[self.time] * _SECONDS[unit]
+        steps = np.diff(time)
+        if not len(steps) or not np.isfinite(steps).all() or (steps <= 0).any():
+            raise ValueError(f"{self.path}: times must be there and grow, but do not; mend the column, or remove it")
+        if (np.abs(steps - np.median(steps)) > _UNEVEN * np.median(steps)).any():
+            raise ValueError(
+                f"{self.path}: samples must be evenly spaced, but steps are {steps.min():.6g} to {steps.max():.6g} s"
+            )
+        return float((time[-1] - time[0]) / len(steps))
+
+    def unit(self, place: int) -> str | None:
+        """What stands in brackets behind the name of a column, as N in ``force [N]``; None where nothing does."""
+        found = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", self.names[place]) if self.names else None
+        return found.group(1) if found else None
+
+    def word(self, place: int) -> str:
+        """The first word of a column's name, in lower case."""
+        return _word(self.names[place]) if self.names else ""
+
+
+def read_table(path: Path) -> Table:
+    """Read a CSV file.
+
+    Fields stand between commas, or semicolons or tabs (then 0,5 is a number), or blanks. Empty ones are missing. Lines
+    that begin with # are passed over. The first line may hold names, such as ``u,y`` or ``time [ms],force [N],x [mm]``;
+    of numbers alone there are the columns u and y, or time, u and y.
+
+    Raises:
+        ValueError: naming the file, the line and what is wrong.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} must be text in UTF-8, but is not: {error}; save it as CSV again") from error
+    rows: list[list[float]] = []
+    names: tuple[str, ...] = ()
+    width = 0
+    for number, words in _fields(text):
+        values = [_number(word) for word in words]
+        if not width and None in values:
+            names, width = tuple(word.strip() for word in words), len(words)
+            continue
+        width = width or len(words)
+        if len(words) != width:
+            raise ValueError(f"{path}, line {number}: must have {width} columns, but has {len(words)}; mend the line")
+        if None in values:
+            bad = words[values.index(None)]
+            raise ValueError(f"{path}, line {number}: {bad!r:.40} must be a number; leave it empty where it is missing")
+        rows.append([value for value in values if value is not None])
+    if not rows:
+        raise ValueError(f"{path} must hold numbers, but holds none")
+    columns = np.array(rows).T
+    return Table(path, names, columns, *_chosen(path, names, len(columns)))
+
+
+def _fields(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and fields of the lines that hold something."""
+    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    first = "".join(line for _, line in lines[:2])
+    separator = next((mark for mark in "\t;," if mark in first), None)
+    if separator is None:
+        yield from ((number, line.split()) for number, line in lines)
+        return
+    for (number, _), words in zip(lines, csv.reader((line for _, line in lines), delimiter=separator), strict=False):
+        if any(word.strip() for word in words):
+            yield number, words if separator == "," else [word.replace(",", ".") for word in words]
+
+
+def _number(word: str) -> float | None:
+    """The number that a field holds, NaN where it is empty; None where it is no finite number."""
+    if not word.strip():
+        return math.nan
+    try:
+        value = float(word)
+    except ValueError:
+        return None
+    return None if math.isinf(value) else value
+
+
+def _word(name: str) -> str:
+    words = "".join(c if c.isalpha() else " " for c in name.lower()).split()
+    return words[0] if words else ""
+
+
+def _chosen(path: Path, names: Sequence[str], count: int) -> tuple[int | None, int, int]:
+    """Places of time (or None), input and output."""
+    if not names:
+        if count not in (2, 3):
+            raise ValueError(f"{path} must have two columns, u and y, or three with the time, but has {count}")
+        return (None, 0, 1) if count == 2 else (0, 1, 2)
+    time, u, y = ([k for k, name in enumerate(names) if _word(name) in known] for known in (_TIMES, _INPUTS, _OUTPUTS))
+    if len(u) != 1 or len(y) != 1 or len(time) > 1:
+        raise ValueError(
+            f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename"
+        )
+    return (time[0] if time else None), u[0], y[0]

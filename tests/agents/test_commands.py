@@ -1,0 +1,251 @@
+"""``duffing-env``, as a user meets it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.commands import main
+from estimator import Rig
+from estimator.rig import SHIPPED
+
+ROOT = Path(__file__).parents[2]
+TRUTH = {"m": 0.4, "c": 0.6, "a": 2500.0, "b": 4e7}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a record: a mass of 0.4 kg on a hardening spring, by small explicit steps."""
+    place = tmp_path_factory.mktemp("bench")
+    rng = np.random.default_rng(0)
+    u = 6.0 * np.repeat(rng.choice([-1.0, 1.0], 128), 8)
+    y, v = np.zeros(1024), 0.0
+    for k in range(1023):
+        x = y[k]
+        for _ in range(50):
+            v += 2e-5 / 0.4 * (u[k] - 0.6 * v - 2500.0 * x - 4e7 * x**3)
+            x += 2e-5 * v
+        y[k + 1] = x
+    y += 5e-6 * rng.standard_normal(1024)
+    rows = np.column_stack([np.arange(1024.0), u, 1e3 * y])
+    head = "time [ms],force [N],displacement [mm]"
+    np.savetxt(place / "record.csv", rows, delimiter=",", header=head, comments="", fmt="%.9g")
+    return place
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Runs a command as the shell would, but within this process: returns status, output and messages."""
+    monkeypatch.setenv("COLUMNS", "100")
+
+    def command(*words, answers=None):
+        if answers is not None:
+            given = iter(answers)
+
+            def answer(question=""):
+                try:
+                    return next(given)
+                except StopIteration:
+                    raise EOFError from None
+
+            monkeypatch.setattr("builtins.input", answer)
+        monkeypatch.setattr(sys, "argv", ["duffing-env", *map(str, words)])
+        status = 0
+        try:
+            main()
+        except SystemExit as stop:
+            status = stop.code
+        return status, *capsys.readouterr()
+
+    return command
+
+
+def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert run("rig", "init", "rig.toml", "--from", "record.csv")[0] == 0
+    rig = Rig.from_file("rig.toml")
+    assert (rig.step, rig.input.unit, rig.output.unit, rig.output.kind) == (1e-3, "N", "mm", "displacement")
+    status, told, _ = run("identify", "rig.toml", "record.csv", "--report", "out/page.html")
+    assert status == 0
+    (row,) = [line.split() for line in told.splitlines() if line.split()[:1] == ["m"] and " to " in line]
+    assert float(row[1]) == pytest.approx(4e-4, rel=0.01)
+    assert row[-2:] == ["N", "s²/mm"]
+    assert "No check speaks against this result." in told
+    page = Path("out/page.html").read_text()
+    assert "duffing-env identify rig.toml record.csv --report out/page.html" in page
+    status, told, _ = run("identify", "rig.toml", "record.csv", "record.csv", "--json")
+    assert status == 0
+    described = json.loads(told)
+    assert [one["samples"] for one in described["records"]] == [1024, 1024]
+    units = {"m": 1e-3, "c": 1e-3, "a": 1e-3, "b": 1e-9}
+    for name, truth in TRUTH.items():
+        found = described["parameters"][name]
+        assert found["mean"] == pytest.approx(truth * units[name], rel=0.01)
+        assert found["low"] < found["mean"] < found["high"]
+    assert described["warnings"] == []
+    assert Rig.from_dict(described["rig"]) == rig
+
+
+def test_warnings_are_told(run, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    Path("late.toml").write_text('step = 1e-3\ndelay = 1\n[input]\nunit = "N"\n[output]\nunit = "mm"\n')
+    status, told, _ = run("identify", "late.toml", "record.csv")
+    assert status == 0
+    assert "delay: " in told
+    assert "No check speaks" not in told
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["identify", "none.toml", "record.csv"],
+            "there is no none.toml; write it by hand, or by duffing-env rig init",
+        ),
+        (["identify", "rig.toml", "none.csv"], "there is no none.csv"),
+        (["identify", "rig.toml"], "data must name at least one CSV or MAT file"),
+        (["identify", "bad.toml", "record.csv"], "did you mean 'step'?"),
+        (["rig", "init", "rig.toml"], "there is rig.toml; name another, or add --force"),
+        (["rig", "init", "new.toml", "--from", "bem"], "there is no bem"),
+        (["rig", "init", "new.toml", "--from", "plain.csv"], "add --step SECONDS"),
+        (["rig", "init", "new.toml", "--from", "uneven.csv"], "samples must be evenly spaced"),
+        (["rig", "init", "new.toml", "--from", "fortnights.csv"], "times must be in one of s, ms"),
+        (["rig", "init", "new.toml", "--step", "1"], "step goes with a record"),
+        (["rig", "init", "new.toml", "--from", "plain.csv", "--step", "-1"], "step must be positive"),
+    ],
+)
+def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text("step = 1e-3")
+    Path("bad.toml").write_text("stepp = 1e-3")
+    Path("record.csv").write_text("u,y\n" + "1,2\n" * 10)
+    Path("plain.csv").write_text("u,y\n1,2\n2,3\n")
+    Path("uneven.csv").write_text("t,u,y\n0,1,2\n1,1,2\n9,2,3\n")
+    Path("fortnights.csv").write_text("t [fortnight],u,y\n0,1,2\n1,1,2\n2,2,3\n")
+    status, told, messages = run(*words)
+    assert (status, told) == (2, "")
+    (line,) = messages.splitlines()
+    assert line.startswith("duffing-env: ")
+    assert message in line
+    assert not Path("new.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("head", "step", "units", "kind"),
+    [
+        ("time [ms],force [N],displacement [mm]", 1.6384e-3, ("N", "mm"), "displacement"),
+        ("t (ms),u (V),v (V)", 1.6384e-3, ("V", "V"), "velocity"),
+        ("time [ms],drive [V],response [m/s^2]", 1.6384e-3, ("V", "m/s^2"), "acceleration"),
+        ("time,input,output", 1.6384, ("1", "1"), "displacement"),
+    ],
+)
+def test_a_rig_takes_what_a_record_tells(run, tmp_path, monkeypatch, head, step, units, kind):
+    monkeypatch.chdir(tmp_path)
+    rows = [f"{1.6384 * k:.6f},{k % 3},{k % 5}" for k in range(2000)]
+    Path("r.csv").write_text("\n".join([head, *rows]))
+    status, told, _ = run("rig", "init", "--from", "r.csv")
+    assert status == 0
+    assert "Next: duffing-env identify rig.toml r.csv" in told
+    rig = Rig.from_file("rig.toml")
+    assert rig == Rig(rig.step, input={"unit": units[0]}, output={"unit": units[1], "kind": kind})
+    assert rig.step == pytest.approx(step, rel=1e-6)
+
+
+def test_a_step_can_be_given(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("r.csv").write_text("1 2\n2 3\n3 4\n")
+    assert run("rig", "init", "--from", "r.csv", "--step", "2e-6")[0] == 0
+    assert Rig.from_file("rig.toml") == Rig(2e-6)
+
+
+def test_a_rig_is_asked_for(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    answers = ["fast", "-3", "500 Hz", "stairs", "linear", "mN", "20", "speed", "velocity", "mm/s", "", "-1 2", "2 1",
+               "0.3 0.5", "0.1, 2", "1e3 5e3", "-1e8 1e8"]  # fmt: skip
+    status, told, _ = run("rig", "init", answers=answers)
+    assert status == 0
+    assert [line.strip() for line in told.splitlines() if line.startswith("  ")] == [
+        "must be a number, but is 'fast'",
+        "must be positive, but is -3",
+        "must be one of zero_order, linear, look_ahead, spline, but is stairs",
+        "must be one of displacement, velocity, acceleration, but is speed",
+        "must be positive, but begins at -1",
+        "must be two numbers, the lower one first, but is 2 1",
+    ]
+    assert Rig.from_file("rig.toml") == Rig(
+        2e-3,
+        "linear",
+        input={"unit": "mN", "limit": 20},
+        output={"unit": "mm/s", "kind": "velocity"},
+        guess={"m": (0.3, 0.5), "c": (0.1, 2), "a": (1e3, 5e3), "b": (-1e8, 1e8)},
+    )
+    text = Path("rig.toml").read_text()
+    assert "[mN" not in text.split("[guess]")[0]
+    assert "# mN/mm³" in text
+    status, _, messages = run("rig", "init", "other.toml", answers=["1e-3"])
+    assert (status, len(messages.splitlines())) == (2, 1)
+    assert "nobody answers" in messages
+    assert not Path("other.toml").exists()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_rig_that_ships_is_listed_and_copied(run, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    assert name in run("rig", "list")[1].split()
+    Path("rig.toml").write_text("step = 1")
+    assert run("rig", "init", "rig.toml", "--from", name, "--force")[0] == 0
+    assert Rig.from_file("rig.toml") == Rig.shipped(name) == Rig.of(name)
+    assert tomllib.loads(Path("rig.toml").read_text())["step"] == Rig.shipped(name).step
+
+
+def test_help_has_examples_on_lines_of_their_own_and_names_every_argument(run):
+    status, told, _ = run("--help")
+    assert status == 0
+    assert "identify" in told
+    assert "rig" in told
+    for words, arguments in (
+        (["identify"], ["RIG", "DATA", "--report PATH", "--json"]),
+        (["rig", "init"], ["--from DATA|NAME", "--step SECONDS", "--force"]),
+        (["rig", "list"], []),
+    ):
+        status, told, _ = run(*words, "--help")
+        assert status == 0
+        lines = [line.strip() for line in told.splitlines()]
+        assert any(line.startswith(f"$ duffing-env {' '.join(words)}") for line in lines)
+        assert all(line.count("duffing-env ") <= 1 for line in lines)
+        assert all(argument in told for argument in arguments)
+
+
+def test_nothing_heavy_is_imported_for_the_help():
+    code = (
+        "import sys\nfrom agents.commands import main\n"
+        "try: main(['identify', '--help'])\nexcept SystemExit: pass\n"
+        "print(sorted({'numba', 'torch', 'gymnasium', 'scipy', 'matplotlib'} & set(sys.modules)))"
+    )
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert finished.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such signal")
+def test_ctrl_c_is_one_line_and_exit_status_130(tmp_path):
+    code = "from agents.commands import main; main(['rig', 'init'])"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    asking = subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=tmp_path, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert asking.stdout is not None
+    assert "Ctrl-C" in asking.stdout.readline()
+    time.sleep(0.2)
+    asking.send_signal(signal.SIGINT)
+    _, messages = asking.communicate(timeout=60)
+    assert asking.returncode == 130
+    assert messages.strip() == "duffing-env: stopped"
+    assert list(tmp_path.iterdir()) == []
