@@ -122,7 +122,7 @@ BOARD_V = replace(BOARD, name="board-v", about="the same, its velocity seen", ki
 WELLS = replace(BOARD, name="wells", about="electronic-duffing, two wells",
                 truth=(1.0461e-4, 1.4231e-4, -1.8099, 1.0077), amplitude=0.8)  # fmt: skip
 BEAM = Bench("beam", "8 Hz in V and mm, 8 kHz filtered and decimated", (8e-4, 1.6e-3, 2.0, 3e-2), 1 / 400,
-             ("V", "mm"), 1.95, 1.8, 0, 40.0, 2e-2, 5e-2, "multisine", interpolation="spline", decimate=20,
+             ("V", "mm"), 1.95, 1.8, 0, 40.0, 2e-2, 2e-2, "multisine", interpolation="spline", decimate=20,
              highest=12.0)  # fmt: skip
 SHAKER = Bench("accel", "0.5 kg at 15 Hz, seen by an accelerometer", (0.5, 1.5, 4500.0, 3e7), 1e-3, ("N", "m/s²"), 20.0,
                5.0, 20, 400.0, 1e-1, 2e-2, kind="acceleration")  # fmt: skip
