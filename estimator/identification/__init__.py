@@ -70,8 +70,8 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         scales = _scales(rig, read)
         u = tuple(one.u / scales.input for one in read)
         y = tuple(one.y / scales.output for one in read)
-        problem = Problem(rig, scales, u, y)
-        found = search(problem, tell)
+        found = search(Problem(rig, scales, u, y), tell)
+        problem = found.fitter.problem
         belief, noises = _belief(problem, found)
         tell("checking the result")
         forecasts = tuple(_forecast(belief, rig, one) for one in read)
@@ -100,7 +100,7 @@ def _belief(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[flo
     belief = about(rig, scales, found.mean[kept], found.cov[np.ix_(kept, kept)])
     shapes = np.full(len(found.weights), problem.samples / 2)
     gamma, xi = (matched_gamma(found.weights, shapes, shapes * noise**2) for noise in found.noises)
-    belief = Belief.of(rig.model, belief.mean, _with_start(belief, problem), gamma, xi, scales=scales)
+    belief = Belief.of(problem.believed, belief.mean, _with_start(belief, problem), gamma, xi, scales=scales)
     gain = dict(zip(names, found.mean, strict=True))["gain"]
     # What moves the velocity as much when it is held over a sample (`estimator.rig_prior`).
     worth = scales.input * np.sqrt(3) / abs(gain), scales.output

@@ -27,17 +27,27 @@ class Problem:
         scales: that the records are in.
         u: inputs of each record, in parts of their scale.
         y: outputs of each record, in parts of theirs, NaN where one is missing.
+        substeps: steps of integration a sample; 0 for as many as the model has by itself.
     """
 
     rig: Rig
     scales: Scales
     u: tuple[FloatArray, ...]
     y: tuple[FloatArray, ...]
+    substeps: int = 0
 
     @cached_property
     def model(self) -> Model:
         """Eq. (1) with all terms that are looked at."""
-        return duffing(offsets=True, cubic_damping=True, quintic=True, sensor=self.rig.output.kind)
+        return self._integrated(duffing(offsets=True, cubic_damping=True, quintic=True, sensor=self.rig.output.kind))
+
+    @cached_property
+    def believed(self) -> Model:
+        """The rig's own, of which the belief is, integrated as `model` is."""
+        return self._integrated(self.rig.model)
+
+    def _integrated(self, model: Model) -> Model:
+        return replace(model, substeps=self.substeps) if self.substeps else model
 
     @property
     def samples(self) -> int:

@@ -27,6 +27,10 @@ _SHORT, _LOOK, _GRID = 4096, 10, 11
 #: Ratios that are looked at lie within these bounds, in the same parts.
 _LOWEST, _HIGHEST = 1e-5, 1e4
 
+#: Steps of integration a sample where the model's own are too few, and the error that these may have, in standard
+#: deviations: their error is of order 4, so that these are enough for motions of a third of a period a sample.
+_FINE, _TOLERABLE = 32, 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -120,7 +124,25 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
         )
     tell("fitting coefficients and noises")
     best = looked.best
-    return settle(fitter, looked.hypotheses[best], looked.mean[best], float(looked.level[best]), 30.0)
+    found = settle(fitter, looked.hypotheses[best], looked.mean[best], float(looked.level[best]), 30.0)
+    if integration_error(found) <= _TOLERABLE:
+        return found
+    tell("fitting again, in finer steps of integration")
+    finer = fitter.on(replace(problem, substeps=_FINE))
+    return settle(finer, found.best, found.mean, found.level, 30.0)
+
+
+def integration_error(found: Found) -> float:
+    """What Runge and Kutta's method of order 4 adds to stiffness or damping, in standard deviations.
+
+    In steps of the phase z = ω/n it turns by z⁵/120 too little and loses z⁶/144 of the amplitude.
+    """
+    problem = found.fitter.problem
+    names, n = list(problem.model.coefficients), problem.model.substeps
+    mean, std = (dict(zip(names, v, strict=True)) for v in (found.mean, np.sqrt(np.diag(found.cov))))
+    square = abs(mean["stiffness"]) + 3 * abs(mean["cubic"]) * problem.displacement**2
+    z2 = square / n**2
+    return float(max(square * z2**2 / 60 / std["stiffness"], 2 * n * z2**3 / 144 / std["damping"]))
 
 
 def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: float, reach: float) -> Found:

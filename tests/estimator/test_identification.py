@@ -65,6 +65,20 @@ def test_a_guess_changes_nothing_that_the_record_tells():
         assert guessed.parameters[name][0] == pytest.approx(alone.parameters[name][0], abs=alone.parameters[name][1])
 
 
+def test_motions_that_are_fast_for_the_sampling_are_integrated_in_finer_steps():
+    from scipy.integrate import solve_ivp
+
+    rng = np.random.default_rng(0)
+    step, u, states = 0.0132, 20.0 * rng.choice([-1.0, 1.0], 800), [np.zeros(2)]  # s, N; 6 samples in a small period
+    for force in u[:-1]:
+        change = lambda t, s, f=force: (s[1], (f - 0.6 * s[1] - 2500.0 * s[0] - 4e7 * s[0] ** 3) / 0.4)  # noqa: E731
+        states.append(solve_ivp(change, (0, step), states[-1], method="DOP853", rtol=1e-10, atol=1e-14).y[:, -1])
+    y = np.array(states)[:, 0] + 5e-6 * rng.standard_normal(800)
+    result = identify(Rig(step, input=Channel("N"), output=Channel("m")), (u, y))
+    assert np.abs(deviations(result, BENCH[0])).max() < 4.5
+    assert result.belief.model.substeps > Rig(step).model.substeps
+
+
 def test_noises_are_found():
     result = identify(rig_of(BENCH), simulated(BENCH))
     for name, truth in (("output", 5e-6), ("input", 3e-3 * 6.0)):
