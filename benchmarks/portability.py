@@ -35,6 +35,7 @@ COMPILED = (
     "tests/duffing_env/test_simulation.py",
     "tests/agents/test_design.py",
     "tests/agents/test_planner.py",
+    "tests/benchmarks/test_coverage.py",
     "tests/benchmarks/test_roofline.py",
     "tests/benchmarks/test_pieces.py",
 )
