@@ -83,8 +83,9 @@ def _run(name: str, config: Config, peers: Peers, samples: Path, on_row: Callabl
 def describe_machine() -> dict[str, Any]:
     """Processor, cores, and the settings that a reader needs to repeat a run."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    told = cpuinfo()
     return {
-        "processor": _processor(),
+        "processor": f"{told.get('model name', 'unknown processor')} (family {told.get('cpu family', '?')})",
         "cores": cores,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
@@ -103,17 +104,14 @@ def print_head(machine: dict[str, Any], versions: dict[str, dict[str, str]], rep
     print(f"Median [minimum, maximum] of {repetitions} repetitions, all rows of a section in turns. Ratios of medians.")
 
 
-def _processor() -> str:
-    """The processor's name, as the system tells it."""
+def cpuinfo() -> dict[str, str]:
+    """What Linux tells of the first processor, by its names; its name alone, or nothing, elsewhere."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
     except OSError:
-        return platform.processor() or "unknown processor"
-    fields: dict[str, str] = {}
-    for line in lines:
-        key, _, value = line.partition(":")
-        fields.setdefault(key.strip(), value.strip())
-    return f"{fields.get('model name', 'unknown processor')} (family {fields.get('cpu family', '?')})"
+        return {"model name": platform.processor()} if platform.processor() else {}
+    fields = (line.partition(":") for line in lines)
+    return {name.strip(): value.strip() for name, _, value in fields}
 
 
 def _load() -> str:

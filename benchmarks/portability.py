@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 
 from agents.cli import run_script
 from agents.results import show, table
-from benchmarks.__main__ import describe_machine
+from benchmarks.__main__ import cpuinfo, describe_machine
 
 ROOT = Path(__file__).parents[1]
 
@@ -114,11 +114,7 @@ def _numpy_features() -> list[str]:
 
 def processor_features() -> set[str]:
     """The features of this machine's processor, by Linux's names; empty where they are not told."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return set()
-    return next((set(line.partition(":")[2].split()) for line in lines if line.startswith("flags")), set())
+    return set(cpuinfo().get("flags", "").split())
 
 
 @dataclass(frozen=True)
