@@ -283,7 +283,7 @@ class DuffingEnv(gym.Env[Any, Any]):
 
         if self._screen is None:
             limits, fps = (self.max_input, self.experiment.max_output), self.metadata["render_fps"]
-            self._screen = Screen(self.render_mode, *limits, fps)
+            self._screen = Screen(self.render_mode, *limits, fps, self.experiment.scales)
         self._screen.start(self._batch.true_of(0), self.belief, self.horizon)
 
     def _draw(self) -> None:

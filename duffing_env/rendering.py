@@ -18,8 +18,10 @@ import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.files import write_atomically
-from estimator.parameters import SAMPLING_STEP, FloatArray, Parameters
+from estimator.models.duffing import DIMENSIONS
+from estimator.parameters import FloatArray, Parameters
 from estimator.physical import propagate
+from estimator.units import VOLTS, Scales
 
 Frame = npt.NDArray[np.uint8]
 
@@ -32,16 +34,9 @@ SPAN = 256
 HALF_90 = 1.6449
 """Half of the central 90 % of a Gaussian, in standard deviations."""
 
-# m, c, a and b: label, and the power of ten that its numbers are in.
-PARAMETERS = (
-    ("mass m [10⁻⁶ s²]", 1e-6),
-    ("damping c [10⁻⁴ s]", 1e-4),
-    ("stiffness a", 1.0),
-    ("cubic stiffness b [V⁻²]", 1.0),
-)
-
 NAMES = ("m", "c", "a", "b")
-MILLISECONDS = 1e3 * SAMPLING_STEP
+_WORDS = ("mass m", "damping c", "stiffness a", "cubic b")
+_SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
 SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"
@@ -57,15 +52,18 @@ class Screen:
 
     Args:
         render_mode: ``rgb_array``, or ``human``: then `start` and `add` show the frame in a window.
-        max_input, max_output: where the limits are drawn [V].
+        max_input, max_output: where the limits are drawn, inside.
+        scales: what one inside is worth outside, where all is drawn.
         fps: frames per second that the window does not exceed.
 
     Raises:
         gymnasium.error.DependencyNotInstalled: in mode ``human`` without pygame.
     """
 
-    def __init__(self, render_mode: str | None, max_input: float, max_output: float, fps: float) -> None:
-        self._limits = max_input, max_output
+    def __init__(
+        self, render_mode: str | None, max_input: float, max_output: float, fps: float, scales: Scales = VOLTS
+    ) -> None:
+        self._limits, self._scales = (max_input, max_output), scales
         self._picture: _Picture | None = None
         self._window = _Window(fps) if render_mode == "human" else None
 
@@ -75,20 +73,21 @@ class Screen:
         self._horizon = horizon
         self._samples = 0
         self._prior_entropy = belief.entropy()
+        self._believed = _physical_moments([belief])[0][:, 0]
         # Input, output and the belief after them; nothing was applied before the prior.
         self._history: deque[tuple[float, float, Belief]] = deque([(np.nan, np.nan, belief)], maxlen=SPAN + 1)
         self._show()
 
     def add(self, u: float, y: float, belief: Belief) -> None:
-        """Take note of a sample: the input applied [V], the output that followed [V] and the belief after it."""
+        """Take note of a sample: the input applied, the output that followed, both inside, and the belief after it."""
         self._samples += 1
-        self._history.append((u, y, belief))
+        self._history.append((self._scales.input * u, self._scales.output * y, belief))
         self._show()
 
     def frame(self) -> Frame:
         """The episode so far (of a long one the last `SPAN` samples) as a new RGB array (HEIGHT, WIDTH, 3)."""
         if self._picture is None:
-            self._picture = _Picture(*self._limits)
+            self._picture = _Picture(*self._limits, self._scales, self._believed)
         inputs, outputs, beliefs = zip(*self._history, strict=True)
         means, stds = _physical_moments(beliefs)
         gained = self._prior_entropy - beliefs[-1].entropy()
@@ -123,9 +122,11 @@ def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray
     but may pass 0 on the way.
     """
     model, scales = beliefs[0].model, beliefs[0].scales
+    names = list(model.coefficients)
+    gain = names.index("gain") if "gain" in names else -1
     mean = np.array([belief.coefficients_mean for belief in beliefs])
     cov = np.array([belief.coefficients_cov for belief in beliefs])
-    known = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2)) & (np.abs(mean[:, -1]) > 1e-9)
+    known = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2)) & (np.abs(mean[:, gain]) > 1e-12)
     means, stds = np.full((2, len(NAMES), len(beliefs)), np.nan)
     with np.errstate(all="ignore"):
         physical, physical_cov = propagate(model, mean[known], cov[known], scales)
@@ -137,29 +138,53 @@ def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray
     return means, stds
 
 
+def _labels(scales: Scales, believed: FloatArray) -> list[tuple[str, float]]:
+    """Label of m, c, a and b, and the power of ten that its numbers are in, from what is believed at the start."""
+    labels = []
+    for name, word, value in zip(NAMES, _WORDS, believed, strict=True):
+        unit = scales.unit(DIMENSIONS[name])
+        power = int(np.floor(np.log10(abs(value)))) if np.isfinite(value) and value != 0 else 0
+        power = 0 if -1 <= power <= 1 else power
+        words = [f"10{str(power).translate(_SUPERSCRIPTS)}"] * (power != 0) + [unit] * (unit != "1")
+        labels.append((f"{word} [{' '.join(words)}]" if words else word, 10.0**power))
+    return labels
+
+
 class _Picture:
     """The figure, on the Agg canvas itself: pyplot would look for a display, and keep the figure for good.
 
     Axes and labels are drawn when the time axes change, and kept as a background; a frame adds curves and numbers.
     """
 
-    def __init__(self, max_input: float, max_output: float) -> None:
+    def __init__(self, max_input: float, max_output: float, scales: Scales, believed: FloatArray) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         self._figure = Figure((WIDTH / 100, HEIGHT / 100), dpi=100, facecolor="white")
         self._canvas = FigureCanvasAgg(self._figure)
+        self._milliseconds = 1e3 * scales.step
+        scales.input * max_input, scales.output * max_output
         self._background: Any = None
         self._extent: tuple[int, int] | None = None
 
         left, right = (0.06, 0.41), (0.575, 0.405)
         self._signals = (
-            _SignalPanel(self._add_axes(*left, 0.52, 0.34), "input u [V]", max_input, "steps-pre"),
-            _SignalPanel(self._add_axes(*left, 0.10, 0.34), "output y [V]", max_output, "default"),
+            _SignalPanel(
+                self._add_axes(*left, 0.52, 0.34),
+                f"input u [{scales.input_unit}]",
+                scales.input * max_input,
+                "steps-pre",
+            ),
+            _SignalPanel(
+                self._add_axes(*left, 0.10, 0.34),
+                f"output y [{scales.output_unit}]",
+                scales.output * max_output,
+                "default",
+            ),
         )
         self._parameters = [
             _ParameterPanel(self._add_axes(*right, 0.10 + 0.205 * row, 0.145), name, unit)
-            for row, (name, unit) in zip((3, 2, 1, 0), PARAMETERS, strict=True)
+            for row, (name, unit) in zip((3, 2, 1, 0), _labels(scales, believed), strict=True)
         ]
         self._panels: tuple[_SignalPanel | _ParameterPanel, ...] = (*self._signals, *self._parameters)
         style: dict[str, Any] = {"color": INK, "verticalalignment": "center_baseline"}
@@ -189,7 +214,7 @@ class _Picture:
         """
         if extent != self._extent:
             self._draw_background(extent)
-        times = MILLISECONDS * np.arange(extent[0], extent[0] + signals.shape[1])
+        times = self._milliseconds * np.arange(extent[0], extent[0] + signals.shape[1])
         self._status.set_text(status)
         for signal_panel, values in zip(self._signals, signals, strict=True):
             signal_panel.update(times, values)
@@ -206,7 +231,7 @@ class _Picture:
     def _draw_background(self, extent: tuple[int, int]) -> None:
         margin = 0.01 * (extent[1] - extent[0])  # for the dots
         for panel in self._panels:
-            panel.axes.set_xlim(MILLISECONDS * (extent[0] - margin), MILLISECONDS * (extent[1] + margin))
+            panel.axes.set_xlim(self._milliseconds * (extent[0] - margin), self._milliseconds * (extent[1] + margin))
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
         self._extent = extent

@@ -222,6 +222,13 @@ class RigPlantExperiment(PlantExperiment):
         return int(self.rig.interpolation == "linear")
 
     @property
+    def center(self) -> dict[str, float]:
+        """What the prior believes, inside: nobody knows the plant."""
+        dimensions = self.model.dimensions
+        told = self.believed.parameters()
+        return {name: told[name][0] / self.scales.factor(dimensions[name]) for name in dimensions}
+
+    @property
     def scales(self) -> Scales:
         """The rig's."""
         assert isinstance(self.rig, Rig)

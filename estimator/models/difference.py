@@ -11,6 +11,7 @@ from __future__ import annotations
 from functools import cache
 from typing import NamedTuple
 
+from estimator.models.duffing import DIMENSIONS
 from estimator.models.model import Model
 
 
@@ -66,7 +67,6 @@ _PHYSICAL = {
     "a": "(1 - theta1 - theta3)/eta",
     "b": "-theta2/eta",
 }
-_DIMENSIONS = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)}
 
 
 @cache
@@ -99,6 +99,6 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
         noise=("1", "0"),
         outputs={"y": "x1"},
         physical=physical,
-        dimensions={p: _DIMENSIONS[p] for p in physical},
+        dimensions={p: DIMENSIONS[p] for p in physical},
         inverse={name: _INVERSE[name] for name in names} if known else {},
     )

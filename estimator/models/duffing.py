@@ -18,6 +18,9 @@ from functools import cache
 
 from estimator.models.model import Model
 
+#: Of the parameters of Eq. (1): powers of the units of input and displacement, and of the second.
+DIMENSIONS = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)}
+
 #: What a sensor may show, and the number of time derivatives.
 KINDS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
@@ -56,7 +59,7 @@ def duffing(
     coefficients = {"stiffness": "1", "cubic": "V⁻²", "damping": "1", "gain": "1"}
     acceleration = f"gain*u - damping*v - stiffness*x - cubic*{x}**3"
     physical = {"m": "step**2/gain", "c": "step*damping/gain", "a": "stiffness/gain", "b": "cubic/gain"}
-    dimensions = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)}
+    dimensions = dict(DIMENSIONS)
     inverse = {"stiffness": "a*step**2/m", "cubic": "b*step**2/m", "damping": "c*step/m", "gain": "step**2/m"}
     per_step = ("", "/step", "/step**2")[order]
     if offsets:
