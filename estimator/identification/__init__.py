@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from estimator.belief import Belief
 from estimator.ensemble import matched_gamma
 from estimator.identification.checks import examine
+from estimator.identification.contraction import contraction
 from estimator.identification.problem import Problem
 from estimator.identification.records import Record, records_of
 from estimator.identification.result import Result
@@ -77,7 +79,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         forecasts = tuple(_forecast(belief, rig, one) for one in read)
         parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
         warnings = examine(problem, found, parameters, noises["input"][0], read, forecasts)
-    return Result(rig, belief, warnings, tuple(read), forecasts, noises)
+    return Result(rig, belief, warnings, tuple(read), forecasts, noises, partial(contraction, problem, found))
 
 
 def _scales(rig: Rig, records: list[Record]) -> Scales:

@@ -114,7 +114,8 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
             Warning(
                 name,
                 f"the records speak for interpolation '{better.interpolation}' with delay {better.delay}, by "
-                f"{gains[best]:.0f} nats, and not for '{rig.interpolation}' with delay {rig.delay}; try that rig",
+                f"{gains[best]:.0f} nats, and not for '{rig.interpolation}' with delay {rig.delay}; write these into "
+                f"the rig, and identify again",
             )
         )
         return warnings

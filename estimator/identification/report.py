@@ -22,14 +22,40 @@ if TYPE_CHECKING:
 #: Samples of a record that a figure shows at most, and outputs that start a free run.
 _SHOWN, _GIVEN = 1500, 20
 
+_MEANINGS = {
+    "m": "mass",
+    "c": "damping",
+    "a": "linear stiffness",
+    "b": "cubic stiffness",
+    "u0": "offset of the input",
+    "y0": "offset of the output",
+}
+
+_CONTRACTION = (
+    "What the first outputs of the records leave open. An interval narrows with the square root of their number, and "
+    "faster at first; where it stays as it is, choose an input that tells about that parameter."
+)
+_FIT = (
+    "The free run gets 20 outputs and then the input alone: it errs where parameters are wrong, and where the force is "
+    "disturbed. The forecast gets every output before its own: 90 % of its errors lie in the band if the intervals are "
+    "to be trusted."
+)
+_RESIDUALS = (
+    "What the forecasts leave, in their standard deviations. It looks normal and white where equation, input and noise "
+    "are as assumed."
+)
+
 
 def write(result: Result, path: Path, commands: Sequence[str] = ()) -> Path:
     """Write the page; see `Result.report`."""
     parts = ["<h1>Identification</h1>", _checks(result), _parameters(result)]
+    parts.append(f"<h2>What each sample told</h2><figure>{svg(_draw_contraction(result))}<figcaption>{_CONTRACTION}")
+    parts.append("</figcaption></figure>")
     for record, forecast in zip(result.records, result.forecasts, strict=True):
-        parts.append(f"<h2>{escape(record.name)}</h2>")
-        for figure in (_draw_fit(result, record, forecast), _draw_residuals(record, forecast)):
-            parts.append(f"<figure>{svg(figure)}</figure>")
+        parts.append(f"<h2>{escape(record.name)}</h2>{_about(result, record)}")
+        drawn = (_draw_fit(result, record, forecast), _FIT), (_draw_residuals(record, forecast), _RESIDUALS)
+        for figure, caption in drawn:
+            parts.append(f"<figure>{svg(figure)}<figcaption>{caption}</figcaption></figure>")
     if commands:
         parts.append(f"<h2>How this page was made</h2><pre>{escape(chr(10).join(commands))}</pre>")
     write_atomically(path, page("Identification", parts))
@@ -49,7 +75,15 @@ def _parameters(result: Result) -> str:
     intervals, rows = result.interval(0.9), []
     for name, (mean, std) in result.parameters.items():
         low, high = intervals[name]
-        rows.append([name, f"{mean:.6g}", f"{std:.2g}", f"{low:.6g} to {high:.6g}", escape(result.units[name])])
+        rows.append(
+            [
+                f"{name}, {_MEANINGS[name]}",
+                f"{mean:.6g}",
+                f"{std:.2g}",
+                f"{low:.6g} to {high:.6g}",
+                escape(result.units[name]),
+            ]
+        )
     for name, what in (("input", "disturbance of the force"), ("output", "noise of the sensor")):
         mean, std = result.noises[name]
         interval = f"{max(mean - 1.645 * std, 0):.3g} to {mean + 1.645 * std:.3g}"
@@ -59,18 +93,46 @@ def _parameters(result: Result) -> str:
     return f"<h2>Parameters</h2>{equation}{table(heads, rows)}"
 
 
-def _figure(rows: int, columns: int, height: float) -> tuple[Figure, Any]:
+def _about(result: Result, record: Record) -> str:
+    seconds = len(record.u) * result.rig.step
+    told = [f"{len(record.u)} samples in {seconds:.4g} s"]
+    told += [
+        f"{count} outputs {what}" for count, what in ((record.missing, "missing"), (record.clipped, "clipped")) if count
+    ]
+    shown = f"; the first {_SHOWN} are shown" if len(record.u) > _SHOWN else ""
+    return f"<p>{', '.join(told)}{shown}.</p>"
+
+
+def _figure(rows: int, columns: int, height: float, **settings: Any) -> tuple[Figure, Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, height), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    return figure, figure.subplots(rows, columns, squeeze=False, **settings)
+
+
+def _draw_contraction(result: Result) -> Figure:
+    """Half widths of the intervals of m, c, a and b against the number of outputs."""
+    figure, ((axis,),) = _figure(1, 1, 3.2)
+    counts = [count for count, _ in result.history]
+    for name, color in zip("mcab", ("#222", "#06c", "#c40", "#084"), strict=True):
+        stds = np.array([told[name][1] for _, told in result.history])
+        axis.plot(counts, 164.5 * stds / abs(result.parameters[name][0]), color=color, marker=".", label=name)
+    axis.set_xscale("log", base=2)
+    axis.set_yscale("log")
+    axis.xaxis.set_major_formatter(lambda value, _: f"{value:.0f}")
+    axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_xlabel("outputs that were used")
+    axis.set_ylabel("half of the 90 % interval\n[% of the last mean]")
+    axis.grid(alpha=0.3)
+    axis.legend(ncols=4, fontsize=8)
+    return figure
 
 
 def _draw_fit(result: Result, record: Record, forecast: FloatArray) -> Figure:
     """Input; measured, forecast and free run; and the errors of both, over the first samples."""
-    figure, axes = _figure(4, 1, 8.5)
+    figure, axes = _figure(4, 1, 8.5, sharex=True)
     count = min(len(record.u), _SHOWN)
     seconds, measured = np.arange(count) * result.rig.step, record.y[:count]
     output, given = result.rig.output, record.y[:_GIVEN]
@@ -80,9 +142,9 @@ def _draw_fit(result: Result, record: Record, forecast: FloatArray) -> Figure:
     driven, shown, far, near = axes[:, 0]
     driven.step(seconds, record.u[:count], where="post", color="#555", linewidth=0.8)
     driven.set_ylabel(_plain(f"input [{result.rig.input.unit}]"))
-    shown.plot(seconds, measured, color="#222", linewidth=1.4, label="measured")
-    shown.plot(seconds, forecast[:count, 0], color="#06c", linewidth=0.8, label="forecast, one sample ahead")
-    shown.plot(seconds, run, color="#c40", linewidth=0.8, linestyle="--", label=f"free run after {_GIVEN} samples")
+    shown.plot(seconds, measured, color="#bbb", linewidth=4, label="measured")
+    shown.plot(seconds, forecast[:count, 0], color="#06c", linewidth=1.2, label="forecast, one sample ahead")
+    shown.plot(seconds, run, color="#c40", linewidth=0.9, linestyle="--", label=f"free run after {_GIVEN} samples")
     shown.set_ylabel(_plain(f"{output.kind} [{output.unit}]"))
     shown.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8)
     far.plot(seconds, measured - run, color="#c40", linewidth=0.8)
@@ -94,6 +156,9 @@ def _draw_fit(result: Result, record: Record, forecast: FloatArray) -> Figure:
     near.set_ylabel(_plain(f"forecast's error [{output.unit}]"))
     near.set_xlabel("time [s]")
     near.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8)
+    for axis in (driven, shown, far, near):
+        axis.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
+    figure.align_ylabels()
     return figure
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
+from estimator.identification.contraction import History
 from estimator.identification.records import Record
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
@@ -43,6 +46,7 @@ class Result:
         forecasts: per record, (T, 2) mean and variance of each output before it was seen.
         noises: name to mean and standard deviation: of ``input``, the disturbance of the force as a standard deviation
             per sample, and of ``output``, the sensor's.
+        contraction: makes `history`, which takes some fits.
     """
 
     rig: Rig
@@ -51,6 +55,7 @@ class Result:
     records: tuple[Record, ...]
     forecasts: tuple[FloatArray, ...]
     noises: Mapping[str, tuple[float, float]]
+    contraction: Callable[[], History]
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
@@ -74,6 +79,14 @@ class Result:
 
         half = float(norm.ppf(0.5 + probability / 2))
         return {name: (mean - half * std, mean + half * std) for name, (mean, std) in self.parameters.items()}
+
+    @cached_property
+    def history(self) -> History:
+        """What the first samples left: how many outputs, and the mean and standard deviation of each parameter.
+
+        From few samples to all, for the same oscillator in the same noise: `estimator.identification.contraction`.
+        """
+        return (*self.contraction(), (sum(int(np.isfinite(one.y).sum()) for one in self.records), self.parameters))
 
     @property
     def estimator(self) -> OnlineEstimator:

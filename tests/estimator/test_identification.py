@@ -150,12 +150,22 @@ def test_the_result_goes_on(tmp_path):
     forecast = result.forecasts[0]
     inside = np.abs(y - forecast[:, 0])[5:] < 1.645 * np.sqrt(forecast[5:, 1])
     assert 0.87 < inside.mean() < 0.93
+    counts, told = zip(*result.history, strict=True)
+    assert counts == (64, 128, 256, 512, 1024, 2048)
+    assert told[-1] == result.parameters
+    for name in BENCH[0]:
+        stds = np.array([one[name][1] for one in told])
+        assert (stds[1:] < stds[:-1]).all()
+        away = np.array([one[name][0] for one in told]) - BENCH[0][name]
+        assert (np.abs(away) < 4.5 * stds).all()
     before = result.parameters["m"][1]
     estimator = result.estimator
     estimator.run(*simulated(BENCH, seed=1))
     assert estimator.belief.parameters()["m"][1] < before
     page = result.report(tmp_path / "folder" / "page.html", ["made <by> this"]).read_text()
     assert "made &lt;by&gt; this" in page
+    assert "2048 samples in 2.048 s; the first 1500 are shown." in page
+    assert page.count("<svg") == 3
     assert "No check speaks against" in page
     assert "http" not in page.replace("http://www.w3.org", "").replace("https://matplotlib.org", "").replace(
         "http://purl.org", ""
