@@ -9,7 +9,6 @@ still finds an expression or two that are written twice; divisions and roots are
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -100,6 +99,9 @@ _YARDSTICKS = {
     _STORES: (move, "store"),
 }
 
+#: Arguments of lane functions that are blocks: that of the systems, and of what is written beside it.
+_BLOCKS = ("W", "B")
+
 #: An instruction of LLVM's to what it is counted as.
 _INSTRUCTIONS = {
     r"= f(?:add|sub|mul) ": ("flop",),
@@ -116,7 +118,7 @@ def count(functions: dict[Any, int]) -> Counter[str]:
     """
     counted: Counter[str] = Counter()
     for function, times in functions.items():
-        kinds = ("ptr",) + ("double",) * (len(function.source.arguments) - 1)
+        kinds = tuple("ptr" if name in _BLOCKS else "double" for name in function.source.arguments)
         text = "".join(function.translated(kinds).definitions.values())
         for instruction, names in _INSTRUCTIONS.items():
             for name in names:
@@ -197,7 +199,7 @@ def _yardstick(function: Any, operations_per_lane: int) -> Callable[[int], float
 
     def action(count: int) -> float:
         for _ in range(count):
-            call(values)
+            call(values, values[0])
         assert np.isfinite(values).all()
         return count * REPEATS * LANES * operations_per_lane
 
@@ -207,47 +209,57 @@ def _yardstick(function: Any, operations_per_lane: int) -> Callable[[int], float
 def _piece(functions: dict[Any, int], factorisation: str) -> Callable[[int], float]:
     """A piece of the step, again and again on blocks that lie in the nearer caches as those of the step do."""
     initial, call = plants(SIZE, factorisation), _calls(functions)
-    blocks = initial.copy()
+    blocks, beside = initial.copy(), np.zeros(initial.shape[1])
 
     def action(count: int) -> float:
         blocks[:] = initial
         for _ in range(count * STEPS):
-            call(blocks)
+            call(blocks, beside)
         return count * STEPS * SIZE
 
     return action
 
 
 def _calls(functions: dict[Any, int]) -> Any:
-    """``call(blocks)``: every lane function, so often on each block. Uniform arguments do not matter to the time."""
+    """``call(blocks, beside)``: every lane function, so often on each block; what goes beside it, into one.
+
+    Uniform arguments do not matter to the time.
+    """
     piece = _nothing
     for function, times in functions.items():
         piece = _then(piece, function, times)
 
     @jit
-    def call(blocks):
+    def call(blocks, beside):
         for b in range(len(blocks)):
-            piece(blocks[b])
+            piece(blocks[b], beside)
 
     return call
 
 
 @jit
-def _nothing(W):
+def _nothing(W, B):
     pass
 
 
 def _then(before: Any, function: Any, times: int) -> Any:
     """What was to be done before, and then a lane function."""
-    arguments = (1e-3,) * (len(inspect.signature(function.py_func).parameters) - 1)
+    names = function.source.arguments
+    uniform = (1e-3,) * sum(name not in _BLOCKS for name in names)
 
     @jit
-    def both(W):
-        before(W)
+    def both(W, B):
+        before(W, B)
         for _ in range(times):
-            function(W, *arguments)
+            function(W, *uniform)
 
-    return both
+    @jit
+    def both_beside(W, B):
+        before(W, B)
+        for _ in range(times):
+            function(W, B, *uniform)
+
+    return both_beside if "B" in names else both
 
 
 def _steps(rule: str) -> Callable[[int], float]:
