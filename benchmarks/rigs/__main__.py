@@ -1,4 +1,4 @@
-"""Run a part: ``python -m benchmarks.rigs accuracy --seeds 200``; also ``faults``, ``peers`` and ``sweep``."""
+"""Run a part: ``python -m benchmarks.rigs accuracy --seeds 200``; also ``faults``, ``peers``, ``sweep``, ``loop``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.rigs import accuracy, faults, peers, sweep
+from benchmarks.rigs import accuracy, faults, loop, peers, sweep
 from benchmarks.rigs.catalogue import BENCHES
 from estimator.files import write_atomically
 
@@ -90,11 +90,30 @@ class Sweep:
         return {"verdict": sweep.show(cells), "cells": [cell.to_dict() for cell in cells]}
 
 
+@dataclass(frozen=True)
+class Loop:
+    """256 samples through Rig-v0 around the integrator, by prbs and by the planner."""
+
+    seeds: int = 100
+    """Runs of each rig and policy."""
+    rigs: tuple[str, ...] = tuple(BENCHES)
+    """Names of rigs."""
+    workers: int = CORES
+    """Processes."""
+    json: Path | None = None
+    """File for the verdict."""
+
+    def run(self) -> dict[str, Any]:
+        """Run, print, and return what goes into the file."""
+        return loop.show(loop.run(self.rigs, self.seeds, self.workers))
+
+
 Part = (
     Annotated[Accuracy, tyro.conf.subcommand("accuracy")]
     | Annotated[Faults, tyro.conf.subcommand("faults")]
     | Annotated[Against, tyro.conf.subcommand("peers")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
+    | Annotated[Loop, tyro.conf.subcommand("loop")]
 )
 
 
