@@ -59,9 +59,8 @@ def members_of(kind: Kind) -> Members:
     fed = tuple((own[row] * LANES, place[row] * LANES) for row in given)
     walks = tuple(own[f"P_{c}_{c}"] * LANES for c in model.coefficients)
     weight, free_energy = own["WEIGHT"] * LANES, place.get("FREE_ENERGY", -1) * LANES
-    energies_of = free_energies(model, kind.iterations, LANES, own)
+    energy_of = free_energies(model, kind.iterations, LANES, own, every=False)
     look = forecaster(kind.name, model, kind.iterations, LANES, own)
-    last = kind.iterations - 1
     inner = part(kind.name)
 
     @inner
@@ -93,20 +92,20 @@ def members_of(kind: Kind) -> Members:
                         V[walks[c] + j] += setup.walk[c]
             update(V)
         weights, shares = np.empty(count), np.empty(count)
-        each, predictions = np.empty((count, last + 1)), np.empty((count, 1, 2))
-        energies, forecasts = np.empty(last + 1), np.empty((1, 2))
+        each, predictions = np.empty((count, 1)), np.empty((count, 1, 2))
+        energies, forecasts = np.empty(1), np.empty((1, 2))
         for j in range((stop - first) // count):
             start = first + j * count
             for m in range(count):
                 V, k = members[(start + m) // LANES], (start + m) % LANES
                 weights[m] = V[weight + k]
-                energies_of(V, k, each[m])
+                energy_of(V, k, each[m])
                 look(V, k, predictions[m])
             weigh(weights, each, predictions, energies, forecasts)
             for m in range(count):
                 members[(start + m) // LANES, weight + (start + m) % LANES] = weights[m]
             mix(members, start, weights, names, shares, W, j, LANES)
             if free_energy >= 0:
-                W[free_energy + j] = energies[last]
+                W[free_energy + j] = energies[0]
 
     return Members(begin, learn)

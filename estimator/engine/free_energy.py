@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
+from estimator.elementary import LOG_2PI, log_gamma_half_step
 from estimator.engine import cache as stored
 from estimator.lanes import jit
 from estimator.models.model import Model
@@ -45,33 +45,35 @@ def precision_part(half_power, variance, shape, rate):
         variance: of the noise, as the iteration assumed it.
         shape: of the precision before the sample.
         rate: of the precision before the sample.
+
+    The three have terms in ψ(shape + 1/2), and in half_power/(rate + half_power), that cancel.
     """
-    after = rate + half_power
-    moved = half_power * ((shape + 0.5) / after - 1 / variance)
-    moved -= 0.5 * (math.log(variance) + expected_log_gamma(shape + 0.5, after))
-    return moved + gamma_step_divergence(shape, rate, half_power)
+    moved = 0.5 * math.log((rate + half_power) / variance) - half_power / variance
+    return moved + shape * math.log1p(half_power / rate) - log_gamma_half_step(shape)
 
 
-def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str, int]) -> Any:
+def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str, int], every: bool = True) -> Any:
     """Compile ``f(W, lane, out)``: the free energy [nats] that the last update left a lane with, after each iteration.
 
     F = KL[q(states, coefficients) || prior, transition, likelihood] + KL[q(γ) || prior] + KL[q(ξ) || prior] to first
     order, summed over the sensors: the first that shows the process noise counts for γ and its own ξ, each further one
-    for its ξ. A missing output counts for nothing. ``out`` is (iterations,).
+    for its ξ. A missing output counts for nothing. ``out`` is (iterations,), or (1,).
 
     Args:
         model: whose belief.
         iterations: of the update.
         lanes: systems in a block.
         layout: of the update, `estimator.engine.tasks.structured` with ``trace=True``.
+        every: whether after every iteration, or only after the last.
     """
+    kept = range(iterations) if every else [iterations - 1]
 
     def make() -> str:
         at = lambda row: f"W[{layout[row] * lanes} + lane]"  # noqa: E731
         source = [
             "@jit",
             "def free_energy(W, lane, out):",
-            f"    for i in range({iterations}):",
+            f"    for i in range({len(kept)}):",
             "        out[i] = 0.0",
         ]
         for k, sensor in enumerate(model.outputs):
@@ -82,16 +84,16 @@ def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str
                 f"        g, n = {at('GAMMA_SHAPE')} - 0.5, {at(f'XI_SHAPE_{sensor}')} - 0.5",
                 f"        g_rate, n_rate = g * {at(f'TRACE_{k}_q_0')}, n * {at(f'TRACE_{k}_r_0')}",
             ]
-            for i in range(iterations):
+            for place, i in enumerate(kept):
                 source += [
                     f"        q, r = {at(f'TRACE_{k}_q_{i}')}, {at(f'TRACE_{k}_r_{i}')}",
                     "        half_w, half_v = half_noise_powers(e, s, q, r)",
-                    f"        out[{i}] += gaussian_part(e, s + q + r) + precision_part(half_v, r, n, n_rate)",
+                    f"        out[{place}] += gaussian_part(e, s + q + r) + precision_part(half_v, r, n, n_rate)",
                     "        if q > 0.0:",
-                    f"            out[{i}] += precision_part(half_w, q, g, g_rate)",
+                    f"            out[{place}] += precision_part(half_w, q, g, g_rate)",
                 ]
         return "\n".join(source) + "\n"
 
     names = {f.__name__: f for f in (gaussian_part, precision_part, half_noise_powers)}
-    key = repr((model.digest, iterations, lanes, sorted(layout.items())))
+    key = repr((model.digest, iterations, lanes, sorted(layout.items()), every))
     return stored.load(model.name, "free-energy", key, make, names).free_energy
