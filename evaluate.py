@@ -4,6 +4,7 @@ $ python evaluate.py                                        the reference and ba
 $ python evaluate.py --policies runs/demo prbs              a trained policy beside PRBS
 $ python evaluate.py --policies "ppo=runs/ppo-*-[0-4]"      five training seeds as one entry
 $ python evaluate.py --report runs/report                   all of it on one HTML page
+$ python evaluate.py --rig rig.toml --policies efe prbs     on a rig of your own
 $ python evaluate.py --options '{"max_output": 0.3}'        under another limit
 """
 
@@ -12,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from agents.cli import JsonOptions, check_track, run_script
+from agents.cli import RIG_TRACK, JsonOptions, check_track, run_script, with_rig
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class Config:
     """Names of policies, or run folders; TITLE=PATTERN for the folders of several training seeds as one entry."""
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
+    rig: str | None = None
+    """Rig file: the track is then Rig-v0, on oscillators that the rig's guess allows."""
     options: JsonOptions = field(default_factory=dict)
     """Further options of the environment, as JSON."""
     systems: int = 256
@@ -35,6 +38,8 @@ class Config:
     """Folder for a report instead: one HTML page, and evaluation.json."""
 
     def __post_init__(self) -> None:
+        if self.rig is not None:
+            object.__setattr__(self, "env", RIG_TRACK)
         check_track(self.env)
 
 
@@ -44,7 +49,7 @@ def main(config: Config) -> None:
 
     folder = config.report if config.report is not None else config.output
     compare(
-        config.policies, config.env, config.systems, config.options, folder,
+        config.policies, config.env, config.systems, with_rig(config.options, config.rig), folder,
         seed=config.seed, report=config.report is not None,
     )  # fmt: skip
 

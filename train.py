@@ -3,6 +3,7 @@
 $ python train.py                                  PPO on Amplitude-v0, into runs/
 $ python train.py --steps 1000000 --seed 3         shorter, another seed
 $ python train.py --reward log_posterior           another reward
+$ python train.py --rig rig.toml                   on a rig of your own
 $ python train.py --algo sac --help                another algorithm, and its hyperparameters
 $ python train.py --algo td3 --tune 50             search for its hyperparameters
 $ python train.py --resume runs/ppo-amplitude-v0-0 go on with a run that was stopped

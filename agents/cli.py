@@ -38,6 +38,24 @@ JsonOptions = Annotated[
 Config = TypeVar("Config")
 
 
+#: The track of a rig.
+RIG_TRACK = "duffing_env/Rig-v0"
+
+
+def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
+    """Options of an environment, with the rig of a file written out.
+
+    Raises:
+        ValueError: for a file that is no rig's.
+        FileNotFoundError: if there is no such file.
+    """
+    if rig is None:
+        return options
+    from estimator.rig import Rig
+
+    return {**options, "rig": Rig.from_file(rig).to_dict()}
+
+
 def progress_bar() -> Progress:
     """A bar on stderr that names what is being done."""
     columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from agents.cli import JsonOptions, check_track
+from agents.cli import RIG_TRACK, JsonOptions, check_track, with_rig
 from agents.policies.learned import CARD, save_policy
 from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
@@ -44,8 +44,14 @@ class Subject:
     """Algorithm; tqc and recurrent_ppo need the extra "contrib"."""
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
+    rig: str | None = None
+    """Rig file: the track is then Rig-v0, on oscillators that the rig's guess allows."""
     settings: Path | None = None
     """File of hyperparameters, TOML; the one that comes with the package where it is not given."""
+
+    def __post_init__(self) -> None:
+        if self.rig is not None:
+            object.__setattr__(self, "env", RIG_TRACK)
 
 
 @dataclass(frozen=True)
@@ -74,6 +80,10 @@ class TrainConfig(Subject):
     """Hyperparameters; those that the file has for the track where they are not given."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        # A run has its rig in itself, and not the name of a file that may change.
+        object.__setattr__(self, "options", with_rig(self.options, self.rig))
+        object.__setattr__(self, "rig", None)
         for name in ("steps", "checkpoints", "torch_threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")

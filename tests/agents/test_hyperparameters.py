@@ -7,6 +7,7 @@ import pytest
 from agents.training import ALGORITHMS, PPOSettings, SACSettings, TrainConfig
 from agents.training.hyperparameters import FILES, read_settings, settings_of, track_of, write_settings
 from duffing_env import TRACKS
+from estimator import Channel, Rig
 
 SHORT = "duffing_env/Short-v0"
 
@@ -114,3 +115,18 @@ def test_a_search_stays_within_the_hyperparameters(kind):
 def test_the_name_of_a_table_is_that_of_the_track():
     assert track_of("duffing_env/Amplitude-v0") == "Amplitude-v0"
     assert track_of("Own-v3") == "Own-v3"
+
+
+def test_a_rig_is_written_out_so_that_a_run_can_rebuild_itself(tmp_path):
+    guess = dict.fromkeys("mcab", (1.0, 2.0))
+    rig = Rig(1e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03), guess=guess)
+    lines = ["step = 1e-3", "[input]", 'unit = "N"', "limit = 6.0", "[output]", 'unit = "m"', "range = 0.03", "[guess]"]
+    path = tmp_path / "rig.toml"
+    path.write_text("\n".join([*lines, *(f"{name} = [1.0, 2.0]" for name in "mcab")]))
+    config = TrainConfig(rig=str(path), options={"horizon": 64})
+    path.unlink()
+    assert (config.env, config.rig) == ("duffing_env/Rig-v0", None)
+    assert config.options == {"horizon": 64, "rig": rig.to_dict()}
+    assert config.hyperparameters == read_settings("ppo", "duffing_env/Rig-v0")
+    with pytest.raises(FileNotFoundError, match="path must be a rig file"):
+        TrainConfig(rig=str(path))
