@@ -98,13 +98,14 @@ class DuffingEnv(gym.Env[Any, Any]):
     of the coefficients of oscillators so drawn; γ and ξ are Gamma of shape 2 about the true noise precisions.
 
     With ``noise_range`` above 1 each noise's standard deviation is drawn log-uniformly about ``process_noise`` and
-    ``measurement_noise``, over a range of that factor: 10 is a decade, from 1/√10 to √10 times. The prior is then about
-    the middle of the range, and ``truth`` has ``process_noise`` and ``measurement_noise``, too.
+    ``measurement_noise``, over a range of that factor: 10 is a decade, from 1/√10 to √10 times. The prior stays about
+    the middle of the range or the guesses, and ``truth`` has ``process_noise`` and ``measurement_noise``, too.
 
     An estimator alone hardly learns how the two noises share what an output shows. With ``noise_hypotheses`` above 1 (9
     resolve it) it weighs as many ratios by their evidence, as `estimator.OnlineEstimator` does, each at three levels:
-    three updates a hypothesis and sample. Observation, ``belief``, rewards and information are then those of the
-    mixture's mean and covariance; ``free_energy`` is the mixture's own. It is for ``structured`` and one sensor.
+    three updates a hypothesis and sample. Observation, ``belief``, information and the rewards that look at the belief
+    are then those of the mixture's mean and covariance; ``free_energy`` is the mixture's own. It is for ``structured``
+    and one sensor.
 
     ## Episode end
 

@@ -159,11 +159,13 @@ class ModelEnv(DuffingEnv):
 
     ## Information
 
-    As `DuffingEnv`; ``truth`` is a `estimator.Parameters`.
+    As `DuffingEnv`; ``truth`` is a `estimator.Parameters`. Where noises are drawn (``noise_range``), of several sensors
+    it has ``measurement_noise_<sensor>``.
 
     ## Arguments
 
-    Those of `DuffingEnv`, and:
+    Those of `DuffingEnv`, and the following. With ``measurement_noise_guess`` the priors of further sensors are as far
+    off as that of the first.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
