@@ -22,13 +22,17 @@ SEGMENTS = (32, 256)  # samples
 
 @dataclass(frozen=True)
 class Problem:
-    """A record and what its user knows. Arrays of NumPy, numbers in the units of the rig."""
+    """A record and what its user knows. Arrays of NumPy, numbers in the units of the rig.
+
+    ``substeps`` of Runge and Kutta's method a sample are enough.
+    """
 
     u: Any
     y: Any
     step: float
     kind: str
     interpolation: str
+    substeps: int
     offset: bool
     rest: float
     guess: Any
@@ -37,11 +41,10 @@ class Problem:
 
 
 def acting(problem: Problem) -> Any:
-    """(T, 2 S + 1) inputs at the ends and middles of S substeps from each sample to the next, 64 to a period."""
+    """(T, 2 S + 1) inputs at the ends and middles of S substeps from each sample to the next."""
     from scipy.interpolate import make_interp_spline
 
-    m, _, a, _ = problem.guess
-    u, substeps = problem.u, int(np.ceil(64 * problem.step * np.sqrt(abs(a) / m) / (2 * np.pi)))
+    u, substeps = problem.u, problem.substeps
     if problem.interpolation == "zero_order":
         return np.repeat(u[:, None], 2 * substeps + 1, axis=1)
     times = np.arange(len(u))[:, None] + np.linspace(0, 1, 2 * substeps + 1)
