@@ -25,7 +25,7 @@ class Config:
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
     rig: str | None = None
-    """Rig file: the track is then Rig-v0, on oscillators that the rig's guess allows."""
+    """Rig file; the track is then Rig-v0."""
     options: JsonOptions = field(default_factory=dict)
     """Further options of the environment, as JSON."""
     systems: int = 256

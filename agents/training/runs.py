@@ -45,7 +45,7 @@ class Subject:
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
     rig: str | None = None
-    """Rig file: the track is then Rig-v0, on oscillators that the rig's guess allows."""
+    """Rig file; the track is then Rig-v0."""
     settings: Path | None = None
     """File of hyperparameters, TOML; the one that comes with the package where it is not given."""
 

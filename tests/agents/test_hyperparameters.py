@@ -128,5 +128,5 @@ def test_a_rig_is_written_out_so_that_a_run_can_rebuild_itself(tmp_path):
     assert (config.env, config.rig) == ("duffing_env/Rig-v0", None)
     assert config.options == {"horizon": 64, "rig": rig.to_dict()}
     assert config.hyperparameters == read_settings("ppo", "duffing_env/Rig-v0")
-    with pytest.raises(FileNotFoundError, match="path must be a rig file"):
+    with pytest.raises(FileNotFoundError, match="rig must be a file"):
         TrainConfig(rig=str(path))
