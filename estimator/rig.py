@@ -167,6 +167,8 @@ class Rig:
     def from_file(cls, path: str | Path) -> Rig:
         """Read a rig file, TOML: ``step``, ``interpolation``, ``delay``, tables ``input``, ``output`` and ``guess``.
 
+        A table ``instrument`` is for who drives the rig, and not looked at.
+
         Raises:
             ValueError: naming the file and what is wrong in it.
             FileNotFoundError: if there is no such file.
@@ -180,7 +182,9 @@ class Rig:
         if not place.is_file() or place.stat().st_size > _LARGEST_FILE:
             raise ValueError(f"path must be a rig file, a short TOML, but {place} is none; name the file itself")
         try:
-            return cls.from_dict(tomllib.loads(place.read_text(encoding="utf-8")))
+            described = tomllib.loads(place.read_text(encoding="utf-8"))
+            described.pop("instrument", None)
+            return cls.from_dict(described)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
             raise ValueError(f"{place}: {error}") from error
 

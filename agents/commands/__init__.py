@@ -13,6 +13,7 @@ import tyro
 from agents.cli import told_in_one_line
 from agents.commands.identify import Identify
 from agents.commands.rig import Init, List
+from agents.commands.run import Run
 
 NAME = "duffing-env"
 
@@ -21,6 +22,7 @@ _subcommand = tyro.conf.subcommand
 #: What the command line chooses from: a name for each command, and commands of a group under one name.
 Command = (
     Annotated[Identify, _subcommand("identify")]
+    | Annotated[Run, _subcommand("run")]
     | Annotated[
         Annotated[Init, _subcommand("init")] | Annotated[List, _subcommand("list")],
         _subcommand("rig", description="Describe your rig in a file; list the rigs that ship."),

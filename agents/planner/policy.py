@@ -69,6 +69,10 @@ class Planner:
         goal_std: its standard deviation [V]; no goal where it is None.
         input_cost: nats for a V² of input energy.
 
+    Attributes:
+        view: of the model that is planned on.
+        terms: what plans are judged by.
+
     Raises:
         ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
             samples, a number is out of range, or a plan of the whole episode is asked to have a goal or cost, or to be
@@ -107,7 +111,7 @@ class Planner:
                 f"env must take an action for every sample, as plans do, but its hold is {experiment.hold}; "
                 "make it with hold=1, or choose a learned policy or a signal"
             )
-        setup, self._view = experiment.setup, View.of(experiment)
+        setup, self.view = experiment.setup, View.of(experiment)
         whole = bool(np.isfinite(setup.budget)) and horizon is None
         if whole and (goal_std is not None or input_cost):
             raise ValueError(
@@ -117,18 +121,18 @@ class Planner:
         horizon = env.horizon if whole else min(horizon or _HORIZON, env.horizon)
         self._energy = setup.budget if whole else None
         if whole:
-            self._pursue = pursuit(self._view.model, self._view.degree).pursue
+            self._pursue = pursuit(self.view.model, self.view.degree).pursue
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
         means = experiment.believed.coefficients_mean
-        self._terms = Terms(
+        self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,
             limit=setup.max_output,
-            margin=float(-ndtri(risk / env.horizon)) * (1 + max(self._view.degree, self._view.lag)),
+            margin=float(-ndtri(risk / env.horizon)) * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
-            scales=scales(self._view, means, setup.max_input, setup.max_output),
+            scales=scales(self.view, means, setup.max_input, setup.max_output),
             price=float(input_cost),
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
@@ -162,7 +166,7 @@ class Planner:
                 f"observation must be of the planner's own {len(records)} environments, but has shape {observed.shape}"
             )
         n = len(records)
-        k, terms = self._view.model.n_coefficients, self._terms
+        k, terms = self.view.model.n_coefficients, self.terms
         if state is None:
             plans, rates, before = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n)
             words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
@@ -171,7 +175,7 @@ class Planner:
         if episode_start is not None:
             begun = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)
             plans[begun], rates[begun], before[begun] = 0.0, 0.0, 0.0
-        at, rows = places(self._view.model), observed.reshape(n, -1)
+        at, rows = places(self.view.model), observed.reshape(n, -1)
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
         last = terms.amplitude * rows[:, at.last_input]
         inputs, scores = np.empty((2, n))
@@ -180,7 +184,7 @@ class Planner:
             self._pursue(records, left, energies, rule, last, plans, words, inputs, scores)
         else:
             lasts = np.stack([last, before], axis=1)
-            search(*self._view).plan(
+            search(*self.view).plan(
                 records, left, self.horizon, self.rounds, terms, lasts, plans, rates, words, inputs, scores
             )
         actions = (inputs / terms.amplitude).astype(np.float32)

@@ -1,0 +1,94 @@
+"""``duffing-env run``: an experiment on a rig, that ends with its parameters."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Run:
+    """Run an experiment on a rig, and identify while it goes on.
+
+    The input is zero before and after, whatever happens. docs/running.md says what a plant is, and what can go wrong.
+
+    $ duffing-env run rig.toml --plant agents.running.simulated:plant --out run
+    $ duffing-env run rig.toml --plant agents.running.instrument:plant --policy prbs --out run
+    $ duffing-env run rig.toml --plant lab:plant --block 64 --out run
+    $ duffing-env identify rig.toml run/samples.csv
+    """
+
+    rig: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RIG")]
+    """Rig file, with input.limit, output.range and a guess."""
+    plant: Annotated[str, tyro.conf.arg(metavar="MODULE:FACTORY")]
+    """What makes the plant: factory(rig, **instrument), with the table [instrument] of the rig file."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+    """New folder for the samples and the manifest."""
+    policy: str = "efe"
+    """What chooses the input: the planner efe, or a signal such as prbs."""
+    samples: int = 256
+    """Samples of the run."""
+    block: int | None = None
+    """Play blocks of so many samples; sample by sample against the clock where it is left out."""
+    bound: float = 0.05
+    """Largest probability that a block, or a whole signal, takes the output out of its range."""
+    listen: int = 16
+    """Samples without input at the start."""
+    watchdog: float | None = None
+    """Seconds of silence after which the plant zeroes its input by itself; chosen where it is left out."""
+    no_watchdog: bool = False
+    """Run on a plant that has no watchdog: somebody has to watch."""
+    stale: int = 32
+    """Outputs in a row that are missing, or the same number again, which end the run; 0 for never."""
+    seed: int = 0
+    """Of the policy, and of the systems that are drawn from the belief."""
+
+    def run(self) -> None:
+        """Run, and print the parameters; the exit status is 1 after a trip, and 128 + its number after a signal."""
+        from agents.cli import progress_bar
+        from agents.running.plant import load_plant
+        from agents.running.run import Plan, run
+        from estimator import Rig
+
+        rig = Rig.of(self.rig)
+        plan = Plan(**{name: getattr(self, name) for name in Plan.__dataclass_fields__})
+        plant = load_plant(self.plant, rig, instrument_of(self.rig))
+        try:
+            with progress_bar() as bar:
+                task = bar.add_task(self.policy, total=self.samples)
+                result = run(rig, plant, self.out, plan, told=lambda done: bar.update(task, completed=done))
+        finally:
+            if hasattr(plant, "close"):
+                plant.close()
+        show(result)
+        if result.exit_status:
+            print(f"duffing-env: ended early ({result.ended}): {result.message}", file=sys.stderr)
+        sys.exit(result.exit_status)
+
+
+def instrument_of(rig: str) -> dict[str, Any]:
+    """The table ``[instrument]`` of a rig file; empty where there is none."""
+    place = Path(rig)
+    table = tomllib.loads(place.read_text(encoding="utf-8")).get("instrument", {}) if place.is_file() else {}
+    if not isinstance(table, dict):
+        raise ValueError(f"{place}: instrument must be a table, but is {table!r:.60}; write [instrument]")
+    return table
+
+
+def show(result: Any) -> None:
+    """Print the parameters with their intervals, and what was late."""
+    from agents.results import show as print_all
+    from agents.results import table
+
+    intervals, units = result.interval(0.9), result.units
+    rows = [
+        [name, f"{mean:.5g}", f"{intervals[name][0]:.5g} to {intervals[name][1]:.5g}", units[name]]
+        for name, (mean, _) in result.parameters.items()
+    ]
+    late = f"{result.late} ticks of the clock were missed" if result.late else "no tick of the clock was missed"
+    print_all(table(("", "mean", "90 % interval", "unit"), rows), f"{late}; the samples are {result.folder}/samples.csv")

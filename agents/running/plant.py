@@ -1,0 +1,99 @@
+"""The plant of a run: what is between a rig and the program. Any object with these methods."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy.typing as npt
+
+from estimator.parameters import FloatArray
+from estimator.rig import Rig
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """A plant, in the rig's units. It begins disarmed, its input at zero; any exception ends the run.
+
+    A method that is never called need not work: a plant for runs by samples needs no `play`, one for runs by blocks
+    neither `apply` nor `read`.
+
+    Attributes:
+        watches: whether it zeroes its input by itself when it has heard nothing for the time that `arm` was told.
+    """
+
+    watches: bool
+
+    def arm(self, watchdog: float | None) -> object:
+        """Let inputs through from now on; zero by itself after ``watchdog`` seconds of silence, if it watches."""
+
+    def apply(self, u: float) -> float:
+        """Apply an input now, until the next; returns what is applied in truth, after clamps of the plant's own."""
+        ...
+
+    def read(self) -> float:
+        """The output now. A value that is not new is an exception, or NaN: never an old value without a word."""
+        ...
+
+    def play(self, u: FloatArray) -> tuple[npt.ArrayLike, npt.ArrayLike]:
+        """Play inputs (N,), one a sampling step, then zero.
+
+        Returns:
+            Inputs (N,) as they were applied, and outputs (N,): the k-th at the moment when the k-th input began.
+        """
+        ...
+
+    def zero(self) -> object:
+        """Bring the input to zero now."""
+
+    def disarm(self) -> object:
+        """Let no input through any more."""
+
+
+_METHODS = ("arm", "apply", "read", "play", "zero", "disarm")
+
+
+def load_plant(place: str, rig: Rig, settings: Mapping[str, Any] | None = None) -> Plant:
+    """The plant that ``factory(rig, **settings)`` makes, where ``place`` is ``module:factory``.
+
+    A module in the working directory is found, too.
+
+    Args:
+        place: such as ``lab:plant``.
+        rig: handed to the factory.
+        settings: the table ``[instrument]`` of the rig file.
+
+    Raises:
+        ValueError: naming what is wrong: no such module or factory, or no plant.
+    """
+    module, _, factory = place.partition(":")
+    if not module or not factory:
+        raise ValueError(f"plant must be module:factory, but is {place!r}; such as lab:plant, for plant() in lab.py")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    try:
+        make = getattr(importlib.import_module(module), factory)
+    except ModuleNotFoundError as error:
+        if error.name is None or not module.startswith(error.name):
+            raise
+        raise ValueError(f"plant must be module:factory, but there is no module {module!r}: {error}") from error
+    except AttributeError as error:
+        raise ValueError(f"plant must be module:factory, but {module} has no {factory!r}; name one it has") from error
+    return check_plant(make(rig, **(settings or {})))
+
+
+def check_plant(plant: Any) -> Plant:
+    """The plant, if it is one.
+
+    Raises:
+        ValueError: naming the methods that are missing.
+    """
+    missing = [name for name in (*_METHODS, "watches") if not hasattr(plant, name)]
+    if missing:
+        raise ValueError(f"plant must have {[*_METHODS, 'watches']}, but {plant!r:.60} has no {missing}; add them")
+    checked: Plant = plant
+    return checked

@@ -1,0 +1,92 @@
+"""What a run writes, as it happens: a manifest, a row for every sample, a line for every event. Nothing is rewritten."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from agents.results import finite, versions
+from estimator.files import write_atomically
+
+#: Columns of samples.csv; `identify` takes ``time``, ``u`` and ``y``. ``time`` is that of the tick, ``clock`` the one
+#: when the row was complete; ``u`` the mean of the applied input until the next tick, ``asked`` what was asked for;
+#: ``untimely`` an output that came too late to be used.
+COLUMNS = ("sample", "time", "u", "y", "asked", "block", "late", "clock", "untimely")
+
+
+class Recording:
+    """The folder of a run.
+
+    - ``manifest.json``: what was to be done, with what; at the end also how it ended.
+    - ``samples.csv``: a row for every sample, handed to the operating system before the next one: after a kill -9 at
+      most the last is missing. A row without input and output is a pause of unknown length.
+    - ``events.jsonl``: armed, disarmed, late samples, designs of blocks, what ended the run.
+
+    Args:
+        folder: is made; must be empty.
+        manifest: what is to be kept about the run.
+
+    Raises:
+        ValueError: for a folder that holds something.
+    """
+
+    def __init__(self, folder: str | Path, manifest: dict[str, Any]) -> None:
+        self.folder = Path(folder)
+        if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
+            raise ValueError(f"out must be a new or empty folder, but {self.folder} holds something; name another one")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        packages = versions("duffing-env", "numpy", "scipy", "numba")
+        self._manifest = {**manifest, "versions": packages, "commit": _commit(), "started": _time(), "ended": None}
+        self._write_manifest()
+        self._samples = self.samples.open("a", encoding="utf-8", newline="")
+        self._events = (self.folder / "events.jsonl").open("a", encoding="utf-8")
+        self._samples.write(",".join(COLUMNS) + "\n")
+        self._samples.flush()
+
+    @property
+    def samples(self) -> Path:
+        """The file of the samples."""
+        return self.folder / "samples.csv"
+
+    def add(self, rows: Sequence[Sequence[float | int | None]]) -> None:
+        """Write rows, with a value or None for each of `COLUMNS`."""
+        lines = [",".join("" if value is None or not math.isfinite(value) else repr(value) for value in row) for row in rows]
+        self._samples.write("\n".join(lines) + "\n")
+        self._samples.flush()
+
+    def note(self, event: str, **details: Any) -> None:
+        """Write a line about an event."""
+        self._events.write(json.dumps(finite({"time": _time(), "event": event, **details})) + "\n")
+        self._events.flush()
+
+    def close(self, **outcome: Any) -> None:
+        """Tell the manifest how it ended; the samples become read-only."""
+        self._samples.close()
+        self._events.close()
+        self._manifest |= {**outcome, "ended": _time()}
+        self._write_manifest()
+        self.samples.chmod(0o444)
+
+    def _write_manifest(self) -> None:
+        write_atomically(self.folder / "manifest.json", json.dumps(finite(self._manifest), indent=1) + "\n")
+
+
+def _time() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def _commit() -> str | None:
+    """Of the repository that the program lies in, if it does."""
+    here = Path(__file__).parents[2]
+    if not (here / ".git").exists():
+        return None
+    try:
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, timeout=5)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None

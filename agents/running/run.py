@@ -1,0 +1,254 @@
+"""`run`: an experiment on a rig, from arming to parameters with intervals."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.policies.signals import SignalPolicy
+from agents.running.blocks import Blocks
+from agents.running.clock import Clock, RealClock
+from agents.running.designs import Design, design_of, policy_of
+from agents.running.follower import Follower
+from agents.running.observed import Observed
+from agents.running.plant import Plant, check_plant
+from agents.running.recording import Recording
+from agents.running.safety import Futures
+from agents.running.samples import Chooser, PolicyChooser, Series, Ticker
+from agents.running.session import Session, Tripped, check_session
+from agents.running.stopping import Stopped
+from estimator.belief import Belief
+from estimator.files import write_atomically
+from estimator.rig import Rig
+from estimator.saving import save_estimator
+
+#: Shortest time of silence that the watchdog is told [s].
+_SHORTEST = 2.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run is to do.
+
+    Attributes:
+        policy: a signal or ``efe`` (`agents.make_policy`); sample by sample also any other policy.
+        samples: of the run.
+        block: samples of a block; None: sample by sample, against the clock.
+        bound: of the probability that a block, or a whole signal, takes the output out of its range.
+        listen: samples without input at the start, which tell where the rig stands.
+        watchdog: seconds of silence after which the plant zeroes its input. None: 2, or 20 sampling steps if that is
+            longer; and a block's length besides.
+        no_watchdog: run on a plant that has none.
+        stale: outputs in a row that are missing, or the same number again, which end the run; 0: never.
+        seed: of the policy, and of the systems that are drawn from the belief.
+
+    Raises:
+        ValueError: naming the argument, the value and the remedy.
+    """
+
+    policy: str = "efe"
+    samples: int = 256
+    block: int | None = None
+    bound: float = 0.05
+    listen: int = 16
+    watchdog: float | None = None
+    no_watchdog: bool = False
+    stale: int = 32
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        least = {"samples": 1, "block": 8, "listen": 1, "stale": 0, "seed": 0}
+        for name, low in least.items():
+            value = getattr(self, name)
+            if (name != "block" or value is not None) and (not isinstance(value, int) or value < low):
+                raise ValueError(f"{name} must be a whole number of at least {low}, but is {value!r}")
+        if not 0 < self.bound < 1:
+            raise ValueError(f"bound must be a probability between 0 and 1, but is {self.bound!r}; 0.05 is usual")
+        if self.watchdog is not None and not 0 < self.watchdog < np.inf:
+            raise ValueError(f"watchdog must be positive, in seconds, but is {self.watchdog!r}")
+
+    def silence(self, step: float) -> float | None:
+        """Seconds that the watchdog is told; None for none."""
+        if self.no_watchdog:
+            return None
+        return self.watchdog or max(_SHORTEST, 20 * step) + 2 * (self.block or 0) * step
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """How a run went.
+
+    Attributes:
+        rig: of the run.
+        folder: with manifest.json, samples.csv, events.jsonl, parameters.json and estimator.npz.
+        ended: ``complete``; ``range``, ``stale``, ``input``, ``plant`` or ``design`` for what tripped
+            (`agents.running.session.Tripped`); or the name of a signal.
+        message: why, where it is not complete.
+        belief: at the end, from all that was measured.
+        late: ticks that were missed.
+        exit_status: for a shell: 0, 1 after a trip, 128 + its number after a signal.
+    """
+
+    rig: Rig
+    folder: Path
+    ended: str
+    message: str
+    belief: Belief
+    late: int
+    exit_status: int
+
+    @property
+    def parameters(self) -> dict[str, tuple[float, float]]:
+        """Parameter to mean and standard deviation, in the rig's units."""
+        return {name: (mean, std) for name, (mean, std, _) in self.belief.parameters().items()}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Parameter to its unit."""
+        return {name: unit for name, (_, _, unit) in self.belief.parameters().items()}
+
+    def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
+        """Parameter to the central interval that holds it with a probability."""
+        from scipy.special import ndtri
+
+        half = float(ndtri(0.5 + probability / 2))
+        return {name: (mean - half * std, mean + half * std) for name, (mean, std) in self.parameters.items()}
+
+
+def run(
+    rig: Rig | Mapping[str, Any] | str | Path,
+    plant: Plant,
+    out: str | Path,
+    plan: Plan | None = None,
+    *,
+    prior: Belief | None = None,
+    clock: Clock | None = None,
+    told: Callable[[int], None] | None = None,
+) -> Run:
+    """Run an experiment, and identify while it goes on.
+
+    The plant is armed when everything is compiled and the output was seen to be in its range, and left with its input
+    at zero, whatever happens. SIGINT, SIGTERM and SIGHUP end the run in order, where this is the main thread.
+
+    Args:
+        rig: with the limit of the input, the range of the output, a delay of 0 or more and ``zero_order``.
+        plant: of the rig (`agents.running.plant.Plant`).
+        out: a new or empty folder.
+        plan: what to do; that of `Plan` where it is None.
+        prior: what is believed before, such as ``identify(...).belief``; the rig's guess where it is None.
+        clock: the machine's where it is None.
+        told: is called with the number of samples, as they come in.
+
+    Returns:
+        How it went: also where it was ended by a trip or a signal.
+
+    Raises:
+        ValueError: naming what is wrong with rig, plant, folder or plan, before anything is armed; or where the belief
+            overflows in the run.
+
+    Example:
+        >>> import tempfile
+        >>> from agents.running.clock import JumpingClock
+        >>> from agents.running.run import Plan, run
+        >>> from agents.running.simulated import SimulatedPlant
+        >>> from estimator import Channel, Rig
+        >>> rig = Rig(1e-3, input=Channel("N", limit=20.0, noise=0.02), output=Channel("m", range=0.03, noise=5e-6),
+        ...           guess={"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (0.0, 1e8)})
+        >>> clock = JumpingClock()
+        >>> plant = SimulatedPlant(rig, {"m": 0.42, "c": 0.6, "a": 2500.0, "b": 4e7}, clock=clock)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     result = run(rig, plant, folder, Plan(policy="prbs", samples=256), clock=clock)
+        >>> result.ended, result.late, plant.applied
+        ('complete', 0, 0.0)
+        >>> mean, std = result.parameters["m"]
+        >>> bool(abs(mean - 0.42) < 4 * std < 0.04)
+        True
+    """
+    rig, plan, clock = Rig.of(rig), plan or Plan(), clock or RealClock()
+    plant, told = check_plant(plant), told or (lambda samples: None)
+    follower = Follower(rig, prior)
+    scales = follower.estimator.scales
+    check_session(rig, plant, plan.silence(rig.step))
+    limits = float(rig.input.limit or 0) / scales.input, float(rig.output.range or 0) / scales.output
+    observed = Observed(follower.belief, *limits, plan.samples)
+    policy = policy_of(plan.policy, observed, plan.seed)
+    design = design_of(policy, observed) if plan.block or isinstance(policy, SignalPolicy) else None
+    chooser = None if design else PolicyChooser(policy, observed, follower)
+    silence = plan.silence(rig.step)
+    _warm_up(follower, observed, design, policy, plan)
+    described = {"command": sys.argv, "rig": rig.to_dict(), "plan": asdict(plan), "watchdog": silence}
+    recording = Recording(out, {**described, "plant": repr(plant)[:200]})
+    ended, message, status, late = "error", "", 1, 0
+    try:
+        with Session(plant, rig, recording.note, silence, plan.stale) as session:
+            rng = np.random.default_rng(plan.seed)
+            if plan.block:
+                assert design is not None
+                blocks = Blocks(session, follower, observed, recording, clock, rig.step, plan.bound, rng)
+                blocks.listen(plan.listen)
+                blocks.play(design, plan.samples, plan.block, told)
+            else:
+                ticker = Ticker(session, follower, recording, clock, rig.step)
+                try:
+                    ticker.listen(plan.listen)
+                    chosen: Chooser = chooser or _series(design, follower, observed, recording, plan, rng)
+                    session.arm()
+                    ticker.play(chosen, plan.samples, told)
+                finally:
+                    late = ticker.late
+        ended, status = "complete", 0
+    except Tripped as trip:
+        ended, message = trip.reason, str(trip)
+    except Stopped as stopped:
+        ended, message, status = str(stopped), f"stopped by {stopped}", 128 + stopped.signum
+    except BaseException as error:
+        message = f"{type(error).__name__}: {error}"
+        raise
+    finally:
+        recording.note("ended", how=ended, message=message, late=late)
+        recording.close(how=ended, message=message, late=late)
+    result = Run(rig, Path(out), ended, message, follower.belief, late, status)
+    _write(result, follower)
+    return result
+
+
+def _warm_up(follower: Follower, observed: Observed, design: Design | None, policy: Any, plan: Plan) -> None:
+    """Compile what the run will call: a plant must not wait for the compiler with its input on."""
+    observed.belief = follower.ahead(0.0)
+    if design is None:
+        policy.predict(observed.observation(0.0, 0.0, 0), None, deterministic=True)
+    elif plan.block and not isinstance(policy, SignalPolicy):
+        design.block(plan.block)
+    Futures(follower.estimator, follower.delay, 1.0, np.random.default_rng(0)).probability(np.zeros(1))
+
+
+def _series(
+    design: Design | None, follower: Follower, observed: Observed, recording: Recording, plan: Plan, rng: Any
+) -> Series:
+    """A whole signal, at the share that is safe enough."""
+    assert design is not None
+    u = design.block(plan.samples)
+    futures = Futures(follower.estimator, follower.delay, observed.experiment.max_output, rng)
+    share, probability = futures.share(u, plan.bound)
+    recording.note("design", share=share, probability=probability)
+    if share == 0.0 and probability >= plan.bound:
+        raise Tripped("design", f"even without input the output would leave its range with probability {probability:.2g}")
+    return Series(share * u * follower.estimator.scales.input)
+
+
+def _write(result: Run, follower: Follower) -> None:
+    """Parameters as JSON, and the estimator as it is at the end."""
+    import json
+
+    low_high = result.interval(0.9)
+    told = {
+        name: {"mean": mean, "std": std, "low": low_high[name][0], "high": low_high[name][1], "unit": unit}
+        for name, (mean, std, unit) in result.belief.parameters().items()
+    }
+    write_atomically(result.folder / "parameters.json", json.dumps(told, indent=1) + "\n")
+    save_estimator(follower.estimator, result.folder / "estimator.npz")

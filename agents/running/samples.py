@@ -1,0 +1,175 @@
+"""A run sample by sample: the clock ticks, and what was decided in time is applied at the tick."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from agents.policies import Policy
+from agents.running.clock import Clock
+from agents.running.follower import Follower
+from agents.running.observed import Observed
+from agents.running.recording import Recording
+from agents.running.session import Session
+from estimator.parameters import FloatArray
+
+#: A tick that is met later than this, in parts of the sampling step, is missed.
+TOLERANCE = 0.1
+
+
+class Chooser(Protocol):
+    """What chooses the next input."""
+
+    def next(self, k: int, u: float, y: float) -> float:
+        """The input of tick k, in the rig's unit, after an input u in force and the output y."""
+        ...
+
+
+class PolicyChooser:
+    """Asks a policy, which sees the belief that its input will meet."""
+
+    def __init__(self, policy: Policy, observed: Observed, follower: Follower) -> None:
+        self._policy, self._observed, self._follower = policy, observed, follower
+        self._state: Any = None
+
+    def next(self, k: int, u: float, y: float) -> float:
+        """The policy's action on the belief one tick ahead."""
+        scales = self._follower.estimator.scales
+        self._observed.belief = self._follower.ahead(u)
+        seen = self._observed.observation(u / scales.input, y / scales.output, k)
+        action, self._state = self._policy.predict(seen, self._state, deterministic=True)
+        return float(action[0]) * self._observed.max_input * scales.input
+
+
+class Series:
+    """Plays inputs (T,) that were designed before, in the rig's unit."""
+
+    def __init__(self, u: FloatArray) -> None:
+        self._u = u
+
+    def next(self, k: int, u: float, y: float) -> float:
+        """The k-th of them."""
+        return float(self._u[k])
+
+
+class Ticker:
+    """Takes the samples of a run.
+
+    At a tick the output is read, and the input that was decided before is applied at once. In the time until the next
+    tick the estimator is told, and the next input decided. A tick that passes meanwhile is missed: the input stays, the
+    output is not read, the row is marked late, and the estimator is told just that. An output that came late is kept
+    beside the others, and not used. Where an input came to act late, its sample has the mean of what was applied.
+
+    Args:
+        session: of the plant.
+        follower: of the estimator.
+        recording: of the rows.
+        clock: of the ticks.
+        step: between them [s].
+    """
+
+    def __init__(self, session: Session, follower: Follower, recording: Recording, clock: Clock, step: float) -> None:
+        self._session, self._follower, self._recording = session, follower, recording
+        self._clock, self._step = clock, step
+        self._begin = clock.now()
+        self.tick = 0
+        self.late = 0
+        self._in_force = self._last_mean = 0.0
+        self._last = math.nan
+
+    def listen(self, samples: int) -> None:
+        """Take samples without input; the plant may be disarmed."""
+        for _ in range(samples):
+            self._miss(late=False)
+            self._clock.wait(self._due)
+            self._sample(0.0, apply=False)
+
+    def skip(self) -> None:
+        """Nobody looked for a while: the ticks that have passed are missing, and none of them is late."""
+        while self._miss(late=False):  # the estimator, too, takes its time to hear of it
+            pass
+
+    def play(self, chooser: Chooser, samples: int, told: Callable[[int], None]) -> None:
+        """Play so many ticks; then the input is zero, and its last response is read.
+
+        Args:
+            chooser: of the inputs.
+            samples: ticks, missed ones included.
+            told: is called with the number of ticks after each.
+        """
+        asked = chooser.next(0, self._in_force, self._last)
+        self.skip()
+        start = self.tick
+        while (k := self.tick - start) <= samples:
+            if self._miss(late=True):
+                continue
+            self._clock.wait(self._due)
+            if self._clock.now() > self._due + TOLERANCE * self._step:
+                continue  # woken too late: `_miss` takes it
+            self._sample(asked if k < samples else 0.0)
+            told(min(self.tick - start, samples))
+            if self.tick - start < samples:
+                asked = chooser.next(self.tick - start, self._last_mean, self._last)
+
+    @property
+    def _due(self) -> float:
+        """When the next tick is."""
+        return self._begin + self.tick * self._step
+
+    def _miss(self, late: bool) -> bool:
+        """Take the ticks that were missed; whether there were any."""
+        behind = (self._clock.now() - self._due) / self._step - TOLERANCE
+        if behind <= 0:
+            return False
+        missed = math.ceil(behind)
+        self._take([self._in_force] * missed, [math.nan] * missed, None, late)
+        return True
+
+    def _sample(self, asked: float, apply: bool = True) -> None:
+        """Read, and apply; find out when that was."""
+        due, now = self._due, self._clock.now
+        begun = now()
+        y = self._session.read()
+        read = now()
+        applied = self._session.apply(asked) if apply else 0.0
+        done = now()
+        at = (begun + read) / 2
+        in_time = at <= due + TOLERANCE * self._step
+        before = self._in_force
+        # What of the tick, which is when the output was read, had passed when the input changed.
+        passed = ((read + done) / 2 - (at if in_time else due)) / self._step if apply else 0.0
+        whole, part = divmod(max(0.0, passed), 1.0)
+        self._in_force = applied
+        self._take(
+            [before] * int(whole) + [(1.0 - part) * applied + part * before],
+            [y if in_time else math.nan] + [math.nan] * int(whole),
+            asked,
+            apply and (not in_time or passed > TOLERANCE),
+            None if in_time else y,
+        )
+
+    def _take(
+        self, u: list[float], y: list[float], asked: float | None, late: bool, untimely: float | None = None
+    ) -> None:
+        """Ticks with the mean inputs of their samples, and their outputs: write them down, judge them, learn from them.
+
+        What is late is so in all of them.
+        """
+        count, clock = len(u), self._clock.now() - self._begin
+        places = range(self.tick, self.tick + count)
+        self._recording.add(
+            [(k, k * self._step, u[i], y[i], asked, 0, int(late), clock, untimely) for i, k in enumerate(places)]
+        )
+        if late:
+            self.late += count
+            self._recording.note("late", tick=self.tick, ticks=count)
+        seen = y if untimely is None else [untimely, *y[1:]]
+        # Outputs that are not there while nobody looked say nothing about the sensor.
+        if late or asked is not None:
+            self._session.check(np.array(seen))
+        self._follower.take([self._last_mean, *u[:-1]], y)
+        self._last_mean, self._last = u[-1], seen[-1]
+        self.tick += count

@@ -1,0 +1,189 @@
+"""Runs through an instrument: the faults that happen on benches, and the instrument's output after them."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from agents.running import instrument
+from agents.running.run import Plan, run
+from estimator import Rig, identify
+
+sys.path.insert(0, str(Path(__file__).parent))
+from bench import RIG, RIG_FILE, TABLE, TRUTH, Scpi
+
+pytest.importorskip("pyvisa", reason="pip install 'duffing-env[instrument]'")
+ROOT = Path(__file__).parents[3]
+COMMAND = [sys.executable, "-c", "from agents.commands import main; main()"]
+
+
+@pytest.fixture
+def scpi(request):
+    made = Scpi(**getattr(request, "param", {}))
+    yield made
+    made.close()
+
+
+def rows(folder):
+    with (folder / "samples.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def play(scpi, folder, **plan):
+    plant = instrument.plant(RIG, resource=scpi.resource, **TABLE)
+    try:
+        return run(RIG, plant, folder, Plan(**{"policy": "prbs", "samples": 40, "listen": 8, **plan}))
+    finally:
+        plant.close()
+
+
+def holds_truth(parameters, deviations=5.0):
+    return all(abs(parameters[name][0] - TRUTH[name]) < deviations * parameters[name][1] for name in TRUTH)
+
+
+def test_a_run_by_samples(scpi, tmp_path):
+    result = play(scpi, tmp_path / "run", samples=80)
+    assert (result.ended, result.exit_status) == ("complete", 0)
+    assert scpi.applied == 0.0
+    assert scpi.lines.index("WDOG 2.0") < scpi.lines.index("OUTP ON")
+    wait_for(lambda: scpi.lines[-1] == "OUTP OFF", 5.0)
+    assert scpi.lines.index("MEAS?") < scpi.lines.index("OUTP ON"), "the output is looked at before arming"
+    assert holds_truth(result.parameters)
+    assert holds_truth(identify(RIG, tmp_path / "run" / "samples.csv").parameters)
+
+
+def test_a_run_by_blocks(scpi, tmp_path):
+    result = play(scpi, tmp_path / "run", samples=128, block=64)
+    assert result.ended == "complete"
+    assert scpi.applied == 0.0
+    assert [row["u"] for row in rows(tmp_path / "run")].count("") == 3, "a pause after each block, the silent one too"
+    assert holds_truth(result.parameters)
+    assert holds_truth(identify(RIG, tmp_path / "run" / "samples.csv").parameters)
+
+
+@pytest.mark.parametrize("scpi", [{"fault": "stall"}], indirect=True)
+def test_a_sensor_that_stalls_ends_the_run(scpi, tmp_path):
+    result = play(scpi, tmp_path / "run")
+    assert (result.ended, result.exit_status) == ("plant", 1)
+    assert "read failed" in result.message
+    kept = [row for row in rows(tmp_path / "run") if row["y"]]
+    assert len(kept) == scpi.answered == 30
+    scpi.quiet.set()  # the instrument comes to its senses, and finds the commands that it has not read
+    wait_for(lambda: scpi.applied == 0.0, 5.0)
+
+
+@pytest.mark.parametrize("scpi", [{"fault": "lose"}], indirect=True)
+def test_a_lost_connection_leaves_the_zero_to_the_watchdog(scpi, tmp_path):
+    result = play(scpi, tmp_path / "run", watchdog=1.0)
+    assert result.ended == "plant"
+    assert len([row for row in rows(tmp_path / "run") if row["y"]]) == scpi.answered == 30
+    wait_for(lambda: scpi.applied == 0.0, 5.0)
+    assert not scpi.plant._armed
+
+
+@pytest.mark.parametrize("scpi", [{"fault": "slow", "after": 20}], indirect=True)
+def test_late_samples_are_counted_marked_and_kept_from_the_estimator(scpi, tmp_path):
+    result = play(scpi, tmp_path / "run", samples=80)
+    assert result.ended == "complete"
+    late = [row for row in rows(tmp_path / "run") if row["late"] == "1"]
+    assert len(late) == result.late >= 10
+    assert {row["y"] for row in late} == {""}
+    assert all(row["u"] for row in late), "the input that stayed on is known"
+    ticks = [int(row["sample"]) for row in rows(tmp_path / "run")]
+    assert ticks == list(range(len(ticks)))
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["late"] == result.late
+    assert scpi.applied == 0.0
+
+
+def command(scpi, folder, *more):
+    table = "\n".join(f"{key} = {json.dumps(value)}" for key, value in {"resource": scpi.resource, **TABLE}.items())
+    (folder / "rig.toml").write_text(f"{RIG_FILE}\n[instrument]\n{table}\n")
+    words = ["run", "rig.toml", "--plant", "agents.running.instrument:plant", "--out", "run", "--policy", "prbs"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(
+        [*COMMAND, *words, "--samples", "2000", *more],
+        cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def wait_for(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+def wait_until_it_plays(scpi, process, samples=60):
+    def plays():
+        assert process.poll() is None, process.communicate()
+        return scpi.answered >= samples
+
+    wait_for(plays, 120.0)
+
+
+def test_a_kill_loses_at_most_a_sample_and_the_watchdog_zeroes(scpi, tmp_path):
+    process = command(scpi, tmp_path, "--watchdog", "1")
+    wait_until_it_plays(scpi, process)
+    wait_for(lambda: scpi.applied != 0.0, 10.0)
+    process.kill()
+    process.communicate()
+    answered = scpi.answered
+    wait_for(lambda: scpi.applied == 0.0, 5.0)
+    assert not scpi.plant._armed
+    kept = [row for row in rows(tmp_path / "run") if row["y"]]
+    assert answered - 1 <= len(kept) <= answered
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["ended"] is None
+    assert identify(Rig.from_file(tmp_path / "rig.toml"), tmp_path / "run" / "samples.csv").parameters["m"][0] > 0
+
+
+def test_a_kill_between_blocks_loses_at_most_a_block(scpi, tmp_path):
+    process = command(scpi, tmp_path, "--block", "16")
+    wait_for(lambda: process.poll() is not None or scpi.lines.count("FETC:IN?") >= 4, 120.0)
+    process.kill()
+    process.communicate()
+    fetched = scpi.lines.count("FETC:IN?")
+    kept = len([row for row in rows(tmp_path / "run") if row["y"]])
+    assert kept in (16 * (fetched - 1), 16 * fetched)
+    wait_for(lambda: scpi.applied == 0.0, 5.0)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_zero_the_input_and_give_parameters(scpi, tmp_path, number, status):
+    process = command(scpi, tmp_path)
+    wait_until_it_plays(scpi, process)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == status, err
+    assert scpi.lines[-1] == "OUTP OFF"
+    assert scpi.applied == 0.0
+    assert "90 % interval" in out
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["how"] == number.name
+
+
+def test_an_instrument_without_a_watchdog_is_not_armed(scpi, tmp_path):
+    table = {key: value for key, value in TABLE.items() if key != "watchdog"}
+    plant = instrument.plant(RIG, resource=scpi.resource, **table)
+    with pytest.raises(ValueError, match="plant must have a watchdog"):
+        run(RIG, plant, tmp_path / "run", Plan(policy="prbs", samples=20))
+    assert "OUTP ON" not in scpi.lines
+    assert run(RIG, plant, tmp_path / "run", Plan(policy="prbs", samples=20, no_watchdog=True)).ended == "complete"
+    plant.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"set": "SOUR?"}, r"instrument.set must have \['u'\] in braces"),
+        ({"read": None, "measure": "MEAS?"}, "has .*measure"),
+        ({"resource": "TCPIP::127.0.0.1::1::SOCKET"}, "cannot be opened"),
+    ],
+)
+def test_tables_that_make_no_instrument_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        instrument.plant(RIG, **{"resource": "TCPIP::127.0.0.1::9::SOCKET", **TABLE, **change})
