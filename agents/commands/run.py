@@ -91,4 +91,6 @@ def show(result: Any) -> None:
         for name, (mean, _) in result.parameters.items()
     ]
     late = f"{result.late} ticks of the clock were missed" if result.late else "no tick of the clock was missed"
-    print_all(table(("", "mean", "90 % interval", "unit"), rows), f"{late}; the samples are {result.folder}/samples.csv")
+    print_all(
+        table(("", "mean", "90 % interval", "unit"), rows), f"{late}; the samples are {result.folder}/samples.csv"
+    )

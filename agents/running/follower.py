@@ -25,11 +25,11 @@ class Follower:
     """Follows a run. Sample k of a run is the output at a tick and the input that is applied from that tick on.
 
     Args:
-        rig: with a guess, where there is no prior.
+        rig: with a guess.
         prior: what is believed before the run, such as the ``belief`` of `estimator.identify`; the guess where None.
 
     Raises:
-        ValueError: for a rig without a guess where there is no prior, or whose input is not held, or comes early.
+        ValueError: for a rig without a guess, or whose input is not held, or comes early.
     """
 
     def __init__(self, rig: Rig, prior: Belief | None = None) -> None:
@@ -39,8 +39,8 @@ class Follower:
             )
         if rig.delay < 0:
             raise ValueError(f"delay must be 0 or more for a run, but is {rig.delay}; an input acts after its tick")
-        if prior is None and rig.guess is None:
-            raise ValueError("rig must have a guess of m, c, a and b for a run, but has none; add one, or pass a prior")
+        if rig.guess is None:
+            raise ValueError("rig must have a guess of m, c, a and b for a run, but has none; add one to the rig")
         # What came before an output is given with it: so the belief is that of the tick, before the next input.
         self.delay, paired = rig.delay, replace(rig, delay=rig.delay - 1)
         if prior is None:

@@ -91,9 +91,9 @@ class Instrument:
         self._commands, self._step = commands, rig.step
         self.watches = commands.watchdog is not None
         try:
-            self._link: Any = pyvisa.ResourceManager(commands.backend).open_resource(
-                commands.resource, read_termination=commands.termination, write_termination=commands.termination
-            )
+            ends = {"read_termination": commands.termination, "write_termination": commands.termination}
+            manager: Any = pyvisa.ResourceManager(commands.backend)
+            self._link = manager.open_resource(commands.resource, **ends)
             self._link.timeout = 1000 * commands.timeout
             for line in (*commands.begin, commands.zero):
                 self._link.write(line)

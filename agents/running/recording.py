@@ -1,4 +1,4 @@
-"""What a run writes, as it happens: a manifest, a row for every sample, a line for every event. Nothing is rewritten."""
+"""What a run writes, as it happens: a manifest, a row for every sample, a line for every event."""
 
 from __future__ import annotations
 
@@ -55,7 +55,9 @@ class Recording:
 
     def add(self, rows: Sequence[Sequence[float | int | None]]) -> None:
         """Write rows, with a value or None for each of `COLUMNS`."""
-        lines = [",".join("" if value is None or not math.isfinite(value) else repr(value) for value in row) for row in rows]
+        lines = [
+            ",".join("" if value is None or not math.isfinite(value) else repr(value) for value in row) for row in rows
+        ]
         self._samples.write("\n".join(lines) + "\n")
         self._samples.flush()
 

@@ -172,10 +172,8 @@ def run(
     rig, plan, clock = Rig.of(rig), plan or Plan(), clock or RealClock()
     plant, told = check_plant(plant), told or (lambda samples: None)
     follower = Follower(rig, prior)
-    scales = follower.estimator.scales
     check_session(rig, plant, plan.silence(rig.step))
-    limits = float(rig.input.limit or 0) / scales.input, float(rig.output.range or 0) / scales.output
-    observed = Observed(follower.belief, *limits, plan.samples)
+    observed = Observed(rig, follower.belief, plan.samples)
     policy = policy_of(plan.policy, observed, plan.seed)
     design = design_of(policy, observed) if plan.block or isinstance(policy, SignalPolicy) else None
     chooser = None if design else PolicyChooser(policy, observed, follower)
@@ -237,7 +235,9 @@ def _series(
     share, probability = futures.share(u, plan.bound)
     recording.note("design", share=share, probability=probability)
     if share == 0.0 and probability >= plan.bound:
-        raise Tripped("design", f"even without input the output would leave its range with probability {probability:.2g}")
+        raise Tripped(
+            "design", f"even without input the output would leave its range with probability {probability:.2g}"
+        )
     return Series(share * u * follower.estimator.scales.input)
 
 

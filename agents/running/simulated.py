@@ -45,7 +45,9 @@ class SimulatedPlant:
         self, rig: Rig, truth: Mapping[str, float] | None = None, seed: int = 0, clock: Clock | None = None
     ) -> None:
         if truth is None and rig.guess is None:
-            raise ValueError("rig must have a guess of m, c, a and b to be simulated, but has none; add one, or a truth")
+            raise ValueError(
+                "rig must have a guess of m, c, a and b to be simulated, but has none; add one, or a truth"
+            )
         if rig.delay != 0:
             raise ValueError(f"rig must have a delay of 0 to be simulated here, but has {rig.delay}; set it to 0")
         self.truth = dict(truth) if truth is not None else {k: sum(v) / 2 for k, v in (rig.guess or {}).items()}

@@ -10,13 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
+from loopback import RIG, RIG_FILE, TABLE, TRUTH, Scpi
 
 from agents.running import instrument
 from agents.running.run import Plan, run
 from estimator import Rig, identify
-
-sys.path.insert(0, str(Path(__file__).parent))
-from bench import RIG, RIG_FILE, TABLE, TRUTH, Scpi
 
 pytest.importorskip("pyvisa", reason="pip install 'duffing-env[instrument]'")
 ROOT = Path(__file__).parents[3]

@@ -1,4 +1,4 @@
-"""A slow rig for tests, and an instrument that obeys SCPI strings on a loopback socket, with a simulated rig behind it."""
+"""A slow rig for tests, and an instrument on a loopback socket that obeys SCPI strings, a simulated rig behind it."""
 
 import socketserver
 import threading
