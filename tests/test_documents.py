@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 # Pages that the manual is built with, out of docstrings; `make docs` fails where a link among them leads nowhere.
 GENERATED = ("tracks/", "reference/", "rewards.md")
 WITH_EXAMPLES = ["README.md"]
-WITH_EXAMPLES += [f"docs/{name}.md" for name in ("estimators", "own_data", "own_plant", "quickstart")]
+WITH_EXAMPLES += [f"docs/{name}.md" for name in ("estimators", "own_data", "own_plant", "quickstart", "running")]
 WITH_EXAMPLES += ["docs/rig_electronic_duffing.md", "docs/rig_beam.md"]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -111,6 +111,7 @@ def test_every_check_is_explained():
     [
         *("duffing_env.continuous", "duffing_env.limited", "duffing_env.model_env"),
         *("estimator.electronic_duffing", "estimator.models.model", "estimator.offline", "estimator.rig"),
+        "agents.running.run",
     ],
 )
 def test_examples_of_the_docstrings_run(module):

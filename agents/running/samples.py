@@ -160,9 +160,9 @@ class Ticker:
         """
         count, clock = len(u), self._clock.now() - self._begin
         places = range(self.tick, self.tick + count)
-        self._recording.add(
-            [(k, k * self._step, u[i], y[i], asked, 0, int(late), clock, untimely) for i, k in enumerate(places)]
-        )
+        rows = [[k, k * self._step, u[i], y[i], asked, 0, int(late), clock, None] for i, k in enumerate(places)]
+        rows[0][-1] = untimely
+        self._recording.add(rows)
         if late:
             self.late += count
             self._recording.note("late", tick=self.tick, ticks=count)
