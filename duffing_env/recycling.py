@@ -1,4 +1,4 @@
-"""Arrays that are given out with every step, without asking the system for memory each time."""
+"""Arrays that are given out with every step, without a copy each time."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import numpy.typing as npt
 class Recycled:
     """Arrays of one shape, given out one after another, and given out again when nobody else holds them any more.
 
-    The system maps fresh memory page by page as it is written to, which can take longer than the step of a thousand
-    environments that is written there.
+    What a step returns stays the caller's. A step writes into an array that nobody holds, so nothing is copied.
 
     Args:
         shape: of the arrays.
