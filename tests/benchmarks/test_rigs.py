@@ -180,7 +180,9 @@ def test_faults_are_what_they_say(name: str) -> None:
     peak = np.abs(good.states[:, 0]).max()
     assert stiff.bench.quintic * peak**5 == pytest.approx(0.2 * bench.truth[3] * peak**3)
     assert faults.faulty("step twice too long", name, 0)[1] == {"step": 2 * bench.step}
-    assert faults.faulty("b not excited", name, 0)[0].deviations()[3] > 1
+    weak = np.array([faults.faulty("b not excited", name, seed)[0].deviations() for seed in range(20)])
+    assert weak[:, 3].min() > 0.5
+    assert weak[:, :3].max() < 0.2
 
 
 def outcome(error: float = 0.001, inside: bool = True, bound: float = 0.001, **warnings: str) -> Outcome:
