@@ -39,6 +39,10 @@ class Identify:
         """Identify, print, and write the page."""
         from estimator import identify
 
+        if Path(self.rig).suffix.lower() in (".csv", ".mat"):
+            raise ValueError(
+                f"rig must be a rig file, but is {self.rig}; write one: duffing-env rig init --from {self.rig}"
+            )
         if not self.data:
             raise ValueError("data must name at least one CSV or MAT file; add it after the rig file")
         result = identify(self.rig, list(self.data), progress=sys.stderr.isatty())

@@ -94,7 +94,7 @@ def from_record(path: Path, step: float | None = None) -> str:
 
 def _output(table: Table) -> Channel:
     word, unit = table.word(table.y), table.unit(table.y) or "1"
-    kind = {"v": "velocity", "a": "acceleration"}.get(word, word)
+    kind = {"v": "velocity", "vel": "velocity", "a": "acceleration", "acc": "acceleration"}.get(word, word)
     if kind not in KINDS:
         ends = {"velocity": ("/s",), "acceleration": ("/s²", "/s^2", "/s2", "g")}
         kind = next((kind for kind, known in ends.items() if unit.endswith(known)), "displacement")

@@ -28,7 +28,7 @@ class Record:
     """One record.
 
     Attributes:
-        name: of its file, or its number.
+        name: of its file, or its number; of a later piece with the sample where it begins.
         u: (T,) inputs.
         y: (T,) outputs; NaN where one is missing or was clipped.
         clipped: outputs that were clipped.
@@ -103,7 +103,10 @@ def _cut(record: Record) -> list[Record]:
             continue
         part = slice(piece.start, piece.start + seen[-1] + 1)
         told = int(stops[part].sum()), int(missing[part].sum())
-        pieces.append(replace(record, u=record.u[part].copy(), y=y[part].copy(), clipped=told[0], missing=told[1]))
+        name = f"{record.name}, from sample {piece.start}" if piece.start else record.name
+        pieces.append(
+            replace(record, name=name, u=record.u[part].copy(), y=y[part].copy(), clipped=told[0], missing=told[1])
+        )
     return pieces
 
 

@@ -15,7 +15,10 @@ from estimator.parameters import FloatArray
 
 #: Names of columns, in lower case, up to the first character that is no letter.
 _INPUTS = ("u", "input", "force", "f", "in", "drive", "excitation")
-_OUTPUTS = ("y", "output", "x", "displacement", "position", "velocity", "v", "acceleration", "a", "out", "response")
+_OUTPUTS = (
+    *("y", "output", "out", "response", "x", "displacement", "disp", "position", "pos"),
+    *("v", "velocity", "vel", "a", "acceleration", "acc"),
+)
 _TIMES = ("t", "time")
 
 #: What a time column may be in [s].

@@ -111,6 +111,7 @@ def test_warnings_are_told(run, folder, monkeypatch):
         ),
         (["identify", "rig.toml", "none.csv"], "there is no none.csv"),
         (["identify", "rig.toml"], "data must name at least one CSV or MAT file"),
+        (["identify", "record.csv"], "is record.csv; write one: duffing-env rig init --from record.csv"),
         (["identify", "bad.toml", "record.csv"], "did you mean 'step'?"),
         (["rig", "init", "rig.toml"], "there is rig.toml; name another, or add --force"),
         (["rig", "init", "new.toml", "--from", "bem"], "there is no bem"),
@@ -143,12 +144,14 @@ def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch
         ("time [ms],force [N],displacement [mm]", 1.6384e-3, ("N", "mm"), "displacement"),
         ("t (ms),u (V),v (V)", 1.6384e-3, ("V", "V"), "velocity"),
         ("time [ms],drive [V],response [m/s^2]", 1.6384e-3, ("V", "m/s^2"), "acceleration"),
+        ("ACC (g),F (N),t (ms)", 1.6384e-3, ("N", "g"), "acceleration"),
         ("time,input,output", 1.6384, ("1", "1"), "displacement"),
     ],
 )
 def test_a_rig_takes_what_a_record_tells(run, tmp_path, monkeypatch, head, step, units, kind):
     monkeypatch.chdir(tmp_path)
-    rows = [f"{1.6384 * k:.6f},{k % 3},{k % 5}" for k in range(2000)]
+    fields = [(f"{1.6384 * k:.6f}", f"{k % 3}", f"{k % 5}") for k in range(2000)]
+    rows = [",".join(row if head.startswith("t") else row[::-1]) for row in fields]
     Path("r.csv").write_text("\n".join([head, *rows]))
     status, told, _ = run("rig", "init", "--from", "r.csv")
     assert status == 0
