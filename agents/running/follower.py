@@ -13,6 +13,7 @@ from estimator.belief import Belief, covariance_places
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
+from estimator.rig_prior import rig_prior
 
 #: A pause is of an unknown length up to so many periods, and never more samples.
 _PERIODS, _LONGEST = 2.0, 4_000
@@ -27,12 +28,14 @@ class Follower:
     Args:
         rig: with a guess.
         prior: what is believed before the run, such as the ``belief`` of `estimator.identify`; the guess where None.
+        pauses: whether there will be some. The state is then known so little that a derivative at its mean would learn
+            too much from the first samples after them: points that spread as the belief does take its place.
 
     Raises:
         ValueError: for a rig without a guess, or whose input is not held, or comes early.
     """
 
-    def __init__(self, rig: Rig, prior: Belief | None = None) -> None:
+    def __init__(self, rig: Rig, prior: Belief | None = None, pauses: bool = False) -> None:
         if rig.interpolation != "zero_order":
             raise ValueError(
                 f"interpolation must be 'zero_order' for a run, whose inputs are held, but is {rig.interpolation!r}"
@@ -43,10 +46,9 @@ class Follower:
             raise ValueError("rig must have a guess of m, c, a and b for a run, but has none; add one to the rig")
         # What came before an output is given with it: so the belief is that of the tick, before the next input.
         self.delay, paired = rig.delay, replace(rig, delay=rig.delay - 1)
-        if prior is None:
-            self.estimator = OnlineEstimator(rig=paired)
-        else:
-            self.estimator = OnlineEstimator(prior.model, prior, paired, noise_hypotheses=9)
+        prior = rig_prior(rig) if prior is None else prior
+        expectations = "sigma_points" if pauses else "first_order"
+        self.estimator = OnlineEstimator(prior.model, prior, paired, noise_hypotheses=9, expectations=expectations)
 
     @property
     def belief(self) -> Belief:

@@ -171,7 +171,7 @@ def run(
     """
     rig, plan, clock = Rig.of(rig), plan or Plan(), clock or RealClock()
     plant, told = check_plant(plant), told or (lambda samples: None)
-    follower = Follower(rig, prior)
+    follower = Follower(rig, prior, pauses=plan.block is not None)
     check_session(rig, plant, plan.silence(rig.step))
     observed = Observed(rig, follower.belief, plan.samples)
     policy = policy_of(plan.policy, observed, plan.seed)
