@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from agents.planner.motion import resonances, survey
+from agents.running.safety import drawn_from
+from estimator.arrays import copy as copy_numbers
 from estimator.belief import Belief, covariance_places
+from estimator.engine.motion import motion
+from estimator.lanes import kernel
+from estimator.models.model import Model
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -18,8 +25,30 @@ from estimator.rig_prior import rig_prior
 #: A pause is of an unknown length up to so many periods, and never more samples.
 _PERIODS, _LONGEST = 2.0, 4_000
 
-#: Lengths of it that are looked at.
-_LENGTHS = 40
+#: What is so far out, in parts of the output's range, has run away.
+_FAR = 3.0
+
+
+@cache
+def _ringer(model: Model) -> Any:
+    """``ring(systems, u, lengths)``: states in rows, behind them coefficients, after a sample with u and pauses."""
+    found = motion(model)
+    at, step, n = found.layout, found.step, model.n_states
+    size, d, place = len(at), len(model.names), at["INPUT"]
+
+    @kernel(kind=f"{model.name}_{model.digest}")
+    def ring(systems, u, lengths):
+        W = np.zeros(size)
+        for i in range(len(systems)):
+            copy_numbers(W, 0, systems[i], d)
+            W[place] = u
+            step(W)
+            W[place] = 0.0
+            for _ in range(lengths[i]):
+                step(W)
+            copy_numbers(systems[i], 0, W, n)
+
+    return ring
 
 
 class Follower:
@@ -48,6 +77,7 @@ class Follower:
         self.delay, paired = rig.delay, replace(rig, delay=rig.delay - 1)
         prior = rig_prior(rig) if prior is None else prior
         expectations = "sigma_points" if pauses else "first_order"
+        self._paused = 0
         self.estimator = OnlineEstimator(prior.model, prior, paired, noise_hypotheses=9, expectations=expectations)
 
     @property
@@ -71,18 +101,28 @@ class Follower:
         """A pause of unknown length without input begins, after a last sample with u. What is known of the state fades.
 
         The state becomes what it may be after any of the lengths; coefficients and noises stay as they are.
+
+        Raises:
+            ValueError: where most of what is believed runs away by itself.
         """
-        longest = self._pause_samples()
-        step = max(1, longest // _LENGTHS)
-        later, means, covs = self._after(u, 1 + self.delay), [], []
-        for _ in range(_LENGTHS):
-            means.append(later.belief.state_mean)
-            covs.append(later.belief.state_cov)
-            later.run(np.zeros(step), np.full(step, np.nan), missing=True)
-        mean = np.mean(means, axis=0)
-        cov = np.mean(covs, axis=0) + np.cov(np.array(means).T, bias=True)
+        rng = np.random.default_rng(self._paused)
+        self._paused += 1
+        systems, _ = drawn_from(self.estimator, rng)
+        systems = np.ascontiguousarray(systems)
+        n = self.estimator.model.n_states
+        # Each rings by itself: of two wells, a linear forecast would not know that they hold.
+        _ringer(self.estimator.model)(
+            systems, u / self.estimator.scales.input, rng.integers(self._pause_samples(), size=len(systems))
+        )
+        states = systems[:, :n]
+        kept = states[(np.abs(states[:, 0]) < _FAR) & np.isfinite(states).all(axis=1)]
+        if len(kept) < len(states) / 2:
+            raise ValueError(
+                "rig must be known well enough to stay in its range between blocks, but most of what is believed runs "
+                "away; give a narrower guess, or run sample by sample"
+            )
         self.estimator.rewind()
-        self._put_state(mean, cov)
+        self._put_state(kept.mean(axis=0), np.cov(kept.T))
 
     def _after(self, u: float, samples: int) -> OnlineEstimator:
         """A copy that has followed so many samples without outputs: one with u, the others with none."""
@@ -96,7 +136,7 @@ class Follower:
         belief = self.belief
         found = survey(belief.model, belief.coefficients_mean, np.zeros(belief.model.n_states))
         cycles = float(resonances(belief.model, found.slopes)[0])
-        return int(np.clip(_PERIODS / max(cycles, 1e-9), _LENGTHS, _LONGEST))
+        return int(np.clip(_PERIODS / max(cycles, 1e-9), 8, _LONGEST))
 
     def _put_state(self, mean: FloatArray, cov: FloatArray) -> None:
         arrays, model = self.estimator.arrays(), self.estimator.model

@@ -19,6 +19,21 @@ _LESS, _TRIALS = 0.8, 31
 _HELD = np.sqrt(3.0)
 
 
+def drawn_from(estimator: OnlineEstimator, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """States and coefficients (draws, d) and noises (draws, 2) from a posterior, hypotheses as often as probable."""
+    arrays = estimator.arrays()
+    weights = np.where(np.isfinite(arrays["records"]).all(axis=1), arrays["weights"], 0.0)
+    counts = rng.multinomial(DRAWS, weights / weights.sum())
+    d, places = len(estimator.model.names), covariance_places(estimator.model)
+    drawn, noises = [], []
+    for record, count in zip(arrays["records"], counts.tolist(), strict=True):
+        if count:
+            drawn.append(rng.multivariate_normal(record[:d], record[places], count, method="eigh"))
+            shapes, rates = record[-4::2], record[-3::2]
+            noises.append(1.0 / np.sqrt(rng.gamma(shapes, 1.0 / rates, (count, 2))))
+    return np.concatenate(drawn), np.concatenate(noises)
+
+
 class Futures:
     """What systems drawn from a posterior do with inputs: coefficients, state and noises are all drawn.
 
@@ -31,18 +46,8 @@ class Futures:
 
     def __init__(self, estimator: OnlineEstimator, delay: int, limit: float, rng: np.random.Generator) -> None:
         self.model, self.delay, self.limit = estimator.model, delay, limit
-        arrays = estimator.arrays()
-        weights = np.where(np.isfinite(arrays["records"]).all(axis=1), arrays["weights"], 0.0)
-        counts = rng.multinomial(DRAWS, weights / weights.sum())
-        d, places = len(self.model.names), covariance_places(self.model)
-        drawn, noises = [], []
-        for record, count in zip(arrays["records"], counts.tolist(), strict=True):
-            if count:
-                drawn.append(rng.multivariate_normal(record[:d], record[places], count, method="eigh"))
-                shapes, rates = record[-4::2], record[-3::2]
-                noises.append(1.0 / np.sqrt(rng.gamma(shapes, 1.0 / rates, (count, 2))))
-        self._drawn = np.concatenate(drawn)
-        self._process, self._sensor = np.concatenate(noises).T
+        self._drawn, noises = drawn_from(estimator, rng)
+        self._process, self._sensor = noises.T
         self._seeds = rng.integers(2**63, size=DRAWS)
 
     def probability(self, u: FloatArray) -> float:
