@@ -71,8 +71,7 @@ class SimulatedPlant:
     def apply(self, u: float) -> float:
         """An input from now on; 0 where the plant is disarmed."""
         self._hear()
-        limit = self.rig.input.limit or math.inf
-        self._u = min(max(u, -limit), limit) if self._armed else 0.0
+        self._u = self._let_through(u)
         return self._u
 
     def read(self) -> float:
@@ -88,9 +87,10 @@ class SimulatedPlant:
         applied, outputs = np.zeros(len(u)), np.zeros(len(u))
         for k, value in enumerate(u.tolist()):
             outputs[k] = self._shown()
-            applied[k] = self.apply(value)
+            applied[k] = self._u = self._let_through(value)
             self._move(1.0)
         self._u = 0.0
+        self._heard = self._moved = self.clock.now()  # what passed on the clock meanwhile was the block
         return applied, outputs
 
     def zero(self) -> None:
@@ -102,6 +102,10 @@ class SimulatedPlant:
         """The input to zero, and no other after it."""
         self.zero()
         self._armed = False
+
+    def _let_through(self, u: float) -> float:
+        limit = self.rig.input.limit or math.inf
+        return min(max(u, -limit), limit) if self._armed else 0.0
 
     def _hear(self) -> None:
         self._move_to_now()

@@ -12,7 +12,7 @@ from loopback import RIG, RIG_FILE, TRUTH
 
 import duffing_env  # noqa: F401
 from agents.commands import main
-from agents.running.clock import JumpingClock
+from agents.running.clock import JumpingClock, RealClock
 from agents.running.designs import holds, policy_of
 from agents.running.follower import Follower
 from agents.running.observed import Observed
@@ -427,6 +427,17 @@ def test_the_folder_of_another_run_is_left_alone(tmp_path):
 def test_plans_that_make_no_sense(plan, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         play(tmp_path / "run", **plan)
+
+
+def test_a_block_of_a_simulated_plant_takes_no_time_of_the_clock():
+    found = []
+    for clock in (JumpingClock(), RealClock()):
+        plant = SimulatedPlant(RIG, TRUTH, clock=clock)
+        plant.arm(None)
+        applied, y = plant.play(np.repeat([4.0, -4.0], 100))
+        np.testing.assert_array_equal(applied, np.repeat([4.0, -4.0], 100))
+        found.append(y)
+    np.testing.assert_allclose(*found, atol=2e-3)  # the clock moved a little before the block, and drew other noises
 
 
 # --- the command
