@@ -238,7 +238,9 @@ def test_nothing_heavy_is_imported_for_the_help():
 
 @pytest.mark.skipif(os.name == "nt", reason="no such signal")
 def test_ctrl_c_is_one_line_and_exit_status_130(tmp_path):
-    code = "from agents.commands import main; main(['rig', 'init'])"
+    # A process that was started in the background ignores the signal.
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += "from agents.commands import main; main(['rig', 'init'])"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     asking = subprocess.Popen(
         [sys.executable, "-c", code],
