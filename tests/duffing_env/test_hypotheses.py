@@ -83,7 +83,7 @@ def weighed(twin):
 
 
 #: Seconds of compilation each; the others only read the mixture.
-KERNELS = ("fisher", "expected_free_energy", "simulation_error")
+KERNELS = ("free_energy", "fisher", "expected_free_energy", "simulation_error")
 
 
 @pytest.mark.parametrize("reward", [pytest.param(r, marks=[pytest.mark.slow] * (r in KERNELS)) for r in REWARDS])
@@ -106,6 +106,7 @@ def test_so_does_one_on_the_differential_equation(reward):
     assert_env_follows_twin(env, twin, reward, 0)
 
 
+@pytest.mark.slow  # a kernel of its own
 def test_drift_widens_every_member():
     options = {"noise_hypotheses": 2, "horizon": 60, "drift": 0.02, "jump": 0.3, "iterations": 2}
     assert_env_follows_twin(DuffingEnv(**options), weighed(TwinEnv)(0, **options), "information_gain", 0)
@@ -157,6 +158,7 @@ class Recorded:
         return next(self.left)
 
 
+@pytest.mark.slow  # a kernel of its own
 def test_a_plant_of_ones_own_is_believed_alike():
     simulated, outputs = DuffingEnv(noise_hypotheses=3), []
     simulated.reset(seed=0)

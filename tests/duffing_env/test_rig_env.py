@@ -128,6 +128,7 @@ def test_around_the_plant_inputs_and_outputs_are_in_its_units():
     )
 
 
+@pytest.mark.slow  # the planner's kernels of another model; those of two others are in the tests
 def test_the_planner_plays_it():
     envs = make_vec(2, horizon=8)
     observations, _ = envs.reset(seed=0)

@@ -30,7 +30,7 @@ def begun(size, **options):
 # --- Drawn for every episode ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("reward", ["information_gain", "fisher"])
+@pytest.mark.parametrize("reward", ["information_gain", pytest.param("fisher", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("equation", ENVS)
 def test_an_environment_with_unknown_noises_follows_its_twin(equation, reward):
     env, twin = ENVS[equation]
