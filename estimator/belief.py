@@ -272,3 +272,16 @@ class Belief:
         units = {name: self.scales.unit(d) for name, d in self.model.dimensions.items()} or self.model.coefficients
         rows = zip(self.model.physical or self.model.coefficients, mean.tolist(), np.sqrt(np.diag(cov)), strict=True)
         return {name: (value, float(std), units[name]) for name, value, std in rows}
+
+    def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
+        """Physical parameter to the central interval that holds it with a probability.
+
+        Raises:
+            ValueError: for a probability that is not between 0 and 1.
+        """
+        if not 0 < probability < 1:
+            raise ValueError(f"probability must be between 0 and 1, but is {probability!r}; 0.9 is usual")
+        from scipy.special import ndtri
+
+        half = float(ndtri(0.5 + probability / 2))
+        return {name: (mean - half * std, mean + half * std) for name, (mean, std, _) in self.parameters().items()}

@@ -114,10 +114,7 @@ class Run:
 
     def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
         """Parameter to the central interval that holds it with a probability."""
-        from scipy.special import ndtri
-
-        half = float(ndtri(0.5 + probability / 2))
-        return {name: (mean - half * std, mean + half * std) for name, (mean, std) in self.parameters.items()}
+        return self.belief.interval(probability)
 
 
 def run(

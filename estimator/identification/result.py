@@ -73,12 +73,7 @@ class Result:
         Raises:
             ValueError: for a probability that is not between 0 and 1.
         """
-        if not 0 < probability < 1:
-            raise ValueError(f"probability must be between 0 and 1, but is {probability!r}; 0.9 is usual")
-        from scipy.stats import norm
-
-        half = float(norm.ppf(0.5 + probability / 2))
-        return {name: (mean - half * std, mean + half * std) for name, (mean, std) in self.parameters.items()}
+        return self.belief.interval(probability)
 
     @cached_property
     def history(self) -> History:
