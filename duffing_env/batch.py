@@ -77,7 +77,7 @@ class Batch:
         """Start environment ``index``'s stream of random numbers from its ``np_random``."""
         block, lane = divmod(index, LANES)
         first = self._place["STREAM_a"]
-        self._blocks[block, first : first + 4, lane] = stream_words(generator)
+        self._blocks[block, first : first + 4, lane] = stream_words(generator, self.experiment.branch)
 
     def reset(self, mask: npt.NDArray[np.bool_]) -> None:
         """Start episodes where ``mask`` (n,) is true."""

@@ -157,6 +157,7 @@ class ContinuousEnv(DuffingEnv):
     | ``noise_shape`` | 2 | shape of the Gamma priors of γ and ξ |
     | ``noise_hypotheses`` | 1 | as `DuffingEnv` |
     | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
+    | ``branch`` | ``train`` | as `DuffingEnv` |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
 
     >>> import gymnasium as gym

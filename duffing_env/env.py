@@ -145,7 +145,11 @@ class DuffingEnv(gym.Env[Any, Any]):
     | ``max_slew`` | None | largest change of the input between samples [V]; a larger one is cut |
     | ``input_cost`` | 0 | taken off the reward for every (u / ``max_input``)² |
     | ``jump``, ``drift`` | 0 | a mass that jumps, an estimator that expects change; see `DriftEnv` |
+    | ``branch`` | ``train`` | of the seeds: ``train``, ``validation`` or ``test``; see below |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
+
+    The same seed gives other oscillators and other noise in each ``branch`` of the seeds. What is trained in ``train``,
+    with whatever seed, never met a system of ``test``, on which `evaluate.py` compares.
 
     With ``hold`` a step is that many samples with the same action, to the bit: its reward is the sum of theirs, limits
     hold for every sample, and an episode may end within. ``horizon`` stays in samples, so an episode has

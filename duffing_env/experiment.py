@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from duffing_env.layout import Kind, Setup, parameter_names
+from duffing_env.noise import BRANCHES
 from duffing_env.rewards import REWARDS, check_reward
 from estimator.belief import Belief
 from estimator.ensemble import priors, start
@@ -43,6 +44,8 @@ class Experiment:
         terminated_return: what an episode that is terminated returns, whatever it gained. None keeps what it gained.
         noise_hypotheses: ratios of the noises that the estimator weighs by their evidence, as
             `estimator.OnlineEstimator` does; structured and for one sensor. 1: the ratio stays nearly the prior's.
+        branch: of the seeds, a name of `duffing_env.noise.BRANCHES`: the same seed gives other systems and noise in
+            each, so that what is trained in ``train`` with whatever seed never met those of ``test``.
     """
 
     factorisation: str = "structured"
@@ -54,8 +57,11 @@ class Experiment:
     terminal: bool = False
     terminated_return: float | None = None
     noise_hypotheses: int = 1
+    branch: str = "train"
 
     def __post_init__(self) -> None:
+        if self.branch not in list(BRANCHES):
+            raise ValueError(f"branch must be one of {list(BRANCHES)}, but is {self.branch!r}")
         if self.factorisation not in list(DEFAULT_ITERATIONS):
             raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {self.factorisation!r}")
         if self.iterations is not None:

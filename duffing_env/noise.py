@@ -17,10 +17,14 @@ _ONE = np.uint64(1)
 _UNIT_52 = 2.0**-52
 
 
-def stream_words(generator: np.random.Generator) -> npt.NDArray[np.float64]:
-    """The four words of a fresh stream, as float64 bits (4,), seeded with 128 bits drawn from ``generator``."""
+#: Branches of the seeds, by their spawn keys: whatever the seed, a stream of one is no stream of another.
+BRANCHES: dict[str, tuple[int, ...]] = {"train": (), "validation": (1,), "test": (2,)}
+
+
+def stream_words(generator: np.random.Generator, branch: str = "train") -> npt.NDArray[np.float64]:
+    """The four words of a fresh stream, as float64 bits (4,): 128 bits drawn from ``generator``, in a branch."""
     entropy = generator.integers(0, 2**32, size=4, dtype=np.uint32)
-    state = np.random.SFC64(np.random.SeedSequence(entropy.tolist())).state
+    state = np.random.SFC64(np.random.SeedSequence(entropy.tolist(), spawn_key=BRANCHES[branch])).state
     words: npt.NDArray[np.uint64] = state["state"]["state"]
     return words.view(np.float64)
 

@@ -8,6 +8,9 @@ import gymnasium as gym
 
 from duffing_env.vector_env import DuffingVectorEnv
 
+#: Options of the systems that policies are compared on.
+TESTED = {"branch": "test"}
+
 
 def make(env_id: str, systems: int, options: dict[str, Any] | None = None) -> DuffingVectorEnv:
     """A batch of a track."""

@@ -7,8 +7,8 @@ what is stored. F is the Fisher information at the true coefficients along the r
 the prior's covariance of the coefficients. With `--policies NAME ...` the search starts from those policies' inputs
 too.
 
-System i is row i of a batch that is reset with seed 0, as `agents.evaluation.rollout.evaluate` does it by default; it
-does not depend on the number of systems.
+System i is row i of a batch that is reset with seed 0 in the branch ``test``, as `agents.evaluation.rollout.evaluate`
+does it by default; it does not depend on the number of systems.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.evaluation import metrics
-from agents.evaluation.batch import make
+from agents.evaluation.batch import TESTED, make
 from agents.planner.plants import plant_of
 from agents.policies import make_policy
 from duffing_env.experiment import Experiment, SimulatedExperiment
@@ -77,6 +77,8 @@ def evaluate(
 ) -> list[Evaluation]:
     """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
 
+    They are of the branch ``test`` of the seeds, unless the options name another: no training meets them.
+
     Learned policies act by their mean. With ``hold`` in the options, inputs, outputs and what is made of them are those
     of every sample; a stored oracle is that of the track without it. An episode that a limit ends is never dropped: it
     counts with what was known by then. Information at the truth, what other estimators make of the inputs and
@@ -105,6 +107,7 @@ def evaluate(
         raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
     if systems < 2:
         raise ValueError(f"systems must be at least 2, but is {systems}; intervals need more than one")
+    options = TESTED | (options or {})
     evaluations = []
     told: dict[str, FloatArray] = {}
     for name in policies:
@@ -113,7 +116,7 @@ def evaluate(
         for member in members:
             if on_policy is not None:
                 on_policy(member)
-            each.append(_evaluate(member, env_id, systems, seed, dict(options or {}), told))
+            each.append(_evaluate(member, env_id, systems, seed, options, told))
         evaluations.append(each[0] if title is None else pooled(title, each))
     return evaluations
 
@@ -164,7 +167,7 @@ def _evaluate(
         found["fisher_gain"] = gains
         evaluation.estimators.update(_audit(evaluation, truth, experiment))
         efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
-        if efficiency is not None:  # an oracle is stored, of the systems of seed 0
+        if efficiency is not None:  # an oracle is stored, of the systems of seed 0 in this branch
             found["efficiency"] = efficiency
     if stays and is_difference:
         told.update(told or metrics.regimes(truth, experiment, seed))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.evaluation.batch import make
+from agents.evaluation.batch import TESTED, make
 from agents.planner.ascent import Limits, climber
 from agents.planner.design import Known
 from agents.planner.plants import Plant, plant_of
@@ -40,12 +40,12 @@ class Systems:
 
     @classmethod
     def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None) -> Systems:
-        """The first systems of a track, as they are evaluated with seed 0.
+        """The first systems of a track, as they are evaluated with seed 0: of the branch ``test``, if not told another.
 
         Raises:
             ValueError: where its plant is none that is simulated and stays as it is.
         """
-        envs = make(env_id, count, options)
+        envs = make(env_id, count, TESTED | (options or {}))
         envs.reset(seed=0)
         e = envs.experiment
         if not isinstance(e, SimulatedExperiment) or e.jump or e.max_slew is not None:
@@ -91,6 +91,7 @@ class Systems:
         names = ("max_input", "max_output", "samples", "process_noise", "measurement_noise", "spread")
         told = {name: getattr(e, name) for name in names}
         told |= {"plant_spread": e.spread if e.plant_spread is None else e.plant_spread, "max_rms": e.max_rms}
+        told["branch"] = e.branch
         if plant.model == difference():
             return told
         return told | {"model": plant.model.digest, "interpolation": plant.interpolation}

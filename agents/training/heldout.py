@@ -1,4 +1,4 @@
-"""What a policy is worth on the way: by the metrics of `evaluate.py`, on systems that it is not trained on."""
+"""What a policy is worth on the way: by the metrics of `evaluate.py`, on systems of the branch ``validation``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FILE = "evaluations.csv"
 BEST = "best"
 
 _SYSTEMS = 128
-_SEED = 1_000_003  # not that of evaluate.py, which is 0
+_SEED = 0
 
 
 class HeldOut:
@@ -40,7 +40,6 @@ class HeldOut:
 
     def __init__(self, folder: Path, config: TrainConfig, steps: int = 0) -> None:
         self._folder, self._config = folder, config
-        self._seed = _SEED + (config.seed == _SEED)
         self._rows: list[dict[str, float]] = []
         if (folder / FILE).exists():
             for row in csv.DictReader((folder / FILE).read_text().splitlines()):
@@ -67,7 +66,8 @@ class HeldOut:
         """
         with tempfile.TemporaryDirectory() as candidate:
             save_policy(Path(candidate), model, card)
-            evaluation, *_ = roll_out(candidate, self._config.env, _SYSTEMS, self._seed, self._config.options)
+            options = self._config.options | {"branch": "validation"}
+            evaluation, *_ = roll_out(candidate, self._config.env, _SYSTEMS, _SEED, options)
         found = {name: float(evaluation.metrics[name].mean()) for name in METRICS}
         self._rows.append({"steps": model.num_timesteps, **found})
         table = io.StringIO()
@@ -80,6 +80,6 @@ class HeldOut:
             save_policy(
                 self._folder / BEST,
                 model,
-                {**card, "evaluation": {"seed": self._seed, "systems": _SYSTEMS, **found}},
+                {**card, "evaluation": {"seed": _SEED, "systems": _SYSTEMS, **found}},
             )
         return found

@@ -93,6 +93,8 @@ class TrainConfig(Subject):
             raise ValueError("tensorboard must be installed; do so with: pip install 'duffing-env[tensorboard]'")
         if "reward" in self.options:
             raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
+        if "branch" in self.options:
+            raise ValueError(f"options must not hold branch, but are {self.options}; the others are to compare on")
         check_track(self.env)
         if self.hyperparameters is None:
             object.__setattr__(self, "hyperparameters", read_settings(self.algo, self.env, self.settings))

@@ -420,7 +420,7 @@ def test_the_example_brings_about_as_much_as_the_oracle():
     from agents.evaluation.systems import Systems
     from estimator import fisher_information
 
-    systems = Systems.of(AMPLITUDE, 32)
+    systems = Systems.of(AMPLITUDE, 32, {"branch": "train"})
     model, experiment = systems.plant.model, systems.experiment
     noises = experiment.process_noise, experiment.measurement_noise
     told = fisher_information(model, systems.theta, Oracle.of(systems).inputs[:32], *noises)

@@ -11,6 +11,7 @@ from agents.evaluation.rollout import evaluate
 from agents.evaluation.systems import Systems
 
 SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Continuous-v0"
+STORED_IN = {"branch": "train"}
 STORED = [SHORT, POWER, "duffing_env/Amplitude-v0", "duffing_env/Output-v0"]
 
 
@@ -33,6 +34,14 @@ def answers(systems, inputs):
 
 def gains(systems, values):
     return values - 0.5 * np.linalg.slogdet(systems.precision)[1]
+
+
+def test_systems_of_another_branch_are_others_with_an_oracle_of_their_own():
+    tested, others = Systems.of(SHORT, 64), [Systems.of(SHORT, 64, {"branch": b}) for b in ("train", "validation")]
+    assert tested.description["branch"] == "test"
+    for other in others:
+        assert not np.isin(other.theta, tested.theta).any()
+        assert other.path != tested.path
 
 
 def test_rows_do_not_depend_on_their_number():
@@ -122,7 +131,7 @@ def test_the_search_starts_from_what_policies_played(empty_folder, monkeypatch):
 
 @pytest.mark.slow  # the search is seconds of compilation
 def test_a_search_that_starts_from_better_inputs_ends_no_worse(monkeypatch):
-    systems = Systems.of(SHORT, 1)
+    systems = Systems.of(SHORT, 1, STORED_IN)
     best = Oracle.of(systems)
     monkeypatch.setattr(module, "_STARTS", 2)
     alone = search(systems, 0, np.empty((0, 48)), np.random.default_rng(0), rounds=0)[1]
@@ -139,7 +148,7 @@ def test_the_command_stores_and_says_where(empty_folder, capsys):
 
 
 def test_efficiency_is_one_for_the_oracle_itself_and_counts_until_the_end():
-    systems = Systems.of(SHORT, 3)
+    systems = Systems.of(SHORT, 3, STORED_IN)
     oracle = Oracle.of(systems)
     outputs = answers(systems, oracle.inputs)
     np.testing.assert_allclose(oracle.efficiency(oracle.inputs, outputs), 1.0, rtol=1e-9)
@@ -162,7 +171,7 @@ def test_what_is_stored_is_never_larger_and_stays():
 
 @pytest.mark.parametrize("track", STORED)
 def test_stored_oracles_keep_the_limits_of_their_tracks(track):
-    oracle = Oracle.of(Systems.of(track, 256))
+    oracle = Oracle.of(Systems.of(track, 256, STORED_IN))
     limits = oracle.systems.limits
     assert len(oracle.values) == 256
     assert np.abs(oracle.inputs).max() <= limits.amplitude

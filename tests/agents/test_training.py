@@ -15,10 +15,12 @@ from safetensors.numpy import load_file
 
 import agents.vec_env
 from agents import make_policy
+from agents.evaluation.batch import TESTED, make
 from agents.evaluation.leaderboard import summarise
 from agents.evaluation.rollout import evaluate
 from agents.training import PPOSettings, TrainConfig, train
 from agents.training.hyperparameters import settings_of
+from agents.training.runs import _make_envs
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SMALL = PPOSettings(num_envs=64, n_steps=64, batch_size=1024, hidden=(16,))
@@ -145,6 +147,25 @@ def test_reward_and_options_reach_the_environment(tmp_path, monkeypatch):
     rows = list(csv.DictReader((run.folder / "progress.csv").read_text().splitlines()))
     assert float(rows[-1]["rollout/ep_len_mean"]) == 8
     assert all(-1 <= mean_return <= 1 for _, _, mean_return in run.curve)
+
+
+def test_no_training_meets_a_system_that_policies_are_compared_on():
+    def begun(options):
+        envs = make("duffing_env/Short-v0", 256, options)
+        envs.reset(seed=0)
+        return envs.truth.m
+
+    for seed in range(3):
+        envs = _make_envs(TrainConfig(env="duffing_env/Short-v0", seed=seed, hyperparameters=SMALL), seed)
+        envs.reset()
+        met = {*envs.envs.truth.m.tolist()}
+        if seed == 0:
+            assert met <= {*begun({}).tolist()}  # what TESTED is for
+        for _ in range(200):
+            envs.step(np.ones((64, 1), dtype=np.float32))
+            met |= {*envs.envs.truth.m.tolist()}
+        assert len(met) > 4 * 64
+        assert not met & {*begun(TESTED).tolist()}
 
 
 def test_hyperparameters_reach_the_algorithm(tmp_path):

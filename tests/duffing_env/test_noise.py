@@ -8,7 +8,7 @@ from scipy import stats
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_NEXT_STEP
-from duffing_env.noise import as_bits, as_word, draw, normal_pair, stream_words, to_unit
+from duffing_env.noise import BRANCHES, as_bits, as_word, draw, normal_pair, stream_words, to_unit
 from estimator.lanes import LANES
 
 
@@ -123,6 +123,20 @@ def test_noise_is_independent(normals):
     }
     for name, (first, second) in pairs.items():
         assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < bound, name
+
+
+def test_a_branch_is_a_stream_of_its_own_for_the_same_numbers():
+    entropy = np.random.default_rng(5).integers(0, 2**32, size=4, dtype=np.uint32).tolist()
+    for branch, key in {"train": (), "validation": (1,), "test": (2,)}.items():
+        expected = np.random.SFC64(np.random.SeedSequence(entropy, spawn_key=key)).state["state"]["state"]
+        words = stream_words(np.random.default_rng(5), branch).view(np.uint64)
+        np.testing.assert_array_equal(words, expected)
+
+
+def test_streams_of_different_branches_never_meet():
+    starts = [stream_words(np.random.default_rng(seed), branch) for branch in BRANCHES for seed in range(1000)]
+    for word in range(3):
+        assert len({int(start.view(np.uint64)[word]) for start in starts}) == len(starts)
 
 
 def test_streams_of_different_seeds_differ():

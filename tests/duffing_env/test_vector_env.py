@@ -21,6 +21,7 @@ from rounding import U32
 
 from duffing_env.batch import spawn_seeds
 from duffing_env.env import DuffingEnv
+from duffing_env.noise import BRANCHES
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 
@@ -397,3 +398,17 @@ def test_final_infos_as_a_list():
         endings += [sorted(info["final_info"]) for info in infos if "final_info" in info]
     assert len(endings) > 10
     assert endings == [["belief", "diverged", "information_gain", "log_posterior_gain", "truth"]] * len(endings)
+
+
+def test_the_same_seed_gives_other_experiments_in_each_branch():
+    actions = random_actions(20, 6)
+    plain, told = DuffingVectorEnv(6), {branch: DuffingVectorEnv(6, branch=branch) for branch in BRANCHES}
+    reference, found = roll_out(plain, actions), {branch: roll_out(envs, actions) for branch, envs in told.items()}
+    assert_same(reference, found["train"])
+    masses = np.concatenate([envs.truth.m for envs in told.values()])
+    assert len(set(masses.tolist())) == 18
+    single = DuffingEnv(branch="test")
+    single.reset(seed=spawn_seeds(0, 6)[3])
+    assert single.truth.m == told["test"].truth.m[3]
+    with pytest.raises(ValueError, match="branch must be one of"):
+        DuffingEnv(branch="exam")
