@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from duffing_env.layout import observation_bounds
 from estimator.arrays import copy, fill
+from estimator.belief import Belief
 from estimator.engine.motion import motion
 from estimator.lanes import kernel
 from estimator.models.model import Model
@@ -153,6 +154,17 @@ def resonances(model: Model, slopes: FloatArray) -> FloatArray:
     angles = np.abs(poles.imag if model.is_continuous else np.where(poles.imag != 0, np.angle(poles), 0.0))
     highest: FloatArray = angles.max(axis=-1) / (2.0 * np.pi)
     return highest
+
+
+def frequency(belief: Belief) -> float:
+    """Cycles per sample at which a believed system rings in small motions: of two wells, at the bottom of one."""
+    means = belief.coefficients_mean
+    found = survey(belief.model, means, np.zeros(belief.model.n_states))
+    cycles = float(resonances(belief.model, found.slopes)[0])
+    if cycles <= 0.0:
+        stiffness = dict(zip(belief.names, means, strict=True)).get("stiffness", 0.0)
+        cycles = np.sqrt(2.0 * abs(stiffness)) / (2.0 * np.pi)
+    return max(cycles, 1e-9)
 
 
 #: Samples of the motion by which states are measured, and where it turns, in parts of the limit.

@@ -11,12 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.planner.motion import frequency
 from agents.policies.excitations import EXCITATIONS, Draw, draw_recorded
+from estimator.belief import Belief
+from estimator.parameters import SAMPLING_STEP
 
 # Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
 SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 DEFAULT_MAX_INPUT = 0.15  # V; the largest input of the Silverbox record is 0.149 V
+_RESONANCE = 68.1 * SAMPLING_STEP  # cycles per sample; the Silverbox's, for which bands and holds are made
 DEFAULT_SAMPLES = 1024  # for environments whose episodes have no fixed length
 
 # Float32 rounding of the actions must not bring a signal of exactly the budget above it.
@@ -211,6 +215,9 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     On an environment that replays a record (it has `recorded_input`) the regimes ``silverbox-...`` play that input
     from its first sample in every episode; on others, a stretch of the regime.
 
+    Signals are made for the Silverbox. On a rig each of their values is held for as many samples as the rig's
+    resonance, as its prior believes it, is slower, and they reach as far as its limit.
+
     Args:
         name: A name in `EXCITATIONS`.
         env: The unwrapped environment, or None.
@@ -221,12 +228,32 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     """
     limits, samples = limits_of(env)
     draw = EXCITATIONS[name](limits.max_input)
+    experiment = getattr(env, "experiment", None)
+    if getattr(experiment, "rig", None) is not None:
+        hold = holds(experiment.believed, samples)
+        draw = _held(EXCITATIONS[name](DEFAULT_MAX_INPUT), hold, limits.max_input / DEFAULT_MAX_INPUT)
     recorded = getattr(env, "recorded_input", None)
     if recorded is not None and name.startswith("silverbox-"):
         draw, samples = draw_recorded(recorded), len(recorded)
     return SignalPolicy(
         name, draw, max_input=limits.max_input, max_rms=limits.max_rms, samples=samples, hold=limits.hold, seed=seed
     )
+
+
+def holds(prior: Belief, samples: int) -> int:
+    """Samples to hold each value of an excitation for, at least 1, so that it excites what is believed."""
+    return int(np.clip(round(_RESONANCE / frequency(prior)), 1, max(1, samples // 8)))
+
+
+def _held(draw: Draw, hold: int, worth: float) -> Draw:
+    """A draw that is slower, and in another unit."""
+
+    def slower(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
+        # Below 5 samples a multisine has no line in its band.
+        values: NDArray[np.float64] = np.repeat(worth * draw(rng, max(5, -(-samples // hold))), hold)[:samples]
+        return values
+
+    return slower
 
 
 def limits_of(env: Any) -> tuple[Limits, int]:

@@ -77,9 +77,7 @@ class Blocks:
         scales = self._follower.estimator.scales
         self._observed.belief = self._follower.belief
         u = np.clip(design.block(samples), -self._observed.max_input, self._observed.max_input)
-        futures = Futures(
-            self._follower.estimator, self._follower.delay, self._observed.experiment.max_output, self._rng
-        )
+        futures = Futures(self._follower, self._observed.experiment.max_output, self._rng)
         share, probability = futures.share(u, self._bound)
         self._recording.note("design", block=self._block, share=share, probability=probability)
         if share == 0.0 and probability >= self._bound:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.planner.motion import resonances, survey
+from agents.planner.motion import frequency
 from agents.running.safety import drawn_from
 from estimator.arrays import copy as copy_numbers
 from estimator.belief import Belief, covariance_places
@@ -78,6 +78,7 @@ class Follower:
         prior = rig_prior(rig) if prior is None else prior
         expectations = "sigma_points" if pauses else "first_order"
         self._paused = 0
+        self._rung: tuple[FloatArray, FloatArray] | None = None
         self.estimator = OnlineEstimator(prior.model, prior, paired, noise_hypotheses=9, expectations=expectations)
 
     @property
@@ -92,6 +93,14 @@ class Follower:
             ValueError: where the belief overflows; it is then as before.
         """
         self.estimator.run(u, y, missing=True)
+        self._rung = None
+
+    def drawn(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """States and coefficients (draws, d) and noises (draws, 2) of systems that are believed in now.
+
+        After a pause they are those that rang: a Gaussian of their states would put many out of the range.
+        """
+        return self._rung or drawn_from(self.estimator, rng)
 
     def ahead(self, u: float) -> Belief:
         """When the next input begins to act, if the one in force is u; nothing changes."""
@@ -107,12 +116,12 @@ class Follower:
         """
         rng = np.random.default_rng(self._paused)
         self._paused += 1
-        systems, _ = drawn_from(self.estimator, rng)
+        systems, noises = drawn_from(self.estimator, rng)
         systems = np.ascontiguousarray(systems)
-        n = self.estimator.model.n_states
+        n, longest = self.estimator.model.n_states, int(np.clip(_PERIODS / frequency(self.belief), 8, _LONGEST))
         # Each rings by itself: of two wells, a linear forecast would not know that they hold.
         _ringer(self.estimator.model)(
-            systems, u / self.estimator.scales.input, rng.integers(self._pause_samples(), size=len(systems))
+            systems, u / self.estimator.scales.input, rng.integers(longest, size=len(systems))
         )
         states = systems[:, :n]
         kept = states[(np.abs(states[:, 0]) < _FAR) & np.isfinite(states).all(axis=1)]
@@ -123,6 +132,7 @@ class Follower:
             )
         self.estimator.rewind()
         self._put_state(kept.mean(axis=0), np.cov(kept.T))
+        self._rung = systems, noises
 
     def _after(self, u: float, samples: int) -> OnlineEstimator:
         """A copy that has followed so many samples without outputs: one with u, the others with none."""
@@ -131,12 +141,6 @@ class Follower:
         inputs[0] = u
         later.run(inputs, np.full(samples, np.nan), missing=True)
         return later
-
-    def _pause_samples(self) -> int:
-        belief = self.belief
-        found = survey(belief.model, belief.coefficients_mean, np.zeros(belief.model.n_states))
-        cycles = float(resonances(belief.model, found.slopes)[0])
-        return int(np.clip(_PERIODS / max(cycles, 1e-9), 8, _LONGEST))
 
     def _put_state(self, mean: FloatArray, cov: FloatArray) -> None:
         arrays, model = self.estimator.arrays(), self.estimator.model

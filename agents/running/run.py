@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from agents.policies import make_policy
 from agents.policies.signals import SignalPolicy
 from agents.running.blocks import Blocks
 from agents.running.clock import Clock, RealClock
-from agents.running.designs import Design, design_of, policy_of
+from agents.running.designs import Design, design_of
 from agents.running.follower import Follower
 from agents.running.observed import Observed
 from agents.running.plant import Plant, check_plant
@@ -171,7 +172,7 @@ def run(
     follower = Follower(rig, prior, pauses=plan.block is not None)
     check_session(rig, plant, plan.silence(rig.step))
     observed = Observed(rig, follower.belief, plan.samples)
-    policy = policy_of(plan.policy, observed, plan.seed)
+    policy = make_policy(plan.policy, observed, seed=plan.seed)  # type: ignore[arg-type]
     design = design_of(policy, observed) if plan.block or isinstance(policy, SignalPolicy) else None
     chooser = None if design else PolicyChooser(policy, observed, follower)
     silence = plan.silence(rig.step)
@@ -219,7 +220,7 @@ def _warm_up(follower: Follower, observed: Observed, design: Design | None, poli
         policy.predict(observed.observation(0.0, 0.0, 0), None, deterministic=True)
     elif plan.block and not isinstance(policy, SignalPolicy):
         design.block(plan.block)
-    Futures(follower.estimator, follower.delay, 1.0, np.random.default_rng(0)).probability(np.zeros(1))
+    Futures(follower, 1.0, np.random.default_rng(0)).probability(np.zeros(1))
 
 
 def _series(
@@ -228,7 +229,7 @@ def _series(
     """A whole signal, at the share that is safe enough."""
     assert design is not None
     u = design.block(plan.samples)
-    futures = Futures(follower.estimator, follower.delay, observed.experiment.max_output, rng)
+    futures = Futures(follower, observed.experiment.max_output, rng)
     share, probability = futures.share(u, plan.bound)
     recording.note("design", share=share, probability=probability)
     if share == 0.0 and probability >= plan.bound:

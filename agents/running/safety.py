@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from estimator.belief import covariance_places
 from estimator.free_run import free_run
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
+
+if TYPE_CHECKING:
+    from agents.running.follower import Follower
 
 #: Systems that are drawn from the belief.
 DRAWS = 300
@@ -38,15 +43,14 @@ class Futures:
     """What systems drawn from a posterior do with inputs: coefficients, state and noises are all drawn.
 
     Args:
-        estimator: whose posterior; each of its hypotheses about the noises is drawn as often as it is probable.
-        delay: samples by which an input acts later.
+        follower: of the run.
         limit: of the output, in the belief's scale.
         rng: of the draws; the noises of a drawn system stay the same from input to input.
     """
 
-    def __init__(self, estimator: OnlineEstimator, delay: int, limit: float, rng: np.random.Generator) -> None:
-        self.model, self.delay, self.limit = estimator.model, delay, limit
-        self._drawn, noises = drawn_from(estimator, rng)
+    def __init__(self, follower: Follower, limit: float, rng: np.random.Generator) -> None:
+        self.model, self.delay, self.limit = follower.estimator.model, follower.delay, limit
+        self._drawn, noises = follower.drawn(rng)
         self._process, self._sensor = noises.T
         self._seeds = rng.integers(2**63, size=DRAWS)
 

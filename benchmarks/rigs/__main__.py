@@ -92,20 +92,24 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Loop:
-    """256 samples through Rig-v0 around the integrator, by prbs and by the planner."""
+    """256 samples on the integrator, through Rig-v0 and in blocks, by prbs and by the planner."""
 
     seeds: int = 100
-    """Runs of each rig and policy."""
+    """Runs of each rig, policy and way."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
+    ways: tuple[str, ...] = loop.WAYS
+    """Sample by sample, and in blocks of 64."""
     workers: int = CORES
     """Processes."""
     json: Path | None = None
-    """File for the verdict."""
+    """File for every run."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        return loop.show(loop.run(self.rigs, self.seeds, self.workers))
+        runs = loop.run(self.rigs, self.ways, self.seeds, self.workers)
+        written = {" ".join(cell): [vars(one) for one in found] for cell, found in runs.items()}
+        return {"verdict": loop.show(runs), "runs": written}
 
 
 Part = (

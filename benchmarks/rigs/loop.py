@@ -1,9 +1,11 @@
-"""The closed loop: 256 samples chosen through ``Rig-v0`` around the adaptive integrator, by prbs and by the planner."""
+"""The closed loop: 256 samples on the adaptive integrator, by prbs and by the planner, one by one and in blocks."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,23 +14,34 @@ from benchmarks.rigs.accuracy import percents
 from benchmarks.rigs.catalogue import BENCHES, PARAMETERS, Bench
 from benchmarks.rigs.judge import LEVEL, POOLED, binomial_interval, calibrated, in_processes
 from benchmarks.rigs.records import generator, guess
-from benchmarks.rigs.simulator import KINDS, simulate
+from benchmarks.rigs.simulator import KINDS, FloatArray, simulate
+from estimator.belief import Belief
+from estimator.rig import Channel, Rig
+from estimator.rig_prior import rig_prior
 
-POLICIES = ("prbs", "efe")
+POLICIES, WAYS = ("prbs", "efe"), ("samples", "blocks")
+SAMPLES, BLOCK = 256, 64
 
 #: Share of runs that may leave the range, of which the upper end of the 95 % interval must stay below.
 ASKED = 0.05
 
-Task = tuple[str, str, int]
+#: Between two blocks an unknown time passes: up to so many samples.
+_PAUSE = 200
+
+Task = tuple[str, str, str, int]
 
 
 class BenchPlant:
-    """A bench as a plant of ``Rig-v0``: the input is held over each sample, and the force is disturbed.
+    """A bench as a plant: of ``Rig-v0`` by `reset` and `step`, of a run in blocks by the others.
+
+    The input is held over each sample, and the force is disturbed.
 
     Args:
         bench: which.
         seed: of its noises.
     """
+
+    watches = True
 
     def __init__(self, bench: Bench, seed: int) -> None:
         self._bench, self._parameters = bench, np.array([*bench.truth, bench.quintic])
@@ -37,17 +50,33 @@ class BenchPlant:
 
     def reset(self) -> None:
         """To rest, without input."""
-        self._state = np.array([self._bench.rest, 0.0])
+        self._state, self._acceleration = np.array([self._bench.rest, 0.0]), 0.0
 
     def step(self, u: float) -> float:
         """Hold an input for a sample; what the sensor shows at its end."""
         bench = self._bench
         force = np.array([u + bench.process_noise * self._rng.standard_normal()])
         states, ends = simulate(self._parameters, force, np.zeros(1), self._state, bench.step, bench.scale)
-        self._state = states[1]
-        place = KINDS.index(bench.kind)
-        shown = ends[1] if place == 2 else states[1, place]
-        return float(shown + bench.offset + bench.sensor_noise * self._rng.standard_normal())
+        self._state, self._acceleration = states[1], ends[1]
+        return self._shown()
+
+    def play(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """After a pause: inputs (N,) as they are, and the outputs as each began."""
+        for _ in range(self._rng.integers(_PAUSE)):
+            self.step(0.0)
+        shown = self._shown()
+        outputs = [shown, *(self.step(value) for value in u)]
+        return u, np.array(outputs[:-1])
+
+    def arm(self, watchdog: float | None) -> None:
+        """Nothing is to do: blocks end with no input."""
+
+    zero = disarm = apply = read = lambda self, *told: None
+
+    def _shown(self) -> float:
+        bench = self._bench
+        clean = (*self._state, self._acceleration)[KINDS.index(bench.kind)]
+        return float(clean + bench.offset + bench.sensor_noise * self._rng.standard_normal())
 
 
 @dataclass(frozen=True)
@@ -69,76 +98,103 @@ class Run:
 
 def trial(task: Task) -> Run:
     """Play 256 samples on a rig by a policy."""
-    import gymnasium as gym
-
-    import duffing_env  # noqa: F401  registers the tracks
-    from agents import make_policy
-    from estimator import Channel, Rig
-
-    name, policy, seed = task
+    name, policy, way, seed = task
     bench = replace(BENCHES[name], decimate=1, interpolation="zero_order")
     rig = Rig(
         bench.step, input=Channel(bench.units[0], limit=bench.limit),
         output=Channel(bench.units[1], kind=bench.kind, range=bench.output_range), guess=guess(bench, seed),
     )  # fmt: skip
-    # The signal is scaled so that it stays in the range; the planner is left to its own judgement.
-    largest = bench.amplitude / bench.limit if policy != "efe" else 1.0
-    env = gym.make("duffing_env/Rig-v0", rig=rig, plant=BenchPlant(bench, seed), horizon=256, max_input=largest)
+    plant = BenchPlant(bench, seed)
+    # A signal sample by sample is scaled so that it stays in the range; blocks, and the planner, find out themselves.
+    largest = bench.amplitude / bench.limit if policy == "prbs" else 1.0
+    play = _samples if way == "samples" else _blocks
+    belief, left = play(rig, plant, policy, seed, largest)
+    mean = np.array([belief.parameters()[p][0] for p in PARAMETERS])
+    low, high = np.array([belief.interval(LEVEL)[p] for p in PARAMETERS]).T
+    truth = np.array(bench.truth)
+    return Run(
+        rig_prior(rig).entropy() - belief.entropy(), ((low <= truth) & (truth <= high)).tolist(),
+        (mean / truth - 1).tolist(), left,
+    )  # fmt: skip
+
+
+def _samples(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float) -> tuple[Belief, bool]:
+    """Sample by sample through ``Rig-v0``: the belief at the end, and whether the output left its range."""
+    import gymnasium as gym
+
+    import duffing_env  # noqa: F401  registers the tracks
+    from agents import make_policy
+
+    env = gym.make("duffing_env/Rig-v0", rig=rig, plant=plant, horizon=SAMPLES, max_input=largest)
     player = make_policy(policy, env, seed=seed)
     observation, _ = env.reset(seed=seed)
-    prior, state, begins, done = env.unwrapped.belief, None, np.ones(1, dtype=bool), False
+    state, begins, done = None, np.ones(1, dtype=bool), False
     while not done:
         action, state = player.predict(observation, state=state, episode_start=begins, deterministic=True)
         begins = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, info = env.step(action)
         done = terminated or truncated
-    belief, truth = info["belief"], np.array(bench.truth)
-    mean, std = np.array([belief.parameters()[p][:2] for p in PARAMETERS]).T
-    from scipy.stats import norm
-
-    half = norm.ppf(0.5 + LEVEL / 2) * std
-    return Run(
-        prior.entropy() - belief.entropy(), (np.abs(mean - truth) <= half).tolist(), (mean / truth - 1).tolist(),
-        bool(terminated),
-    )  # fmt: skip
+    return info["belief"], bool(terminated)
 
 
-def run(names: Sequence[str], seeds: int, workers: int) -> dict[tuple[str, str], list[Run]]:
-    """Runs by rig and policy."""
-    tasks = [(name, policy, seed) for name in names for policy in POLICIES for seed in range(seeds)]
-    runs = in_processes(trial, tasks, workers, "Playing")
-    return {(name, policy): [runs[name, policy, s] for s in range(seeds)] for name in names for policy in POLICIES}
+def _blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float) -> tuple[Belief, bool]:
+    """In blocks, as ``duffing-env run`` scales them: each has its share of what a run is allowed."""
+    from agents.running.clock import JumpingClock
+    from agents.running.run import Plan, run
+
+    plan = Plan(policy, SAMPLES, BLOCK, bound=ASKED * BLOCK / SAMPLES, seed=seed)
+    with tempfile.TemporaryDirectory() as folder:
+        ran = run(rig, plant, folder, plan, clock=JumpingClock())
+    if ran.ended not in ("complete", "range"):
+        raise RuntimeError(f"a run in blocks ended: {ran.message}")
+    return ran.belief, ran.ended == "range"
 
 
-def show(runs: dict[tuple[str, str], list[Run]]) -> dict[str, Any]:
-    """Print the table and the verdict; return it for the JSON file."""
+def run(names: Sequence[str], ways: Sequence[str], seeds: int, workers: int) -> dict[tuple[str, str, str], list[Run]]:
+    """Runs by rig, policy and way."""
+    cells = list(product(names, POLICIES, ways))
+    runs = in_processes(trial, [(*cell, seed) for cell in cells for seed in range(seeds)], workers, "Playing")
+    return {cell: [runs[*cell, seed] for seed in range(seeds)] for cell in cells}
+
+
+def show(runs: dict[tuple[str, str, str], list[Run]]) -> dict[str, Any]:
+    """Print the table and the verdicts by way; return these for the JSON file."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(width=150)
-    table = Table("rig", "policy", "gained, nats", "median error of m, c, a, b, %", "coverage of 90 %",
+    console = Console(width=160)
+    table = Table("rig", "played by", "policy", "gained, nats", "median error of m, c, a, b, %", "coverage of 90 %",
                   "left its range", box=box.MARKDOWN)  # fmt: skip
-    hits, trials, kept, ahead = [], [], [], []
-    for (name, policy), found in runs.items():
-        number = len(found)
-        inside = np.sum([one.inside for one in found], axis=0).tolist()
-        gains = np.array([one.gain for one in found])
-        left = sum(one.left for one in found)
-        hits += inside
-        trials += [number] * len(inside)
+    for (name, policy, way), found in runs.items():
+        gains, number = np.array([one.gain for one in found]), len(found)
         table.add_row(
-            name, policy, f"{gains.mean():.2f} ± {1.96 * gains.std(ddof=1) / np.sqrt(number):.2f}",
+            name, way, policy, f"{gains.mean():.2f} ± {1.96 * gains.std(ddof=1) / np.sqrt(number):.2f}",
             percents(np.median(np.abs([one.error for one in found]), axis=0)),
-            ", ".join(f"{count / number:.2f}" for count in inside), f"{left} of {number}",
+            ", ".join(f"{share:.2f}" for share in np.mean([one.inside for one in found], axis=0)),
+            f"{sum(one.left for one in found)} of {number}",
         )  # fmt: skip
+    console.print(table)
+    verdicts = {way: verdict(runs, way) for way in dict.fromkeys(way for *_, way in runs)}
+    console.print(verdicts)
+    return verdicts
+
+
+def verdict(runs: dict[tuple[str, str, str], list[Run]], way: str) -> dict[str, Any]:
+    """What the runs of a way say of the intervals, of what the planner learns, and of how often it leaves the range."""
+    hits, trials, kept, ahead = [], [], [], []
+    for (name, policy, played), found in runs.items():
+        if played != way:
+            continue
+        hits += np.sum([one.inside for one in found], axis=0).tolist()
+        trials += [len(found)] * len(PARAMETERS)
         if policy == "efe":
             # One-sided: the upper end of the central 90 % interval.
-            kept.append(binomial_interval(left, number, 0.9)[1] < ASKED)
-            ahead.append(gains.mean() > np.mean([one.gain for one in runs[name, "prbs"]]))
-    console.print(table)
+            kept.append(binomial_interval(sum(one.left for one in found), len(found), 0.9)[1] < ASKED)
+            gains = [np.mean([one.gain for one in runs[name, each, way]]) for each in POLICIES]
+            ahead.append(bool(gains[1] > gains[0]))
     pooled, meets = calibrated(hits, trials)
-    verdict = {
+    return {
         "calibrated": POOLED[0] <= pooled <= POOLED[1] and all(meets),
         "pooled coverage": pooled,
         "cells outside": len(meets) - sum(meets),
@@ -146,5 +202,3 @@ def show(runs: dict[tuple[str, str], list[Run]]) -> dict[str, Any]:
         "efe within its limits on": sum(kept),
         "rigs": len(ahead),
     }
-    console.print(verdict)
-    return verdict

@@ -11,9 +11,10 @@ import pytest
 from loopback import RIG, RIG_FILE, TRUTH
 
 import duffing_env  # noqa: F401
+from agents import make_policy
 from agents.commands import main
+from agents.policies.signals import holds
 from agents.running.clock import JumpingClock, RealClock
-from agents.running.designs import holds, policy_of
 from agents.running.follower import Follower
 from agents.running.observed import Observed
 from agents.running.plant import load_plant
@@ -225,7 +226,7 @@ def test_signals_are_as_slow_as_the_rig():
     follower = Follower(RIG)
     hold = holds(follower.belief, 256)
     assert hold in (2, 3), "1.9 Hz at 50 Hz are 27 samples a period; the Silverbox has 9"
-    policy = policy_of("prbs", Observed(RIG, follower.belief, 256), seed=0)
+    policy = make_policy("prbs", Observed(RIG, follower.belief, 256), seed=0)
     actions, state = [], None
     for _ in range(hold * 6):
         action, state = policy.predict(np.zeros(1), state)
@@ -254,7 +255,7 @@ def listened(rig, truth, seed):
 
 def test_the_probability_of_leaving_grows_with_the_input():
     follower, _ = listened(RIG, TRUTH, 0)
-    futures = Futures(follower.estimator, 0, 1.0, np.random.default_rng(0))
+    futures = Futures(follower, 1.0, np.random.default_rng(0))
     u = np.repeat([1.0, -1.0], 16)
     found = [futures.probability(share * u) for share in (0.0, 1.0, 5.0, 30.0)]
     assert found[0] < 0.01
@@ -289,8 +290,8 @@ def test_blocks_leave_the_range_as_rarely_as_asked(policy):
         truth["m"] = float(np.exp(np.log(low * high) / 2 + np.log(high / low) / 2 / HALF_WIDTH * rng.standard_normal()))
         follower, plant = listened(rig, truth, k)
         observed = Observed(rig, follower.belief, 64)
-        u = design_of(policy_of(policy, observed, k), observed).block(64)
-        share, probability = Futures(follower.estimator, 0, 1.0, rng).share(u, 0.05)
+        u = design_of(make_policy(policy, observed, seed=k), observed).block(64)
+        share, probability = Futures(follower, 1.0, rng).share(u, 0.05)
         _, y = plant.play(share * 40.0 * u)
         left += bool((np.abs(y) > 0.08).any())
         promised.append(probability)
