@@ -228,7 +228,7 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     """
     limits, samples = limits_of(env)
     draw = EXCITATIONS[name](limits.max_input)
-    experiment = getattr(env, "experiment", None)
+    experiment: Any = getattr(env, "experiment", None)
     if getattr(experiment, "rig", None) is not None:
         hold = holds(experiment.believed, samples)
         draw = _held(EXCITATIONS[name](DEFAULT_MAX_INPUT), hold, limits.max_input / DEFAULT_MAX_INPUT)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.planner.motion import frequency
+from agents.planner.motion import frequency, survey
 from agents.running.safety import drawn_from
 from estimator.arrays import copy as copy_numbers
 from estimator.belief import Belief, covariance_places
@@ -124,7 +124,8 @@ class Follower:
             systems, u / self.estimator.scales.input, rng.integers(longest, size=len(systems))
         )
         states = systems[:, :n]
-        kept = states[(np.abs(states[:, 0]) < _FAR) & np.isfinite(states).all(axis=1)]
+        shown = survey(self.estimator.model, systems[:, n:], states).shown
+        kept = states[(np.abs(shown) < _FAR) & np.isfinite(states).all(axis=1)]
         if len(kept) < len(states) / 2:
             raise ValueError(
                 "rig must be known well enough to stay in its range between blocks, but most of what is believed runs "

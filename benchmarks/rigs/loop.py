@@ -62,7 +62,7 @@ class BenchPlant:
 
     def play(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """After a pause: inputs (N,) as they are, and the outputs as each began."""
-        for _ in range(self._rng.integers(_PAUSE)):
+        for _ in range(1 + self._rng.integers(_PAUSE)):
             self.step(0.0)
         shown = self._shown()
         outputs = [shown, *(self.step(value) for value in u)]
