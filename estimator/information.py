@@ -21,7 +21,7 @@ import numpy.typing as npt
 from estimator.engine.feeding import input_degree
 from estimator.engine.rows import path_results
 from estimator.engine.tasks import path
-from estimator.lanes import LANES, kernel
+from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.physical import physical_slopes, to_physical
@@ -249,11 +249,14 @@ def follow(
 #: Variance of what a missing output would have shown, in parts of a sensor's.
 _MISSING = 1e18
 
+#: Series that run side by side: one vector of the widest kind, because a fit has few.
+_LANES = 8
+
 
 @cache
 def follower(model: Model, degree: int, observed: bool) -> Any:
     """The compiled loop of `follow`, with totals (n, 2 + K + K (K + 1)/2) packed."""
-    task = path(model, degree, observed=observed)
+    task = path(model, degree, observed=observed, lanes=_LANES)
     sample, at, size = task.sample, task.layout, len(task.layout)
     n, k, p = model.n_states, model.n_coefficients, model.n_outputs
     first_total, first_coefficient, live = at["LOSS"], at[next(iter(model.coefficients))], at["LIVE"]
@@ -263,41 +266,41 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}_{int(observed)}")
     def run(points, inputs, y, lengths, start, noises, totals):
-        W = np.empty(size * LANES)
-        for first in range(0, len(inputs), LANES):
-            lanes = min(LANES, len(inputs) - first)
+        W = np.empty(size * _LANES)
+        for first in range(0, len(inputs), _LANES):
+            lanes = min(_LANES, len(inputs) - first)
             W[:] = 0.0
             longest = 0
-            for j in range(LANES):
+            for j in range(_LANES):
                 i = first + min(j, lanes - 1)  # a spare lane repeats the last one
                 longest = max(longest, lengths[i])
-                W[live * LANES + j] = 1.0
+                W[live * _LANES + j] = 1.0
                 for c in range(k):
-                    W[(first_coefficient + c) * LANES + j] = points[i, c]
+                    W[(first_coefficient + c) * _LANES + j] = points[i, c]
                 for c in range(spreads):
-                    W[(n + c) * LANES + j] = start[c]
+                    W[(n + c) * _LANES + j] = start[c]
                 for c in range(1 + p):
-                    W[(first_noise + c) * LANES + j] = noises[i, c]
+                    W[(first_noise + c) * _LANES + j] = noises[i, c]
             for t in range(longest):
-                for j in range(LANES):
+                for j in range(_LANES):
                     i = first + min(j, lanes - 1)
                     runs = t < lengths[i]
                     for c in range(inputs.shape[2]):
-                        W[(first_input + c) * LANES + j] = inputs[i, t, c] if runs else 0.0
+                        W[(first_input + c) * _LANES + j] = inputs[i, t, c] if runs else 0.0
                     if observed:
                         whole = True
                         for c in range(p):
                             seen = runs and not np.isnan(y[i, t, c])
                             whole = whole and seen
-                            W[(shown + c) * LANES + j] = y[i, t, c] if seen else 0.0
-                            W[(first_noise + 1 + c) * LANES + j] = noises[i, 1 + c] * (1.0 if seen else _MISSING)
-                        W[live * LANES + j] = 1.0 if whole else 0.0
+                            W[(shown + c) * _LANES + j] = y[i, t, c] if seen else 0.0
+                            W[(first_noise + 1 + c) * _LANES + j] = noises[i, 1 + c] * (1.0 if seen else _MISSING)
+                        W[live * _LANES + j] = 1.0 if whole else 0.0
                 sample(W)
                 for j in range(lanes):
                     if t + 1 == lengths[first + j]:
                         for c in range(n_totals):
-                            totals[first + j, c] = W[(first_total + c) * LANES + j]
+                            totals[first + j, c] = W[(first_total + c) * _LANES + j]
                         for c in range(first_total):  # it is over, and goes on at rest
-                            W[c * LANES + j] = 0.0
+                            W[c * _LANES + j] = 0.0
 
     return run

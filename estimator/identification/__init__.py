@@ -97,13 +97,11 @@ def _scales(rig: Rig, records: list[Record]) -> Scales:
 def _belief(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[float, float]]]:
     """The posterior of the rig's own model, and the noises' standard deviations in its units."""
     rig, scales = problem.rig, problem.scales
-    names = list(problem.model.coefficients)
-    kept = [names.index(name) for name in rig.model.coefficients]
-    belief = about(rig, scales, found.mean[kept], found.cov[np.ix_(kept, kept)])
+    belief = about(rig, scales, found.mean, found.cov)
     shapes = np.full(len(found.weights), problem.samples / 2)
     gamma, xi = (matched_gamma(found.weights, shapes, shapes * noise**2) for noise in found.noises)
     belief = Belief.of(problem.believed, belief.mean, _with_start(belief, problem), gamma, xi, scales=scales)
-    gain = dict(zip(names, found.mean, strict=True))["gain"]
+    gain = dict(zip(problem.model.coefficients, found.mean, strict=True))["gain"]
     # What moves the velocity as much when it is held over a sample (`estimator.rig_prior`).
     worth = scales.input * np.sqrt(3) / abs(gain), scales.output
     noises = {

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from estimator.identification.fit import Hypothesis
+from estimator.identification.fit import Fitter, Hypothesis
 from estimator.identification.problem import EXTRA, Problem
 from estimator.identification.records import Record, residuals
 from estimator.identification.result import Warning
-from estimator.identification.search import Found, at
+from estimator.identification.search import Found
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
 from estimator.rig import INTERPOLATIONS
@@ -21,6 +22,9 @@ _EVIDENCE = 7.0
 
 #: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
 _RATIOS = (1.0, 0.1, 0.01)
+
+#: Samples by which the input may be earlier or later than is thought.
+_DELAYS = range(-3, 4)
 
 #: Steps of a fit of another hypothesis, at most.
 _STEPS = 12
@@ -92,22 +96,23 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Warning]:
 
 def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
     """The input's way and delay, and further terms, by their evidence."""
-    rig = problem.rig
+    rig, own = problem.rig, found.fits.free_energy.min()
     ways = [name for name in ("zero_order", "linear") if INTERPOLATIONS[rig.interpolation] < 2] or [rig.interpolation]
-    others: list[Hypothesis] = []
-    for way in ways:
-        for delay in (rig.delay - 1, rig.delay, rig.delay + 1):
-            if (way, delay) != (rig.interpolation, rig.delay) and delay >= (-1 if way == "zero_order" else 0):
-                others.append(at(found, interpolation=way, delay=delay))
-    terms = [at(found, extra=(name,)) for name in EXTRA]
-    tried = [at(h, ratio=found.best.ratio * part) for h in (found.best, *others, *terms) for part in _RATIOS]
-    fits = found.fitter.fit(tried, found.mean, found.level, _STEPS)
-    energies = fits.free_energy.reshape(-1, len(_RATIOS)).min(axis=1)
-    own = min(energies[0], found.fits.free_energy.min())
-    gains = own - energies[1:]
+    others = [
+        replace(found.best, interpolation=way, delay=rig.delay + later)
+        for way in ways
+        for later in _DELAYS
+        if (way, later) != (rig.interpolation, 0) and rig.delay + later >= (-1 if way == "zero_order" else 0)
+    ]
+    gains = own - _energies(found.fitter, others, found, own)
+    of_terms = []
+    for name in EXTRA:
+        prior = found.fitter.prior.widened(problem.natural()[name])
+        fitter = Fitter(replace(problem, terms=(name,)), prior)
+        of_terms.append(float(own - _energies(fitter, [found.best], found, own)[0]))
     warnings = []
-    best = int(np.argmax(gains[: len(others)])) if others else -1
-    if best >= 0 and gains[best] > _EVIDENCE:
+    best = int(np.argmax(gains))
+    if gains[best] > _EVIDENCE:
         better = others[best]
         name = "interpolation" if better.interpolation != rig.interpolation else "delay"
         warnings.append(
@@ -119,11 +124,19 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
             )
         )
         return warnings
-    for term, gain in zip(EXTRA, gains[len(others) :], strict=True):
-        if gain > _EVIDENCE and gain >= gains[len(others) :].max():
+    for term, gain in zip(EXTRA, of_terms, strict=True):
+        if gain > _EVIDENCE and gain == max(of_terms):
             message = f"the records speak for {_TERMS[term]}, by {gain:.0f} nats; m, c, a and b alone do not hold"
             warnings.append(Warning(term, message))
     return warnings
+
+
+def _energies(fitter: Fitter, hypotheses: Sequence[Hypothesis], found: Found, own: float) -> FloatArray:
+    """(H,) free energies of other hypotheses, each in the best of some ratios of the noises."""
+    tried = [replace(h, ratio=h.ratio * part) for h in hypotheses for part in _RATIOS]
+    start = np.append(found.mean, np.zeros(len(fitter.prior.mean) - len(found.mean)))
+    fits = fitter.fit(tried, start, found.level, _STEPS, bar=own)
+    return np.asarray(fits.free_energy.reshape(-1, len(_RATIOS)).min(axis=1))
 
 
 def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
@@ -166,12 +179,10 @@ def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[f
 
 def _told(problem: Problem, found: Found) -> dict[str, float]:
     """Relative standard deviations that the records alone would leave of m, c, a and b."""
-    model = problem.rig.model
-    kept = [list(problem.model.coefficients).index(name) for name in model.coefficients]
-    mean, cov = found.mean[kept], found.cov[np.ix_(kept, kept)]
+    model, mean, cov = problem.rig.model, found.mean, found.cov
     scale = np.sqrt(np.diag(cov))
     unit = np.outer(scale, scale)
-    known = np.linalg.inv(cov / unit) - found.fitter.prior.precision[np.ix_(kept, kept)] * unit
+    known = np.linalg.inv(cov / unit) - found.fitter.prior.precision * unit
     values, ways = np.linalg.eigh(known)
     alone = (ways / np.maximum(values, 1e-9)) @ ways.T * unit
     parameters, spread = propagate(model, mean, alone)

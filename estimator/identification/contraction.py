@@ -22,8 +22,6 @@ def contraction(problem: Problem, found: Found) -> History:
     Each is a fit of its own from what all samples say, with the noises in the best ratio. One that runs away is left
     out.
     """
-    rig, names = problem.rig, list(problem.model.coefficients)
-    kept = [names.index(name) for name in rig.model.coefficients]
     longest, history = max(len(u) for u in problem.u), []
     for halvings in range(_HALVINGS, 0, -1):
         count = longest >> halvings
@@ -32,7 +30,7 @@ def contraction(problem: Problem, found: Found) -> History:
         short = problem.shortened(count)
         fits = found.fitter.on(short).fit([found.best], found.mean, found.level, _STEPS)
         if fits.free_energy[0] < float("inf"):
-            belief = about(rig, problem.scales, fits.mean[0][kept], fits.cov[0][kept][:, kept])
+            belief = about(problem.rig, problem.scales, fits.mean[0], fits.cov[0])
             told = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
             history.append((short.samples, told))
     return tuple(history)

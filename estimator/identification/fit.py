@@ -12,24 +12,27 @@ so at the best level Σ ν²/S is the number of outputs N, and ½ Σ(...) = ½ (
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.identification.problem import EXTRA, Problem
+from estimator.identification.problem import Problem
 from estimator.information import follow
 from estimator.parameters import FloatArray
 
-Flags: TypeAlias = npt.NDArray[np.bool_]
+#: Damping at the start of a fit, its change after a step that fails or succeeds, its least, and where a fit is given
+#: up.
+_DAMPING, _UP, _DOWN, _LEAST, _STUCK = 1e-3, 10.0, 0.1, 1e-9, 1e2
 
-#: Damping at the start of a fit, its change after a step that fails or succeeds, and where a fit is given up: the slope
-#: leaves out what S and the gain tell, so at the minimum no step of any length succeeds.
-_DAMPING, _UP, _DOWN, _STUCK = 1e-3, 10.0, 0.1, 1e2
+#: A step that promises to lower the loss by less is the last of a fit [nats]: it is a seventh of a standard deviation,
+#: of which it leaves a small part.
+_SMALL = 1e-2
 
-#: A step that promises to lower the loss by less ends a fit [nats]; it is a fraction of a standard deviation.
-_SMALL = 1e-3
+#: So many times what the last step gained is what a fit may still gain.
+_MANY = 10.0
 
 
 @dataclass(frozen=True)
@@ -39,13 +42,11 @@ class Hypothesis:
     Attributes:
         interpolation: of the input.
         delay: of the input, in samples.
-        extra: terms beside those of Eq. (1) with offsets.
         ratio: σ_w/σ_v inside.
     """
 
     interpolation: str
     delay: int
-    extra: tuple[str, ...] = ()
     ratio: float = 1.0
 
 
@@ -56,6 +57,12 @@ class Prior:
     mean: FloatArray
     precision: FloatArray
 
+    def widened(self, std: float) -> Prior:
+        """With one more coefficient, of which it is only known that it is about 0."""
+        more = np.zeros((len(self.mean) + 1,) * 2)
+        more[:-1, :-1], more[-1, -1] = self.precision, std**-2
+        return Prior(np.append(self.mean, 0.0), more)
+
 
 @dataclass(frozen=True, eq=False)
 class Fits:
@@ -64,7 +71,7 @@ class Fits:
     Attributes:
         hypotheses: in order.
         mean: (H, K) most probable coefficients.
-        cov: (H, K, K) their covariance; 0 for terms that a hypothesis does not have.
+        cov: (H, K, K) their covariance.
         level: (H,) σ_v.
         free_energy: (H,) in nats, up to a constant that all share; inf where the numbers ran away.
     """
@@ -75,14 +82,13 @@ class Fits:
     level: FloatArray
     free_energy: FloatArray
 
-    @property
-    def best(self) -> int:
-        """The hypothesis of the lowest free energy."""
-        return int(np.argmin(self.free_energy))
+    def best(self, count: int) -> Fits:
+        """Those of the lowest free energies, the lowest first."""
+        return self.where(np.argsort(self.free_energy, kind="stable")[:count])
 
-    def where(self, chosen: Flags) -> Fits:
-        """Those of some hypotheses."""
-        kept = tuple(h for h, keep in zip(self.hypotheses, chosen, strict=True) if keep)
+    def where(self, chosen: npt.NDArray[Any]) -> Fits:
+        """Those of some hypotheses, told by their numbers or by flags."""
+        kept = tuple(self.hypotheses[i] for i in np.arange(len(self.hypotheses))[chosen])
         return Fits(kept, self.mean[chosen], self.cov[chosen], self.level[chosen], self.free_energy[chosen])
 
 
@@ -96,7 +102,7 @@ class Fitter:
 
     def __init__(self, problem: Problem, prior: Prior) -> None:
         self.problem, self.prior = problem, prior
-        self._outputs, self._samples = problem.outputs, problem.samples
+        self._scale = 1 / np.sqrt(np.diag(prior.precision))
         self._inputs: dict[tuple[str, int], FloatArray] = {}
 
     def on(self, problem: Problem) -> Fitter:
@@ -104,7 +110,12 @@ class Fitter:
         return Fitter(problem, self.prior)
 
     def fit(
-        self, hypotheses: list[Hypothesis], start: FloatArray, level: FloatArray | float, iterations: int = 30
+        self,
+        hypotheses: Sequence[Hypothesis],
+        start: FloatArray,
+        level: FloatArray | float,
+        iterations: int = 30,
+        bar: float = np.inf,
     ) -> Fits:
         """Fit each hypothesis by damped Gauss-Newton steps (Levenberg and Marquardt).
 
@@ -113,40 +124,38 @@ class Fitter:
             start: (K,) or (H, K) coefficients to begin with.
             level: (H,) or one: σ_v to begin with.
             iterations: at most.
+            bar: a free energy; a hypothesis that cannot come below it is given up.
         """
-        names = list(self.problem.model.coefficients)
-        count = len(hypotheses)
-        free = np.array([[_has(h, name) for name in names] for h in hypotheses])
-        points = np.where(free, np.broadcast_to(start, (count, len(names))), 0.0)
-        inputs = np.concatenate([self._driven(h) for h in hypotheses])
+        count, k = len(hypotheses), len(self._scale)
+        points = np.broadcast_to(start, (count, k)).copy()
+        levels = np.broadcast_to(np.asarray(level, dtype=np.float64), count)
+        inputs = np.array([self._driven(h) for h in hypotheses])
         ratios = np.array([h.ratio for h in hypotheses])
-        levels = np.broadcast_to(np.asarray(level, dtype=np.float64), count).copy()
-        scale = 1 / np.sqrt(np.diag(self.prior.precision))
-        loss, slope, curvature, levels = self._appraise(points, inputs, ratios, levels, free)
+        loss, slope, curvature, levels = self._appraise(points, inputs, ratios, levels)
         damping = np.full(count, _DAMPING)
-        done = ~np.isfinite(loss)
+        at = np.flatnonzero(np.isfinite(loss))
         for _ in range(iterations):
-            if done.all():
+            if not len(at):
                 break
-            diagonal = np.einsum("hii->hi", curvature)
-            damped = curvature + (damping[:, None] * diagonal)[:, :, None] * np.eye(len(names))
-            step = -_solved(damped, slope)
-            step[done] = 0.0
-            promised = -0.5 * np.einsum("hk,hk->h", slope, step)
-            trial = points + scale * step
-            new_loss, new_slope, new_curvature, new_levels = self._appraise(trial, inputs, ratios, levels, free)
-            better = (new_loss <= loss) & ~done  # False for what is not finite
-            points = np.where(better[:, None], trial, points)
-            loss, levels = np.where(better, new_loss, loss), np.where(better, new_levels, levels)
-            slope = np.where(better[:, None], new_slope, slope)
-            curvature = np.where(better[:, None, None], new_curvature, curvature)
-            damping = np.where(better, np.maximum(_DOWN * damping, 1e-9), _UP * damping)
-            done |= (promised < _SMALL) | (damping > _STUCK)
-        inverse = _inverted(curvature)
-        cov = np.where(free[:, :, None] & free[:, None, :], inverse, 0.0) * np.outer(scale, scale)
-        log_det = np.linalg.slogdet(curvature)[1] - np.array([self._prior_log_det(row, scale) for row in free])
-        energy = np.where(np.isfinite(loss + log_det), loss + 0.5 * log_det, np.inf)
-        return Fits(tuple(hypotheses), points, cov, levels, energy)
+            damped = curvature[at] + (damping[at, None] * np.einsum("hii->hi", curvature[at]))[:, :, None] * np.eye(k)
+            step = -_solved(damped, slope[at])
+            promised = -0.5 * np.einsum("hk,hk->h", slope[at], step)
+            trial = points[at] + self._scale * step
+            found = self._appraise(trial, inputs[at], ratios[at], levels[at])
+            better = found[0] <= loss[at]  # False for what is not finite
+            gained = np.where(better, loss[at] - found[0], promised)
+            kept = at[better]
+            points[kept] = trial[better]
+            loss[kept], slope[kept], curvature[kept], levels[kept] = (values[better] for values in found)
+            damping[at] = np.where(better, np.maximum(_DOWN * damping[at], _LEAST), _UP * damping[at])
+            over = (
+                (promised < _SMALL)
+                | (damping[at] > _STUCK)
+                | (self._energy(loss[at], curvature[at]) - _MANY * gained > bar)
+            )
+            at = at[~over]
+        cov = _inverted(curvature) * np.outer(self._scale, self._scale)
+        return Fits(tuple(hypotheses), points, cov, levels, self._energy(loss, curvature))
 
     def _driven(self, hypothesis: Hypothesis) -> FloatArray:
         key = hypothesis.interpolation, hypothesis.delay
@@ -155,50 +164,43 @@ class Fitter:
         return self._inputs[key]
 
     def _appraise(
-        self,
-        points: FloatArray,
-        inputs: FloatArray,
-        ratios: FloatArray,
-        levels: FloatArray,
-        free: npt.NDArray[np.bool_],
+        self, points: FloatArray, inputs: FloatArray, ratios: FloatArray, levels: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Loss (H,), its slope (H, K) and curvature (H, K, K) in units of the prior, and the best levels (H,)."""
-        records, count = len(self.problem.u), len(points)
+        problem, count, n = self.problem, len(points), self.problem.samples
+        records = len(problem.u)
         noises = np.stack([(ratios * levels) ** 2, levels**2], axis=1)
         found = follow(
-            self.problem.model,
+            problem.model,
             np.repeat(points, records, axis=0),
-            inputs,
-            np.tile(self._outputs, (count, 1, 1)),
+            inputs.reshape(-1, *inputs.shape[2:]),
+            np.tile(problem.outputs, (count, 1, 1)),
             np.repeat(noises, records, axis=0),
-            self.problem.start,
+            problem.start,
         )
         total = lambda values: values.reshape(count, records, *values.shape[1:]).sum(axis=1)  # noqa: E731
         loss, slope, information, misfit = (total(values) for values in found)
-        n = self._samples
         with np.errstate(all="ignore"):
             excess = misfit / n
             data = 0.5 * (2 * loss - misfit + n * np.log(excess) + n)
-            scale = 1 / np.sqrt(np.diag(self.prior.precision))
-            away = np.where(free, points - self.prior.mean, 0.0)
+            away = points - self.prior.mean
             pull = away @ self.prior.precision
             whole = data + 0.5 * (away * pull).sum(axis=1)
-            slope = np.where(free, scale * (slope / excess[:, None] + pull), 0.0)
-            curvature = (information / excess[:, None, None] + self.prior.precision) * np.outer(scale, scale)
-        both = free[:, :, None] & free[:, None, :]
-        curvature = np.where(both, curvature, np.eye(len(scale)))
+            slope = self._scale * (slope / excess[:, None] + pull)
+            curvature = self._in_units(information / excess[:, None, None] + self.prior.precision)
         bad = ~(np.isfinite(whole) & np.isfinite(slope).all(axis=1) & np.isfinite(curvature).all(axis=(1, 2)))
         whole = np.where(bad, np.inf, whole)
-        slope[bad], curvature[bad] = 0.0, np.eye(len(scale))
+        slope[bad], curvature[bad] = 0.0, np.eye(len(self._scale))
         return whole, slope, curvature, np.where(bad, levels, levels * np.sqrt(np.where(bad, 1.0, excess)))
 
-    def _prior_log_det(self, free: Flags, scale: FloatArray) -> float:
-        unit = (self.prior.precision * np.outer(scale, scale))[np.ix_(free, free)]
-        return float(np.linalg.slogdet(unit)[1])
+    def _energy(self, loss: FloatArray, curvature: FloatArray) -> FloatArray:
+        """(H,) free energies; inf where they are not finite."""
+        log_det = np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(self._in_units(self.prior.precision))[1]
+        return np.where(np.isfinite(loss + log_det), loss + 0.5 * log_det, np.inf)
 
-
-def _has(hypothesis: Hypothesis, name: str) -> bool:
-    return name not in EXTRA or name in hypothesis.extra
+    def _in_units(self, precision: FloatArray) -> FloatArray:
+        """A precision of the coefficients, of these in standard deviations of the prior."""
+        return precision * np.outer(self._scale, self._scale)
 
 
 def _unit(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ from estimator.parameters import FloatArray
 from estimator.rig import INTERPOLATIONS, Rig
 from estimator.units import Scales
 
-#: Terms that a model may have beside those of Eq. (1) and the offsets: they are known to be 0 until a check frees them.
+#: Terms that an equation may have beside those of Eq. (1) and the offsets: checks look for them.
 EXTRA = ("cubic_damping", "quintic")
 
 
@@ -27,27 +27,29 @@ class Problem:
         scales: that the records are in.
         u: inputs of each record, in parts of their scale.
         y: outputs of each record, in parts of theirs, NaN where one is missing.
-        substeps: steps of integration a sample; 0 for as many as the model has by itself.
+        substeps: steps of integration a sample.
+        terms: of the equation, beside those of Eq. (1) and the offsets; some of `EXTRA`.
     """
 
     rig: Rig
     scales: Scales
     u: tuple[FloatArray, ...]
     y: tuple[FloatArray, ...]
-    substeps: int = 0
+    substeps: int = 2
+    terms: tuple[str, ...] = ()
 
     @cached_property
     def model(self) -> Model:
-        """Eq. (1) with all terms that are looked at."""
-        return self._integrated(duffing(offsets=True, cubic_damping=True, quintic=True, sensor=self.rig.output.kind))
+        """The rig's own, with the terms."""
+        more = dict.fromkeys(self.terms, True)
+        model = duffing(offsets=True, sensor=self.rig.output.kind, **more)
+        return replace(model, substeps=self.substeps)
 
-    @cached_property
+    @property
     def believed(self) -> Model:
-        """The rig's own, of which the belief is, integrated as `model` is."""
-        return self._integrated(self.rig.model)
-
-    def _integrated(self, model: Model) -> Model:
-        return replace(model, substeps=self.substeps) if self.substeps else model
+        """The rig's own, of which the belief is; integrated as `model` is, where that is finer."""
+        own = self.rig.model
+        return replace(own, substeps=self.substeps) if self.substeps > own.substeps else own
 
     @property
     def samples(self) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.identification.fit import Fits, Fitter, Hypothesis, Prior, with_ratios
-from estimator.identification.problem import EXTRA, Problem
+from estimator.identification.problem import Problem
 from estimator.identification.start import starts
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
@@ -21,15 +21,21 @@ _WIDE = 30.0
 #: output as much as it disturbs it. It is open to either side.
 _RATIOS = np.geomspace(1e-2, 1e2, 5)
 
-#: The first look takes this many samples of a record, and so many steps; the grid of ratios has so many points.
-_SHORT, _LOOK, _GRID = 4096, 10, 11
+#: The first look takes so many periods of a record, and at least and at most so many samples.
+_PERIODS, _SHORTEST, _LONGEST = 25, 1024, 4096
+
+#: Steps of it, after which so many of its hypotheses are kept.
+_LOOK = ((3, 8), (10, 1))
+
+#: Ratios of a grid, and how many standard deviations it is to reach either way in the end.
+_GRID, _REACH = 8, 3.0
 
 #: Ratios that are looked at lie within these bounds, in the same parts.
 _LOWEST, _HIGHEST = 1e-5, 1e4
 
-#: Steps of integration a sample where the model's own are too few, and the error that these may have, in standard
-#: deviations: their error is of order 4, so that these are enough for motions of a third of a period a sample.
-_FINE, _TOLERABLE = 32, 0.1
+#: Steps of integration a sample, of which the fewest are taken whose error is small, in standard deviations. It is of
+#: order 4, so that the most are enough for motions of a third of a period a sample.
+_SUBSTEPS, _TOLERABLE = (2, 4, 8, 16, 32), 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +66,12 @@ class Found:
     @property
     def best(self) -> Hypothesis:
         """The most probable hypothesis."""
-        return self.fits.hypotheses[self.fits.best]
+        return self.fits.best(1).hypotheses[0]
 
     @property
     def level(self) -> float:
         """σ_v of the most probable hypothesis."""
-        return float(self.fits.level[self.fits.best])
+        return float(self.fits.best(1).level[0])
 
     @property
     def noises(self) -> tuple[FloatArray, FloatArray]:
@@ -76,19 +82,14 @@ class Found:
 
 def prior_of(problem: Problem) -> Prior:
     """What the rig's guess says of the coefficients; next to nothing where there is none."""
-    names, natural = list(problem.model.coefficients), problem.natural()
-    mean = np.zeros(len(names))
-    cov = np.diag([(_WIDE * natural[name]) ** 2 for name in names])
-    for name in EXTRA:
-        place = names.index(name)
-        cov[place, place] = natural[name] ** 2
-    if problem.rig.guess is not None:
-        believed = rig_prior(problem.rig, problem.scales)
-        known = [names.index(name) for name in believed.names]
-        mean[known] = believed.coefficients_mean
-        cov[np.ix_(known, known)] = believed.coefficients_cov
+    if problem.rig.guess is None:
+        natural = problem.natural()
+        stds = np.array([_WIDE * natural[name] for name in problem.model.coefficients])
+        return Prior(np.zeros(len(stds)), np.diag(stds**-2))
+    believed = rig_prior(problem.rig, problem.scales)
+    cov = believed.coefficients_cov
     scale = np.sqrt(np.diag(cov))
-    return Prior(mean, np.linalg.inv(cov / np.outer(scale, scale)) / np.outer(scale, scale))
+    return Prior(believed.coefficients_mean, np.linalg.inv(cov / np.outer(scale, scale)) / np.outer(scale, scale))
 
 
 def search(problem: Problem, tell: Callable[[str], None]) -> Found:
@@ -102,11 +103,26 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
         ValueError: where no start leads anywhere.
     """
     fitter = Fitter(problem, prior_of(problem))
-    base = Hypothesis(problem.rig.interpolation, problem.rig.delay)
-    unit = problem.frequency**2 / problem.frequency ** _order(problem)
     tell("looking for a start")
-    short = fitter.on(problem.shortened(_SHORT)) if len(problem.outputs[0]) > _SHORT else fitter
-    candidates = starts(problem.shortened(_SHORT))
+    looked, share = _look(fitter)
+    start, level, hypothesis, reach = looked.mean[0], float(looked.level[0]), looked.hypotheses[0], 30.0
+    substeps = enough_substeps(problem, start, looked.cov[0] * share)
+    tell("fitting coefficients and noises")
+    while True:
+        found = settle(fitter.on(replace(problem, substeps=substeps)), hypothesis, start, level, reach)
+        start, level, hypothesis, reach = found.mean, found.level, found.best, 2.0
+        needed = enough_substeps(problem, found.mean, found.cov)
+        if needed <= substeps:
+            return found
+        substeps = needed
+
+
+def _look(fitter: Fitter) -> tuple[Fits, float]:
+    """The best of all starts and ratios of the noises, and the share of the outputs that it was fitted to."""
+    problem = fitter.problem
+    period = 2 * np.pi / problem.frequency
+    short = fitter.on(problem.shortened(int(np.clip(_PERIODS * period, _SHORTEST, _LONGEST))))
+    candidates = starts(problem.shortened(_LONGEST))
     if problem.rig.guess is not None:
         candidates.append(_middle(problem))
     if not candidates:
@@ -114,35 +130,36 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
             f"records must be longer than a few periods to find a start, but have {problem.samples} outputs; add "
             f"samples, or a guess to the rig"
         )
-    hypotheses = [h for _ in candidates for h in with_ratios(base, unit * _RATIOS)]
-    points = np.repeat(np.array(candidates), len(_RATIOS), axis=0)
-    looked = short.fit(hypotheses, points, 0.1 * problem.size, _LOOK)
-    if not np.isfinite(looked.free_energy).any():
+    ratios = _RATIOS * problem.frequency ** (2 - _order(problem))
+    base = Hypothesis(problem.rig.interpolation, problem.rig.delay)
+    hypotheses = [h for _ in candidates for h in with_ratios(base, ratios)]
+    points, level = np.repeat(np.array(candidates), len(_RATIOS), axis=0), np.full(len(hypotheses), 0.1 * problem.size)
+    for steps, kept in _LOOK:
+        fits = short.fit(hypotheses, points, level, steps).best(kept)
+        hypotheses, points, level = list(fits.hypotheses), fits.mean, fits.level
+    if not np.isfinite(fits.free_energy).any():
         raise ValueError(
             "records must be of an oscillator that Eq. (1) can follow, but every start ran away; check units, columns "
             "and the sampling step, or add a guess to the rig"
         )
-    tell("fitting coefficients and noises")
-    best = looked.best
-    found = settle(fitter, looked.hypotheses[best], looked.mean[best], float(looked.level[best]), 30.0)
-    if integration_error(found) <= _TOLERABLE:
-        return found
-    tell("fitting again, in finer steps of integration")
-    finer = fitter.on(replace(problem, substeps=_FINE))
-    return settle(finer, found.best, found.mean, found.level, 30.0)
+    return fits, short.problem.samples / problem.samples
 
 
-def integration_error(found: Found) -> float:
-    """What Runge and Kutta's method of order 4 adds to stiffness or damping, in standard deviations.
+def enough_substeps(problem: Problem, mean: FloatArray, cov: FloatArray) -> int:
+    """The fewest steps of integration whose error is tolerable, for coefficients (K,) with a covariance (K, K).
 
-    In steps of the phase z = ω/n it turns by z⁵/120 too little and loses z⁶/144 of the amplitude.
+    In steps of the phase z = ω/n Runge and Kutta's method of order 4 turns by z⁵/120 too little and loses z⁶/144 of the
+    amplitude: what this adds to stiffness and damping is compared with their standard deviations.
     """
-    problem = found.fitter.problem
-    names, n = list(problem.model.coefficients), problem.model.substeps
-    mean, std = (dict(zip(names, v, strict=True)) for v in (found.mean, np.sqrt(np.diag(found.cov))))
-    square = abs(mean["stiffness"]) + 3 * abs(mean["cubic"]) * problem.displacement**2
-    z2 = square / n**2
-    return float(max(square * z2**2 / 60 / std["stiffness"], 2 * n * z2**3 / 144 / std["damping"]))
+    names = list(problem.model.coefficients)
+    known, std = (dict(zip(names, v, strict=True)) for v in (mean, np.sqrt(np.diag(cov))))
+    square = abs(known["stiffness"]) + 3 * abs(known["cubic"]) * problem.displacement**2
+    for n in _SUBSTEPS:
+        z2 = square / n**2
+        error = max(square * z2**2 / 60 / std["stiffness"], 2 * n * z2**3 / 144 / std["damping"])
+        if error <= _TOLERABLE:
+            break
+    return n
 
 
 def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: float, reach: float) -> Found:
@@ -158,25 +175,35 @@ def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: flo
         reach: factor of the ratio, either way, that the first grid spans.
     """
     unit = fitter.problem.frequency ** (2 - _order(fitter.problem))
-    lowest, highest = _LOWEST * unit, _HIGHEST * unit
-    width, middle = np.log(reach), np.log(np.clip(hypothesis.ratio, lowest, highest))
+    lowest, highest = np.log(_LOWEST * unit), np.log(_HIGHEST * unit)
+    width, middle = np.log(reach), np.clip(np.log(hypothesis.ratio), lowest, highest)
+    starts, levels = start, np.full(_GRID, level)
     for _ in range(12):
-        logs = np.clip(middle + np.linspace(-width, width, _GRID), np.log(lowest), np.log(highest))
-        fits = fitter.fit(with_ratios(hypothesis, np.exp(logs)), start, level)
+        logs = np.clip(middle + np.linspace(-width, width, _GRID), lowest, highest)
+        fits = fitter.fit(with_ratios(hypothesis, np.exp(logs)), starts, levels)
         if not np.isfinite(fits.free_energy).any():
             raise ValueError("records must keep the fit finite, but it ran away; check units and the sampling step")
-        best = fits.best
-        start, level, middle = fits.mean[best], float(fits.level[best]), logs[best]
-        if best in (0, _GRID - 1) and np.log(lowest) < middle < np.log(highest):
+        best = int(np.argmin(fits.free_energy))
+        starts, levels, middle = fits.mean[best], np.full(_GRID, fits.level[best]), logs[best]
+        if best in (0, _GRID - 1) and lowest < middle < highest:
             continue
         weights = np.exp(fits.free_energy[best] - fits.free_energy)
         weights /= weights.sum()
         spread = np.sqrt(weights @ (logs - weights @ logs) ** 2)
-        if spread > 1.2 * (logs[-1] - logs[0]) / (_GRID - 1) or width < 0.02:
+        step = (logs[-1] - logs[0]) / (_GRID - 1)
+        if spread > step or width < 0.02:
             break
-        width /= 3.0
+        width = max(width / 8, min(_REACH * _std(logs, fits.free_energy, best), width / 3))
     alive = weights > 1e-6
     return Found(fits.where(alive), weights[alive] / weights[alive].sum(), fitter)
+
+
+def _std(places: FloatArray, energies: FloatArray, best: int) -> float:
+    """Standard deviation of what has the curvature of these free energies about the best."""
+    if not 0 < best < len(places) - 1:
+        return np.inf
+    curvature = 2 * np.polyfit(places[best - 1 : best + 2], energies[best - 1 : best + 2], 2)[0]
+    return float(1 / np.sqrt(curvature)) if curvature > 0 else np.inf
 
 
 def _middle(problem: Problem) -> FloatArray:
@@ -189,9 +216,3 @@ def _middle(problem: Problem) -> FloatArray:
 
 def _order(problem: Problem) -> int:
     return problem.scales.order
-
-
-def at(found: Found | Hypothesis, **changes: object) -> Hypothesis:
-    """The best hypothesis with other properties."""
-    best = found if isinstance(found, Hypothesis) else found.best
-    return replace(best, **changes)  # type: ignore[arg-type]
