@@ -14,7 +14,7 @@ from benchmarks.rigs.simulator import KINDS, FloatArray, paths, sensor, simulate
 
 GUESS_SPREAD = 0.3
 #: Recorded samples that are cut at either end of what a filter has gone over.
-_MARGIN = 16
+_MARGIN = 100
 _STREAMS = {"input": 0, "noise": 1, "guess": 2, "fault": 3}
 
 
@@ -99,16 +99,17 @@ def record(bench: Bench, seed: int, samples: int = SAMPLES, late: int = 0, inter
 
 
 def decimated(series: FloatArray, by: int) -> FloatArray:
-    """Every ``by``-th sample, behind an anti-alias filter without delay: for inputs and outputs alike.
+    """Every ``by``-th sample, behind a long anti-alias filter without delay: for inputs and outputs alike.
 
-    Its gain is 1 to a millionth where the oscillator moves: b goes with the inverse square of the gain, so that the
-    ripple of 0.1 % of SciPy's ``decimate`` would be 0.2 % of b.
+    The page of the beam says why.
     """
     if by == 1:
         return series
-    from scipy.signal import resample_poly
+    from scipy.signal import firwin, resample_poly
 
-    return np.asarray(resample_poly(series, 1, by, window=("kaiser", 12.0)))
+    return np.asarray(
+        resample_poly(series, 1, by, window=firwin(2 * _MARGIN * by + 1, 1 / by, window=("kaiser", 12.0)))
+    )
 
 
 def guess(bench: Bench, seed: int) -> dict[str, tuple[float, float]]:

@@ -32,11 +32,15 @@ _STEPS = 12
 #: Probability of a false alarm of a test of the residuals.
 _ALARM = 1e-4
 
-#: Largest disturbance of the force in parts of the input, and in parts of what the rig says of it.
-_DISTURBANCE, _BEYOND = 0.02, 3.0
+#: Largest disturbance of the force in parts of the input, in parts of its limit, which is there however weak an input
+#: is, and in parts of what the rig says of it.
+_DISTURBANCE, _REST, _BEYOND = 0.02, 0.005, 3.0
 
 #: Largest relative standard deviation of a parameter that is called identified.
 _VAGUE = 1 / 3
+
+#: Largest cubic force, in parts of the linear one, of a spring that is called linear.
+_LINEAR = 0.05
 
 #: Standard deviations from the guess that are far. A step is called wrong that is nearer to a factor of 2, either way,
 #: than to 1, where the guess of m and c together has less than 1 % of a chance.
@@ -142,7 +146,8 @@ def _energies(fitter: Fitter, hypotheses: Sequence[Hypothesis], found: Found, ow
 def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
     channel = problem.rig.input
     strength = problem.strength * problem.scales.input
-    allowed = _BEYOND * channel.noise if channel.noise else _DISTURBANCE * strength
+    usual = max(_DISTURBANCE * strength, _REST * (channel.limit or 0.0))
+    allowed = _BEYOND * channel.noise if channel.noise else usual
     if disturbance <= allowed:
         return []
     message = (
@@ -158,6 +163,8 @@ def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[f
     warnings = []
     if vague:
         message = f"{', '.join(vague)}: not identified by this input; what is said of it is hardly from the records"
+        if "b" in vague and (part := _cubic(problem, parameters)) < _LINEAR:
+            message += f"; the spring is linear to {100 * part:.2g} %, as far as the oscillator moved"
         warnings.append(Warning("not_identified", message))
     if problem.rig.guess is None:
         return warnings
@@ -175,6 +182,13 @@ def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[f
         message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
         warnings.append(Warning("guess", message))
     return warnings
+
+
+def _cubic(problem: Problem, parameters: Mapping[str, tuple[float, float]]) -> float:
+    """The largest part of the linear force that the cubic one may have been, within two standard deviations of b."""
+    largest = 3 * problem.displacement * problem.scales.displacement
+    (a, _), (b, std) = parameters["a"], parameters["b"]
+    return (abs(b) + 2 * std) * largest**2 / abs(a)
 
 
 def _told(problem: Problem, found: Found) -> dict[str, float]:

@@ -189,6 +189,7 @@ class Fitter:
             slope = self._scale * (slope / excess[:, None] + pull)
             curvature = self._in_units(information / excess[:, None, None] + self.prior.precision)
         bad = ~(np.isfinite(whole) & np.isfinite(slope).all(axis=1) & np.isfinite(curvature).all(axis=(1, 2)))
+        bad |= (np.einsum("hii->hi", curvature) <= 0).any(axis=1)
         whole = np.where(bad, np.inf, whole)
         slope[bad], curvature[bad] = 0.0, np.eye(len(self._scale))
         return whole, slope, curvature, np.where(bad, levels, levels * np.sqrt(np.where(bad, 1.0, excess)))

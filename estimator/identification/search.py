@@ -34,8 +34,9 @@ _GRID, _REACH = 8, 3.0
 _LOWEST, _HIGHEST = 1e-5, 1e4
 
 #: Steps of integration a sample, of which the fewest are taken whose error is small, in standard deviations. It is of
-#: order 4, so that the most are enough for motions of a third of a period a sample.
-_SUBSTEPS, _TOLERABLE = (2, 4, 8, 16, 32), 0.01
+#: order 4, so that the most are enough for motions of a third of a period a sample. Before a fit
+#: it is known only that a step should turn the motion by no more than an angle.
+_SUBSTEPS, _TOLERABLE, _ANGLE = (2, 4, 8, 16, 32), 0.01, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +103,8 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
     Raises:
         ValueError: where no start leads anywhere.
     """
-    fitter = Fitter(problem, prior_of(problem))
+    coarse = next(n for n in _SUBSTEPS if problem.frequency / n < _ANGLE)
+    fitter = Fitter(replace(problem, substeps=coarse), prior_of(problem))
     tell("looking for a start")
     looked, share = _look(fitter)
     start, level, hypothesis, reach = looked.mean[0], float(looked.level[0]), looked.hypotheses[0], 30.0

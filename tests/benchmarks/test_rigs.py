@@ -160,7 +160,7 @@ def test_the_beam_is_filtered_before_it_is_decimated() -> None:
     clean = record(replace(bench, sensor_noise=0.0), 0, 300)
     noise = (made.y - clean.y).std()
     assert noise == pytest.approx(bench.sensor_noise / np.sqrt(bench.decimate), rel=0.15)
-    inner = made.states[:: bench.decimate, 0][16 : 16 + 300]
+    inner = made.states[:: bench.decimate, 0][100 : 100 + 300]
     assert np.abs(clean.y - inner).max() < 2e-3 * np.abs(inner).max()
 
 
