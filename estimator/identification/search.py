@@ -27,8 +27,9 @@ _PERIODS, _SHORTEST, _LONGEST = 25, 1024, 4096
 #: Steps of it, after which so many of its hypotheses are kept.
 _LOOK = ((3, 8), (10, 1))
 
-#: Ratios of a grid, and how many standard deviations it is to reach either way in the end.
-_GRID, _REACH = 8, 3.0
+#: Ratios of a grid, how many standard deviations it is to reach either way in the end, and by how many nats its ends
+#: must be worse than its best.
+_GRID, _REACH, _EDGE = 8, 3.0, 2.0
 
 #: Ratios that are looked at lie within these bounds, in the same parts.
 _LOWEST, _HIGHEST = 1e-5, 1e4
@@ -36,7 +37,7 @@ _LOWEST, _HIGHEST = 1e-5, 1e4
 #: Steps of integration a sample, of which the fewest are taken whose error is small, in standard deviations. It is of
 #: order 4, so that the most are enough for motions of a third of a period a sample. Before a fit
 #: it is known only that a step should turn the motion by no more than an angle.
-_SUBSTEPS, _TOLERABLE, _ANGLE = (2, 4, 8, 16, 32), 0.01, 0.25
+_SUBSTEPS, _TOLERABLE, _ANGLE = (2, 4, 8, 16, 32), 0.02, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,35 +178,38 @@ def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: flo
         reach: factor of the ratio, either way, that the first grid spans.
     """
     unit = fitter.problem.frequency ** (2 - _order(fitter.problem))
-    lowest, highest = np.log(_LOWEST * unit), np.log(_HIGHEST * unit)
-    width, middle = np.log(reach), np.clip(np.log(hypothesis.ratio), lowest, highest)
-    starts, levels = start, np.full(_GRID, level)
+    bounds = np.log([_LOWEST * unit, _HIGHEST * unit])
+    width, middle = np.log(reach), np.log(hypothesis.ratio)
     for _ in range(12):
-        logs = np.clip(middle + np.linspace(-width, width, _GRID), lowest, highest)
-        fits = fitter.fit(with_ratios(hypothesis, np.exp(logs)), starts, levels)
+        logs = np.clip(middle + np.linspace(-width, width, _GRID), *bounds)
+        fits = fitter.fit(with_ratios(hypothesis, np.exp(logs)), start, level)
         if not np.isfinite(fits.free_energy).any():
             raise ValueError("records must keep the fit finite, but it ran away; check units and the sampling step")
         best = int(np.argmin(fits.free_energy))
-        starts, levels, middle = fits.mean[best], np.full(_GRID, fits.level[best]), logs[best]
-        if best in (0, _GRID - 1) and lowest < middle < highest:
+        start, level = fits.mean[best], float(fits.level[best])
+        worse = fits.free_energy - fits.free_energy[best]
+        middle, std = _vertex(logs, worse, best)
+        if (worse[[0, -1]] < _EDGE)[logs[[0, -1]] != bounds].any():
+            width *= 1.5
             continue
-        weights = np.exp(fits.free_energy[best] - fits.free_energy)
-        weights /= weights.sum()
+        weights = np.exp(-worse) / np.exp(-worse).sum()
         spread = np.sqrt(weights @ (logs - weights @ logs) ** 2)
-        step = (logs[-1] - logs[0]) / (_GRID - 1)
-        if spread > step or width < 0.02:
+        if spread > 0.8 * (logs[-1] - logs[0]) / (_GRID - 1) or width < 0.02:
             break
-        width = max(width / 8, min(_REACH * _std(logs, fits.free_energy, best), width / 3))
+        width = np.clip(_REACH * std, width / 40, width / 2)
     alive = weights > 1e-6
     return Found(fits.where(alive), weights[alive] / weights[alive].sum(), fitter)
 
 
-def _std(places: FloatArray, energies: FloatArray, best: int) -> float:
-    """Standard deviation of what has the curvature of these free energies about the best."""
+def _vertex(places: FloatArray, energies: FloatArray, best: int) -> tuple[float, float]:
+    """Mean and standard deviation of what has the free energies of the parabola through the best and its neighbours."""
     if not 0 < best < len(places) - 1:
-        return np.inf
-    curvature = 2 * np.polyfit(places[best - 1 : best + 2], energies[best - 1 : best + 2], 2)[0]
-    return float(1 / np.sqrt(curvature)) if curvature > 0 else np.inf
+        return float(places[best]), np.inf
+    near = slice(best - 1, best + 2)
+    curvature, slope, _ = np.polyfit(places[near] - places[best], energies[near], 2)
+    if not 0 < curvature < np.inf:
+        return float(places[best]), np.inf
+    return float(places[best] - slope / (2 * curvature)), float(1 / np.sqrt(2 * curvature))
 
 
 def _middle(problem: Problem) -> FloatArray:
