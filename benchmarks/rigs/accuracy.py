@@ -13,24 +13,26 @@ from benchmarks.rigs.records import guess, record
 
 SETTINGS = ("guess", "no guess")
 
-Task = tuple[str, str, int]
+Task = tuple[str, tuple[str, ...], int]
 
 
-def trial(task: Task) -> Outcome:
-    """Simulate and identify one record of a rig, in a setting, of a seed."""
-    name, setting, seed = task
+def trial(task: Task) -> list[Outcome]:
+    """Simulate one record of a rig, of a seed, and identify it in each of some settings."""
+    name, settings, seed = task
     bench = BENCHES[name]
-    return identified(record(bench, seed), guess(bench, seed) if setting == "guess" else None)
+    made = record(bench, seed)
+    return [identified(made, guess(bench, seed) if setting == "guess" else None) for setting in settings]
 
 
 def run(names: Sequence[str], settings: Sequence[str], seeds: int, workers: int) -> list[Cell]:
     """A cell for each rig and setting."""
-    tasks = [(name, setting, seed) for name in names for setting in settings for seed in range(seeds)]
+    chosen = tuple(settings)
+    tasks = [(name, chosen, seed) for name in names for seed in range(seeds)]
     outcomes = in_processes(trial, tasks, workers, "Identifying")
     return [
-        Cell(BENCHES[name], setting, [outcomes[name, setting, seed] for seed in range(seeds)])
+        Cell(BENCHES[name], setting, [outcomes[name, chosen, seed][place] for seed in range(seeds)])
         for name in names
-        for setting in settings
+        for place, setting in enumerate(chosen)
     ]
 
 

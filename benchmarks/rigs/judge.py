@@ -48,7 +48,7 @@ def identified(made: Record, guess: dict[str, tuple[float, float]] | None, **cha
     """Write a record and its rig file, with ``changed`` settings, and identify from these two files."""
     from estimator import Rig, identify
 
-    truth, bound = np.array(made.bench.truth), made.deviations()
+    truth, bound = np.array(made.bench.truth), made.deviations
     with tempfile.TemporaryDirectory() as folder:
         rig_file, data_file = Path(folder) / "rig.toml", Path(folder) / "data.csv"
         write_rig(rig_file, made.bench, guess, **changed)

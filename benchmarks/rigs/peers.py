@@ -109,10 +109,17 @@ def _turn(method: str, name: str, seed: int, folder: Path, peers: Peers) -> tupl
     return np.array([parameters[key][0] for key in ("m", "c", "a", "b")]), seconds
 
 
-def ratio(mine: Any, theirs: Any) -> float:
-    """Geometric mean, over seeds and parameters, of our errors over theirs; NaN where they have none."""
+def ratio(mine: Any, theirs: Any) -> tuple[float, float]:
+    """Geometric mean, over seeds and parameters, of our errors over theirs, and the factor of its 95 % interval.
+
+    Both NaN where they have none.
+    """
     logs = np.log(np.array(mine)) - np.log(np.array(theirs))
-    return float(np.exp(np.mean(logs[np.isfinite(logs)]))) if np.isfinite(logs).any() else float("nan")
+    told = np.isfinite(logs)
+    if not told.any():
+        return float("nan"), float("nan")
+    known = np.array([row[good].mean() for row, good in zip(logs, told, strict=True) if good.any()])
+    return float(np.exp(known.mean())), float(np.exp(1.96 * known.std() / np.sqrt(max(len(known) - 1, 1))))
 
 
 def show(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -122,20 +129,26 @@ def show(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
     from rich.table import Table
 
     console = Console(width=170)
-    table = Table("rig", "method", "median error of m, c, a, b, %", "our error over theirs", "s, the first",
+    table = Table("rig", "method", "median error of m, c, a, b, %", "our error over theirs [95 %]", "s, the first",
                   "s, others", "failed", "verdict", box=box.MARKDOWN)  # fmt: skip
     verdict: dict[str, Any] = {}
     for name, methods in results.items():
         for method, here in methods.items():
             errors = ", ".join(f"{100 * value:.2g}" for value in np.nanmedian(here["errors"], axis=0))
             failed = f"{len(here['reasons'])}" + (f": {here['reasons'][0][:40]}" if here["reasons"] else "")
-            over = ratio(methods[OURS]["errors"], here["errors"])
+            over, factor = ratio(methods[OURS]["errors"], here["errors"])
             good = over <= RATIO_BARS.get(method, np.inf)
             word = "" if method == OURS else "not available" if np.isnan(over) else "PASS" if good else "MISS"
             first, others = seconds(here)
-            shown = "" if method == OURS else f"{over:.3g}"
+            shown = "" if method == OURS else f"{over:.3g} [{over / factor:.3g}, {over * factor:.3g}]"
             table.add_row(name, method, errors, shown, f"{first:.2f}", f"{others:.2f}", failed, word)
-            verdict[f"{name}, {method}"] = {"ratio": over, "first": first, "others": others, "verdict": word}
+            verdict[f"{name}, {method}"] = {
+                "ratio": over,
+                "factor": factor,
+                "first": first,
+                "others": others,
+                "verdict": word,
+            }
     console.print(table)
     counts = {OURS: statements(ours)}
     counts |= {peer: statements(function, *peer_rows.HELPERS[peer]) for peer, function in peer_rows.PEERS.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ class Record:
     slope: FloatArray
     ends: FloatArray
 
+    @cached_property
     def deviations(self) -> FloatArray:
         """(4,) Cramér-Rao bound of m, c, a and b, relative; a sensor's offset is unknown where there is one.
 

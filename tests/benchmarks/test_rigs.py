@@ -123,7 +123,7 @@ def test_the_bound_is_that_of_finite_differences_of_whole_records(name: str) -> 
     prior = block_diag(np.zeros((4, 4)), np.eye(2), np.zeros((unknowns.shape[1] - 6,) * 2))
     found = unknowns.T @ np.linalg.solve(noise, unknowns) + prior
     expected = np.sqrt(np.diag(np.linalg.inv(found)))[:4]
-    assert made.deviations() == pytest.approx(expected, rel=1e-3)
+    assert made.deviations == pytest.approx(expected, rel=1e-3)
 
 
 def test_records_repeat_and_differ_by_seed() -> None:
@@ -180,7 +180,7 @@ def test_faults_are_what_they_say(name: str) -> None:
     peak = np.abs(good.states[:, 0]).max()
     assert stiff.bench.quintic * peak**5 == pytest.approx(0.2 * bench.truth[3] * peak**3)
     assert faults.faulty("step twice too long", name, 0)[1] == {"step": 2 * bench.step}
-    weak = np.array([faults.faulty("b not excited", name, seed)[0].deviations() for seed in range(20)])
+    weak = np.array([faults.faulty("b not excited", name, seed)[0].deviations for seed in range(20)])
     assert weak[:, 3].min() > 0.5
     assert weak[:, :3].max() < 0.2
 
@@ -231,9 +231,15 @@ def test_the_sweep_spans_its_rates() -> None:
 
 
 def test_ratios_are_geometric_means() -> None:
-    assert peers.ratio([[1.0, 4.0]], [[2.0, 2.0]]) == pytest.approx(1.0)
-    assert peers.ratio([[1.0, 4.0]], [[np.nan, 2.0]]) == pytest.approx(2.0)
-    assert np.isnan(peers.ratio([[1.0]], [[np.nan]]))
+    assert peers.ratio([[1.0, 4.0]], [[2.0, 2.0]]) == pytest.approx((1.0, 1.0))
+    assert peers.ratio([[1.0, 4.0]], [[np.nan, 2.0]]) == pytest.approx((2.0, 1.0))
+    assert np.isnan(peers.ratio([[1.0]], [[np.nan]])).all()
+    rng = np.random.default_rng(0)
+    inside = 0
+    for _ in range(200):
+        mean, factor = peers.ratio(*rng.lognormal([[[0.1]], [[0.0]]], 0.5, (2, 100, 4)))
+        inside += mean / factor < np.exp(0.1) < mean * factor
+    assert 0.89 * 200 < inside < 200
 
 
 def test_what_a_user_of_ours_writes_is_short() -> None:
