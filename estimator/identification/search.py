@@ -68,12 +68,12 @@ class Found:
     @property
     def best(self) -> Hypothesis:
         """The most probable hypothesis."""
-        return self.fits.best(1).hypotheses[0]
+        return self.fits.hypotheses[int(np.argmax(self.weights))]
 
     @property
     def level(self) -> float:
         """σ_v of the most probable hypothesis."""
-        return float(self.fits.best(1).level[0])
+        return float(self.fits.level[np.argmax(self.weights)])
 
     @property
     def noises(self) -> tuple[FloatArray, FloatArray]:
@@ -168,7 +168,9 @@ def enough_substeps(problem: Problem, mean: FloatArray, cov: FloatArray) -> int:
 def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: float, reach: float) -> Found:
     """The posterior over coefficients and noises, of one hypothesis about all else.
 
-    A grid of ratios is laid about the best and narrowed, until it is finer than what the records leave open.
+    A grid of ratios is laid about the best and narrowed, until it is finer than what the records leave open. Where they
+    do not tell σ_w from 0, or σ_v, the prior decides: half a Cauchy density of the ratio (Gelman 2006), about the one
+    that moves the output as much as it disturbs it. One even in the logarithm would hold that one of the noises is 0.
 
     Args:
         fitter: of the records.
@@ -185,9 +187,11 @@ def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: flo
         fits = fitter.fit(with_ratios(hypothesis, np.exp(logs)), start, level)
         if not np.isfinite(fits.free_energy).any():
             raise ValueError("records must keep the fit finite, but it ran away; check units and the sampling step")
-        best = int(np.argmin(fits.free_energy))
+        away = logs - np.log(unit)
+        energies = fits.free_energy + np.logaddexp(away, -away)
+        best = int(np.argmin(energies))
         start, level = fits.mean[best], float(fits.level[best])
-        worse = fits.free_energy - fits.free_energy[best]
+        worse = energies - energies[best]
         middle, std = _vertex(logs, worse, best)
         if (worse[[0, -1]] < _EDGE)[logs[[0, -1]] != bounds].any():
             width *= 1.5
