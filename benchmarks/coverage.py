@@ -38,7 +38,7 @@ EQUAL_CENTER = 5e-4  # V
 WIDE_NOISES, WIDE_CENTERS, WIDE_SPREADS = (5e-6, 3e-4), (3e-4, 1e-3), (0.3, 0.1)
 
 #: Estimators of the environment whose plants are the population ``track``.
-TRACK, TRACK_ESTIMATORS, NO_LIMIT = "duffing_env/Continuous-v0", ("ode", "nlarx"), 1e3
+TRACK, TRACK_ESTIMATORS, NO_LIMIT = "duffing_env/Amplitude-v1", ("ode", "nlarx"), 1e3
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ def _identify_in_track(case: Case, systems: int, seed: int) -> Identified:
     envs = gym.make_vec(
         TRACK, num_envs=systems, vectorization_mode="vector_entry_point", copy=False, estimator=case.estimator,
         process_noise=case.process_noise, measurement_noise=case.measurement_noise, horizon=case.samples,
-        max_output=NO_LIMIT,
+        max_output=NO_LIMIT, noise_range=1.0, noise_hypotheses=1,
     )  # fmt: skip
     assert isinstance(envs, ContinuousVectorEnv)
     envs.reset(seed=seed)

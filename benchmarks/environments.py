@@ -21,7 +21,7 @@ from benchmarks.timing import Row, measure, timed
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.lanes import LANES
 
-TRACK, CONTINUOUS = "duffing_env/Amplitude-v0", "duffing_env/Continuous-v0"
+TRACK, CONTINUOUS = "duffing_env/Amplitude-v0", "duffing_env/Amplitude-v1"
 UNIT = "env-steps/s"
 SIZES = (1, 8, 64, 1024, 16384)
 SYNC_SIZES = (1, 8, 64, 1024)

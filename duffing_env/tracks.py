@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
+
+#: On Eq. (1) the noises are drawn for every episode, over a decade each, and known to nobody.
+_UNKNOWN = {"noise_range": 10.0, "noise_hypotheses": 7}
 
 #: Id of a track to what it is registered with. Any change of numbers or spaces is a new version. None registers
 #: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short, without the belief in the last info.
@@ -32,10 +36,18 @@ TRACKS: dict[str, dict[str, Any]] = {
         "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
         "kwargs": {"horizon": 512, "max_input": 0.15, "max_output": 0.6, "jump": 0.3, "drift": 0.01},
     },
-    "duffing_env/Continuous-v0": {
-        "entry_point": "duffing_env.continuous:ContinuousEnv",
-        "vector_entry_point": "duffing_env.vector_env:ContinuousVectorEnv",
-        "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
+    **{
+        f"duffing_env/{name}-v1": {
+            "entry_point": f"duffing_env.continuous:{entry}",
+            "vector_entry_point": "duffing_env.vector_env:ContinuousVectorEnv",
+            "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6, **limits, **_UNKNOWN},
+        }
+        for name, entry, limits in (
+            ("Amplitude", "ContinuousEnv", {}),
+            ("Short", "ContinuousShortEnv", {"horizon": 48}),
+            ("Power", "ContinuousPowerEnv", {"max_rms": 0.0222}),
+            ("Output", "ContinuousOutputEnv", {"max_output": 0.3}),
+        )
     },
     # The pendulum of IO-SMC²: angle and velocity are seen without noise (here 1 µrad), every 0.05 s.
     "duffing_env/Pendulum-v0": {
@@ -89,6 +101,9 @@ TRACKS: dict[str, dict[str, Any]] = {
 def register_tracks() -> None:
     """Register every track with Gymnasium; what is registered already is left as it is."""
     from gymnasium.envs.registration import register, registry
+
+    # To Gymnasium a higher version is a newer one. Here v0 is the paper's equation, and v1 the differential equation.
+    warnings.filterwarnings("ignore", r".*duffing_env/\w+-v0 is out of date", DeprecationWarning)
 
     for track_id, spec in TRACKS.items():
         if track_id not in registry:

@@ -32,7 +32,7 @@ def fisher_information(
     model: Model,
     coefficients: npt.ArrayLike,
     u: npt.ArrayLike,
-    process_noise: float,
+    process_noise: npt.ArrayLike,
     measurement_noise: npt.ArrayLike,
     *,
     y: npt.ArrayLike | None = None,
@@ -48,8 +48,8 @@ def fisher_information(
             first NaN, so that episodes of different lengths fit into one array; before its first sample there was no
             input.
         process_noise: what the process noise of one sample alone does to the first sensor: standard deviation in its
-            unit, 0 or more.
-        measurement_noise: the sensors' standard deviations, positive: one number, or one for each.
+            unit, 0 or more; (n,) of a batch.
+        measurement_noise: the sensors' standard deviations, positive: one number, or one for each; (n, p) of a batch.
         y: (T,) or (n, T) the outputs that followed the inputs, or (..., T, p) those of p sensors: the information is
             then taken along the filter's trajectory on them. Without them it is taken along the response without noise,
             as a design needs it.
@@ -74,11 +74,10 @@ def fisher_information(
         raise ValueError(f"u must have shape (T,) or (n, T), but has {inputs.shape}")
     outputs = None if y is None else outputs_of(model, inputs, y)
     try:
-        shape = np.broadcast_shapes(points.shape[:-1], inputs.shape[:-1])
+        shape = np.broadcast_shapes(points.shape[:-1], inputs.shape[:-1], noises.shape[:-1])
     except ValueError:
-        raise ValueError(
-            f"coefficients and u must be batches of one size, but are of {points.shape[:-1]} and {inputs.shape[:-1]}"
-        ) from None
+        sizes = points.shape[:-1], inputs.shape[:-1], noises.shape[:-1]
+        raise ValueError(f"coefficients, u and noises must be batches of one size, but are of {sizes}") from None
     rows, samples = int(np.prod(shape)), inputs.shape[-1]
 
     def whole(array: FloatArray, *last: int) -> FloatArray:
@@ -90,25 +89,26 @@ def fisher_information(
         whole(points, model.n_coefficients),
         sampled(model, whole(inputs, samples), degree),
         None if outputs is None else whole(outputs, samples, model.n_outputs),
-        np.array(noises),
+        whole(noises, 1 + model.n_outputs),
         covariance,
     )
     k = model.n_coefficients
     return found.information.reshape(*shape, k, k)
 
 
-def variances(model: Model, process_noise: float, measurement_noise: npt.ArrayLike) -> tuple[float, ...]:
-    """Of the process noise, and of each sensor's, from standard deviations.
+def variances(model: Model, process_noise: npt.ArrayLike, measurement_noise: npt.ArrayLike) -> FloatArray:
+    """(1 + p,) of the process noise, and of each sensor's, from standard deviations; (n, 1 + p) of a batch.
 
     Raises:
         ValueError: for one that is out of range, or a number of sensors that is not the model's.
     """
-    if not 0 <= process_noise < np.inf:
+    process = np.asarray(process_noise, dtype=np.float64)
+    if process.ndim > 1 or not (np.all(process >= 0) and np.isfinite(process).all()):
         raise ValueError(
-            f"process_noise must be 0 or more and finite, but is {process_noise}; pass a standard deviation"
+            f"process_noise must be 0 or more and finite, but is {process_noise!r}; pass a standard deviation"
         )
     stds = np.asarray(measurement_noise, dtype=np.float64)
-    if stds.ndim > 1 or (stds.ndim == 1 and len(stds) != model.n_outputs):
+    if stds.ndim > 2 or (stds.ndim and stds.shape[-1] != model.n_outputs):
         raise ValueError(
             f"measurement_noise must be one number, or one for each of {list(model.outputs)}, but has shape "
             f"{stds.shape}"
@@ -117,8 +117,9 @@ def variances(model: Model, process_noise: float, measurement_noise: npt.ArrayLi
         raise ValueError(
             f"measurement_noise must be positive and finite, but is {stds.tolist()}; pass a standard deviation"
         )
-    sensors = np.broadcast_to(stds, model.n_outputs)
-    return (float(process_noise) ** 2, *(float(std) ** 2 for std in sensors))
+    shape = np.broadcast_shapes(process.shape, stds.shape[:-1])
+    sensors = np.broadcast_to(stds, (*shape, model.n_outputs))
+    return np.concatenate([np.broadcast_to(process, shape)[..., None], sensors], axis=-1) ** 2
 
 
 def outputs_of(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> FloatArray:

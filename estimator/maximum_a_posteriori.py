@@ -48,7 +48,7 @@ def maximum_a_posteriori(
     u: npt.ArrayLike,
     y: npt.ArrayLike,
     prior: Belief,
-    process_noise: float,
+    process_noise: npt.ArrayLike,
     measurement_noise: npt.ArrayLike,
     interpolation: str = "zero_order",
 ) -> Fit:
@@ -62,8 +62,9 @@ def maximum_a_posteriori(
         prior: of the coefficients, in the model's order, and of the state about rest. Its belief in the noises is not
             used. A coefficient of variance 0 is known.
         process_noise: what the process noise of one sample alone does to the first sensor: standard deviation, 0 or
-            more.
-        measurement_noise: the sensors' standard deviations, positive: one number, or one for each.
+            more; (n,) of each record.
+        measurement_noise: the sensors' standard deviations, positive: one number, or one for each; (n, p) of each
+            record.
         interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
 
     Raises:
@@ -73,7 +74,7 @@ def maximum_a_posteriori(
     if inputs.ndim != 2:
         raise ValueError(f"u must have shape (n, T), but has {inputs.shape}")
     outputs = np.array(outputs_of(model, inputs, y))
-    noises = np.array(variances(model, process_noise, measurement_noise))
+    noises = variances(model, process_noise, measurement_noise)
     taken = sampled(model, inputs, input_degree(model, interpolation))
     center, cov = prior.coefficients_mean, prior.coefficients_cov
     if center.shape != (model.n_coefficients,):

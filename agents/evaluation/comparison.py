@@ -9,6 +9,7 @@ from typing import Any
 
 from agents.evaluation.leaderboard import print_estimators, print_table, write_evaluations
 from agents.evaluation.rollout import Evaluation, evaluate
+from duffing_env.silverbox import record_available
 
 
 def compare(
@@ -32,6 +33,8 @@ def compare(
     title = f"{env_id}, {systems} systems"
     print_table(evaluations, title)
     print_estimators(evaluations)
+    if not record_available():
+        print("What is measured by the Silverbox record is left out: the Silverbox record is not on this machine.")
     settings = {"env": env_id, "systems": systems, "seed": seed, "options": options}
     write_evaluations(folder / "evaluation.json", evaluations, settings)
     written = ["evaluation.json"]

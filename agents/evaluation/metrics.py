@@ -78,7 +78,7 @@ def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatA
     (T, n, sensors) that were seen, or along the response without noise; Λ0 is the inverse covariance of the prior of
     plants so drawn.
     """
-    plant = plant_of(experiment)
+    plant = plant_of(experiment, truth)
     F = fisher_information(
         plant.model, plant.coefficients_of(truth), inputs.T, plant.process_noise, plant.sensor_noises,
         interpolation=plant.interpolation, y=None if outputs is None else np.swapaxes(outputs, 0, 1),

@@ -7,7 +7,7 @@ lower bound of the highest. So whoever finds a better input puts it in its place
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from agents.evaluation.systems import Systems
 from estimator.files import write_atomically
-from estimator.information import fisher_information
 from estimator.parameters import FloatArray
 
 
@@ -51,7 +50,7 @@ class Oracle:
         n = min(len(theta), len(systems.theta))
         if not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
             raise ValueError(f"oracle must be for the systems at hand, but {path.name} is not; make it anew")
-        chosen = replace(systems, theta=systems.theta[:n])
+        chosen = systems.rows(0, n)
         inputs = systems.limits.amplitude * scaled[:n].astype(np.float64)
         return cls(chosen, inputs, chosen.worth(inputs)[0])
 
@@ -86,13 +85,9 @@ class Oracle:
         u = np.asarray(inputs, dtype=np.float64)
         if u.ndim != 2 or len(u) > len(self.values):
             raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
-        plant = self.systems.plant
-        information = fisher_information(
-            plant.model, self.systems.theta[: len(u)], u, plant.process_noise, plant.sensor_noises, y=outputs,
-            interpolation=plant.interpolation,
-        )  # fmt: skip
+        information = self.systems.information(u, outputs)
         values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]
-        efficiency: FloatArray = np.exp(2 * (values - self.values[: len(u)]) / plant.model.n_coefficients)
+        efficiency: FloatArray = np.exp(2 * (values - self.values[: len(u)]) / information.shape[-1])
         return efficiency
 
 

@@ -56,7 +56,8 @@ def search(
     Returns:
         The best input (samples,) [V] that keeps all limits also as it is stored, and its worth [nats]; -inf if none.
     """
-    one = replace(systems, theta=np.repeat(systems.theta[row : row + 1], len(given) + _STARTS, axis=0))
+    rows = np.full(len(given) + _STARTS, row)
+    one = replace(systems, theta=systems.theta[rows], variances=systems.variances[rows])
     model, limits = systems.plant.model, systems.limits
     is_frugal = bool(np.isfinite(limits.energy))
     is_planned = not is_frugal and model == difference()
@@ -97,7 +98,7 @@ def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.N
     n = model.n_states
     mean, cov = np.zeros(len(model.names)), np.zeros((len(model.names), len(model.names)))
     mean[n:], cov[n:, n:] = one.theta[0], np.linalg.inv(one.precision)
-    noises = [(1.0, variance) for variance in one.noises]
+    noises = [(1.0, variance) for variance in one.variances[0]]
     record = Belief.of(model, mean, cov, noises[0], noises[1:]).record.copy()
     first = int(rng.integers(-one.samples // 8, one.samples - 1))
     horizon, rounds = int(rng.integers(8, 25)), int(rng.integers(1, 9))

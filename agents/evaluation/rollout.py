@@ -22,6 +22,8 @@ from duffing_env.silverbox import record_available
 from estimator.belief import Belief
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.models.model import Model
 from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
 from estimator.posteriors import posteriors
@@ -81,12 +83,12 @@ def evaluate(
 
     Learned policies act by their mean. With ``hold`` in the options, inputs, outputs and what is made of them are those
     of every sample; a stored oracle is that of the track without it. An episode that a limit ends is never dropped: it
-    counts with what was known by then. Information at the truth, what other estimators make of the inputs and
-    outputs, and the arrow error need a simulated plant whose truth stays as it is, with noises that all systems share;
-    what is measured by free runs or in samples of the Silverbox regime, the difference equation. The arrow error is
-    that of the difference equation identified on the track's twin (``plant_spread=0``) in a free run over the real
-    arrow record; it is left out without the record, and for the differential equation: the simulated plant has no
-    offsets, and those of the circuit, 8 mV at the input, would be nearly all of its error (5.3 mV for the twin itself).
+    counts with what was known by then. Information at the truth, with the true noises, and what other estimators make
+    of the inputs and outputs need a simulated plant whose truth stays as it is. With the Silverbox record there are
+    also the samples of its regime that tell as much, for the oscillators of the tracks; and for the difference equation
+    the errors of free runs over the arrow's input and, identified on the track's twin (``plant_spread=0``), over the
+    arrow's record. The latter is none for the differential equation: the simulated plant has no offsets, and those of
+    the circuit, 8 mV at the input, would be nearly all of its error (5.3 mV for the twin itself).
 
     Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the
     entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.
@@ -160,7 +162,7 @@ def _evaluate(
     evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
     if not isinstance(experiment, SimulatedExperiment):
         return evaluation
-    found, stays = evaluation.metrics, experiment.jump == 0 and experiment.noise_range == 1
+    found, stays = evaluation.metrics, experiment.jump == 0
     is_difference = experiment.plant == difference()
     if stays:
         gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
@@ -169,13 +171,15 @@ def _evaluate(
         efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
         if efficiency is not None:  # an oracle is stored, of the systems of seed 0 in this branch
             found["efficiency"] = efficiency
-    if stays and is_difference:
+    if not record_available():  # what follows is measured by it
+        return evaluation
+    if stays and (is_difference or experiment.plant == duffing()):
         told.update(told or metrics.regimes(truth, experiment, seed))
         found |= {regime: metrics.equivalents(gains, information) for regime, information in told.items()}
     if is_difference:
         means = np.array([belief.coefficients_mean for belief in beliefs])
         found["simulation_rmse"] = metrics.simulation_errors(means, truth)
-    if stays and is_difference and record_available():
+    if stays and is_difference:
         _, twins, _, _ = roll_out(name, env_id, systems, seed, {**options, "plant_spread": 0.0})
         found["arrow_rmse"] = metrics.arrow_errors(np.array([twin.coefficients_mean for twin in twins]))
     return evaluation
@@ -225,8 +229,7 @@ def roll_out(
             curve[t + 2 :] = curve[t + 1]
             break
     envs.close()
-    names = parameter_names(envs.experiment.truth_model)
-    truth = Parameters({p: np.array([getattr(t, p) for t in truths]) for p in names})
+    truth = Parameters({p: np.array([getattr(t, p) for t in truths]) for p in began})
     means = np.array([belief.coefficients_mean for belief in beliefs])
     covs = np.array([belief.coefficients_cov for belief in beliefs])
     # The environment does not count what a jump of the truth takes away: what lacks at the end was lost there.
@@ -257,13 +260,13 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
     action to the next, takes as an environment does the input at the sample before.
     """
     u, y = evaluation.inputs.T, np.swapaxes(evaluation.outputs, 0, 1)
-    plant, interpolation, own_prior, process_noise, sensor_noises = plant_of(experiment)
+    plant, interpolation, own_prior, process_noise, sensor_noises = plant_of(experiment, truth)
     rig = Rig(experiment.step, interpolation=interpolation, delay=0 if interpolation == "linear" else -1)
     hands: dict[str, tuple[Belief, FloatArray]] = {}
     if plant == difference():
         hands = {name: (experiment.prior_of(plant, name), u) for name in FACTORISATIONS}
     else:
-        hands["ode" if plant.is_continuous else "structured"] = own_prior, u
+        hands[_own_hand(plant, experiment)] = own_prior, u
         if set(parameter_names(plant)) == set(parameter_names(difference())):
             earlier = u if not experiment.degree else np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
             hands |= {f"nlarx_{name}": (experiment.prior_of(difference(), name), earlier) for name in FACTORISATIONS}
@@ -275,3 +278,9 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
     fit = maximum_a_posteriori(plant, u, y, own_prior, process_noise, sensor_noises, interpolation)
     found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, plant, experiment.scales)
     return found
+
+
+def _own_hand(plant: Model, experiment: SimulatedExperiment) -> str:
+    """Name of the environment's own estimator, without the hypotheses that it may weigh."""
+    name = "ode" if plant.is_continuous else "structured"
+    return f"{name}_alone" if experiment.noise_hypotheses > 1 else name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from agents.planner.design import Known
 from agents.planner.plants import Plant, plant_of
 from duffing_env.experiment import SimulatedExperiment
 from estimator.engine.feeding import input_degree
-from estimator.information import variances
+from estimator.information import fisher_information, variances
 from estimator.models.difference import difference
 from estimator.parameters import FloatArray
 
@@ -32,11 +32,13 @@ class Systems:
         experiment: what they are drawn for.
         theta: (n, K) their coefficients.
         precision: (K, K) Λ0.
+        variances: (n, 1 + p) of the process noise and of each sensor's.
     """
 
     experiment: SimulatedExperiment
     theta: FloatArray
     precision: FloatArray
+    variances: FloatArray
 
     @classmethod
     def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None) -> Systems:
@@ -50,9 +52,16 @@ class Systems:
         e = envs.experiment
         if not isinstance(e, SimulatedExperiment) or e.jump or e.max_slew is not None:
             raise ValueError(f"env must simulate a plant without jump and slew limit, but is {e}; choose another track")
-        plant = plant_of(e)
+        plant = plant_of(e, envs.truth)
         precision = np.linalg.inv(plant.prior.coefficients_cov).astype(np.float64)
-        return cls(e, plant.coefficients_of(envs.truth), precision)
+        strengths = variances(plant.model, plant.process_noise, plant.sensor_noises)
+        strengths = np.broadcast_to(strengths, (count, strengths.shape[-1])).copy()
+        return cls(e, plant.coefficients_of(envs.truth), precision, strengths)
+
+    def rows(self, first: int, stop: int) -> Systems:
+        """Some of them."""
+        chosen = slice(first, stop)
+        return replace(self, theta=self.theta[chosen], variances=self.variances[chosen])
 
     @property
     def plant(self) -> Plant:
@@ -72,11 +81,6 @@ class Systems:
         return Limits(e.max_output, e.max_output, e.max_input, energy)
 
     @property
-    def noises(self) -> tuple[float, ...]:
-        """Variances of the process noise and of each sensor's."""
-        return variances(self.plant.model, self.plant.process_noise, self.plant.sensor_noises)
-
-    @property
     def degree(self) -> int:
         """Of the input's polynomial over a sample."""
         return input_degree(self.plant.model, self.plant.interpolation)
@@ -92,6 +96,8 @@ class Systems:
         told = {name: getattr(e, name) for name in names}
         told |= {"plant_spread": e.spread if e.plant_spread is None else e.plant_spread, "max_rms": e.max_rms}
         told["branch"] = e.branch
+        if e.noise_range != 1:
+            told["noise_range"] = e.noise_range
         if plant.model == difference():
             return told
         return told | {"model": plant.model.digest, "interpolation": plant.interpolation}
@@ -104,7 +110,7 @@ class Systems:
 
     def known(self, row: int) -> Known:
         """What the worth of an input to one system is taken at."""
-        return Known(self.theta[row].copy(), self.precision, self.noises)
+        return Known(self.theta[row].copy(), self.precision, tuple(self.variances[row]))
 
     def worth(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Worth ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
@@ -116,5 +122,19 @@ class Systems:
             raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.theta)}, but have {u.shape}")
         values, peaks = np.empty((2, len(u)))
         appraise = climber(self.plant.model, self.degree).appraise
-        appraise(self.theta, self.precision, self.noises, self.limits.output, u, values, peaks)
+        for row in range(len(u)):
+            one = slice(row, row + 1)
+            noises = tuple(self.variances[row])
+            appraise(self.theta[one], self.precision, noises, self.limits.output, u[one], values[one], peaks[one])
         return values, peaks
+
+    def information(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike | None = None) -> FloatArray:
+        """(n, K, K) F of inputs (n, samples) [V], along the outputs that followed, or the response without noise.
+
+        Raises:
+            ValueError: as `estimator.fisher_information`.
+        """
+        n, plant, stds = len(np.asarray(inputs)), self.plant, np.sqrt(self.variances)
+        return fisher_information(
+            plant.model, self.theta[:n], inputs, stds[:n, 0], stds[:n, 1:], y=outputs, interpolation=plant.interpolation
+        )

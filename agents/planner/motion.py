@@ -53,6 +53,7 @@ class Places(NamedTuple):
         mean: of the coefficients' means.
         log_std: of the logarithms of their standard deviations.
         correlation: of their correlations.
+        noise: of the logarithms of the precisions: process noise, then each sensor's.
         state: of the states.
         last_input: of the last input.
         last_output: of the last outputs.
@@ -64,6 +65,7 @@ class Places(NamedTuple):
     mean: int
     log_std: int
     correlation: int
+    noise: int
     state: int
     last_input: int
     last_output: int
@@ -78,8 +80,8 @@ def places(model: Model) -> Places:
     at = {name: i for i, name in enumerate(observation_bounds(model))}
     k, state, sensor = model.n_coefficients, next(iter(model.states)), next(iter(model.outputs))
     return Places(
-        0, k, 2 * k, at[f"state_{state}"], at["last_input"], at[f"last_{sensor}"], at["time_left"], at["budget_left"],
-        len(at),
+        0, k, 2 * k, at["log_gamma"], at[f"state_{state}"], at["last_input"], at[f"last_{sensor}"], at["time_left"],
+        at["budget_left"], len(at),
     )  # fmt: skip
 
 

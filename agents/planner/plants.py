@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from duffing_env.layout import noise_rows
 from estimator.belief import Belief
 from estimator.models.model import Model
 from estimator.parameters import FloatArray, Parameters
@@ -17,24 +20,28 @@ class Plant(NamedTuple):
         model: its equation.
         interpolation: of the input between samples.
         prior: of its coefficients.
-        process_noise: standard deviation.
-        sensor_noises: standard deviations, one for each sensor.
+        process_noise: standard deviation, or that of each system (n,).
+        sensor_noises: standard deviations, one for each sensor (p,), or those of each system (n, p).
     """
 
     model: Model
     interpolation: str
     prior: Belief
-    process_noise: float
-    sensor_noises: list[float]
+    process_noise: float | FloatArray
+    sensor_noises: FloatArray
 
     def coefficients_of(self, truth: Parameters) -> FloatArray:
         """(..., K) the coefficients of one plant or a batch."""
         return coefficients_of(self.model, truth, self.prior.scales)
 
 
-def plant_of(experiment: Any) -> Plant:
-    """The plant of an experiment that simulates one."""
+def plant_of(experiment: Any, truth: Parameters | None = None) -> Plant:
+    """The plant of an experiment that simulates one; with its systems' own noises, where these are drawn."""
     model = experiment.plant
     interpolation = "linear" if experiment.degree and model.is_continuous else "zero_order"
-    sensors = getattr(experiment, "noises", [experiment.measurement_noise])
-    return Plant(model, interpolation, experiment.prior_of(model), experiment.process_noise, sensors)
+    prior, setup, names = experiment.prior_of(model), experiment.setup, list(noise_rows(model))
+    process, sensors = setup.process_noise, setup.measurement_noise
+    if truth is not None and names[0] in truth:
+        process, *others = (np.asarray(truth[name]) / prior.scales.output for name in names)
+        sensors = np.stack(others, axis=-1)
+    return Plant(model, interpolation, prior, process, sensors)

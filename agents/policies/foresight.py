@@ -87,12 +87,12 @@ class Foresight:
         described = dict(view or {})
         model = Model(**described.pop("model")) if "model" in described else difference()
         k = model.n_coefficients
-        center, std, others, rate = np.split(np.asarray(numbers, dtype=np.float64), [k, 2 * k, 2 * k + 5])
-        max_input, max_output, samples, energy, variance = others.tolist()
+        center, std, others, rate = np.split(np.asarray(numbers, dtype=np.float64), [k, 2 * k, 2 * k + 6])
+        max_input, max_output, samples, energy, process, sensor = others.tolist()
         seen = View(model, **described)
         sizes = scales(seen, center, max_input, max_output)
-        outlook = Outlook(center, std, max_input, max_output, samples, energy, variance, rate.reshape(k, k), sizes)
-        return cls(outlook, seen)
+        rate = rate.reshape(k, k)
+        return cls(Outlook(center, std, max_input, max_output, samples, energy, process, sensor, rate, sizes), seen)
 
     def to_array(self) -> FloatArray:
         """All of it but the model, flat, as a file holds it."""
@@ -116,7 +116,7 @@ class Foresight:
         at_limits = (survey(self._view.model, here.center, o.scales, o.max_input) for o in (here, there))
         made, made_there = (found.regressors[0] for found in at_limits)
         growth = np.abs(np.divide(made_there, made, out=np.ones_like(made), where=made != 0))
-        growth *= np.sqrt(here.variance / there.variance)
+        growth *= np.sqrt((here.process + here.sensor) / (there.process + there.sensor))
         return Foresight(there._replace(rate=here.rate * np.outer(growth, growth)), self._view)
 
     @property
@@ -157,8 +157,7 @@ class Foresight:
 
 def _outlook_of(experiment: Experiment, rate: FloatArray) -> Outlook:
     """What is ahead in an experiment."""
-    setup, prior = experiment.setup, experiment.believed
-    center = prior.coefficients_mean
+    setup, center = experiment.setup, experiment.believed.coefficients_mean
     return Outlook(
         center=center,
         std=1.0 / setup.inverse_std,
@@ -166,7 +165,8 @@ def _outlook_of(experiment: Experiment, rate: FloatArray) -> Outlook:
         max_output=setup.max_output,
         samples=setup.horizon,
         energy=setup.budget,
-        variance=float(prior.noises[1] / prior.noises[0] + prior.noises[3] / prior.noises[2]),
+        process=float(np.exp(-setup.log_precisions[0])),
+        sensor=float(np.exp(-setup.log_precisions[1])),
         rate=np.asarray(rate, dtype=np.float64),
         scales=scales(View.of(experiment), center, setup.max_input, setup.max_output),
     )

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 WEIGHTS = "policy.safetensors"
 CARD = "policy.json"
-FORMAT = 2
+FORMAT = 3
 
 FloatArray = npt.NDArray[np.float32]
 State = tuple[FloatArray, FloatArray]

@@ -85,8 +85,9 @@ class Outlook(NamedTuple):
         max_output: limit of the first sensor.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
-        variance: σ² of the first sensor's output about its prediction.
-        rate: (K, K) information about the coefficients that a sample brings.
+        process: variance that the observation's log E[γ] is relative to.
+        sensor: that of the first sensor's log E[ξ].
+        rate: (K, K) information about the coefficients that a sample brings, where the noises have these variances.
         scales: (n,) sizes of the states when the first sensor is at its limit.
     """
 
@@ -96,7 +97,8 @@ class Outlook(NamedTuple):
     max_output: float
     samples: float
     energy: float
-    variance: float
+    process: float
+    sensor: float
     rate: FloatArray
     scales: FloatArray
 
@@ -110,7 +112,7 @@ class Prospect(NamedTuple):
         W: (K, K) what is still unknown at the end, weighted.
         push: size of a push.
         limit: of the first sensor.
-        variance: see `Outlook`.
+        variance: σ² of the first sensor's output about its prediction, as it is believed.
         scales: see `Outlook`.
     """
 
@@ -294,12 +296,14 @@ def lookout(view: View) -> Any:
                 # What is still to come takes time and energy.
                 share = 0.5 * (share + seen[at.budget_left])
                 push = min(push, _THRIFT * np.sqrt(max(0.0, seen[at.budget_left]) * outlook.energy / left))
-            to_come = weigh(C, rate, share * samples, unknown, work)
-            weight = samples / (2.0 * k * outlook.variance)
+            variance = outlook.process * np.exp(-seen[at.noise]) + outlook.sensor * np.exp(-seen[at.noise + 1])
+            growth = (outlook.process + outlook.sensor) / variance
+            to_come = weigh(C, rate, share * samples * growth, unknown, work)
+            weight = samples / (2.0 * k * variance)
             copy_scaled(unknown, weight, unknown)
             signs[i] = stand(seen, outlook, start)
             copy(shown, 0, seen, own)
-            prospect = Prospect(start, C, unknown, push, limit, outlook.variance, outlook.scales)
+            prospect = Prospect(start, C, unknown, push, limit, variance, outlook.scales)
             attempt(prospect, W, shown, safe[i])
             place = n_features - 6
             motions[i] = drift(start, prospect, outlook, shown, place)
@@ -309,7 +313,7 @@ def lookout(view: View) -> Any:
             for a in range(k):
                 for b in range(k):
                     total += unknown[a, b] * rate[a, b]
-            shown[place + 5] = np.log(samples / k / weight * total + 1e-3)
+            shown[place + 5] = np.log(samples / k / weight * growth * total + 1e-3)
             for j in range(len(shown)):
                 # NaN becomes 0.
                 shown[j] = max(-BOUND, min(shown[j], BOUND)) if shown[j] == shown[j] else 0.0

@@ -17,6 +17,7 @@ from agents.policies.foresight import Foresight
 from agents.policies.prospects import BOUND, EXPECTED, feature_names
 from agents.vec_env import DuffingVecEnv
 from duffing_env.vector_env import DuffingVectorEnv
+from estimator.belief import Belief
 from estimator.parameters import FloatArray
 
 #: Rewards are scaled to returns of about 1, where a critic begins.
@@ -111,14 +112,22 @@ def example_rate(env_id: str, options: dict[str, Any], seed: int) -> FloatArray:
 
 
 def _rate(envs: DuffingVectorEnv, act: Callable[[Any], Any], seed: int) -> FloatArray:
-    """The mean information per sample of one episode in every environment."""
+    """The mean information per sample of one episode in every environment, if noises were those of the prior."""
     observations, _ = envs.reset(seed=seed)
-    before = np.linalg.inv(envs.belief(0).coefficients_cov)
+    before, usual = np.linalg.inv(envs.belief(0).coefficients_cov), _variance(envs.belief(0))
     rates, running = np.zeros((envs.num_envs, *before.shape)), np.ones(envs.num_envs, dtype=np.bool_)
     for t in range(envs.horizon):
         observations, _, terminated, truncated, infos = envs.step(act(observations))
         for row in np.flatnonzero(running & (terminated | truncated)):
-            rates[row] = (np.linalg.inv(infos["belief"][row].coefficients_cov) - before) / (t + 1)
+            belief = infos["belief"][row]
+            gained = np.linalg.inv(belief.coefficients_cov) - before
+            rates[row] = gained * (_variance(belief) / usual) / (t + 1)
             running[row] = False
     mean: FloatArray = rates.mean(axis=0)
     return mean
+
+
+def _variance(belief: Belief) -> float:
+    """What is believed of the variance of an output about its prediction."""
+    noises = belief.noises
+    return float(noises[1] / noises[0] + noises[3] / noises[2])

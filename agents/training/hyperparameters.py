@@ -21,8 +21,13 @@ Settings = TypeVar("Settings")
 
 
 def track_of(env_id: str) -> str:
-    """The name of a track without its namespace, which is that of its table: "Amplitude-v0"."""
+    """The name of a track without its namespace: "Amplitude-v0"."""
     return env_id.split("/")[-1]
+
+
+def table_of(env_id: str) -> str:
+    """The name of a track's table, which all its versions share: "Amplitude"."""
+    return track_of(env_id).rpartition("-v")[0]
 
 
 def read_settings(algo: str, env_id: str, path: Path | None = None) -> AlgorithmSettings:
@@ -46,7 +51,7 @@ def read_settings(algo: str, env_id: str, path: Path | None = None) -> Algorithm
         raise ValueError(f"settings must be a TOML file, but {path} is not: {error}") from error
     for table, entries in tables.items():
         _check_table(table, entries, ALGORITHMS[algo], path)
-    return settings_of(ALGORITHMS[algo], tables.get(DEFAULT, {}) | tables.get(track_of(env_id), {}))
+    return settings_of(ALGORITHMS[algo], tables.get(DEFAULT, {}) | tables.get(table_of(env_id), {}))
 
 
 def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
@@ -83,7 +88,7 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
 
 def write_settings(path: Path, env_id: str, settings: AlgorithmSettings, comment: str) -> None:
     """Write a file that `read_settings` reads, with these hyperparameters for this track."""
-    lines = [f"# {comment}", f'["{track_of(env_id)}"]']
+    lines = [f"# {comment}", f"[{table_of(env_id)}]"]
     for name, value in as_written(settings).items():
         entries = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
         lines += [f"{key} = {json.dumps(each)}" for key, each in entries.items()]
@@ -98,8 +103,8 @@ def _check_table(table: str, entries: Any, kind: type[AlgorithmSettings], path: 
 
     if not isinstance(entries, dict):
         raise ValueError(f"settings must be in tables such as [{DEFAULT}], but {path} has {table} in none")
-    if table not in [DEFAULT, *(track_of(name) for name in registry)]:
-        ours = [DEFAULT, *(track_of(name) for name in registry if name.startswith("duffing_env/"))]
+    if table not in [DEFAULT, *map(table_of, registry)]:
+        ours = [DEFAULT, *dict.fromkeys(table_of(name) for name in registry if name.startswith("duffing_env/"))]
         raise ValueError(
             f"settings must have tables [{DEFAULT}] or of tracks, but {path} has [{table}]{_hint(table, ours)}"
         )

@@ -239,7 +239,7 @@ def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
 
 @pytest.mark.parametrize("name", FEEDBACK)
 def test_feedback_pumps_equation_1_too(name):
-    asked, seen, ended = roll_out(name, "duffing_env/Continuous-v0", 16, horizon=128)
+    asked, seen, ended = roll_out(name, "duffing_env/Amplitude-v1", 16, horizon=128)
     assert ended == 0
     assert set(np.unique(np.abs(asked))) == {1.0}
     # The first state of its observation is the displacement too.
@@ -247,7 +247,7 @@ def test_feedback_pumps_equation_1_too(name):
 
 
 def test_resonance_and_amplitude_are_read_off_equation_1():
-    env = gym.make("duffing_env/Continuous-v0").unwrapped
+    env = gym.make("duffing_env/Amplitude-v1").unwrapped
     policy, model = make_policy("square-believed", env), env.experiment.model
     prior = env.experiment.believed.coefficients_mean
     row = np.zeros((1, len(observation_bounds(model))))

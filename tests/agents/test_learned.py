@@ -195,7 +195,7 @@ def test_the_card_tells_what_it_was_told(tmp_path):
     card = load_policy(folder).card
     assert json.loads((folder / CARD).read_text()) == card
     assert card.pop("network")["activation"] == "tanh"
-    assert card == {"format": 2, "algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}}
+    assert card == {"format": 3, "algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}}
 
 
 def test_actions_are_in_range_and_the_state_is_passed_on(tmp_path):
@@ -267,7 +267,7 @@ def test_pickles_and_archives_are_refused_unopened(tmp_path):
     for path in (folder, folder / "policy.zip", folder / "policy.pkl"):
         with pytest.raises(ValueError, match="must hold"):
             make_policy(str(path))
-    (folder / CARD).write_text('{"format": 2}')
+    (folder / CARD).write_text('{"format": 3}')
     for content in (pickle.dumps(Trap(sprung)), (folder / "policy.zip").read_bytes()):
         (folder / WEIGHTS).write_bytes(content)
         with pytest.raises(ValueError, match=r"must hold sound files, but .*run does not"):
@@ -280,15 +280,15 @@ def test_pickles_and_archives_are_refused_unopened(tmp_path):
 @pytest.mark.parametrize(
     ("card", "message"),
     [
-        ('{"format": 3}', "must have format 2, but .*policy.json has 3"),
-        ("{}", "must have format 2, but .*policy.json has None"),
-        ("[1]", "must have format 2, but .*policy.json has None"),
-        ('{"format": 2}', "must be what its card says, but .* is not: KeyError"),
-        ('{"format": 2, "network": {"layers": ["elsewhere"]}}', "KeyError.'elsewhere.weight'"),
-        ('{"format": 2, "network": {"layers": []}}', "IndexError"),
-        ('{"format": 2, "network": {"layers": ["action_net"], "activation": "swish"}}', "KeyError.'swish'"),
-        ('{"format": 2, "network": {"layers": ["action_net"], "depth": 3}}', "TypeError.*depth"),
-        ('{"format": 2', "must hold sound files"),
+        ('{"format": 99}', "must have format 3, but .*policy.json has 99"),
+        ("{}", "must have format 3, but .*policy.json has None"),
+        ("[1]", "must have format 3, but .*policy.json has None"),
+        ('{"format": 3}', "must be what its card says, but .* is not: KeyError"),
+        ('{"format": 3, "network": {"layers": ["elsewhere"]}}', "KeyError.'elsewhere.weight'"),
+        ('{"format": 3, "network": {"layers": []}}', "IndexError"),
+        ('{"format": 3, "network": {"layers": ["action_net"], "activation": "swish"}}', "KeyError.'swish'"),
+        ('{"format": 3, "network": {"layers": ["action_net"], "depth": 3}}', "TypeError.*depth"),
+        ('{"format": 3', "must hold sound files"),
         ("", "must hold sound files"),
     ],
 )

@@ -10,7 +10,7 @@ from agents.evaluation.oracle_search import Config, design, main, search
 from agents.evaluation.rollout import evaluate
 from agents.evaluation.systems import Systems
 
-SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Continuous-v0"
+SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Amplitude-v1"
 STORED_IN = {"branch": "train"}
 STORED = [SHORT, POWER, "duffing_env/Amplitude-v0", "duffing_env/Output-v0"]
 

@@ -14,7 +14,7 @@ from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
 
 TRACK = "duffing_env/Amplitude-v0"
-CONTINUOUS = "duffing_env/Continuous-v0"
+CONTINUOUS = "duffing_env/Amplitude-v1"
 HORIZON = 24
 # A limit that about half of the episodes reach before their horizon.
 OPTIONS = {"horizon": HORIZON, "max_output": 0.22}

@@ -72,7 +72,8 @@ def test_where_the_manual_says_that_they_do_not(case):
 def test_those_of_another_equation_do_not():
     result = evaluate(Case(*SAME, 256, SAME, "track", estimator="nlarx"), 128, 1)
     assert set(result.hits) == PHYSICAL  # its coefficients have no truth
-    assert result.hits["m"] == result.hits["a"] == 0
+    assert result.hits["m"] == 0
+    assert result.hits["a"] < 0.3 * result.kept
     assert result.nees > 50
     assert result.error["m"] > 0.1
 

@@ -17,7 +17,8 @@ from estimator.lanes import LANES
 from estimator.models.duffing import duffing
 
 EXPERIMENT = ContinuousExperiment()
-KIND, HELD = EXPERIMENT.kind, EXPERIMENT.kind._replace(plant=duffing(noise="held"))
+KIND = EXPERIMENT.kind._replace(degree=1)  # which holds an input that does not rise
+HELD = KIND._replace(plant=duffing(noise="held"))
 PLACE = layout_of(KIND)
 STREAM = ("STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d")
 RATES = ("TRUE_stiffness", "TRUE_cubic", "TRUE_damping", "TRUE_gain")

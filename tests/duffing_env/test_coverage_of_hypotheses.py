@@ -9,7 +9,10 @@ import pytest
 from agents.evaluation.rollout import roll_out
 
 NOISE, SYSTEMS = 5e-4, 400  # V
-TRACKS = {"duffing_env/Amplitude-v0": {"max_output": 10.0}, "duffing_env/Continuous-v0": {"max_output": 1e3}}
+TRACKS = {
+    "duffing_env/Amplitude-v0": {"max_output": 10.0},
+    "duffing_env/Amplitude-v1": {"max_output": 1e3, "noise_range": 1.0},
+}
 
 
 def shown(track, hypotheses, **options):

@@ -22,17 +22,23 @@ def sums(track="duffing_env/Amplitude-v0", systems=SYSTEMS, samples=SAMPLES, **o
     return promised, gained
 
 
-KNOWN = {"noise_shape": 1e9, "horizon": 60}  # noises that are known, so that no outcome changes what it tells
+EQUATION_1 = "duffing_env/Amplitude-v1"
+KNOWN = {
+    "noise_range": 1.0,
+    "noise_hypotheses": 1,
+    "noise_shape": 1e9,
+    "horizon": 60,
+}  # noises that are known, so that no outcome changes what it tells
 
 
 @pytest.mark.parametrize(
     ("track", "options"),
     [
         ("duffing_env/Amplitude-v0", {}),
-        ("duffing_env/Continuous-v0", {}),
+        (EQUATION_1, {}),
         # seconds of compilation for another combination
-        pytest.param("duffing_env/Continuous-v0", {"estimator": "nlarx"}, marks=pytest.mark.slow),
-        ("duffing_env/Continuous-v0", {"max_slew": 0.02}),
+        pytest.param(EQUATION_1, {"estimator": "nlarx"}, marks=pytest.mark.slow),
+        (EQUATION_1, {"max_slew": 0.02}),
     ],
 )
 def test_what_is_promised_is_gained_where_the_noises_are_known(track, options):

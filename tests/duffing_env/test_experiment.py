@@ -139,7 +139,7 @@ def test_the_first_belief_is_the_prior(factorisation):
 def test_a_continuous_experiment_is_told_of_its_estimator():
     options = {"spread": 0.2, "process_noise": 1e-3, "measurement_noise": 2e-3, "noise_shape": 5.0}
     ode = ContinuousExperiment(**options)
-    assert (ode.kind.plant, ode.kind.belief, ode.kind.degree) == (duffing(), duffing(), 1)
+    assert (ode.kind.plant, ode.kind.belief, ode.kind.degree) == (duffing(), duffing(), 0)
     assert ode.setup.center.tolist() == [getattr(CONTINUOUS_TWIN, name) for name in "mcab"]
     assert ode.believed == prior_of(duffing(), CONTINUOUS_TWIN, **options)
     for factorisation in ("structured", "mean_field"):

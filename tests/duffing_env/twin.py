@@ -422,13 +422,10 @@ class TwinContinuousEnv(TwinEnv):
             self.model, self.to_coefficients, self.to_parameters = duffing(), to_rates, from_rates
         super().__init__(seed, **options)
 
-    def _input_of_the_model(self):
-        return self.last_u  # the input at x_t, as in Eq. (2)
-
     def _model_step(self, mean):
         if self.estimator == "ode":
-            return continuous_step(mean, self.last_u, self.u)
-        return difference_step(mean, self.last_u)
+            return continuous_step(mean, self.u, self.u)
+        return difference_step(mean, self.u)
 
     def _fisher_gain(self):
         # Refused where the estimator has another equation than the plant.
@@ -438,10 +435,10 @@ class TwinContinuousEnv(TwinEnv):
         """x (64,) of the model alone, from rest under the test input."""
         if self.estimator != "ode":
             return super().free_run(coefficients)
-        state, told, last_u = np.zeros(2), [], 0.0
+        state, told = np.zeros(2), []
         with np.errstate(all="ignore"):
             for u in self.max_input * multisine():
-                state, last_u = oscillate(state, coefficients, last_u, u), u
+                state = oscillate(state, coefficients, u, u)
                 told.append(state[0])
         return np.array(told)
 
@@ -452,11 +449,10 @@ class TwinContinuousEnv(TwinEnv):
         state = self.state
         # Increments of a Wiener process and of its integral, which moves x by `process_noise` in a sample.
         spread = np.linalg.cholesky(np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]]))
-        for s in range(8):
+        for _ in range(8):
 
-            def slope(tau, state, begin=s * h):
-                u = self.last_u + (begin + h * tau) * (self.u - self.last_u)
-                return h * np.array([state[1], g * u - c * state[1] - k * state[0] - b * state[0] ** 3])
+            def slope(tau, state):
+                return h * np.array([state[1], g * self.u - c * state[1] - k * state[0] - b * state[0] ** 3])
 
             increments = np.sqrt(3) * self.process_noise * spread @ self.stream.normal_pair()
             state = runge_kutta(slope, state, 1) + increments[::-1]
