@@ -1,6 +1,6 @@
 """Compare policies on common random numbers: a table, JSON and figures.
 
-$ python evaluate.py                                        the reference and baseline policies
+$ python evaluate.py                                        what ships, the planner and two signals
 $ python evaluate.py --policies runs/demo prbs              a trained policy beside PRBS
 $ python evaluate.py --policies "ppo=runs/ppo-*-[0-4]"      five training seeds as one entry
 $ python evaluate.py --report runs/report                   all of it on one HTML page
@@ -20,8 +20,8 @@ from agents.cli import RIG_TRACK, JsonOptions, check_track, run_script, with_rig
 class Config:
     """Compare policies on common random numbers."""
 
-    policies: tuple[str, ...] = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")
-    """Names of policies, or run folders; TITLE=PATTERN for the folders of several training seeds as one entry."""
+    policies: tuple[str, ...] = ()
+    """Names of policies, run folders, TITLE=PATTERN for those of several seeds; what ships and the planner if none."""
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
     rig: str | None = None
@@ -45,11 +45,12 @@ class Config:
 
 def main(config: Config) -> None:
     """Compare, and say where everything is."""
-    from agents.evaluation.comparison import compare
+    from agents.evaluation.comparison import compare, usual_policies
 
+    options = with_rig(config.options, config.rig)
     folder = config.report if config.report is not None else config.output
     compare(
-        config.policies, config.env, config.systems, with_rig(config.options, config.rig), folder,
+        config.policies or usual_policies(config.env, options), config.env, config.systems, options, folder,
         seed=config.seed, report=config.report is not None,
     )  # fmt: skip
 

@@ -40,8 +40,7 @@ class Config(TrainConfig):
 
 def main(config: Config) -> None:
     """Train, compare, and say where everything is."""
-    from agents.evaluation.comparison import compare
-    from agents.evaluation.leaderboard import BASELINES
+    from agents.evaluation.comparison import compare, usual_policies
 
     if config.tune:
         best = tune(config, config.tune)
@@ -55,7 +54,7 @@ def main(config: Config) -> None:
         run = resume(config.resume)
     print(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
     if config.systems:
-        policies = (str(run.folder), *BASELINES)
+        policies = (str(run.folder), *usual_policies(run.config.env, run.config.options))
         compare(policies, run.config.env, config.systems, run.config.options, run.folder)
     print(run.folder / "learning_curve.png")
 

@@ -7,9 +7,29 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 from agents.evaluation.leaderboard import print_estimators, print_table, write_evaluations
 from agents.evaluation.rollout import Evaluation, evaluate
+from agents.policies import TRAINED, trained_policies
+from agents.policies.learned import load_policy
 from duffing_env.silverbox import record_available
+
+#: What every input has to beat.
+SIGNALS = ("prbs", "uniform")
+
+
+def usual_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
+    """What is compared on a track where nothing else is asked for: what ships for it, the planner, and two signals.
+
+    A record can be asked for its own input only.
+    """
+    if gym.spec(env_id).kwargs.get("regime") is not None:
+        return (f"silverbox-{options.get('regime', 'multisine')}",)
+    shipped = [name for name in trained_policies() if load_policy(TRAINED / name).card["track"] == env_id]
+    # The planner decides sample by sample.
+    planner = ["efe"] if options.get("hold", 1) == 1 else []
+    return (*shipped, *planner, *SIGNALS)
 
 
 def compare(

@@ -17,9 +17,6 @@ from agents.results import show, table, write_json
 
 FloatArray = npt.NDArray[np.float64]
 
-#: What a new policy is compared with: the paper's regimes, and two classical excitations.
-BASELINES = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")
-
 _RESAMPLES = 2000
 
 
