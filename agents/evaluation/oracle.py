@@ -51,15 +51,27 @@ class Oracle:
         if not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
             raise ValueError(f"oracle must be for the systems at hand, but {path.name} is not; make it anew")
         chosen = systems.rows(0, n)
-        inputs = systems.limits.amplitude * scaled[:n].astype(np.float64)
+        inputs = systems.limits.amplitude * (scaled[:n] / LEVELS)
         return cls(chosen, inputs, chosen.worth(inputs)[0])
+
+    @staticmethod
+    def stored(systems: Systems) -> int:
+        """The number of systems that an oracle is stored of."""
+        if not systems.path.is_file():
+            return 0
+        with np.load(systems.path, allow_pickle=False) as stored:
+            return len(stored["theta"])
+
+    def first(self, count: int) -> Oracle:
+        """That of the first systems."""
+        return Oracle(self.systems.rows(0, count), self.inputs[:count], self.values[:count])
 
     def save(self) -> Path:
         """Store it in the package, in one piece."""
         content = BytesIO()
         np.savez_compressed(
             content,
-            inputs=as_stored(self.inputs / self.systems.limits.amplitude),
+            inputs=_as_integers(self.inputs / self.systems.limits.amplitude),
             theta=self.systems.theta,
             values=self.values,
             task=np.array(json.dumps(self.systems.description)),
@@ -91,9 +103,15 @@ class Oracle:
         return efficiency
 
 
-def as_stored(scaled: FloatArray) -> npt.NDArray[np.float16]:
-    """Inputs in parts of the largest as they are stored, never larger than they were; what was stored stays so."""
-    stored = scaled.astype(np.float16)
-    # A little larger is no larger: volts and back again are not exact.
-    larger = np.abs(stored.astype(np.float64)) > np.abs(scaled) * (1 + 1e-12)
-    return np.where(larger, np.nextafter(stored, np.float16(0)), stored)
+#: Inputs are stored as whole numbers, of which this one stands for the largest.
+LEVELS = 32767
+
+
+def as_stored(scaled: FloatArray) -> FloatArray:
+    """Inputs in parts of the largest as they come back from the store, never larger than they were."""
+    return _as_integers(scaled) / LEVELS
+
+
+def _as_integers(scaled: FloatArray) -> npt.NDArray[np.int16]:
+    # A little more, so that what was stored stays so.
+    return np.trunc(scaled * (LEVELS * (1 + 1e-9))).astype(np.int16)

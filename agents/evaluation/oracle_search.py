@@ -2,10 +2,13 @@
 
     python -m agents.evaluation.oracle_search --env duffing_env/Amplitude-v0 --systems 64
 
-climbs ½ log det(Λ0 + F(u)) of each system from many starts, under the track's limits, and keeps what is better than
-what is stored. F is the Fisher information at the true coefficients along the response without noise, Λ0 the inverse of
-the prior's covariance of the coefficients. With `--policies NAME ...` the search starts from those policies' inputs
-too.
+takes many ways through the map of each system's states (`agents.planner.search`), polishes each to a summit of
+½ log det(Λ0 + F(u)) under the track's limits (`agents.planner.polish`), and keeps what is better than what is stored. F
+is the Fisher information at the true coefficients along the response without noise, Λ0 the inverse of the prior's
+covariance of the coefficients. What is stored is a start.
+
+With `--check` nothing is stored: three searches from independent starts, and one twice as long, say by how much they
+differ, and what the latter gains over what is stored.
 
 System i is row i of a batch that is reset with seed 0 in the branch ``test``, as `agents.evaluation.rollout.evaluate`
 does it by default; it does not depend on the number of systems.
@@ -14,169 +17,131 @@ does it by default; it does not depend on the number of systems.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from agents.cli import JsonOptions, run_script
-from agents.evaluation.oracle import Oracle, as_stored
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.oracle import LEVELS, Oracle, as_stored
 from agents.evaluation.systems import Systems
 from agents.planner import search as planning
-from agents.planner.ascent import climber
+from agents.planner.ascent import Limits, climber
 from agents.planner.imagination import Terms
 from agents.planner.motion import View, scales
+from agents.planner.polish import polish
 from agents.planner.pursuit import pursuit
 from estimator.belief import Belief
-from estimator.models.difference import difference
 from estimator.parameters import FloatArray
 
-#: Steps of the gradient, random starts, and changed copies in a round.
-_ITERATIONS, _STARTS, _COPIES = 100, 24, 16
+#: Starts of a search.
+_TRIES = 24
+
+#: Cells of the map along each axis, one of which is drawn for every start.
+_CELLS = (24, 32, 48, 64)
+
+#: Share of the limits of signal and energy that is aimed at, because what is stored is rounded.
+_AIM = 1.0 - 1e-4
+
+#: Spread of the factors by which starts change the rate of information that they expect.
+_DOUBT = 0.3
 
 
 def search(
-    systems: Systems, row: int, given: FloatArray, rng: np.random.Generator, rounds: int = 8
+    systems: Systems, row: int, given: FloatArray, rng: np.random.Generator, tries: int = _TRIES
 ) -> tuple[FloatArray, float]:
     """Search the best input of one system.
 
-    Gradient ascent from many starts, then in rounds from changed copies of the best one (iterated local search). Where
-    only amplitudes are limited and the plant is the paper's equation, copies are planned anew from a random sample on,
-    which finds more than the gradient.
+    A start is the best way through the map of the states, whose criterion expects of the rest of the way the rate of
+    information that the best input so far has brought, each coefficient's changed at random; every second one keeps the
+    begin of the best input. Under a limit of energy a start is a burst that pushes as the system moves.
 
     Args:
         systems: of a track.
         row: the system.
         given: (k, samples) inputs to start from besides [V].
-        rng: of the random starts and changes.
-        rounds: of changed copies, `_COPIES` in each.
+        rng: of the starts.
+        tries: starts besides those given.
 
     Returns:
         The best input (samples,) [V] that keeps all limits also as it is stored, and its worth [nats]; -inf if none.
     """
-    rows = np.full(len(given) + _STARTS, row)
-    one = replace(systems, theta=systems.theta[rows], variances=systems.variances[rows])
-    model, limits = systems.plant.model, systems.limits
-    is_frugal = bool(np.isfinite(limits.energy))
-    is_planned = not is_frugal and model == difference()
-    best, best_value = np.zeros(systems.samples), -np.inf
+    one, model = systems.rows(row, row + 1), systems.plant.model
+    exact = systems.limits
+    limits = exact._replace(aim=_AIM * exact.output, energy=_AIM * exact.energy)
+    sizes = scales(View(model, systems.degree), one.theta[0], limits.amplitude, limits.output)
     words = rng.integers(0, 2**64, 4, dtype=np.uint64)
-    if is_frugal:
-        pool = np.empty((_STARTS, systems.samples))
-        pursuit(model, systems.degree).swings(one.known(0), limits.output, limits.energy, pool, words)
-    else:
-        pool = _signals(_STARTS, systems.samples, limits.amplitude, rng)
-    pool = np.concatenate([given, pool])
-    for k in range(rounds + 1):
-        if k == 0 or not is_planned:
-            _climb(one, pool, 0.3 if k == 0 else 0.1)
-        # What is stored is rounded; only what keeps the limits as stored counts.
-        pool = limits.amplitude * as_stored(pool / limits.amplitude).astype(np.float64)
-        values, peaks = one.worth(pool)
-        values[~(peaks <= limits.output)] = -np.inf
-        if values.max() > best_value:
-            best, best_value = pool[values.argmax()].copy(), float(values.max())
-        if is_planned:
-            pool = np.stack([_planned(best, one, rng, words) for _ in range(_COPIES)])
+    best, best_value = np.zeros(systems.samples), -np.inf
+    for k in range(len(given) + tries):
+        if k < len(given):
+            start = given[k]
+        elif np.isfinite(limits.energy):
+            start = _burst(one, limits, words)
         else:
-            pool = np.stack([_changed(best, rng) for _ in range(_COPIES)])
+            start = _way(one, limits, sizes, best, k % 2 == 1 and np.isfinite(best_value), rng, words)
+        start = as_stored(np.clip(start / limits.amplitude, -1.0, 1.0)) * limits.amplitude
+        u, _ = polish(model, systems.degree, one.known(0), limits, sizes, start, limits.amplitude / LEVELS)
+        u = as_stored(u / limits.amplitude) * limits.amplitude
+        value, peak = (float(found[0]) for found in one.worth(u[None]))
+        if peak <= exact.output and u @ u <= exact.energy and value > best_value:
+            best, best_value = u, value
     return best, best_value
 
 
-def _climb(one: Systems, pool: FloatArray, rate: float) -> None:
-    """Gradient ascent from every input of a pool (k, samples), in place."""
-    improve = climber(one.plant.model, one.degree).improve
-    improve(one.known(0), one.limits, rate, _ITERATIONS, pool, np.empty(len(pool)))
-
-
-def _planned(u: FloatArray, one: Systems, rng: np.random.Generator, words: npt.NDArray[np.uint64]) -> FloatArray:
-    """A copy that the planner, who knows the system, plans anew from a random sample on."""
-    planned = u.copy()
-    model, limits = one.plant.model, one.limits
-    n = model.n_states
-    mean, cov = np.zeros(len(model.names)), np.zeros((len(model.names), len(model.names)))
+def _way(
+    one: Systems, limits: Limits, sizes: FloatArray, best: FloatArray, keeps: bool, rng: np.random.Generator,
+    words: np.ndarray,
+) -> FloatArray:  # fmt: skip
+    """The best way through the map of the states; ``keeps`` says that it begins as the best input so far."""
+    model = one.plant.model
+    n, size = model.n_states, len(model.names)
+    mean, cov = np.zeros(size), np.zeros((size, size))
     mean[n:], cov[n:, n:] = one.theta[0], np.linalg.inv(one.precision)
     noises = [(1.0, variance) for variance in one.variances[0]]
     record = Belief.of(model, mean, cov, noises[0], noises[1:]).record.copy()
-    first = int(rng.integers(-one.samples // 8, one.samples - 1))
-    horizon, rounds = int(rng.integers(8, 25)), int(rng.integers(1, 9))
-    limit = 0.9999 * limits.output  # leaves room for the rounding of what is stored
+    told = one.information(best[None])[0]
+    doubts = np.exp(_DOUBT * rng.standard_normal(len(told)))
+    rate = told * np.outer(doubts, doubts) / one.samples
+    u = best.copy()
+    first = int(rng.integers(one.samples // 16, one.samples * 7 // 8)) if keeps else 0
+    terms = Terms(limits.amplitude, np.inf, limits.aim, 0.0, np.zeros(model.n_coefficients), sizes)
     view = View(model, one.degree)
-    sizes = scales(view, one.theta[0], limits.amplitude, limit)
-    terms = Terms(limits.amplitude, np.inf, limit, 0.0, np.zeros(model.n_coefficients), sizes)
-    planning.search(*view).play(record, first, horizon, rounds, terms, planned, words)
-    return planned
+    planning.search(*view).through(record, first, int(rng.choice(_CELLS)), terms, rate, words, u)
+    return u
 
 
-def _signals(count: int, samples: int, amplitude: float, rng: np.random.Generator) -> FloatArray:
-    """(count, samples) random binary signals of several holds, and square waves about resonance."""
-    signals = np.empty((count, samples))
-    t = np.arange(samples)
-    for i in range(count):
-        if i % 2:
-            half_period = rng.uniform(2.5, 6.0)  # of 610 Hz: 50 to 120 Hz
-            signals[i] = np.where(((t + rng.uniform(0, 12)) // half_period) % 2 == 0, 1.0, -1.0)
-        else:
-            hold = rng.integers(1, 9)
-            signals[i] = np.repeat(rng.choice([-1.0, 1.0], -(-samples // hold)), hold)[:samples]
-        # Weak ones too, because strong ones may begin far beyond the displacement limit.
-        signals[i] *= amplitude * rng.choice([0.3, 0.6, 1.0])
-    return signals
+def _burst(one: Systems, limits: Limits, words: np.ndarray) -> FloatArray:
+    """A burst that pushes as the system moves, improved by its gradient."""
+    u = np.empty((1, one.samples))
+    pursuit(one.plant.model, one.degree).swings(one.known(0), limits.output, limits.energy, u, words)
+    climber(one.plant.model, one.degree).improve(one.known(0), limits, 0.3, 100, u, np.empty(1))
+    return u[0]
 
 
-def _changed(u: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """A copy with a stretch turned over, shifted, or drawn anew."""
-    changed = u.copy()
-    length = int(rng.integers(4, max(5, len(u) // 4)))
-    first = int(rng.integers(0, len(u) - length + 1))
-    stretch = slice(first, first + length)
-    kind = rng.integers(3)
-    if kind == 0:
-        changed[stretch] = -changed[stretch]
-    elif kind == 1:
-        changed[stretch] = np.roll(changed[stretch], rng.integers(1, length))
-    else:
-        changed[stretch] = np.abs(changed[stretch]) * rng.choice([-1.0, 1.0], length)
-    return changed
-
-
-def design(
-    systems: Systems,
-    given: FloatArray,
-    *,
-    rounds: int = 8,
-    seed: int = 0,
-    on_row: Callable[[int, float], None] | None = None,
-) -> Oracle:
-    """Search all systems; what is stored is a start, so the result is never worse.
-
-    Args:
-        systems: of a track.
-        given: (k, n, samples) inputs to start from besides [V].
-        rounds: see `search`.
-        seed: of the search.
-        on_row: called with each row and its value.
-    """
+def begun(systems: Systems) -> Oracle:
+    """The stored oracle, with systems that it lacks at rest and worth -inf."""
     n = len(systems.theta)
     inputs, values = np.zeros((n, systems.samples)), np.full(n, -np.inf)
-    try:
+    count = Oracle.stored(systems)
+    if count:
         stored = Oracle.of(systems)
-        inputs[: len(stored.values)], values[: len(stored.values)] = stored.inputs, stored.values
-    except FileNotFoundError:
-        pass
-    for row in range(n):
-        starts = given[:, row]
-        if np.isfinite(values[row]):
-            starts = np.concatenate([starts, inputs[row : row + 1]])
-        rng = np.random.default_rng([seed, row])
-        found, value = search(systems, row, np.nan_to_num(starts), rng, rounds=rounds)
-        if value > values[row]:
-            inputs[row], values[row] = found, value
-        if on_row is not None:
-            on_row(row, values[row])
+        inputs[:count], values[:count] = stored.inputs, stored.values
     return Oracle(systems, inputs, values)
+
+
+def check(oracle: Oracle, tries: int, seed: int) -> str:
+    """Three searches from independent starts of every system, and one twice as long: how they compare, in words."""
+    none = np.empty((0, oracle.systems.samples))
+    found = np.empty((len(oracle.values), 4))
+    for row in range(len(found)):
+        for k in range(4):
+            rng = np.random.default_rng([seed, row, k])
+            found[row, k] = search(oracle.systems, row, none, rng, tries * (2 if k == 3 else 1))[1]
+    apart, gain = np.ptp(found[:, :3], axis=1), np.maximum(found[:, 3] - oracle.values, 0.0)
+    return (
+        f"{len(found)} systems; means and maxima in nats:\n"
+        f"three searches differ by {apart.mean():.4f}, {apart.max():.4f};\n"
+        f"one twice as long gains {gain.mean():.4f}, {gain.max():.4f} over what is stored"
+    )
 
 
 @dataclass(frozen=True)
@@ -189,26 +154,37 @@ class Config:
     """Further options of the environment, as JSON."""
     systems: int = 256
     """Number of systems: the first rows of a batch that is reset with seed 0."""
-    policies: tuple[str, ...] = ("efe",)
-    """Policies whose inputs to start from besides."""
-    rounds: int = 8
-    """Rounds of changed copies of the best input."""
+    first: int = 0
+    """The first of them that is searched; those before stay as they are stored."""
+    tries: int = _TRIES
+    """Starts of a search."""
     seed: int = 0
     """Of the search."""
+    check: bool = False
+    """Search anew and compare, and store nothing."""
 
 
 def main(config: Config) -> None:
     """Search, store, and say how far it is."""
     systems = Systems.of(config.env, config.systems, config.options)
-    given = np.empty((0, config.systems, systems.samples))
-    if config.policies:
-        played = evaluate(config.policies, config.env, config.systems, options=config.options)
-        given = np.stack([evaluation.inputs.T for evaluation in played])
     began = time.perf_counter()
-    oracle = design(systems, given, rounds=config.rounds, seed=config.seed)
-    path = oracle.save()
-    gained = oracle.values - 0.5 * np.linalg.slogdet(systems.precision)[1]
-    print(f"{len(oracle.values)} systems in {time.perf_counter() - began:.0f} s: mean gain {gained.mean():.3f} nats")
+    if config.check:
+        print(check(Oracle.of(systems), config.tries, config.seed))
+        print(f"{time.perf_counter() - began:.0f} s")
+        return
+    count = max(config.systems, Oracle.stored(systems))
+    oracle = begun(Systems.of(config.env, count, config.options))
+    for row in range(config.first, config.systems):
+        starts = oracle.inputs[row : row + 1] if np.isfinite(oracle.values[row]) else oracle.inputs[:0]
+        rng = np.random.default_rng([config.seed, row])
+        found, value = search(oracle.systems, row, starts, rng, config.tries)
+        if value > oracle.values[row]:
+            oracle.inputs[row], oracle.values[row] = found, value
+        if row + 1 == config.systems or row % 8 == 7:  # a search that is cut short leaves what it found
+            path = oracle.first(int(np.isfinite(oracle.values).sum())).save()
+    gained = oracle.values - 0.5 * np.linalg.slogdet(oracle.systems.precision)[1]
+    seconds = time.perf_counter() - began
+    print(f"{config.systems - config.first} systems in {seconds:.0f} s; mean gain of {count}: {gained.mean():.3f} nats")
     print(f"stored in {path}")
 
 

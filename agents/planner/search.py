@@ -43,9 +43,6 @@ _HOPELESS = 1.0
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
 
-_MOST = _LATE_CELLS * _LATE_CELLS
-_BLOCKS = -(-_MOST // LANES)
-
 
 class Search(NamedTuple):
     """The search for a model, compiled.
@@ -69,10 +66,14 @@ class Search(NamedTuple):
         play: ``play(record, first, horizon, rounds, terms, u, words)`` plans the inputs u (T,) from sample ``first``
             on, where the means of the belief are the truth. The inputs before it are followed as they are. Arguments as
             of ``plan``; ``words`` is (4,), and the record is overwritten.
+        through: ``through(record, cells, terms, rate, words, u)`` finds all inputs u (T,) of an episode, where the
+            means of the belief are the truth, as the best way through so many cells along each axis. ``rate`` (K, K) is
+            the information per sample that is expected of the rest of the way.
     """
 
     plan: Any
     play: Any
+    through: Any
 
 
 class Memory(NamedTuple):
@@ -122,9 +123,11 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     inner, entry = part(kind), kernel(kind=kind)
 
     @inner
-    def memory(horizon):
-        ways, continued = np.empty((_BLOCKS, size)), np.empty((_CHOICES * _BLOCKS, size))
-        origins, inputs = np.empty((horizon, _MOST), np.int64), np.empty((horizon, _MOST))
+    def memory(horizon, cells):
+        blocks = -(-(cells * cells if is_plane else cells) // LANES)
+        most = blocks * LANES
+        ways, continued = np.empty((blocks, size)), np.empty((_CHOICES * blocks, size))
+        origins, inputs = np.empty((horizon, most), np.int64), np.empty((horizon, most))
         return Memory(ways, continued, origins, inputs, np.empty((LANES, horizon)))
 
     @inner
@@ -255,7 +258,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
     @entry
     def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, scores):
-        kept_memory = memory(horizon)
+        kept_memory = memory(horizon, _LATE_CELLS)
         for i in range(len(records)):
             rest = max(1, left[i])
             scores[i] = improve(
@@ -265,7 +268,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
     @entry
     def play(record, first, horizon, rounds, terms, u, words):
-        kept_memory = memory(horizon)
+        kept_memory = memory(horizon, _LATE_CELLS)
         best, rate, W = np.zeros(horizon), np.zeros((k, k)), np.empty(size)
         lasts = np.zeros(2)
         for t in range(len(u)):
@@ -280,7 +283,21 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             collect(W, record)
             lasts[1], lasts[0] = lasts[0], u[t]
 
-    return Search(plan, play)
+    @entry
+    def through(record, first, cells, terms, rate, words, u):
+        M, W, lasts = np.zeros((k, k)), np.empty(size), np.zeros(2)
+        factorise(rate, M)
+        for t in range(first):
+            begin(W, record, lasts)
+            for j in range(LANES):
+                W[U + j] = u[t]
+            advance(W, record, terms)
+            collect(W, record)
+            lasts[1], lasts[0] = lasts[0], u[t]
+        left = len(u) - first
+        find_way(memory(left, cells), Task(record, left, left, terms, lasts, M), cells, u[first:], words)
+
+    return Search(plan, play, through)
 
 
 @jit
