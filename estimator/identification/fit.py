@@ -7,7 +7,8 @@ coefficients ψ it is judged by the free energy of a Gaussian at the minimum (va
     L = ½ Σ_t (ν_t²/S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0),    F = L + ½ log det(Λ0 + I) - ½ log det Λ0,
 
 with the information I of `estimator.information`. The level of the noises is not searched: S grows with it as a whole,
-so at the best level Σ ν²/S is the number of outputs N, and ½ Σ(...) = ½ (Σ log S + N log(Σ ν²/S / N) + N).
+so at the best level Σ ν²/S is the number of outputs N, and ½ Σ(...) = ½ (Σ log S + N log(Σ ν²/S / N) + N). The
+first outputs of a record, as many as there are states, do not count: any motion may have been before them.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from estimator.parameters import FloatArray
 
 #: Damping at the start of a fit, its change after a step that fails or succeeds, its least, and where a fit is given
 #: up.
-_DAMPING, _UP, _DOWN, _LEAST, _STUCK = 1e-3, 10.0, 0.1, 1e-9, 1e2
+_DAMPING, _UP, _DOWN, _LEAST, _STUCK = 1e-6, 30.0, 0.1, 1e-9, 1e2
 
 #: A step that promises to lower the loss by less is the last of a fit [nats]: it is a seventh of a standard deviation,
 #: of which it leaves a small part.
@@ -167,8 +168,8 @@ class Fitter:
         self, points: FloatArray, inputs: FloatArray, ratios: FloatArray, levels: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Loss (H,), its slope (H, K) and curvature (H, K, K) in units of the prior, and the best levels (H,)."""
-        problem, count, n = self.problem, len(points), self.problem.samples
-        records = len(problem.u)
+        problem, count, records = self.problem, len(points), len(self.problem.u)
+        n = problem.samples - records * problem.model.n_states
         noises = np.stack([(ratios * levels) ** 2, levels**2], axis=1)
         found = follow(
             problem.model,
