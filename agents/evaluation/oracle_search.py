@@ -27,7 +27,7 @@ from agents.evaluation.systems import Systems
 from agents.planner import search as planning
 from agents.planner.ascent import Limits, climber
 from agents.planner.imagination import Terms
-from agents.planner.motion import View, scales
+from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
 from agents.planner.pursuit import pursuit
 from estimator.belief import Belief
@@ -68,7 +68,7 @@ def search(
     one, model = systems.rows(row, row + 1), systems.plant.model
     exact = systems.limits
     limits = exact._replace(aim=_AIM * exact.output, energy=_AIM * exact.energy)
-    sizes = scales(View(model, systems.degree), one.theta[0], limits.amplitude, limits.output)
+    sizes = swing_of(View(model, systems.degree), one.theta[0], limits.amplitude, limits.output).scales
     words = rng.integers(0, 2**64, 4, dtype=np.uint64)
     best, best_value = np.zeros(systems.samples), -np.inf
     for k in range(len(given) + tries):

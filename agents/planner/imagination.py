@@ -21,6 +21,9 @@ from estimator.parameters import FloatArray
 #: Nats that an output beyond its limit costs, per limit that it is beyond: more than any plan can teach.
 _BEYOND = 1e4
 
+#: A margin is no wider than this part of the limit: where noise alone leads beyond it, no plan is safe.
+MOST_MARGIN = 0.5
+
 
 class Terms(NamedTuple):
     """What a plan is judged by besides the belief, and what bounds its inputs.
@@ -32,6 +35,8 @@ class Terms(NamedTuple):
         margin: predictive standard deviations that a plan keeps from it.
         walk: (K,) variances of the coefficients' random walk in a sample; zeros for constants.
         scales: (n,) sizes of the states when the first sensor is at its limit.
+        pace: samples that a planned input is held for.
+        shaken: times the process noise's variance that a plan keeps from the limit besides (`agents.planner.motion`).
         price: nats for the square of an input.
         goal: mean of the goal prior of what the first sensor shows.
         goal_weight: half its precision; 0 for no goal.
@@ -43,6 +48,8 @@ class Terms(NamedTuple):
     margin: float
     walk: FloatArray
     scales: FloatArray
+    pace: int = 1
+    shaken: float = 0.0
     price: float = 0.0
     goal: float = 0.0
     goal_weight: float = 0.0
@@ -76,9 +83,9 @@ class Mind(NamedTuple):
     precision: Any
 
 
-def _charge(INPUT, SHOWN, SPREAD, COST, noise, limit, margin, price, goal, goal_weight):
-    """What a sample costs; of the output's variance ``noise`` is the sensor's own."""
-    over = abs(SHOWN) + margin * np.sqrt(SPREAD) - limit
+def _charge(INPUT, SHOWN, SPREAD, COST, noise, unforeseen, limit, margin, price, goal, goal_weight):
+    """What a sample costs; of the output's variance ``noise`` is the sensor's own, ``unforeseen`` comes to it."""
+    over = abs(SHOWN) + min(margin * np.sqrt(SPREAD + unforeseen), MOST_MARGIN * limit) - limit
     over = over if over > 0.0 else 0.0
     off = SHOWN - goal
     return COST + _BEYOND / limit * over + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise)
@@ -106,7 +113,7 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     covariance = place[f"P_{first}_{first}"] * LANES
     noise = names.index("GAMMA_SHAPE") + 2
     advance_belief, judge = imagined.advance, imagined.judge
-    uniform = "noise limit margin price goal goal_weight"
+    uniform = "noise unforeseen limit margin price goal goal_weight"
     charge = lanewise(place, "COST", uniform=uniform)(_charge)
     weigh = lanewise(place, "SCORE")(_weigh)
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
@@ -132,8 +139,8 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     @inner
     def advance(W, record, terms):
         advance_belief(W, record, terms.walk)
-        r = record[noise + 1] / record[noise]
-        charge(W, r, terms.limit, terms.margin, terms.price, terms.goal, terms.goal_weight)
+        r, q = record[noise + 1] / record[noise], record[noise - 1] / record[noise - 2]
+        charge(W, r, terms.shaken * q, terms.limit, terms.margin, terms.price, terms.goal, terms.goal_weight)
 
     @inner
     def appraise(W, M, scale):

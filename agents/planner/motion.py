@@ -169,26 +169,64 @@ def frequency(belief: Belief) -> float:
     return max(cycles, 1e-9)
 
 
-#: Samples of the motion by which states are measured, and where it turns, in parts of the limit.
+#: Samples of the motion by which a system is measured, and where it turns, in parts of the limit.
 _SAMPLES, _TURN = 128, 0.95
+
+#: Moves of the input in a period of the motion: fewer cannot follow it, more take time and look less far.
+_MOVES = 9
+
+
+class Swing(NamedTuple):
+    """How a system swings when it is pumped up along its velocity, and turned before the limit.
+
+    Attributes:
+        scales: (states,) sizes of the states when the first sensor is at its limit. The sensor's own state, and one
+            that keeps its last value, have the limit itself. Others, such as a velocity, have the limit times the ratio
+            of their peak to the sensor's. So they have no unit of their own to go wrong by, and are right where the
+            limit is out of reach, too.
+        pace: samples that a planned input is held for, so that a plan of some moves looks some periods ahead also
+            where there are many samples in a period.
+        shaken: variance by which process noise moves the oscillator in a quarter of a period, in parts of what it does
+            to the first sensor in a sample, less that sample's own. Nothing done within this time takes it back.
+        taught: (K, K) the mean of φ φᵀ over the samples, with φ the derivatives by the coefficients of what the first
+            sensor shows a sample later.
+    """
+
+    scales: FloatArray
+    pace: int
+    shaken: float
+    taught: FloatArray
 
 
 @cache
 def _swinger(view: View) -> Any:
-    """``swing(means, max_input, limit, peaks)``: the peaks of states and sensor of a system that is pumped up."""
+    """``swing(means, max_input, limit, peaks, taught)`` fills `Swing.taught`, and what the others are made of.
+
+    These are the peaks of states and sensor, then samples in a period, or 0.
+    """
     found = motion(*view)
     at, sense, glance, step = found.layout, found.sense, found.glance, found.step
     n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
     u, shown, velocity = at["INPUT"], at["SHOWN"], at["VELOCITY"]
+    phi = at[f"PHI_{next(iter(view.model.coefficients))}"]
 
     @kernel(kind=f"{view.model.name}_{view.model.digest}_{view.degree}_{view.lag}")
-    def swing(means, max_input, limit, peaks):
+    def swing(means, max_input, limit, peaks, taught):
         W = np.zeros(size)
         copy(W, n, means, k)
         fill(peaks, 0.0)
-        for _ in range(_SAMPLES):
+        for a in range(k):
+            fill(taught[a], 0.0)
+        turns, first, last, way = 0, 0, 0, 0.0
+        for t in range(_SAMPLES):
             sense(W)
-            W[u] = max_input if W[velocity] >= 0.0 else -max_input
+            now = 1.0 if W[velocity] >= 0.0 else -1.0
+            W[u] = max_input * now
+            if t > 0 and now != way:
+                first = t if turns == 0 else first
+                last = t
+                turns += 1
+            way = now
             glance(W)
             if abs(W[shown]) > _TURN * limit:
                 W[u] = -W[u]
@@ -198,17 +236,17 @@ def _swinger(view: View) -> Any:
             for i in range(n):
                 peaks[i] = max(peaks[i], abs(W[i]))
             peaks[n] = max(peaks[n], abs(W[shown]))
+            for a in range(k):
+                for b in range(k):
+                    taught[a, b] += W[phi + a] * W[phi + b] / _SAMPLES
+        if turns > 1:
+            peaks[n + 1] = 2.0 * (last - first) / (turns - 1)
 
     return swing
 
 
-def scales(view: View, prior_means: npt.ArrayLike, max_input: float, limit: float) -> FloatArray:
-    """Sizes of the states when the first sensor is at its limit.
-
-    The sensor's own state, and one that keeps its last value, have the limit itself. Others, such as a velocity, are
-    measured by the motion of the prior's means, pumped up along the velocity and turned before the limit: a state's
-    scale is the limit times the ratio of its peak to the sensor's. So it has no unit of its own to go wrong by, and is
-    right where the limit is out of reach, too.
+def swing_of(view: View, prior_means: npt.ArrayLike, max_input: float, limit: float) -> Swing:
+    """How the prior's means swing.
 
     Args:
         view: of the model.
@@ -217,10 +255,14 @@ def scales(view: View, prior_means: npt.ArrayLike, max_input: float, limit: floa
         limit: of the first sensor.
     """
     model = view.model
-    peaks = np.empty(model.n_states + 1)
-    _swinger(view)(np.asarray(prior_means, dtype=np.float64), float(max_input), float(limit), peaks)
+    peaks, taught = np.empty(model.n_states + 2), np.empty((model.n_coefficients, model.n_coefficients))
+    _swinger(view)(np.asarray(prior_means, dtype=np.float64), float(max_input), float(limit), peaks, taught)
+    sizes, peak, period = peaks[:-2], peaks[-2], peaks[-1]
     sensor = next(iter(model.outputs.values()))
     moves = zip(model.states, model.moves, strict=True)
     keeps = np.array([x == sensor or (not model.is_continuous and move == sensor) for x, move in moves])
-    keeps |= (peaks[:-1] <= 0) | (peaks[-1] <= 0)
-    return limit * np.divide(peaks[:-1], peaks[-1], out=np.ones(model.n_states), where=~keeps)
+    keeps |= (sizes <= 0) | (peak <= 0)
+    scales = limit * np.divide(sizes, peak, out=np.ones(model.n_states), where=~keeps)
+    # Kicks of the velocity, of variance 3 a sample, after a quarter period 2π/4ω: 3 (t/2ω²).
+    shaken = max(0.0, 3.0 * period**3 / (32.0 * np.pi**2) - 1.0)
+    return Swing(scales, max(1, round(period / _MOVES)), float(shaken), taught)

@@ -30,23 +30,40 @@ That search knows neither ``max_slew`` nor ``drift``.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
 from agents.planner.imagination import Terms
-from agents.planner.motion import View, places, scales
+from agents.planner.motion import View, places, swing_of
 from agents.planner.pursuit import Rule, pursuit
 from agents.planner.search import search
 from estimator.parameters import FloatArray
 
-#: The last plans (n, horizon) in V, what plans taught per sample (n, K, K), the streams of random numbers (n, 4), and
-#: the last input (n,) in V.
-PlannerState = tuple[FloatArray, FloatArray, npt.NDArray[np.uint64], FloatArray]
 
-#: Samples to plan for under an amplitude limit: some periods of the oscillator.
+class PlannerState(NamedTuple):
+    """What `Planner.predict` goes on from, of n environments.
+
+    Attributes:
+        plans: (n, horizon) the last plans [V].
+        rates: (n, K, K) what plans taught per sample.
+        words: (n, 4) the streams of random numbers.
+        last: (n,) the last inputs [V].
+        chosen: (n,) the inputs that were chosen last [V].
+        held: (n,) samples that these are still to be held for.
+    """
+
+    plans: FloatArray
+    rates: FloatArray
+    words: npt.NDArray[np.uint64]
+    last: FloatArray
+    chosen: FloatArray
+    held: npt.NDArray[np.int64]
+
+
+#: Moves to plan under an amplitude limit: some periods of the oscillator.
 _HORIZON = 24
 
 
@@ -60,9 +77,9 @@ class Planner:
         env: the unwrapped environment, single or vector, whose beliefs it reads: `predict` must be called between
             its steps, with its observations.
         seed: of the search.
-        horizon: samples to plan for; by default 24, and the whole episode where the energy is limited. No more than 20
-            of the last 48 of an episode.
-        rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 samples; of no
+        horizon: moves to plan for, each held for ``terms.pace`` samples; by default 24, and the whole episode sample by
+            sample where the energy is limited. No more than 20 of the last 48 of an episode.
+        rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 moves; of no
             effect on a plan of the whole episode.
         risk: upper bound of the probability that an episode ends early, in (0, 1), where the belief is right.
         goal: mean of the goal prior of the displacement [V].
@@ -126,13 +143,16 @@ class Planner:
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
         means = experiment.believed.coefficients_mean
+        swing = swing_of(self.view, means, setup.max_input, setup.max_output)
         self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,
             limit=setup.max_output,
             margin=float(-ndtri(risk / env.horizon)) * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
-            scales=scales(self.view, means, setup.max_input, setup.max_output),
+            scales=swing.scales,
+            pace=swing.pace,
+            shaken=swing.shaken,
             price=float(input_cost),
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
@@ -168,27 +188,37 @@ class Planner:
         n = len(records)
         k, terms = self.view.model.n_coefficients, self.terms
         if state is None:
-            plans, rates, before = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n)
             words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
-        else:
-            plans, rates, words, before = state[0].copy(), state[1].copy(), state[2].copy(), state[3].copy()
+            plans, rates, held = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n, dtype=np.int64)
+            state = PlannerState(plans, rates, words, np.zeros(n), np.zeros(n), held)
+        plans, rates, words = state.plans.copy(), state.rates.copy(), state.words.copy()
+        before, chosen, held = state.last.copy(), state.chosen.copy(), state.held.copy()
         if episode_start is not None:
             begun = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)
-            plans[begun], rates[begun], before[begun] = 0.0, 0.0, 0.0
+            plans[begun], rates[begun], before[begun], held[begun] = 0.0, 0.0, 0.0, 0
         at, rows = places(self.view.model), observed.reshape(n, -1)
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
         last = terms.amplitude * rows[:, at.last_input]
-        inputs, scores = np.empty((2, n))
+        due = np.flatnonzero(held == 0)
+        inputs, scores = np.empty((2, len(due)))
+        searched = plans[due], rates[due], words[due]
         if self._energy is not None:
-            energies, rule = rows[:, at.budget_left] * self._energy, Rule(terms.amplitude, terms.limit, terms.margin)
-            self._pursue(records, left, energies, rule, last, plans, words, inputs, scores)
-        else:
-            lasts = np.stack([last, before], axis=1)
-            search(*self.view).plan(
-                records, left, self.horizon, self.rounds, terms, lasts, plans, rates, words, inputs, scores
+            energies, rule = (
+                rows[:, at.budget_left] * self._energy,
+                Rule(terms.amplitude, terms.limit, terms.margin, terms.shaken),
             )
-        actions = (inputs / terms.amplitude).astype(np.float32)
-        return actions.reshape(*observed.shape[:-1], 1), (plans, rates, words, last)
+            self._pursue(records, left, energies, rule, last, *searched[::2], inputs, scores)
+        else:
+            lasts = np.stack([last, before], axis=1)[due]
+            search(*self.view).plan(
+                records[due], left[due], self.horizon, self.rounds, terms, lasts, *searched, inputs, scores
+            )
+            held[due] = np.clip(left[due], 1, terms.pace)
+            held -= 1
+        plans[due], rates[due], words[due] = searched
+        chosen[due] = inputs
+        actions = (chosen / terms.amplitude).astype(np.float32)
+        return actions.reshape(*observed.shape[:-1], 1), PlannerState(plans, rates, words, last, chosen, held)
 
 
 def _stream(seed: np.random.SeedSequence) -> npt.NDArray[np.uint64]:

@@ -162,7 +162,7 @@ def polish(
         degree: of the input's polynomial over a sample.
         known: what the worth is taken at.
         limits: to be kept; ``aim`` is the limit of the signal that is aimed at. The energy may be exceeded a little.
-        sizes: (n,) of the states (`agents.planner.motion.scales`).
+        sizes: (n,) of the states (`agents.planner.motion.Swing`).
         u: (T,) inputs, which may be beyond the limits of signal and energy.
         unit: that inputs are multiples of, and the amplitude too. Rounding them afterwards would lead far away: of a
             hard oscillator errors grow by several powers of ten over an episode.

@@ -17,6 +17,7 @@ import numpy as np
 from agents.planner.ascent import Limits, climber, project
 from agents.planner.candidates import uniform
 from agents.planner.design import Known, designer, half_log_det, invert
+from agents.planner.imagination import MOST_MARGIN
 from estimator.arrays import copy
 from estimator.belief import covariance_places
 from estimator.engine.rows import belief_names
@@ -34,6 +35,9 @@ _RATE = 0.2
 
 #: A burst that drives the signal further than so many times its limit goes on from rest.
 _FAR = 2.0
+
+#: A plan that leads beyond the limit is halved up to so many times.
+_SOFTER = 6
 
 
 class Pursuit(NamedTuple):
@@ -68,18 +72,20 @@ class Rule(NamedTuple):
         amplitude: largest input.
         limit: of the first sensor's signal.
         margin: its predictive standard deviations, those of the first sample, that a plan keeps from the limit.
+        shaken: see `agents.planner.imagination.Terms`.
     """
 
     amplitude: float
     limit: float
     margin: float
+    shaken: float = 0.0
 
 
 @cache
 def pursuit(model: Model, degree: int = 0) -> Pursuit:
     """Planning the whole rest of an episode of a model; arguments as `agents.planner.design.designer`."""
     found, ascend = designer(model, degree), climber(model, degree).ascend
-    memory_for, start_size, n_path = found.memory, found.start_size, found.n_path
+    worth, memory_for, start_size, n_path = found.worth, found.memory, found.start_size, found.n_path
     begin_path, coefficients_of, lay, step = found.code.begin, found.code.coefficients, found.code.lay, found.code.step
     n, k, sensors = model.n_states, model.n_coefficients, model.n_outputs
     kind = f"{model.name}_{model.digest}_{degree}"
@@ -140,7 +146,8 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
                 variances[a] = records[i, noise + 2 * a + 1] / records[i, noise + 2 * a]
             known = Known(coefficients, precision, as_noises(variances))
             _, _, spread = rest(known, start, last[i], memory.tape)
-            aim = rule.limit - rule.margin * np.sqrt(spread)
+            margin = rule.margin * np.sqrt(spread + rule.shaken * variances[0])
+            aim = rule.limit - min(margin, MOST_MARGIN * rule.limit)
             u, other = plans[i, :steps], challenger[:steps]
             fresh = plans[i, 0] == 0.0
             for t in range(T - 1):
@@ -155,6 +162,13 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
             if fresh or ascend(known, limits, _RATE, _TRIAL, start, other, best[:steps], memory) > scores[i]:
                 copy(u, 0, other, steps)
                 scores[i] = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
+            # The gradient may not have come down from where it began.
+            for _ in range(_SOFTER):
+                _, peak = worth(known, aim, 0.0, start, u, memory)
+                if peak <= rule.limit:
+                    break
+                for t in range(steps):
+                    u[t] *= 0.5
             actions[i] = u[0]
 
     @kernel(kind=kind)

@@ -7,8 +7,9 @@ zero. A way's score is what it has taught together with what the rest of the epi
 the last plans. Without the latter a way would be praised for what every way teaches sooner or later.
 
 The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
-line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.scales`). Other
-states, and older inputs, are followed with their way, and do not tell ways apart.
+line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.Swing`). Other
+states, and older inputs, are followed with their way, and do not tell ways apart. An input is held for
+`agents.planner.imagination.Terms.pace` samples, a *move*.
 
 The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one.
 """
@@ -30,8 +31,8 @@ from estimator.models.model import Model
 #: Cells of the map along each axis, from minus a state's scale to plus.
 _CELLS = 24
 
-#: Towards the end of an episode, when so many samples are left, no later plan mends what a plan misses: the map is then
-#: finer, the rounds are more by this factor, and plans look no further than so many samples.
+#: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: the map is then
+#: finer, the rounds are more by this factor, and plans look no further than so many moves.
 _LATE, _LATE_CELLS, _LATE_ROUNDS, _LATE_HORIZON = 48, 32, 4, 20
 
 #: Inputs that are tried at every cell.
@@ -53,11 +54,11 @@ class Search(NamedTuple):
 
             - ``records`` (n, size): their beliefs;
             - ``left`` (n,): samples left in their episodes;
-            - ``horizon``: samples to plan for, at most;
+            - ``horizon``: moves to plan, at most;
             - ``rounds``: of `LANES` changed copies each;
             - ``terms``: `agents.planner.imagination.Terms`;
             - ``lasts`` (n, 2): the inputs that were applied last, newest first;
-            - ``plans`` (n, horizon): the last plans, begun one sample ago; overwritten by the new ones;
+            - ``plans`` (n, horizon): the last plans, begun one move ago; overwritten by the new ones;
             - ``rates`` (n, K, K): information per sample that plans have brought, a running mean; zeros where there was
               none yet; overwritten;
             - ``words`` (n, 4): streams of random numbers; overwritten;
@@ -100,7 +101,8 @@ class Task(NamedTuple):
     Attributes:
         record: the belief.
         left: samples left in the episode.
-        steps: of the plan.
+        steps: moves of the plan.
+        pace: samples of a move.
         terms: `agents.planner.imagination.Terms`.
         lasts: (2,) the inputs that were applied last, newest first.
         M: (K, K) factor of the information per sample that is to come.
@@ -109,6 +111,7 @@ class Task(NamedTuple):
     record: Any
     left: int
     steps: int
+    pace: int
     terms: Any
     lasts: Any
     M: Any
@@ -171,8 +174,9 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                 copy(W, 0, ways[b // _CHOICES], kept)
                 for j in range(LANES):
                     W[U + j] = choose(b % _CHOICES, W[U + j], terms)
-                advance(W, task.record, terms)
-                appraise(W, task.M, np.sqrt(task.left - h - 1))
+                for _ in range(task.pace):
+                    advance(W, task.record, terms)
+                appraise(W, task.M, np.sqrt(task.left - (h + 1) * task.pace))
                 for j in range(min(LANES, count - b // _CHOICES * LANES)):
                     cell = place(W[j], terms.scales[0], cells, right)
                     if is_plane:
@@ -193,7 +197,8 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         for h in range(task.steps):
             for j in range(LANES):
                 W[U + j] = candidates[j % len(candidates), h]
-            advance(W, task.record, task.terms)
+            for _ in range(task.pace):
+                advance(W, task.record, task.terms)
 
     @inner
     def refresh(W, task, best, rate):
@@ -210,18 +215,19 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         for a in range(k):
             for b in range(k):
                 if is_finite:
-                    rate[a, b] += share * ((after[a, b] - before[a, b]) / task.steps - rate[a, b])
+                    rate[a, b] += share * ((after[a, b] - before[a, b]) / (task.steps * task.pace) - rate[a, b])
 
     @inner
-    def improve(memory, record, left, steps, rounds, terms, lasts, best, rate, words):
-        """Improve the plan ``best`` (horizon,), begun one sample ago, and ``rate``; gives the plan's score [nats]."""
+    def improve(memory, record, left, rounds, terms, lasts, best, rate, words):
+        """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the plan's score [nats]."""
         candidates, last = memory.candidates, lasts[0]
-        cells = _CELLS
-        if left <= _LATE:
+        cells, pace = _CELLS, min(terms.pace, left)
+        steps = min(len(best), left // pace)
+        if left <= _LATE * pace:
             cells, steps, rounds = _LATE_CELLS, min(steps, _LATE_HORIZON), _LATE_ROUNDS * rounds
         M = np.zeros((k, k))
         factorise(rate, M)
-        task = Task(record, left, steps, terms, lasts, M)
+        task = Task(record, left, steps, pace, terms, lasts, M)
         turned = -best[0]
         for h in range(len(best) - 1):
             best[h] = best[h + 1]
@@ -243,7 +249,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                 change(candidates[j], steps, terms.amplitude, words)
                 bound(candidates[j], steps, last, terms)
             follow(W, task, candidates)
-            appraise(W, M, np.sqrt(left - steps))
+            appraise(W, M, np.sqrt(left - steps * pace))
             for j in range(LANES):
                 if W[SCORE + j] > score:
                     score = W[SCORE + j]
@@ -260,10 +266,9 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, scores):
         kept_memory = memory(horizon, _LATE_CELLS)
         for i in range(len(records)):
-            rest = max(1, left[i])
             scores[i] = improve(
-                kept_memory, records[i], rest, min(horizon, rest), rounds, terms, lasts[i], plans[i], rates[i], words[i]
-            )  # fmt: skip
+                kept_memory, records[i], max(1, left[i]), rounds, terms, lasts[i], plans[i], rates[i], words[i]
+            )
             actions[i] = plans[i, 0]
 
     @entry
@@ -272,9 +277,9 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         best, rate, W = np.zeros(horizon), np.zeros((k, k)), np.empty(size)
         lasts = np.zeros(2)
         for t in range(len(u)):
-            left = len(u) - t
             if t >= first:
-                improve(kept_memory, record, left, min(horizon, left), rounds, terms, lasts, best, rate, words)
+                if (t - max(first, 0)) % terms.pace == 0:
+                    improve(kept_memory, record, len(u) - t, rounds, terms, lasts, best, rate, words)
                 u[t] = best[0]
             begin(W, record, lasts)
             for j in range(LANES):
@@ -295,7 +300,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             collect(W, record)
             lasts[1], lasts[0] = lasts[0], u[t]
         left = len(u) - first
-        find_way(memory(left, cells), Task(record, left, left, terms, lasts, M), cells, u[first:], words)
+        find_way(memory(left, cells), Task(record, left, left, 1, terms, lasts, M), cells, u[first:], words)
 
     return Search(plan, play, through)
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.planner.motion import View, places, scales, survey
+from agents.planner.motion import View, places, survey, swing_of
 from agents.policies.prospects import Outlook, look_at
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
@@ -90,7 +90,7 @@ class Foresight:
         center, std, others, rate = np.split(np.asarray(numbers, dtype=np.float64), [k, 2 * k, 2 * k + 6])
         max_input, max_output, samples, energy, process, sensor = others.tolist()
         seen = View(model, **described)
-        sizes = scales(seen, center, max_input, max_output)
+        sizes = swing_of(seen, center, max_input, max_output).scales
         rate = rate.reshape(k, k)
         return cls(Outlook(center, std, max_input, max_output, samples, energy, process, sensor, rate, sizes), seen)
 
@@ -168,5 +168,5 @@ def _outlook_of(experiment: Experiment, rate: FloatArray) -> Outlook:
         process=float(np.exp(-setup.log_precisions[0])),
         sensor=float(np.exp(-setup.log_precisions[1])),
         rate=np.asarray(rate, dtype=np.float64),
-        scales=scales(View.of(experiment), center, setup.max_input, setup.max_output),
+        scales=swing_of(View.of(experiment), center, setup.max_input, setup.max_output).scales,
     )

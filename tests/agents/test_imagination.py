@@ -163,17 +163,19 @@ def test_imagination_is_the_plain_recursion(case, walks):
         assert W[place["SCORE"], j] + W[place["COST"], j] == pytest.approx(nats, abs=1e-5)
 
 
+@pytest.mark.parametrize("limit", [0.05, 0.15])
 @pytest.mark.parametrize("case", CASES)
-def test_the_cost_is_price_goal_and_what_is_beyond_the_limit(case):
+def test_the_cost_is_price_goal_and_what_is_beyond_the_limit(case, limit):
     model, degree, *_ = CASES[case]
     belief = random_belief(model, np.random.default_rng(1))
-    told = terms(model, limit=0.05, price=3.0, goal=0.1, goal_weight=4.0)
+    told = terms(model, limit=limit, price=3.0, goal=0.1, goal_weight=4.0, shaken=5.0)
     W, _ = block_after(model, degree, belief, np.full((1, LANES), 0.1), told)
     place = imagination(model, degree).layout
     shown, variance = W[place["SHOWN"], 0], W[place["SPREAD"], 0]
-    beyond = abs(shown) + 2.0 * np.sqrt(variance) - 0.05
+    # Five times what process noise does in a sample comes to it; but at most half of the limit is kept from it.
+    beyond = abs(shown) + min(2.0 * np.sqrt(variance + 5.0 * 0.01**2), 0.5 * limit) - limit
     assert beyond > 0
-    cost = 1e4 * beyond / 0.05 + 3.0 * 0.1**2 + 4.0 * ((shown - 0.1) ** 2 + variance - 0.02**2)
+    cost = 1e4 * beyond / limit + 3.0 * 0.1**2 + 4.0 * ((shown - 0.1) ** 2 + variance - 0.02**2)
     np.testing.assert_allclose(W[place["COST"]], cost, rtol=1e-9)
 
 

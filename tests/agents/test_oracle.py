@@ -7,7 +7,7 @@ from agents.evaluation import systems as module_of_systems
 from agents.evaluation.oracle import Oracle, as_stored
 from agents.evaluation.oracle_search import Config, main, search
 from agents.evaluation.systems import Systems
-from agents.planner.motion import View, scales
+from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
 
 SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Amplitude-v1"
@@ -119,7 +119,7 @@ def test_the_command_stores_what_is_better_and_nothing_else(empty_folder, capsys
 def test_polishing_ends_at_a_summit_within_the_limits():
     systems = Systems.of(SHORT, 1)
     model, limits = systems.plant.model, systems.limits
-    sizes = scales(View(model), systems.theta[0], limits.amplitude, limits.output)
+    sizes = swing_of(View(model), systems.theta[0], limits.amplitude, limits.output).scales
     start = 0.05 * np.random.default_rng(0).choice([-1.0, 1.0], 48)
     unit, aimed = limits.amplitude / 32767, limits._replace(aim=0.9999 * limits.output)
     u, value = polish(model, 0, systems.known(0), aimed, sizes, start, unit)

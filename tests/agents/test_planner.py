@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import duffing_env
-from agents.planner.motion import View, scales
+from agents.planner.motion import View, swing_of
 from agents.planner.policy import Planner
 from agents.policies import make_policy
 from duffing_env.experiment import SimulatedExperiment
@@ -179,20 +179,20 @@ def test_it_plays_a_plant_of_ones_own():
 
 def test_the_map_measures_every_state_by_its_size_at_the_limit():
     paper = SimulatedExperiment().believed.coefficients_mean
-    np.testing.assert_array_equal(scales(View(difference()), paper, 0.15, 0.6), [0.6, 0.6])
+    np.testing.assert_array_equal(swing_of(View(difference()), paper, 0.15, 0.6).scales, [0.6, 0.6])
     # A linear oscillator of 2π / 40 rad per sample: its velocity has that much of the displacement's amplitude.
     omega = 2 * np.pi / 40
-    found = scales(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 0.6)
+    found = swing_of(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 0.6).scales
     np.testing.assert_allclose(found, [0.6, 0.6 * omega], rtol=0.15)
     # Also where no input comes near the limit.
     np.testing.assert_allclose(
-        scales(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 1e3)[1], 1e3 * omega, rtol=0.15
+        swing_of(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 1e3).scales[1], 1e3 * omega, rtol=0.15
     )
-    seen = scales(View(WIENER_HAMMERSTEIN), [0.4, 0.1, 0.0, 0.5], 0.15, 0.6)
+    seen = swing_of(View(WIENER_HAMMERSTEIN), [0.4, 0.1, 0.0, 0.5], 0.15, 0.6).scales
     assert seen[2] == 0.6
     assert np.all(seen[:2] > 0.1)
     decay = Model("decay", {"x": "V"}, {"rate": "1"}, noise=("1",), outputs={"y": "x"}, rates=("u - rate*x",))
-    assert scales(View(decay), [0.3], 1.0, 2.0) == [2.0]
+    assert swing_of(View(decay), [0.3], 1.0, 2.0).scales == [2.0]
 
 
 @pytest.mark.slow  # seconds of compilation
