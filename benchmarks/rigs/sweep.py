@@ -88,7 +88,7 @@ def show(cells: Sequence[Cell]) -> dict[str, Any]:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(width=170)
+    console = Console(width=210)
     table = Table("samples per period, share of the limit", "median error of m, c, a, b, %", "bound (1 σ), %",
                   "coverage of 90 %", "out of reach, said", "within, denied", "s", "warnings and failures",
                   box=box.MARKDOWN)  # fmt: skip
