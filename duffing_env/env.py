@@ -103,9 +103,10 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     An estimator alone hardly learns how the two noises share what an output shows. With ``noise_hypotheses`` above 1 (9
     resolve it) it weighs as many ratios by their evidence, as `estimator.OnlineEstimator` does, each at three levels:
-    three updates a hypothesis and sample. Observation, ``belief``, information and the rewards that look at the belief
-    are then those of the mixture's mean and covariance; ``free_energy`` is the mixture's own. It is for ``structured``
-    and one sensor.
+    three updates a hypothesis and sample. Two numbers, such as (5, 5), are values of each noise, a factor of 3 apart,
+    in all combinations: for guesses of which each may be wrong by itself. Observation, ``belief``, information and the
+    rewards that look at the belief are then those of the mixture's mean and covariance; ``free_energy`` is the
+    mixture's own. It is for ``structured`` and one sensor.
 
     ## Episode end
 

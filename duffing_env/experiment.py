@@ -16,16 +16,16 @@ from duffing_env.layout import Kind, Setup, parameter_names
 from duffing_env.noise import BRANCHES
 from duffing_env.rewards import REWARDS, check_reward
 from estimator.belief import Belief
-from estimator.ensemble import priors, start
+from estimator.ensemble import Hypotheses, priors, start
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
-from estimator.settings import check_hypotheses
+from estimator.settings import checked_hypotheses
 from estimator.units import Scales
 
-#: More ratios of the noises than are worth their time: each is three updates a sample.
+#: More ratios of the noises, or values of each, than are worth their time.
 MOST_HYPOTHESES = 99
 
 
@@ -43,7 +43,8 @@ class Experiment:
         terminal: whether the episode's whole reward is paid in its last step, and 0 before.
         terminated_return: what an episode that is terminated returns, whatever it gained. None keeps what it gained.
         noise_hypotheses: ratios of the noises that the estimator weighs by their evidence, as
-            `estimator.OnlineEstimator` does; structured and for one sensor. 1: the ratio stays nearly the prior's.
+            `estimator.OnlineEstimator` does; structured and for one sensor. 1: the ratio stays nearly the prior's. Two
+            numbers: values of each noise, in all combinations.
         branch: of the seeds, a name of `duffing_env.noise.BRANCHES`: the same seed gives other systems and noise in
             each, so that what is trained in ``train`` with whatever seed never met those of ``test``.
     """
@@ -56,7 +57,7 @@ class Experiment:
     hold: int = 1
     terminal: bool = False
     terminated_return: float | None = None
-    noise_hypotheses: int = 1
+    noise_hypotheses: Hypotheses = 1
     branch: str = "train"
 
     def __post_init__(self) -> None:
@@ -74,7 +75,8 @@ class Experiment:
         worth = self.terminated_return
         if worth is not None and not (_is_number(worth) and np.isfinite(worth)):
             raise ValueError(f"terminated_return must be a finite number, but is {worth!r}; None keeps what was gained")
-        check_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MOST_HYPOTHESES)
+        hypotheses = checked_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MOST_HYPOTHESES)
+        object.__setattr__(self, "noise_hypotheses", hypotheses)
 
     def _check_positive(self, name: str) -> None:
         value = getattr(self, name)
@@ -121,6 +123,11 @@ class Experiment:
         return SAMPLING_STEP
 
     @property
+    def points(self) -> bool:
+        """Whether hypotheses about the noises are moved by sigma points: where they start from a wide belief."""
+        return False
+
+    @property
     def scales(self) -> Scales:
         """What one inside is worth outside."""
         return Scales(self.step)
@@ -156,7 +163,7 @@ class Experiment:
             self.model, self.plant, self.degree, self.factorisation,
             self._iterations if self.factorisation == "structured" else 0,
             self.reward if REWARDS[self.reward].hooks is not None else "",
-            self.noise_hypotheses > 1,
+            self.noise_hypotheses != 1, self.points and self.noise_hypotheses != 1,
         )  # fmt: skip
 
     @property
@@ -164,7 +171,7 @@ class Experiment:
         """The experiment as the kernel is told of it."""
         prior, model = self.believed, self.model
         first, noises = prior.record.copy(), np.empty(0)
-        if self.noise_hypotheses > 1:
+        if self.noise_hypotheses != 1:
             members = priors(prior, self.noise_hypotheses)
             first, noises = start(members, len(model.names)), members[:, -4:].ravel()
         precisions = first[-2 - 2 * model.n_outputs :]

@@ -28,7 +28,8 @@ def member_layout(kind: Kind) -> Mapping[str, int]:
 
 
 def _update(kind: Kind) -> Any:
-    return structured(kind.belief, kind.degree, iterations=kind.iterations, trace=True)
+    expectations = "sigma_points" if kind.points else "first_order"
+    return structured(kind.belief, kind.degree, iterations=kind.iterations, trace=True, expectations=expectations)
 
 
 class Members(NamedTuple):
@@ -59,6 +60,7 @@ def members_of(kind: Kind) -> Members:
     fed = tuple((own[row] * LANES, place[row] * LANES) for row in given)
     walks = tuple(own[f"P_{c}_{c}"] * LANES for c in model.coefficients)
     weight, free_energy = own["WEIGHT"] * LANES, place.get("FREE_ENERGY", -1) * LANES
+    unsound = own.get("UNSOUND", -1) * LANES
     energy_of = free_energies(model, kind.iterations, LANES, own, every=False)
     look = forecaster(kind.name, model, kind.iterations, LANES, own)
     inner = part(kind.name)
@@ -90,6 +92,8 @@ def members_of(kind: Kind) -> Members:
                 for c in range(len(walks)):
                     for j in range(LANES):
                         V[walks[c] + j] += setup.walk[c]
+            for j in range(LANES if unsound >= 0 else 0):
+                V[unsound + j] = 0.0
             update(V)
         weights, shares = np.empty(count), np.empty(count)
         each, predictions = np.empty((count, 1)), np.empty((count, 1, 2))
@@ -100,6 +104,8 @@ def members_of(kind: Kind) -> Members:
                 V, k = members[(start + m) // LANES], (start + m) % LANES
                 weights[m] = V[weight + k]
                 energy_of(V, k, each[m])
+                if unsound >= 0 and V[unsound + k] > 0.0:
+                    each[m, 0] = np.nan
                 look(V, k, predictions[m])
             weigh(weights, each, predictions, energies, forecasts)
             for m in range(count):

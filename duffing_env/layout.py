@@ -42,6 +42,7 @@ class Kind(NamedTuple):
             for mean field, which is told.
         work: name of the reward, if it has hooks (`duffing_env.rewards`); the others are weights that a kernel is told.
         weighs: whether several beliefs are weighed (`duffing_env.hypotheses`); how many is told.
+        points: whether these are moved by sigma points (`estimator.engine.points`).
     """
 
     belief: Model
@@ -51,6 +52,7 @@ class Kind(NamedTuple):
     iterations: int = 3
     work: str = ""
     weighs: bool = False
+    points: bool = False
 
     @property
     def name(self) -> str:

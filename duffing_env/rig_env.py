@@ -15,6 +15,7 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.own_plant import Plant, PlantEnv, PlantExperiment
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
+from estimator.ensemble import Hypotheses
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -60,8 +61,8 @@ class RigExperiment(SimulatedExperiment):
         max_input: input of the action 1, in parts of the input's limit; at most 1.
         max_output: largest output, in parts of the output's range; at most 1.
         process_noise: disturbance of the force, as a standard deviation per sample, in parts of the input's limit; the
-            rig's, or 1 % where it has none.
-        measurement_noise: of the sensor, in parts of the output's range; the rig's, or 1 % where it has none.
+            rig's, or 0.1 % where it has none.
+        measurement_noise: of the sensor, in parts of the output's range; the rig's, or 0.1 % where it has none.
         noise_range: both are drawn for every episode, over a range of this factor.
         noise_hypotheses: of the estimator.
     """
@@ -72,7 +73,7 @@ class RigExperiment(SimulatedExperiment):
     process_noise: float | None = None  # type: ignore[assignment]
     measurement_noise: float | None = None  # type: ignore[assignment]
     noise_range: float = 10.0
-    noise_hypotheses: int = 9
+    noise_hypotheses: Hypotheses = (5, 5)
 
     def __post_init__(self) -> None:
         if self.factorisation != "structured":
@@ -113,6 +114,11 @@ class RigExperiment(SimulatedExperiment):
     def degree(self) -> int:
         """Of the input over a sample."""
         return int(self.described.interpolation == "linear")
+
+    @property
+    def points(self) -> bool:
+        """A guess is wide."""
+        return True
 
     @property
     def step(self) -> float:
@@ -197,13 +203,13 @@ class RigPlantExperiment(PlantExperiment):
         rig: see `RigExperiment`.
         max_input: see `RigExperiment`.
         max_output: see `RigExperiment`.
-        noise_hypotheses: of the estimator.
+        noise_hypotheses: of the estimator; seven values of each noise reach over three decades.
     """
 
     rig: AnyRig | None = None
     max_input: float = 1.0
     max_output: float = 1.0
-    noise_hypotheses: int = 9
+    noise_hypotheses: Hypotheses = (7, 7)
 
     def __post_init__(self) -> None:
         rig = _checked(self.rig)
@@ -220,6 +226,11 @@ class RigPlantExperiment(PlantExperiment):
         """Of the input over a sample."""
         assert isinstance(self.rig, Rig)
         return int(self.rig.interpolation == "linear")
+
+    @property
+    def points(self) -> bool:
+        """A guess is wide."""
+        return True
 
     @property
     def center(self) -> dict[str, float]:
@@ -289,10 +300,10 @@ class RigEnv(DuffingEnv):
     | ``plant`` | None | the plant itself: an object with ``reset()`` and ``step(u)``, in the rig's units |
     | ``max_input`` | 1 | input of the action 1, in parts of the rig's limit |
     | ``max_output`` | 1 | largest output, in parts of the rig's range |
-    | ``process_noise`` | the rig's, or 0.01 | disturbance of the force, in parts of the input's limit |
-    | ``measurement_noise`` | the rig's, or 0.01 | noise of the sensor, in parts of the output's range |
+    | ``process_noise`` | the rig's, or 0.001 | disturbance of the force, in parts of the input's limit |
+    | ``measurement_noise`` | the rig's, or 0.001 | noise of the sensor, in parts of the output's range |
     | ``noise_range`` | 10 | both are drawn for every episode, over a range of this factor |
-    | ``noise_hypotheses`` | 9 | of the estimator |
+    | ``noise_hypotheses`` | (5, 5), or (7, 7) with ``plant`` | values of each noise that the estimator weighs |
 
     >>> import gymnasium as gym
     >>> import duffing_env

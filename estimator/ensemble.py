@@ -29,6 +29,12 @@ from estimator.parameters import FloatArray
 #: Furthest displacement of σ_w/σ_v from that of the prior, either way.
 FARTHEST = 30.0
 
+#: A number of ratios of the noises; or how many values of each are combined.
+Hypotheses = int | tuple[int, int]
+
+#: Factor between two values of a noise's standard deviation.
+APART = 3.0
+
 #: Displacements of the noises' total standard deviation. A member learns its total by itself, but slowly where the two
 #: noises are alike: what it loses meanwhile would be held against its ratio, were there no other of this ratio.
 LEVELS = (1 / 3, 1.0, 3.0)
@@ -50,18 +56,24 @@ class NoiseRatio:
     prior_std: float
 
 
-def grid(noises: FloatArray, ratios: int) -> FloatArray:
+def grid(noises: FloatArray, hypotheses: Hypotheses) -> FloatArray:
     """(members, 4) shapes and rates of all hypotheses about those of one sensor.
 
-    Their σ_w/σ_v is that of ``noises`` times 1/30 to 30 in equal steps, and each is there with the same σ_w² + σ_v²,
-    and with a third and three times its root: the sum is what every member learns by itself, so the members of a level
-    start equally near to it.
+    Of two numbers: so many values of σ_w and of σ_v, `APART` from each other about those of ``noises``, in all
+    combinations: for noises of which each may be wrong by itself, by a factor of 9 for five values and of 27 for seven.
+
+    Of one number, for noises whose total is known about: their σ_w/σ_v is that of ``noises`` times 1/30 to 30 in equal
+    steps, and each is there with the same σ_w² + σ_v², and with a third and three times its root: the sum is what every
+    member learns by itself, so the members of a level start equally near to it.
     """
-    factors = np.geomspace(1 / FARTHEST, FARTHEST, ratios)
+    if isinstance(hypotheses, tuple):
+        process, sensor = (APART ** (2 * np.arange(count) - (count - 1.0)) for count in hypotheses)
+        return np.array([noises * [1.0, a, 1.0, b] for a in process for b in sensor])
+    factors = np.geomspace(1 / FARTHEST, FARTHEST, hypotheses)
     return np.array([displaced(noises, factor, level) for level in LEVELS for factor in factors])
 
 
-def priors(prior: Belief, hypotheses: int) -> FloatArray:
+def priors(prior: Belief, hypotheses: Hypotheses) -> FloatArray:
     """(members, size) the records that the members begin with; the prior's own where there is one hypothesis."""
     if hypotheses == 1:
         return prior.record[None].copy()
@@ -100,12 +112,12 @@ def log_ratio(noises: FloatArray) -> float:
     return float(0.5 * np.log(noises[1] / noises[0] / (noises[3] / noises[2])))
 
 
-def ratio_of(weights: FloatArray, ratios: FloatArray, size: int) -> NoiseRatio:
-    """What weights (M,) of members with these log ratios (M,) say, on a grid of ``size`` ratios."""
+def ratio_of(weights: FloatArray, ratios: FloatArray, first: FloatArray) -> NoiseRatio:
+    """What weights (M,) of members with these log ratios (M,) say, which were (members,) at first."""
     mean = weights @ ratios
-    step = 2 * np.log(FARTHEST) / (size - 1)
-    std = np.sqrt(weights @ (ratios - mean) ** 2 + step**2 / 12)
-    return NoiseRatio(float(mean), float(std), float(size * step / np.sqrt(12)))
+    within = np.diff(np.unique(first.round(9)))[0] ** 2 / 12
+    std = np.sqrt(weights @ (ratios - mean) ** 2 + within)
+    return NoiseRatio(float(mean), float(std), float(np.sqrt(first.var() + within)))
 
 
 def matched_gamma(weights: FloatArray, shapes: FloatArray, rates: FloatArray) -> tuple[float, float]:

@@ -154,7 +154,8 @@ class Filter:
         """What the weights say, at the precisions that each member has learned."""
         weights, _ = mixture(self._block, self._weights, len(self.model.names))
         ratios = np.array([log_ratio(record[-4:]) for record in self.records[weights > 0]])
-        return ratio_of(weights[weights > 0], ratios, self.settings.noise_hypotheses)
+        first = [log_ratio(record[-4:]) for record in priors(self.prior, self.settings.noise_hypotheses)]
+        return ratio_of(weights[weights > 0], ratios, np.array(first))
 
     def _mixture(self) -> FloatArray:
         """(size,) a record with the mixture's moments."""

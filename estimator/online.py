@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.checks import scalar, series
-from estimator.ensemble import NoiseRatio
+from estimator.ensemble import Hypotheses, NoiseRatio
 from estimator.filter import Filter
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
@@ -37,7 +37,8 @@ class OnlineEstimator:
             model, `recorded_prior` for other difference equations and for `duffing`; others need one.
         rig: what the inputs do, or the name of a rig file. Where it is None: input linear between samples, or delay 1
             for a difference equation. A rig with a guess brings model and prior along, and its noises are weighed
-            (``noise_hypotheses`` 9). u, y and parameters are in the prior's units.
+            (``noise_hypotheses`` 7 and 7); its belief, which is wide, goes by ``sigma_points``. u, y and parameters are
+            in the prior's units.
         factorisation: ``structured`` (states and coefficients jointly Gaussian) or ``mean_field`` (the paper's, for the
             paper's model).
         iterations: variational iterations per sample, 1 to 100; 3 structured, 10 mean field where it is None.
@@ -45,10 +46,13 @@ class OnlineEstimator:
         drift: lets the coefficients walk at random, to follow a system that changes: standard deviation of a
             coefficient's step per sample, in parts of that of its prior. 0.01 forgets in some hundred samples.
         expectations: what a step does to the Gaussian belief: ``first_order``, by the derivative at its mean; or
-            ``sigma_points``, by points that spread as the belief does, for beliefs that are wide.
+            ``sigma_points``, by points that spread as the belief does, for beliefs that are wide. By default the
+            former, or the latter with a rig that brings the prior.
         noise_hypotheses: number of ratios σ_w/σ_v to weigh by their evidence (`estimator.ensemble`), structured only.
             With 1, the default, the ratio stays nearly what the priors of γ and ξ say. 9 resolve it; an odd number has
             the priors' own ratio among them. Each is there at three levels: a sample costs three updates a hypothesis.
+            Two numbers, such as (5, 5), are values of σ_w and of σ_v, a factor of 3 apart, in all combinations: where
+            each may be wrong by itself, by 9 times for 5 values and 27 times for 7.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -81,8 +85,8 @@ class OnlineEstimator:
         iterations: int | None = None,
         as_published: bool = False,
         drift: float = 0.0,
-        expectations: str = "first_order",
-        noise_hypotheses: int | None = None,
+        expectations: str | None = None,
+        noise_hypotheses: Hypotheses | None = None,
     ) -> None:
         rig = None if rig is None else Rig.of(rig)
         of_rig = rig is not None and rig.guess is not None and model is None and prior is None
@@ -90,8 +94,10 @@ class OnlineEstimator:
             assert rig is not None
             prior = rig_prior(rig)
             model = prior.model
+        if expectations is None:
+            expectations = "sigma_points" if of_rig else "first_order"
         if noise_hypotheses is None:
-            noise_hypotheses = 9 if of_rig else 1
+            noise_hypotheses = (7, 7) if of_rig else 1
         if not isinstance(model, Model | None):
             raise ValueError(f"model must be a Model, but is {model!r:.60}; use difference() or duffing()")
         self.model = difference() if model is None else model

@@ -16,7 +16,7 @@ from estimator.units import Scales
 HALF_WIDTH = 1.6448536269514722
 
 #: Standard deviation of an offset, and of a noise of which nothing is known, in parts of the channel's scale.
-OFFSET, NOISE = 0.03, 0.01
+OFFSET, NOISE = 0.03, 0.001
 
 #: Of a displacement at the start, in parts of the output's scale.
 _START = 0.3

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from estimator.ensemble import Hypotheses
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -30,7 +32,7 @@ class Settings:
         as_published: with the departures of the published run.
         expectations: ``first_order`` or ``sigma_points``.
         drift: standard deviation of a coefficient's step per sample, in parts of that of its prior.
-        noise_hypotheses: ratios of the noises.
+        noise_hypotheses: ratios of the noises, or values of each (`estimator.ensemble.grid`).
     """
 
     factorisation: str = "structured"
@@ -38,7 +40,7 @@ class Settings:
     as_published: bool = False
     expectations: str = "first_order"
     drift: float = 0.0
-    noise_hypotheses: int = 1
+    noise_hypotheses: Hypotheses = 1
 
 
 def settled(model: Model, given: Settings) -> Settings:
@@ -68,29 +70,31 @@ def settled(model: Model, given: Settings) -> Settings:
         raise ValueError(f"drift must be at least 0 and finite, but is {drift!r}; 0 is a system that stays")
     if drift and published:
         raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {drift!r}; use structured")
-    check_hypotheses(given.noise_hypotheses, given.factorisation, model)
     return replace(
         given,
         iterations=int(given.iterations),
         as_published=bool(given.as_published),
         drift=float(drift),
-        noise_hypotheses=int(given.noise_hypotheses),
+        noise_hypotheses=checked_hypotheses(given.noise_hypotheses, given.factorisation, model),
     )
 
 
-def check_hypotheses(count: object, factorisation: str, model: Model, most: int = _MOST_HYPOTHESES) -> None:
-    """A number of noise hypotheses that fits factorisation and model, and is at most ``most``.
+def checked_hypotheses(given: object, factorisation: str, model: Model, most: int = _MOST_HYPOTHESES) -> Hypotheses:
+    """A number of noise hypotheses, or two, that fit factorisation and model, and are at most ``most``.
 
     Raises:
         ValueError: naming the option, the value and the remedy.
     """
-    _whole("noise_hypotheses", count, most)
+    counts: list[Any] = list(given) if isinstance(given, tuple | list) and len(given) == 2 else [given]
+    for count in counts:
+        _whole("noise_hypotheses", count, most)
     published = factorisation == "mean_field"
-    if count != 1 and (published or model.n_outputs > 1):
+    if given != 1 and (published or model.n_outputs > 1):
         what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"
         raise ValueError(
-            f"noise_hypotheses must be 1 for {what}, but is {count}; use factorisation='structured' and one sensor"
+            f"noise_hypotheses must be 1 for {what}, but is {given}; use factorisation='structured' and one sensor"
         )
+    return (int(counts[0]), int(counts[1])) if len(counts) == 2 else int(counts[0])
 
 
 def _whole(name: str, value: object, most: int) -> None:

@@ -25,6 +25,9 @@ from estimator.rig_prior import rig_prior
 #: A pause is of an unknown length up to so many periods, and never more samples.
 _PERIODS, _LONGEST = 2.0, 4_000
 
+#: Where a system may be after a pause is taken apart into so many Gaussians, each wider by this part of the variance.
+_PARTS, _WIDER = 16, 0.01
+
 #: What is so far out, in parts of the output's range, has run away.
 _FAR = 3.0
 
@@ -51,20 +54,32 @@ def _ringer(model: Model) -> Any:
     return ring
 
 
+def _parts(states: FloatArray) -> list[tuple[float, FloatArray, FloatArray]]:
+    """A mixture of Gaussians for states (N, n): logarithm of the weight, mean and covariance of each."""
+    from scipy.cluster.vq import kmeans2
+
+    size = states.std(axis=0)
+    labels = kmeans2(states / size, _PARTS, seed=0, minit="++")[1]
+    parts = [states[labels == k] for k in range(_PARTS)]
+    return [
+        (float(np.log(len(part) / len(states))), part.mean(axis=0), np.cov(part.T) + _WIDER * np.diag(size**2))
+        for part in parts
+        if len(part) > states.shape[1]
+    ]
+
+
 class Follower:
     """Follows a run. Sample k of a run is the output at a tick and the input that is applied from that tick on.
 
     Args:
         rig: with a guess.
         prior: what is believed before the run, such as the ``belief`` of `estimator.identify`; the guess where None.
-        pauses: whether there will be some. The state is then known so little that a derivative at its mean would learn
-            too much from the first samples after them: points that spread as the belief does take its place.
 
     Raises:
         ValueError: for a rig without a guess, or whose input is not held, or comes early.
     """
 
-    def __init__(self, rig: Rig, prior: Belief | None = None, pauses: bool = False) -> None:
+    def __init__(self, rig: Rig, prior: Belief | None = None) -> None:
         if rig.interpolation != "zero_order":
             raise ValueError(
                 f"interpolation must be 'zero_order' for a run, whose inputs are held, but is {rig.interpolation!r}"
@@ -76,10 +91,12 @@ class Follower:
         # What came before an output is given with it: so the belief is that of the tick, before the next input.
         self.delay, paired = rig.delay, replace(rig, delay=rig.delay - 1)
         prior = rig_prior(rig) if prior is None else prior
-        expectations = "sigma_points" if pauses else "first_order"
         self._paused = 0
+        self._starts: list[tuple[float, FloatArray, FloatArray]] = []
         self._rung: tuple[FloatArray, FloatArray] | None = None
-        self.estimator = OnlineEstimator(prior.model, prior, paired, noise_hypotheses=9, expectations=expectations)
+        self.estimator = OnlineEstimator(
+            prior.model, prior, paired, noise_hypotheses=(7, 7), expectations="sigma_points"
+        )
 
     @property
     def belief(self) -> Belief:
@@ -92,8 +109,21 @@ class Follower:
         Raises:
             ValueError: where the belief overflows; it is then as before.
         """
-        self.estimator.run(u, y, missing=True)
-        self._rung = None
+        starts, self._starts, self._rung = self._starts, [], None
+        begun, best, most = self.estimator.arrays(), None, -np.inf
+        for logarithm, mean, cov in starts:
+            self._put_state(mean, cov)
+            try:
+                evidence = logarithm - self.estimator.run(u, y, missing=True)[:, -1].sum()
+            except ValueError:  # as far from the truth as that
+                evidence = -np.inf
+            if evidence > most:
+                best, most = self.estimator.arrays(), evidence
+            self.estimator.restore(begun)
+        if best is None:
+            self.estimator.run(u, y, missing=True)
+        else:
+            self.estimator.restore(best)
 
     def drawn(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """States and coefficients (draws, d) and noises (draws, 2) of systems that are believed in now.
@@ -134,6 +164,7 @@ class Follower:
         self.estimator.rewind()
         self._put_state(kept.mean(axis=0), np.cov(kept.T))
         self._rung = systems, noises
+        self._starts = _parts(kept)
 
     def _after(self, u: float, samples: int) -> OnlineEstimator:
         """A copy that has followed so many samples without outputs: one with u, the others with none."""

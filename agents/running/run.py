@@ -169,7 +169,7 @@ def run(
     """
     rig, plan, clock = Rig.of(rig), plan or Plan(), clock or RealClock()
     plant, told = check_plant(plant), told or (lambda samples: None)
-    follower = Follower(rig, prior, pauses=plan.block is not None)
+    follower = Follower(rig, prior)
     check_session(rig, plant, plan.silence(rig.step))
     observed = Observed(rig, follower.belief, plan.samples)
     policy = make_policy(plan.policy, observed, seed=plan.seed)  # type: ignore[arg-type]
