@@ -2,55 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import Experiment, SimulatedExperiment
-from duffing_env.own_plant import Plant, PlantEnv, PlantExperiment
+from duffing_env.rig_plant import AnyRig, Plant, RigNumbers, RigPlantEnv, checked_rig
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 from estimator.ensemble import Hypotheses
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.rig import Rig
 from estimator.rig_prior import HALF_WIDTH, NOISE, OFFSET, rig_prior
-from estimator.units import Scales
-
-AnyRig = Rig | Mapping[str, Any] | str | Path
-
-
-def _checked(rig: AnyRig | None) -> Rig:
-    """The rig of an environment.
-
-    Raises:
-        ValueError: for none, one without limit, range or guess, or with an input that is not known sample by sample.
-    """
-    if rig is None:
-        raise ValueError("rig must be a Rig, a dictionary or a file name, but is None; pass rig='rig.toml'")
-    rig = Rig.of(rig)
-    for missing, where in (("limit", rig.input.limit), ("range", rig.output.range), ("guess", rig.guess)):
-        if where is None:
-            raise ValueError(f"rig must have a {missing} for an environment, but has none; add it to the rig")
-    if rig.interpolation not in ("zero_order", "linear"):
-        raise ValueError(
-            f"rig must have interpolation 'zero_order' or 'linear' for an environment, but has {rig.interpolation!r}, "
-            f"which needs inputs of the future"
-        )
-    if rig.delay > 0:
-        raise ValueError(
-            f"rig must have no delay for an environment, but has {rig.delay}; the plant waits for its input"
-        )
-    return rig
 
 
 @dataclass(frozen=True)
-class RigExperiment(SimulatedExperiment):
+class RigExperiment(RigNumbers, SimulatedExperiment):
     """An experiment on oscillators that are drawn from a rig's guess. All numbers are in parts of its limit and range.
 
     The fields of `SimulatedExperiment` are the same, but for these; ``spread``, ``plant_spread`` and ``jump`` are not
@@ -78,7 +48,7 @@ class RigExperiment(SimulatedExperiment):
     def __post_init__(self) -> None:
         if self.factorisation != "structured":
             raise ValueError(f"factorisation must be 'structured' for a rig, but is {self.factorisation!r}")
-        rig = _checked(self.rig)
+        rig = checked_rig(self.rig)
         object.__setattr__(self, "rig", rig)
         for name, channel, scale in (
             ("process_noise", rig.input, rig.scales.input),
@@ -87,18 +57,10 @@ class RigExperiment(SimulatedExperiment):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, NOISE if channel.noise is None else channel.noise / scale)
         super().__post_init__()
-        for name in ("max_input", "max_output"):
-            if getattr(self, name) > 1:
-                raise ValueError(f"{name} must be at most 1, the rig's own limit, but is {getattr(self, name)!r}")
+        self._check_parts()
         for name, usual in (("spread", 0.3), ("plant_spread", None), ("jump", 0.0)):
             if getattr(self, name) != usual:
                 raise ValueError(f"{name} must be left out for a rig, whose guess says the range")
-
-    @property
-    def described(self) -> Rig:
-        """The rig."""
-        assert isinstance(self.rig, Rig)
-        return self.rig
 
     @property
     def plant(self) -> Model:
@@ -111,24 +73,9 @@ class RigExperiment(SimulatedExperiment):
         return self.plant
 
     @property
-    def degree(self) -> int:
-        """Of the input over a sample."""
-        return int(self.described.interpolation == "linear")
-
-    @property
-    def points(self) -> bool:
-        """A guess is wide."""
-        return True
-
-    @property
     def step(self) -> float:
         """The rig's."""
         return float(self.described.step)
-
-    @property
-    def scales(self) -> Scales:
-        """The rig's."""
-        return self.described.scales
 
     @property
     def center(self) -> dict[str, float]:
@@ -195,57 +142,6 @@ def _moved(disturbance: float, gain: float) -> float:
     return float(disturbance * gain / np.sqrt(3))
 
 
-@dataclass(frozen=True)
-class RigPlantExperiment(PlantExperiment):
-    """An experiment on a rig's plant itself, whose parameters nobody knows.
-
-    Attributes:
-        rig: see `RigExperiment`.
-        max_input: see `RigExperiment`.
-        max_output: see `RigExperiment`.
-        noise_hypotheses: of the estimator; seven values of each noise reach over three decades.
-    """
-
-    rig: AnyRig | None = None
-    max_input: float = 1.0
-    max_output: float = 1.0
-    noise_hypotheses: Hypotheses = (7, 7)
-
-    def __post_init__(self) -> None:
-        rig = _checked(self.rig)
-        object.__setattr__(self, "rig", rig)
-        if self.prior is None:
-            object.__setattr__(self, "prior", rig_prior(rig))
-        super().__post_init__()
-        for name in ("max_input", "max_output"):
-            if getattr(self, name) > 1:
-                raise ValueError(f"{name} must be at most 1, the rig's own limit, but is {getattr(self, name)!r}")
-
-    @property
-    def degree(self) -> int:
-        """Of the input over a sample."""
-        assert isinstance(self.rig, Rig)
-        return int(self.rig.interpolation == "linear")
-
-    @property
-    def points(self) -> bool:
-        """A guess is wide."""
-        return True
-
-    @property
-    def center(self) -> dict[str, float]:
-        """What the prior believes, inside: nobody knows the plant."""
-        dimensions = self.model.dimensions
-        told = self.believed.parameters()
-        return {name: told[name][0] / self.scales.factor(dimensions[name]) for name in dimensions}
-
-    @property
-    def scales(self) -> Scales:
-        """The rig's."""
-        assert isinstance(self.rig, Rig)
-        return self.rig.scales
-
-
 class RigEnv(DuffingEnv):
     r"""Choose the input of an oscillator of one's own so that its parameters are identified.
 
@@ -255,7 +151,7 @@ class RigEnv(DuffingEnv):
     units, the limit of the input, the range and kind of the sensor, and what is guessed of m, c, a and b. The
     environment draws oscillators from the guess, with offsets of input and output and noises that neither estimator nor
     policy is told, and steps them with the differential equation. With ``plant=`` the plant itself takes their place
-    (`duffing_env.own_plant`).
+    (`duffing_env.rig_plant`).
 
     Inside, everything is in parts of the input's limit and the output's range; ``belief`` and ``truth`` are in the
     rig's units.
@@ -288,7 +184,7 @@ class RigEnv(DuffingEnv):
 
     ## Information
 
-    As `DuffingEnv`; with ``plant=`` as `duffing_env.own_plant.PlantEnv`.
+    As `DuffingEnv`; with ``plant=`` as `duffing_env.rig_plant.RigPlantEnv`.
 
     ## Arguments
 
@@ -333,13 +229,15 @@ class RigEnv(DuffingEnv):
         return super().__new__(cls) if plant is None else RigPlantEnv(plant, **options)
 
 
-class RigPlantEnv(PlantEnv):
-    """A rig around its plant; what ``Rig-v0`` is with ``plant=``."""
-
-    experiment_kind: ClassVar[type[Experiment]] = RigPlantExperiment
-
-
 class RigVectorEnv(DuffingVectorEnv):
     """Many `RigEnv` at once."""
 
     single: ClassVar[type[DuffingEnv]] = RigEnv
+
+    def __init__(self, num_envs: int = 1, *, plant: Plant | None = None, **options: Any) -> None:
+        if plant is not None:
+            raise ValueError(
+                "plant must be left out of make_vec: one plant is one environment; for several use "
+                "gymnasium.vector.SyncVectorEnv([lambda: gym.make('duffing_env/Rig-v0', rig=rig, plant=plant_1), ...])"
+            )
+        super().__init__(num_envs, **options)

@@ -90,11 +90,6 @@ TRACKS: dict[str, dict[str, Any]] = {
         "vector_entry_point": "duffing_env.vector_env:SilverboxReplayVectorEnv",
         "kwargs": {"regime": "multisine"},
     },
-    "duffing_env/Plant-v0": {
-        "entry_point": "duffing_env.own_plant:PlantEnv",
-        "vector_entry_point": "duffing_env.own_plant:refuse_vector",
-        "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
-    },
 }
 
 

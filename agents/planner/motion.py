@@ -169,6 +169,14 @@ def frequency(belief: Belief) -> float:
     return max(cycles, 1e-9)
 
 
+def seen(belief: Belief, displacement: float) -> float:
+    """The part of a peak that samples see at least, of a believed oscillator that swings by a displacement."""
+    means = dict(zip(belief.names, belief.coefficients_mean, strict=True))
+    square = means.get("stiffness", 0.0) + 0.75 * means.get("cubic", 0.0) * displacement**2
+    # Half a sample from the peak; and no worse than at six samples a period.
+    return float(np.cos(min(np.sqrt(max(square, 0.0)) / 2, np.pi / 6)))
+
+
 #: Samples of the motion by which a system is measured, and where it turns, in parts of the limit.
 _SAMPLES, _TURN = 128, 0.95
 

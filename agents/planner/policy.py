@@ -20,6 +20,9 @@ true. Where an input comes to act in full only a sample later, because it goes l
 the noise of the sample between moves the next output about as much again, and no input makes up for it: the margin is
 then twice as wide.
 
+Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
+nothing helps: on a rig the limit is lower by what a swing at it can hide.
+
 The search (`agents.planner.search`) builds a plan sample by sample, by the best ways through the plane of the
 model's first two states, and improves it by small changes. Horizon 1 is myopic.
 
@@ -37,7 +40,7 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from agents.planner.imagination import Terms
-from agents.planner.motion import View, places, swing_of
+from agents.planner.motion import View, places, seen, swing_of
 from agents.planner.pursuit import Rule, pursuit
 from agents.planner.search import search
 from estimator.parameters import FloatArray
@@ -144,10 +147,11 @@ class Planner:
         self.horizon, self.rounds = int(horizon), int(rounds)
         means = experiment.believed.coefficients_mean
         swing = swing_of(self.view, means, setup.max_input, setup.max_output)
+        of_rig = getattr(experiment, "rig", None) is not None
         self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,
-            limit=setup.max_output,
+            limit=setup.max_output * (seen(experiment.believed, float(swing.scales[0])) if of_rig else 1.0),
             margin=float(-ndtri(risk / env.horizon)) * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
             scales=swing.scales,

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.layout import observation_bounds
-from duffing_env.rig_env import RigPlantExperiment
+from duffing_env.rig_plant import RigPlantExperiment
 from estimator.belief import Belief
 from estimator.parameters import FloatArray
 from estimator.rig import Rig

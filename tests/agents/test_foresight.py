@@ -26,7 +26,9 @@ from agents.training.callbacks import Watch
 from agents.training.foresight_env import ForesightVecEnv, example_rate
 from agents.vec_env import DuffingVecEnv
 from duffing_env.layout import observation_bounds
+from estimator import Channel, Rig
 from estimator.models.difference import difference
+from estimator.parameters import SAMPLING_STEP
 from estimator.priors import silverbox_prior
 
 OBSERVATION = tuple(observation_bounds(difference()))
@@ -325,6 +327,9 @@ def test_in_another_environment_it_takes_what_is_ahead_there():
     np.testing.assert_allclose(moved.rate, RATE * np.outer(third, third) / 2.5, rtol=1e-12)
 
 
+VOLTS = Rig(SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
+
+
 def test_on_a_plant_of_ones_own_it_takes_the_prior_and_the_limits():
     class Silent:
         def reset(self):
@@ -334,7 +339,9 @@ def test_on_a_plant_of_ones_own_it_takes_the_prior_and_the_limits():
             return 0.0
 
     prior = silverbox_prior(spread=0.1, process_noise=1e-4, measurement_noise=2e-4, noise_shape=5.0)
-    env = gym.make("duffing_env/Plant-v0", plant=Silent(), max_output=0.4, prior=prior).unwrapped
+    env = gym.make(
+        "duffing_env/Rig-v0", rig=VOLTS, plant=Silent(), max_input=0.15, max_output=0.4, prior=prior, noise_hypotheses=1
+    ).unwrapped
     moved = Foresight.of(make(AMPLITUDE, 1), RATE).moved_to(env)._outlook
     np.testing.assert_allclose(moved.center, prior.coefficients_mean)
     np.testing.assert_allclose(moved.std, np.sqrt(np.diag(prior.coefficients_cov)))

@@ -11,10 +11,13 @@ from agents.planner.motion import View, swing_of
 from agents.planner.policy import Planner
 from agents.policies import make_policy
 from duffing_env.experiment import SimulatedExperiment
+from estimator import Channel, Rig
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
+from estimator.parameters import SAMPLING_STEP
+from estimator.priors import silverbox_prior
 
 
 def make(track, n, **options):
@@ -165,7 +168,9 @@ def test_it_plays_a_plant_of_ones_own():
 
     gains = {}
     for name in ("efe", "prbs"):
-        env = gym.make("duffing_env/Plant-v0", plant=Plant(), horizon=48)
+        rig = Rig(SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
+        own = {"max_input": 0.15, "max_output": 0.6, "prior": silverbox_prior(), "noise_hypotheses": 1}
+        env = gym.make("duffing_env/Rig-v0", rig=rig, plant=Plant(), horizon=48, **own)
         policy, state, gains[name] = make_policy(name, env), None, 0.0
         observation, _ = env.reset(seed=0)
         terminated = truncated = False

@@ -9,13 +9,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from rounding import U32
-from test_own_plant import Difference
+from test_rig_plant import Difference, around
 from test_vector_env import assert_same, random_actions, roll_out, without_empty_keys
 
 from duffing_env.batch import spawn_seeds
 from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
-from duffing_env.own_plant import PlantEnv
 from duffing_env.replay import ReplayExperiment
 from duffing_env.vector_env import ContinuousVectorEnv, DuffingVectorEnv
 
@@ -33,11 +32,11 @@ KINDS = [
     (DuffingEnv, {"max_output": 1e300, "spread": 0.9, "horizon": 60, "terminated_return": -5.0, "reward": "fisher"}),
     (ContinuousEnv, {"reward": "parameter_error"}),
 ]
-PLANT = pytest.param(PlantEnv, {"horizon": 22, "max_output": 0.25}, id="own plant")
+PLANT = pytest.param(around, {"horizon": 22, "max_output": 0.25}, id="own plant")
 
 
 def make(kind, **options):
-    return kind(Difference(), **options) if kind is PlantEnv else kind(**options)
+    return kind(Difference(), **options) if kind is around else kind(**options)
 
 
 @pytest.mark.parametrize(("kind", "options"), [*KINDS, PLANT])

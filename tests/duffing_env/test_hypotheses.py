@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from scipy.special import logsumexp
+from test_rig_env import RIG
 from test_vector_env import assert_same, random_actions, roll_out
 from twin import Moments, TwinContinuousEnv, TwinEnv, assert_env_follows_twin, structured_update
 
@@ -16,7 +17,6 @@ from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.model_env import ModelEnv
-from duffing_env.own_plant import PlantEnv
 from duffing_env.replay import SilverboxReplayEnv
 from duffing_env.rewards import REWARDS
 from duffing_env.tracks import TRACKS
@@ -158,24 +158,14 @@ class Recorded:
         return next(self.left)
 
 
-@pytest.mark.slow  # a kernel of its own
-def test_a_plant_of_ones_own_is_believed_alike():
-    simulated, outputs = DuffingEnv(noise_hypotheses=3), []
-    simulated.reset(seed=0)
-    played = random_actions(50, 1)[:, 0]
-    for action in played:
-        simulated.step(action)
-        outputs.append(simulated._batch.quantity("Y_y")[0])
-    env = PlantEnv(Recorded([*outputs, np.nan]), noise_hypotheses=3)
+def test_a_plant_that_gives_no_number_leaves_the_belief():
+    env = gym.make("duffing_env/Rig-v0", rig=RIG, plant=Recorded([1e-4, np.nan])).unwrapped
     env.reset()
-    for action in played:
-        env.step(action)
-    assert env.belief == simulated.belief
-    observation, reward, terminated, _, info = env.step(played[0])  # what the plant gives is not a number
-    assert terminated
-    assert info["diverged"]
-    assert reward == 0
-    assert env.belief == simulated.belief
+    env.step([0.5])
+    before = env.belief
+    observation, reward, terminated, _, info = env.step([0.5])
+    assert (terminated, info["diverged"], reward) == (True, True, 0)
+    assert env.belief == before
     assert np.isfinite(observation).all()
 
 

@@ -1,8 +1,8 @@
-"""A plant of one's own: it gets what is promised, and the estimator gets what it gives."""
+"""A rig around its plant: it gets what is promised, and the estimator gets what it gives."""
 
 import copy
-import doctest
 import pickle
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -12,15 +12,19 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from gymnasium.vector import SyncVectorEnv
 
 from agents import make_policy
-from duffing_env import own_plant
 from duffing_env.env import DuffingEnv
-from duffing_env.own_plant import PlantEnv
 from duffing_env.rewards import REWARDS
+from duffing_env.rig_env import RigEnv
+from estimator import Channel, Rig
 from estimator.models.difference import difference
 from estimator.models.pendulum import PENDULUM
+from estimator.parameters import SAMPLING_STEP
 from estimator.priors import silverbox_prior, weak_prior
+from estimator.rig_prior import rig_prior
 
-TRACK = "duffing_env/Plant-v0"
+#: In volts, as the tracks are, so that the same numbers go into the same estimator.
+VOLTS = Rig(SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
+GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
 
 
 class Difference:
@@ -55,14 +59,15 @@ class Scripted:
         return output
 
 
+def around(plant, factorisation="structured", **options):
+    """The rig in volts around a plant, with the estimator of Amplitude-v0."""
+    usual = {"prior": silverbox_prior().factorised(factorisation), "noise_hypotheses": 1}
+    usual |= {"max_input": 0.15, "max_output": 0.6, "factorisation": factorisation}
+    return RigEnv(rig=VOLTS, plant=plant, **usual | options)
+
+
 def actions(count, seed=0):
     return np.random.default_rng(seed).uniform(-1.2, 1.2, (count, 1)).astype(np.float32)
-
-
-def test_example_of_the_docstring():
-    results = doctest.testmod(own_plant)
-    assert results.attempted > 3
-    assert results.failed == 0
 
 
 @pytest.mark.parametrize(
@@ -84,7 +89,7 @@ def test_a_plant_that_gives_the_simulated_outputs_gives_the_same_episode_to_the_
         if told[-1][2]:
             break
     assert told[-1][2]
-    env = PlantEnv(Scripted(outputs), **options)
+    env = around(Scripted(outputs), **options)
     np.testing.assert_array_equal(env.reset(seed=99)[0], told[0][0])
     for action, expected in zip(played, told[1:], strict=False):
         observation, received, terminated, truncated, info = env.step(action)
@@ -97,7 +102,7 @@ def test_a_plant_that_gives_the_simulated_outputs_gives_the_same_episode_to_the_
 
 def test_the_plant_gets_the_clipped_float32_action_in_volts():
     plant = Difference()
-    env = gym.make(TRACK, plant=plant, max_input=0.07, max_output=10.0)
+    env = around(plant, max_input=0.07, max_output=10.0)
     env.reset()
     assert (plant.resets, plant.inputs) == (1, [])
     asked = [0.1, -1.0, 1 + 1e-6, 7.0, -1e300, np.float64(np.pi / 10)]
@@ -110,7 +115,7 @@ def test_the_plant_gets_the_clipped_float32_action_in_volts():
 
 @pytest.mark.parametrize("output", [np.nan, np.inf, -np.inf, 1e200, "volts", None, [0.1, 0.2], OSError("cable")])
 def test_a_plant_that_fails_ends_the_episode_flagged_with_the_belief_before(output):
-    env = PlantEnv(Scripted([0.01, -0.02, output]))
+    env = around(Scripted([0.01, -0.02, output]))
     first, _ = env.reset(seed=0)
     env.step([0.5])
     _, _, terminated, _, info = env.step([0.5])
@@ -137,7 +142,7 @@ def test_a_plant_that_cannot_be_reset_begins_no_episode():
             if self.resets == 2:
                 raise OSError("no answer")
 
-    env = PlantEnv(Broken())
+    env = around(Broken())
     env.reset()
     with pytest.raises(OSError, match="no answer"):
         env.reset()
@@ -149,7 +154,7 @@ def test_a_plant_that_cannot_be_reset_begins_no_episode():
 
 def test_refused_actions_do_not_reach_the_plant():
     plant = Difference()
-    env = PlantEnv(plant)
+    env = around(plant)
     with pytest.raises(ResetNeeded):
         env.step([0.0])
     env.reset()
@@ -162,12 +167,12 @@ def test_refused_actions_do_not_reach_the_plant():
 def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(factorisation):
     from stable_baselines3.common.env_checker import check_env as sb3_check
 
-    gymnasium_check(gym.make(TRACK, plant=Difference(), factorisation=factorisation).unwrapped, skip_render_check=True)
-    sb3_check(gym.make(TRACK, plant=Difference(), factorisation=factorisation))
+    gymnasium_check(around(Difference(), factorisation), skip_render_check=True)
+    sb3_check(around(Difference(), factorisation))
 
 
 def test_policies_find_their_limits():
-    env = gym.make(TRACK, plant=Difference(), horizon=30, max_input=0.05, max_output=1.0)
+    env = around(Difference(), horizon=30, max_input=0.05, max_output=1.0)
     observation, _ = env.reset()
     policy, state, ended = make_policy("prbs", env), None, []
     while not any(ended[-1:]):
@@ -179,13 +184,13 @@ def test_policies_find_their_limits():
 
 
 def test_nobody_knows_the_truth():
-    env = PlantEnv(Difference())
+    env = around(Difference())
     with pytest.raises(AttributeError, match="nobody knows"):
         _ = env.truth
     assert not hasattr(env, "truth")
     for reward in set(REWARDS) - {"information_gain", "expected_free_energy", "free_energy"}:
         with pytest.raises(ValueError, match=f"not be '{reward}'.*use 'information_gain'"):
-            PlantEnv(Difference(), reward=reward)
+            around(Difference(), reward=reward)
 
 
 @pytest.mark.parametrize(
@@ -197,28 +202,31 @@ def test_nobody_knows_the_truth():
         (Difference(), {"prior": weak_prior(PENDULUM, np.ones(3), np.eye(3))}, "of a model with one sensor"),
         (Difference(), {"horizon": 0}, "horizon must be a whole number"),
         (Difference(), {"spread": 0.1}, "spread=0.1 is no option of this environment"),
+        (Difference(), {"max_input": 1.5}, "max_input must be at most 1, the rig's own limit"),
+        (Difference(), {"prior": rig_prior(replace(VOLTS, step=1.0, guess=GUESS))}, "prior must have the scales of"),
+        (Difference(), {"prior": None}, "rig must have a guess for an environment, but has none"),
     ],
 )
 def test_bad_arguments_are_refused_with_a_remedy(plant, options, message):
     with pytest.raises(ValueError, match=message):
-        PlantEnv(plant, **options)
+        around(plant, **options)
 
 
 def test_a_prior_of_ones_own_is_where_episodes_start():
     twin = silverbox_prior()
     prior = weak_prior(twin.model, twin.coefficients_mean, twin.coefficients_cov / 9, state_std=0.2)
-    env = PlantEnv(Difference(), prior=prior)
+    env = around(Difference(), prior=prior)
     env.reset()
     np.testing.assert_array_equal(env.belief.coefficients_cov, prior.coefficients_cov)
     env.step([1.0])
-    assert env.belief.entropy() < PlantEnv(Difference(), prior=prior).belief.entropy()
+    assert env.belief.entropy() < around(Difference(), prior=prior).belief.entropy()
 
 
 @pytest.mark.slow  # a kernel of its own
 def test_a_model_without_the_cubic_term_recovers_from_a_plant_that_fails():
     # Mean field keeps rows of a θ2 that the model does not have: they must not stay NaN.
     prior = silverbox_prior(difference("linear")).factorised("mean_field")
-    env = PlantEnv(Scripted([0.01, 1e200]), prior=prior, factorisation="mean_field", max_output=1e300)
+    env = around(Scripted([0.01, 1e200]), "mean_field", prior=prior, max_output=1e300)
     told = []
     for _ in range(2):
         env.reset()
@@ -232,8 +240,8 @@ def test_a_model_without_the_cubic_term_recovers_from_a_plant_that_fails():
 def test_several_plants_are_several_environments():
     plants = [Difference(), Difference()]
     with pytest.raises(ValueError, match="SyncVectorEnv"):
-        gym.make_vec(TRACK, num_envs=2, plant=plants[0])
-    envs = SyncVectorEnv([lambda plant=plant: PlantEnv(plant) for plant in plants])
+        gym.make_vec("duffing_env/Rig-v0", num_envs=2, rig=VOLTS, plant=plants[0])
+    envs = SyncVectorEnv([lambda plant=plant: around(plant) for plant in plants])
     envs.reset()
     envs.step(np.array([[1.0], [-1.0]], dtype=np.float32))
     assert [plant.inputs for plant in plants] == [[0.15], [-0.15]]
@@ -241,7 +249,7 @@ def test_several_plants_are_several_environments():
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_copies_continue_apart(copied):
-    env = PlantEnv(Difference(), max_output=1.0)
+    env = around(Difference(), max_output=1.0)
     env.reset()
     for action in actions(20):
         env.step(action)
@@ -252,7 +260,7 @@ def test_copies_continue_apart(copied):
 
 
 def test_it_is_drawn():
-    env = gym.make(TRACK, plant=Difference(), render_mode="rgb_array")
+    env = around(Difference(), render_mode="rgb_array")
     env.reset()
     blank = env.render()
     env.step([1.0])

@@ -1,0 +1,241 @@
+"""A rig around the plant itself: an object that takes inputs and gives outputs in the rig's units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, SupportsFloat
+
+import numpy as np
+
+from duffing_env.env import DuffingEnv, Observation
+from duffing_env.experiment import Experiment
+from duffing_env.rewards import REWARDS
+from estimator.belief import Belief
+from estimator.ensemble import Hypotheses
+from estimator.models.model import Model
+from estimator.parameters import Parameters
+from estimator.rig import Rig
+from estimator.rig_prior import rig_prior
+from estimator.units import Scales
+
+AnyRig = Rig | Mapping[str, Any] | str | Path
+
+
+class Plant(Protocol):
+    """What a plant is: a simulator, a circuit behind a converter, a process behind a socket."""
+
+    def reset(self) -> object:
+        """Bring the plant to rest, with no input; what is returned is not looked at."""
+
+    def step(self, u: float) -> SupportsFloat:
+        """Apply the input u for one sampling step, and give the output at its end, both in the rig's units."""
+        ...
+
+
+def checked_rig(rig: AnyRig | None, needs_guess: bool = True) -> Rig:
+    """The rig of an environment.
+
+    An input that a generator smooths between samples (``look_ahead``, ``spline``) cannot be known sample by sample: an
+    environment's goes linearly from one to the next instead.
+
+    Raises:
+        ValueError: for none, one without limit, range or guess, or one with a delay.
+    """
+    if rig is None:
+        raise ValueError("rig must be a Rig, a dictionary or a file name, but is None; pass rig='rig.toml'")
+    rig = Rig.of(rig)
+    for missing, where in (("limit", rig.input.limit), ("range", rig.output.range), ("guess", rig.guess)):
+        if where is None and (needs_guess or missing != "guess"):
+            raise ValueError(f"rig must have a {missing} for an environment, but has none; add it to the rig")
+    if rig.delay > 0:
+        raise ValueError(
+            f"rig must have no delay for an environment, but has {rig.delay}; the plant waits for its input"
+        )
+    return rig
+
+
+class RigNumbers:
+    """What experiments on a rig share.
+
+    Attributes:
+        rig: a `Rig`, a dictionary, or the name of a rig file; with limit, range and guess.
+        max_input: input of the action 1, in parts of the input's limit; at most 1.
+        max_output: largest output, in parts of the output's range; at most 1.
+    """
+
+    rig: AnyRig | None
+    max_input: float
+    max_output: float
+
+    def _check_parts(self) -> None:
+        for name in ("max_input", "max_output"):
+            if getattr(self, name) > 1:
+                raise ValueError(f"{name} must be at most 1, the rig's own limit, but is {getattr(self, name)!r}")
+
+    @property
+    def described(self) -> Rig:
+        """The rig."""
+        assert isinstance(self.rig, Rig)
+        return self.rig
+
+    @property
+    def degree(self) -> int:
+        """Of the input over a sample: held, or linear from the last to this one."""
+        return int(self.described.interpolation != "zero_order")
+
+    @property
+    def points(self) -> bool:
+        """A guess is wide."""
+        return True
+
+    @property
+    def scales(self) -> Scales:
+        """The rig's."""
+        return self.described.scales
+
+
+@dataclass(frozen=True)
+class RigPlantExperiment(RigNumbers, Experiment):
+    """An experiment on a rig's plant itself, whose parameters nobody knows.
+
+    Attributes:
+        rig: see `RigNumbers`; it needs no guess where there is a prior.
+        max_input: see `RigNumbers`.
+        max_output: see `RigNumbers`.
+        horizon: samples of an episode; it is then truncated.
+        prior: the belief that every episode starts from, in the rig's scales; what the guess says where it is None.
+        noise_hypotheses: of the estimator; seven values of each noise reach over three decades.
+    """
+
+    rig: AnyRig | None = None
+    max_input: float = 1.0
+    max_output: float = 1.0
+    horizon: int = 256
+    prior: Belief | None = None
+    noise_hypotheses: Hypotheses = (7, 7)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rig", checked_rig(self.rig, self.prior is None))
+        if self.prior is None:
+            object.__setattr__(self, "prior", rig_prior(self.described))
+        if not isinstance(self.prior, Belief):
+            raise ValueError(f"prior must be an estimator.Belief or None, but is {self.prior!r:.60}")
+        if self.prior.scales != self.scales:
+            raise ValueError(
+                f"prior must have the scales of the rig, {self.scales}, but has {self.prior.scales}; give it those"
+            )
+        super().__post_init__()
+        self._check_parts()
+        self._check_count("horizon")
+        if REWARDS[self.reward].needs_truth:
+            raise ValueError(
+                f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "
+                "use 'information_gain', 'expected_free_energy' or 'free_energy'"
+            )
+        if self.model.n_outputs != 1:
+            raise ValueError(
+                f"prior must be of a model with one sensor, but {self.model.name!r} has {self.model.n_outputs}; "
+                "a plant gives one number"
+            )
+
+    @property
+    def samples(self) -> int:
+        """The horizon."""
+        return self.horizon
+
+    @property
+    def model(self) -> Model:
+        """That of the prior."""
+        return self.believed.model
+
+    @property
+    def step(self) -> float:
+        """The rig's."""
+        return float(self.described.step)
+
+    @property
+    def center(self) -> dict[str, float]:
+        """What the prior believes, inside: nobody knows the plant."""
+        dimensions = self.model.dimensions
+        told = self.believed.parameters()
+        return {name: mean / self.scales.factor(dimensions.get(name, (0, 0, 0))) for name, (mean, *_) in told.items()}
+
+    @cached_property
+    def believed(self) -> Belief:
+        """The prior."""
+        assert self.prior is not None
+        return self.prior
+
+
+class RigPlantEnv(DuffingEnv):
+    r"""A rig around its plant; what ``Rig-v0`` is with ``plant=``.
+
+    What the plant gets is what the estimator is told: the action in float32, clipped to [-1, 1], times ``max_input``
+    and the rig's limit. ``step`` has to keep the time: it returns when the sample is there. Nothing is applied between
+    two calls of the environment's ``step``, and nothing after the end of an episode until ``reset``: that of the plant
+    must switch its input off. The compiled step is ready before the plant is first touched. With ``hold`` the plant's
+    ``step`` is called for every sample, with the same input.
+
+    Rewards that compare with the true oscillator are refused, because nobody knows it: there is no
+    ``log_posterior_gain`` and no ``truth`` in the info, and ``env.unwrapped.truth`` raises AttributeError. A plant that
+    raises an exception or gives something that is not a finite number ends the episode (``info["diverged"]``), and
+    leaves the belief as it was before that step; ``info["plant_error"]`` is the exception's type and message. An
+    exception in ``plant.reset()`` comes out of ``reset``, and no episode has begun.
+
+    A plant and a prior are Python objects, so the specification of an environment made with them is not JSON-able; and
+    an environment is copied and pickled with its plant, if the plant can be. One plant is one environment.
+
+    Args:
+        plant: it stays the caller's, who closes it.
+        render_mode: as `DuffingEnv`.
+        options: fields of `RigPlantExperiment`.
+    """
+
+    experiment_kind: ClassVar[type[Experiment]] = RigPlantExperiment
+    _reported: ClassVar[tuple[str, ...]] = ("information_gain",)
+
+    def __init__(self, plant: Plant, *, render_mode: str | None = None, **options: Any) -> None:
+        for method in ("reset", "step"):
+            if not callable(getattr(plant, method, None)):
+                raise ValueError(f"plant must have methods reset() and step(u), but {plant!r} has no {method}()")
+        super().__init__(render_mode=render_mode, **options)
+        self.plant = plant
+        self._plant_error: str | None = None
+        # A plant would wait for the compiler with its first input on.
+        self._batch.step(0.0)
+
+    @property
+    def truth(self) -> Parameters:
+        """The plant's true parameters are not known.
+
+        Raises:
+            AttributeError: always.
+        """
+        raise AttributeError("nobody knows the true parameters of a plant of one's own; ask for env.unwrapped.belief")
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Bring the plant to rest and start an episode; ``options`` has no keys, and the plant is not told the seed."""
+        self._running = False
+        self.plant.reset()
+        return super().reset(seed=seed, options=options)
+
+    def _apply(self, action: float) -> None:
+        scales = self.experiment.scales
+        u = self.max_input * float(np.float32(action))
+        self._plant_error = None
+        try:
+            y = float(self.plant.step(scales.input * u)) / scales.output
+        except Exception as error:  # whatever it is: the episode ends in order, and its belief is told
+            self._plant_error = f"{type(error).__name__}: {error}"
+            y = np.nan
+        self._batch.measure(u, y)
+        self._batch.step(action)
+
+    def _final_info(self) -> dict[str, Any]:
+        failure = {} if self._plant_error is None else {"plant_error": self._plant_error}
+        return {"belief": self.belief, **failure}
