@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+
+from agents.running.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -29,39 +31,22 @@ class Run:
     """What makes the plant: factory(rig, **instrument), with the table [instrument] of the rig file."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
     """New folder for the samples and the manifest."""
-    policy: str = "efe"
-    """What chooses the input: the planner efe, or a signal such as prbs."""
-    samples: int = 256
-    """Samples of the run."""
-    block: int | None = None
-    """Play blocks of so many samples; sample by sample against the clock where it is left out."""
-    bound: float = 0.05
-    """Largest probability that a block, or a whole signal, takes the output out of its range."""
-    listen: int = 16
-    """Samples without input at the start."""
-    watchdog: float | None = None
-    """Seconds of silence after which the plant zeroes its input by itself; chosen where it is left out."""
-    no_watchdog: bool = False
-    """Run on a plant that has no watchdog: somebody has to watch."""
-    stale: int = 32
-    """Outputs in a row that are missing, or the same number again, which end the run; 0 for never."""
-    seed: int = 0
-    """Of the policy, and of the systems that are drawn from the belief."""
+    plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=Plan)
+    """What to do."""
 
     def run(self) -> None:
         """Run, and print the parameters; the exit status is 1 after a trip, and 128 + its number after a signal."""
         from agents.cli import progress_bar
         from agents.running.plant import load_plant
-        from agents.running.run import Plan, run
+        from agents.running.run import run
         from estimator import Rig
 
         rig = Rig.of(self.rig)
-        plan = Plan(**{name: getattr(self, name) for name in Plan.__dataclass_fields__})
         plant = load_plant(self.plant, rig, instrument_of(self.rig))
         try:
             with progress_bar() as bar:
-                task = bar.add_task(self.policy, total=self.samples)
-                result = run(rig, plant, self.out, plan, told=lambda done: bar.update(task, completed=done))
+                task = bar.add_task(self.plan.policy, total=self.plan.samples)
+                result = run(rig, plant, self.out, self.plan, told=lambda done: bar.update(task, completed=done))
         finally:
             if hasattr(plant, "close"):
                 plant.close()

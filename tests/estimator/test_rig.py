@@ -172,7 +172,7 @@ def test_numbers_do_not_depend_on_the_units():
     rng = np.random.default_rng(0)
     u, y = rng.choice([-6.0, 6.0], 300), 0.01 * rng.standard_normal(300).cumsum() / 10
     one, other = OnlineEstimator(rig=BENCH), OnlineEstimator(rig=small)
-    assert one.settings.noise_hypotheses == 9
+    assert one.settings.noise_hypotheses == (7, 7)
     one.run(u, y)
     other.run(1e3 * u, 1e6 * y)
     for name, (mean, std, _) in one.belief.parameters().items():
