@@ -283,4 +283,4 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
 def _own_hand(plant: Model, experiment: SimulatedExperiment) -> str:
     """Name of the environment's own estimator, without the hypotheses that it may weigh."""
     name = "ode" if plant.is_continuous else "structured"
-    return f"{name}_alone" if experiment.noise_hypotheses > 1 else name
+    return f"{name}_alone" if experiment.noise_hypotheses != 1 else name
