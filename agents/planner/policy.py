@@ -16,7 +16,8 @@ is imagined too.
 What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then
 predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
 exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes
-true. Where an input comes to act in full only a sample later, because it goes linearly from the last one to the new,
+true. Where hypotheses about the noises are weighed (``noise_hypotheses``) an output is believed to be a mixture, with
+heavier tails: the quantile is that of Student's t with `_TAILS` degrees of freedom. Where an input comes to act in full only a sample later, because it goes linearly from the last one to the new,
 the noise of the sample between moves the next output about as much again, and no input makes up for it: the margin is
 then twice as wide.
 
@@ -37,7 +38,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtri
+from scipy.special import ndtri, stdtrit
 
 from agents.planner.imagination import Terms
 from agents.planner.motion import View, places, seen, swing_of
@@ -68,6 +69,9 @@ class PlannerState(NamedTuple):
 
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
 _HORIZON = 24
+
+#: Degrees of freedom of what is predicted where the noises are not known.
+_TAILS = 16.0
 
 
 class Planner:
@@ -145,14 +149,16 @@ class Planner:
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
-        means = experiment.believed.coefficients_mean
+        means, chance = experiment.believed.coefficients_mean, risk / env.horizon
         swing = swing_of(self.view, means, setup.max_input, setup.max_output)
         of_rig = getattr(experiment, "rig", None) is not None
+        weighs = experiment.noise_hypotheses > 1 and not of_rig
         self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,
             limit=setup.max_output * (seen(experiment.believed, float(swing.scales[0])) if of_rig else 1.0),
-            margin=float(-ndtri(risk / env.horizon)) * (1 + max(self.view.degree, self.view.lag)),
+            margin=float(-stdtrit(_TAILS, chance) if weighs else -ndtri(chance))
+            * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
             scales=swing.scales,
             pace=swing.pace,

@@ -66,6 +66,12 @@ def test_the_median_seed_ships_with_the_scores_of_all(runs, shelf, capsys):
     assert "(3 seeds)" in capsys.readouterr().out
 
 
+def test_a_single_seed_ships_as_one(runs, shelf):
+    card = json.loads((ship(Config("ppo/short", runs[1:2], systems=8)) / "policy.json").read_text())
+    assert (card["seeds"], card["shipped"]["seed"]) == ([1], 1)
+    assert "seeds" not in card["scores"]["information_gain"]
+
+
 def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
     other = changed(runs[1], tmp_path / "other", reward="fisher")
     with pytest.raises(ValueError, match=r"one recipe, but .*other has another reward"):
@@ -75,8 +81,8 @@ def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
         ship(Config("ppo/short", (runs[0], twice)))
     with pytest.raises(ValueError, match="finished run folders"):
         ship(Config("ppo/short", (runs[0], tmp_path)))
-    with pytest.raises(ValueError, match="two folders or more, but are 1"):
-        Config("ppo/short", runs[:1])
+    with pytest.raises(ValueError, match="runs must be run folders, but are none"):
+        Config("ppo/short", ())
     with pytest.raises(ValueError, match="ALGORITHM/TRACK"):
         Config("../short", runs)
     assert not shelf.exists()
