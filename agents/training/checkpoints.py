@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.learned import save_policy
+from agents.policies.learned import WEIGHTS, save_policy
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -93,6 +93,22 @@ def load_progress(checkpoint: Path) -> Progress:
         return Progress(**{**found, "curve": [tuple(point) for point in found["curve"]]})
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"checkpoint must hold a sound {STATE}, but {checkpoint} does not: {error!r}") from error
+
+
+def begin_with(folder: Path, model: BaseAlgorithm) -> None:
+    """Give a new model the network of a trained policy.
+
+    Raises:
+        ValueError: where it holds no policy, or that of another network.
+    """
+    import torch
+    from safetensors.numpy import load_file
+
+    try:
+        tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(folder / WEIGHTS).items()}
+        model.policy.load_state_dict({name: t for name, t in tensors.items() if name != "foresight"})
+    except (OSError, RuntimeError) as error:
+        raise ValueError(f"begin must be a policy with the network of the training, but {folder} is not") from error
 
 
 def restore(checkpoint: Path, model: BaseAlgorithm) -> None:

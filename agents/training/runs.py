@@ -21,6 +21,7 @@ from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.checkpoints import (
     Progress,
+    begin_with,
     drop_states,
     latest_checkpoint,
     load_progress,
@@ -68,6 +69,8 @@ class TrainConfig(Subject):
     """Further options of the environment, as JSON."""
     output: Path | None = None
     """Run folder; runs/ALGO-TRACK-SEED where it is not given, with a number where that exists."""
+    begin: Path | None = None
+    """Policy folder whose network to begin with, of the same algorithm and shape; at random where it is not given."""
     checkpoints: int = 5
     """Checkpoints over the run, evenly spaced."""
     eval_every: int = 0
@@ -189,6 +192,8 @@ class _Training:
         self._model = config.hyperparameters.make(self._envs, seed)
         if checkpoint is not None:
             restore(checkpoint, self._model)
+        elif config.begin is not None:
+            begin_with(config.begin, self._model)
         self._checkpoints = self._due_checkpoints()
         self._held_out = HeldOut(folder, config, begun)
         self._evaluated = on_evaluation
@@ -327,6 +332,6 @@ def _read_config(folder: Path) -> TrainConfig:
         known = {f.name: found[f.name] for f in fields(TrainConfig)}
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"config.json must be that of a run, but that of {folder} is not: {error!r}") from error
-    known |= {name: None if known[name] is None else Path(known[name]) for name in ("output", "settings")}
+    known |= {name: None if known[name] is None else Path(known[name]) for name in ("output", "settings", "begin")}
     known["hyperparameters"] = settings_of(ALGORITHMS[known["algo"]], known["hyperparameters"])
     return TrainConfig(**known)

@@ -168,6 +168,16 @@ def test_no_training_meets_a_system_that_policies_are_compared_on():
         assert not met & {*begun(TESTED).tolist()}
 
 
+def test_a_training_can_begin_with_the_network_of_a_policy(runs, tmp_path):
+    settings = {"output": tmp_path / "on", "begin": runs["first"].folder, "steps": 4096}
+    begun = train(TrainConfig(**settings, hyperparameters=replace(SMALL, learning_rate=1e-12)))
+    before, after = (load_file(folder / "policy.safetensors") for folder in (runs["first"].folder, begun.folder))
+    for name, tensor in before.items():
+        np.testing.assert_allclose(after[name], tensor, atol=1e-6)
+    with pytest.raises(ValueError, match="begin must be a policy with the network of the training"):
+        tiny(tmp_path / "other", begin=runs["first"].folder)
+
+
 def test_hyperparameters_reach_the_algorithm(tmp_path):
     ppo = replace(TINY, n_steps=32, n_epochs=3, log_std_init=-1.25, hidden=(5, 7), learning_rate=1e-9)
     run = tiny(tmp_path / "run", steps=512, hyperparameters=ppo)
