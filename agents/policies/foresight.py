@@ -22,8 +22,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from agents.planner.imagination import Terms
 from agents.planner.motion import View, places, survey, swing_of
-from agents.policies.prospects import Outlook, look_at
+from agents.policies.imagined import FEATURES, Ahead, imaginer
+from agents.policies.prospects import MARGIN, Outlook, look_at
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -35,6 +37,12 @@ _DRIVE, _DRIVE_SPAN = 0.06, 0.1
 
 #: An oscillator that is within this part of the limit is at rest; it is pushed as if it moved by so much.
 _REST, _NUDGE = 0.007, 0.05
+
+#: A push alone changes the displacement by no more than half of this part of its limit in a move.
+_LEAP = 0.5
+
+#: Features of the free motion.
+_FREE = [FEATURES.index(f"free_{t}") for t in (1, 2, 3)]
 
 
 @dataclass(frozen=True)
@@ -98,6 +106,10 @@ class Foresight:
         """All of it but the model, flat, as a file holds it."""
         return np.concatenate([np.ravel(entry) for entry in self._outlook[:-1]])
 
+    def to_tensors(self) -> dict[str, FloatArray]:
+        """The same, by the name that a policy's file has it under."""
+        return {"foresight": self.to_array()}
+
     def describe(self) -> dict[str, Any]:
         """The model and how it is taken, as JSON can hold it."""
         return {"model": self._view.model.to_dict(), "degree": self._view.degree, "lag": self._view.lag}
@@ -135,24 +147,112 @@ class Foresight:
 
     def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
         """The actions (n, 1) in [-1, 1] that a network's choices (n,) in [-1, 1] stand for."""
-        chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
+        nudge = None
         if self.is_drive:
             outlook = self._outlook
             first = places(self._view.model).state
             # In the observation all states are in parts of the first sensor's limit.
             sizes = (outlook.scales / outlook.max_output).astype(np.float32)
             states = view.features[:, first : first + self._view.model.n_states] / sizes
-            at_rest = np.abs(states).max(axis=1) < _REST
             at_rest_gain = survey(self._view.model, outlook.center, np.zeros(self._view.model.n_states)).gains[0]
-            nudge = _NUDGE * outlook.max_output / abs(at_rest_gain)
-            motions = np.where(at_rest, nudge, view.motions)
-            chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / outlook.max_input, -1.0, 1.0)
-        up, none, down = view.safe.T
-        chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -1.0), chosen)
-        chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, 1.0), chosen)
-        chosen = np.where((chosen == 0) & ~none, np.where(up, 1.0, -1.0), chosen)
-        actions: npt.NDArray[np.float32] = (chosen * view.signs).astype(np.float32)[:, None]
-        return actions
+            nudge = np.where(
+                np.abs(states).max(axis=1) < _REST, _NUDGE * outlook.max_output / abs(at_rest_gain), view.motions
+            )
+        return acted(choices, view, nudge, self._outlook.max_input)
+
+
+class CommonForesight:
+    """What a policy for all oscillators looks with in an environment, single or vector, of whatever model.
+
+    What it sees is `agents.policies.imagined`; nothing of it is of the systems that a policy was trained on.
+
+    Args:
+        env: the unwrapped environment.
+
+    Raises:
+        ValueError: where an action is held for several samples, or ``env`` is not one of duffing_env.
+    """
+
+    def __init__(self, env: Any) -> None:
+        experiment: Experiment | None = getattr(env, "experiment", None)
+        if experiment is None:
+            raise ValueError(
+                f"env must be one of duffing_env for foresight, but is {type(env).__name__}; pass that one"
+            )
+        if experiment.hold != 1:
+            raise ValueError(f"hold must be 1 for foresight, but is {experiment.hold}; set foresight to false")
+        setup, prior, self._view = experiment.setup, experiment.believed, View.of(experiment)
+        center = prior.coefficients_mean
+        swing = swing_of(self._view, center, setup.max_input, setup.max_output)
+        process, sensor = (float(rate / shape) for shape, rate in (prior.noises[:2], prior.noises[2:4]))
+        rate = swing.taught / (process + sensor)
+        gain = abs(survey(self._view.model, center, np.zeros(self._view.model.n_states)).gains[0]) * swing.pace**2
+        push = min(setup.max_input, _LEAP * setup.max_output / gain)
+        self._ahead = Ahead(center, 1.0 / setup.inverse_std, push, process, sensor, setup.horizon, setup.budget, rate)
+        self._terms = Terms(
+            setup.max_input,
+            np.inf,
+            setup.max_output,
+            MARGIN,
+            np.zeros(len(center)),
+            swing.scales,
+            swing.pace,
+            swing.shaken,
+        )
+        self._nudge, self._push = _NUDGE * setup.max_output / gain, push / setup.max_input
+
+    def to_tensors(self) -> dict[str, FloatArray]:
+        """Nothing: all of it is taken from the environment at hand."""
+        return {}
+
+    def describe(self) -> dict[str, Any]:
+        """As `Foresight.describe`."""
+        return {"is_common": True}
+
+    @property
+    def observation_size(self) -> int:
+        """Entries of the observations that it looks at."""
+        return places(self._view.model).size
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether an action is how hard to push along the motion."""
+        return bool(np.isfinite(self._ahead.energy))
+
+    def look(self, observations: npt.ArrayLike) -> Sight:
+        """What observations (n, entries) look like."""
+        seen = np.ascontiguousarray(observations, dtype=np.float32)
+        n = len(seen)
+        features, safe = np.empty((n, len(FEATURES)), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
+        signs, motions = np.empty(n), np.empty(n)
+        imaginer(self._view)(seen, self._ahead, self._terms, features, safe, signs, motions)
+        return Sight(features, safe, signs, motions)
+
+    def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
+        """As `Foresight.act`."""
+        if self.is_drive:
+            at_rest = np.abs(view.features[:, _FREE]).max(axis=1) < _REST
+            motions = np.where(at_rest, self._nudge, view.motions)
+            return acted(choices, view, motions, self._terms.amplitude, self._push)
+        return acted(self._push * np.asarray(choices, dtype=np.float64), view, None, self._terms.amplitude, self._push)
+
+
+def acted(
+    choices: npt.ArrayLike, view: Sight, motions: FloatArray | None, max_input: float, push: float = 1.0
+) -> npt.NDArray[np.float32]:
+    """The actions (n, 1) of choices (n,); where there are ``motions`` (n,), a choice drives along them.
+
+    One in whose direction no way is left within the limit becomes none or a ``push`` the other way.
+    """
+    chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
+    if motions is not None:
+        chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / max_input, -1.0, 1.0)
+    up, none, down = view.safe.T
+    chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -push), chosen)
+    chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, push), chosen)
+    chosen = np.where((chosen == 0) & ~none, np.where(up, push, -push), chosen)
+    actions: npt.NDArray[np.float32] = (chosen * view.signs).astype(np.float32)[:, None]
+    return actions
 
 
 def _outlook_of(experiment: Experiment, rate: FloatArray) -> Outlook:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.foresight import Foresight
+from agents.policies.foresight import CommonForesight, Foresight
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
@@ -89,8 +89,9 @@ class LearnedPolicy:
         if network.spread is not None:
             self._spread = tensors[network.spread] if network.spread in tensors else layer(network.spread)
         self._features = (self._layers[0][0] if self._memory is None else self._memory.from_input).shape[1]
-        self._foresight = None
-        if network.foresight:
+        self._foresight: Foresight | CommonForesight | None = None
+        self._is_common = bool((card.get("foresight") or {}).get("is_common"))
+        if network.foresight and not self._is_common:
             self._foresight = Foresight.from_array(tensors["foresight"], card.get("foresight"))
         self._rng = np.random.default_rng(seed)
 
@@ -100,7 +101,9 @@ class LearnedPolicy:
         Raises:
             ValueError: for a policy with foresight and an environment that is not one of duffing_env.
         """
-        if self._foresight is None:
+        if self._is_common:
+            self._foresight = CommonForesight(env)
+        if not isinstance(self._foresight, Foresight):
             return
         if not hasattr(env, "experiment"):
             raise ValueError(
@@ -121,6 +124,8 @@ class LearnedPolicy:
         The state is Stable-Baselines3's: hidden and cell values, each (1, n, units), of a policy with a memory, which
         forgets them where ``episode_start``; None is a memory of nothing. Without a memory it is handed on unused.
         """
+        if self._is_common and self._foresight is None:
+            raise ValueError("env must be given to a policy for all oscillators, but is None; pass it to make_policy")
         hidden = np.asarray(observation, dtype=np.float32)
         seen = self._features if self._foresight is None else self._foresight.observation_size
         if hidden.shape[-1:] != (seen,):
@@ -205,7 +210,8 @@ def save_policy(folder: Path, model: BaseAlgorithm, card: dict[str, Any]) -> Non
     network = _network_of(model.policy, tensors)
     foresight = getattr(model.get_env(), "foresight", None)
     if foresight is not None:
-        network, tensors["foresight"] = replace(network, foresight=True), foresight.to_array()
+        network = replace(network, foresight=True)
+        tensors |= foresight.to_tensors()
     write_atomically(folder / WEIGHTS, save(tensors))
     described = {"format": FORMAT, "network": asdict(network), **card}
     if foresight is not None:

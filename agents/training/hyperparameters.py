@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
+from agents.training.family import FAMILY
 from estimator.files import write_atomically
 
 #: Folder of the files that come with the package, ``ALGORITHM.toml``.
@@ -103,7 +104,7 @@ def _check_table(table: str, entries: Any, kind: type[AlgorithmSettings], path: 
 
     if not isinstance(entries, dict):
         raise ValueError(f"settings must be in tables such as [{DEFAULT}], but {path} has {table} in none")
-    if table not in [DEFAULT, *map(table_of, registry)]:
+    if table not in [DEFAULT, FAMILY, *map(table_of, registry)]:
         ours = [DEFAULT, *dict.fromkeys(table_of(name) for name in registry if name.startswith("duffing_env/"))]
         raise ValueError(
             f"settings must have tables [{DEFAULT}] or of tracks, but {path} has [{table}]{_hint(table, ours)}"

@@ -28,6 +28,7 @@ from agents.training.checkpoints import (
     restore,
     save_checkpoint,
 )
+from agents.training.family import FAMILY
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import read_settings, settings_of, track_of
 
@@ -44,7 +45,7 @@ class Subject:
     algo: Literal["ppo", "sac", "td3", "tqc", "recurrent_ppo"] = "ppo"
     """Algorithm; tqc and recurrent_ppo need the extra "contrib"."""
     env: str = "duffing_env/Amplitude-v0"
-    """Id of the track."""
+    """Id of the track; or family, the oscillators of all kinds that ppo/universal is trained on."""
     rig: str | None = None
     """Rig file; the track is then Rig-v0."""
     settings: Path | None = None
@@ -98,7 +99,13 @@ class TrainConfig(Subject):
             raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
         if "branch" in self.options:
             raise ValueError(f"options must not hold branch, but are {self.options}; the others are to compare on")
-        check_track(self.env)
+        if self.env != FAMILY:
+            check_track(self.env)
+        elif self.options or self.eval_every or self.algo != "ppo":
+            raise ValueError(
+                f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare with "
+                "python -m agents.studies.universal"
+            )
         if self.hyperparameters is None:
             object.__setattr__(self, "hyperparameters", read_settings(self.algo, self.env, self.settings))
         if type(self.hyperparameters) is not ALGORITHMS[self.algo]:
@@ -289,6 +296,10 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
     asked = config.hyperparameters
     levels = getattr(asked, "levels", 0)
     options = {"reward": config.reward, **config.options}
+    if config.env == FAMILY:
+        from agents.training.family_env import FamilyVecEnv
+
+        return FamilyVecEnv(asked.num_envs, seed, reward=config.reward, levels=levels)
     if not asked.foresight:
         return DuffingVecEnv(config.env, asked.num_envs, seed=seed, levels=levels, **options)
     from agents.policies.foresight import Foresight

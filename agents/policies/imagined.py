@@ -1,0 +1,271 @@
+"""What the beliefs of all oscillators have in common: what they expect of simple ways to go on, imagined exactly.
+
+From an observation the believed oscillator is imagined for `HORIZONS`[-1] moves, each held for as many samples as
+`agents.planner.motion.Swing` says. The first move is a push up, none, or a push down; then follows one of
+
+- the eight signs of the next three pushes, and from there on pushes along the motion, but against it where they would
+  lead beyond the limit (the *best* of them counts),
+- *brake*: pushes against the motion,
+- *rest*: none.
+
+All of these thirty ways lie side by side in the lanes of one block, and are imagined as the planner imagines its own:
+by belief propagation (`agents.planner.imagination`), so that what one sample teaches is not counted again by the next,
+and with what the rest of the episode will bring anyway. What a way is worth is in nats known at the end.
+
+An observation does not hold the covariance of the state, nor that of state and coefficients. They are taken to be those
+of a state that was just seen, and nothing.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.planner.imagination import MOST_MARGIN, mind
+from agents.planner.motion import View, places
+from agents.planner.search import factorise
+from estimator.arrays import copy, fill
+from estimator.engine.imagination import imagination
+from estimator.engine.motion import motion
+from estimator.engine.rows import belief_names
+from estimator.lanes import LANES, kernel, part
+from estimator.parameters import FloatArray
+
+CONTINUATIONS = ("best", "brake", "rest")
+HORIZONS = (4, 8, 16)
+FIRST_INPUTS = ("up", "none", "down")
+
+#: What all observations become.
+FEATURES = (
+    "log_std_mean", "log_std_max", "last_input", "last_output", "log_gamma", "log_xi", "time_left", "budget_left",
+    *(f"{c}_{way}_{h}" for c in CONTINUATIONS for h in HORIZONS for way in ("up", "none")),
+    *(f"{c}_peak_{first}" for c in CONTINUATIONS for first in FIRST_INPUTS),
+    "free_1", "free_2", "free_3", "pushed_1", "pushed_2", "brings", "to_come",
+)  # fmt: skip
+
+#: Largest size of a feature; what a difference of one nat counts for before arcsinh.
+BOUND, _NAT = 10.0, 20.0
+
+#: Continuations of each first move: the signs of three pushes, then brake and rest.
+_TRIED = 3
+_CODES = (1 << _TRIED) + 2
+
+#: Moves in which an output can still be kept within the limit: nearly a period. Where pushes along the motion turn, in
+#: parts of the limit.
+_IN_REACH, _TURN = 8, 0.95
+
+#: Covariances of float32 correlations are made positive definite by this much.
+_RIDGE = 1e-6
+
+#: A push lasts at most so many times longer than the energy that is left allows for the samples that are left.
+_THRIFT = 3.0
+
+
+class Ahead(NamedTuple):
+    """What an observation is relative to, and what is ahead.
+
+    Attributes:
+        center: (K,) prior means of the coefficients.
+        std: (K,) their standard deviations.
+        push: size of a push; no more than what moves the first sensor by a part of its limit in a move.
+        process: variance of the process noise that the prior is centred at.
+        sensor: the same of the first sensor's noise.
+        samples: of an episode.
+        energy: limit of Σ u²; inf where there is none.
+        rate: (K, K) information about the coefficients that a sample brings.
+    """
+
+    center: FloatArray
+    std: FloatArray
+    push: float
+    process: float
+    sensor: float
+    samples: float
+    energy: float
+    rate: FloatArray
+
+
+@cache
+def imaginer(view: View) -> Any:
+    """``look(observations, ahead, terms, features, safe, signs, motions)``: what n observations of a model become.
+
+    - ``observations`` (n, entries) float32;
+    - ``ahead``: `Ahead`; ``terms``: `agents.planner.imagination.Terms`;
+    - ``features`` (n, len(FEATURES)) float32, receives the features, upright, all finite and at most `BOUND` in size;
+    - ``safe`` (n, 3) bool, receives which first moves need not lead beyond the limit; one of them is the safest;
+    - ``signs`` (n,) receives -1.0 where up and down changed places, so that the motion is upwards without input;
+    - ``motions`` (n,) receives what an input that is all of the motion in two samples would be, upright, by the pace.
+    """
+    model = view.model
+    size, _, U, SCORE, begin, _, advance, appraise, _ = mind(*view)
+    found, at, place = motion(*view), places(model), imagination(*view).layout
+    row, sense, glance, step = found.layout, found.sense, found.glance, found.step
+    shown, spread = place["SHOWN"] * LANES, place["SPREAD"] * LANES
+    n, k, width, n_record = model.n_states, model.n_coefficients, len(row), len(belief_names(model))
+    d, n_outputs, noise = n + k, model.n_outputs, belief_names(model).index("GAMMA_SHAPE")
+    u, now, velocity, gain, later = (row[name] for name in ("INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN"))
+    last, older = row["LAST_INPUT"], row["OLDER_INPUT"]
+    pairs = tuple(combinations(range(k), 2))
+    kind = f"{model.name}_{model.digest}_{view.degree}_{view.lag}"
+    inner, entry = part(kind), kernel(kind=kind)
+
+    @inner
+    def believe(seen, ahead, terms, record, P):
+        """Put what an observation tells of the belief into a record; the coefficients' covariance also into ``P``."""
+        for a in range(k):
+            record[n + a] = ahead.center[a] + ahead.std[a] * seen[at.mean + a]
+            std = ahead.std[a] * np.exp(seen[at.log_std + a])
+            P[n + a, n + a] = (1.0 + _RIDGE) * std * std
+        for p in range(len(pairs)):
+            a, b = pairs[p]
+            std = np.sqrt(P[n + a, n + a] * P[n + b, n + b]) / (1.0 + _RIDGE)
+            P[n + a, n + b] = seen[at.correlation + p] * std
+        process = ahead.process * np.exp(-seen[at.noise])
+        sensor = ahead.sensor * np.exp(-seen[at.noise + 1])
+        for a in range(n):
+            record[a] = terms.limit * seen[at.state + a]
+            P[a, a] = 0.5 * (process + sensor) * (terms.scales[a] / terms.limit) ** 2
+        to = d
+        for a in range(d):
+            for b in range(a, d):
+                record[to] = P[a, b]
+                to += 1
+        for i in range(1 + n_outputs):
+            record[to + 2 * i] = 1.0
+            record[to + 2 * i + 1] = sensor if i else process
+
+    @inner
+    def along(W, j, still, push, terms):
+        """The push of lane j along its motion, or against it where that would lead beyond the limit."""
+        for a in range(n):
+            still[a] = W[a * LANES + j]
+        sense(still)
+        way = push if still[velocity] >= 0.0 else -push
+        still[u] = way
+        glance(still)
+        ahead = still[later] + (terms.pace - 1) * (still[later] - still[now])
+        return way, -way if abs(ahead) > _TURN * terms.limit else way
+
+    @inner
+    def choose(W, t, still, push, terms):
+        """Put the inputs of move t into all lanes."""
+        for j in range(3 * _CODES):
+            code = j % _CODES
+            if t == 0:
+                W[U + j] = (1.0 - j // _CODES) * push
+            elif code == _CODES - 1:
+                W[U + j] = 0.0
+            elif code < _CODES - 2 and t <= _TRIED:
+                W[U + j] = push if (code >> (t - 1)) & 1 else -push
+            else:
+                way, pump = along(W, j, still, push, terms)
+                W[U + j] = pump if code < _CODES - 2 else -way
+
+    @inner
+    def best(values, first, group):
+        """The best of a first move's ways in a group of continuations, which are 0 best, 1 brake, 2 rest."""
+        begin_at = first * _CODES + (0 if group == 0 else _CODES - 3 + group)
+        count = _CODES - 2 if group == 0 else 1
+        found = values[begin_at]
+        for j in range(begin_at + 1, begin_at + count):
+            found = max(found, values[j])
+        return found
+
+    @entry
+    def look(observations, ahead, terms, features, safe, signs, motions):
+        W, still, record, P = np.zeros(size), np.zeros(width), np.zeros(n_record), np.zeros((d, d))
+        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(LANES)
+        brought = np.empty((len(HORIZONS), LANES))
+        free = np.empty((3, 3))
+        factorise(ahead.rate, M)
+        for i in range(len(observations)):
+            seen, told = observations[i], features[i]
+            believe(seen, ahead, terms, record, P)
+            lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
+            copy(still, 0, record, d)
+            still[last] = still[older] = lasts[0]
+            sense(still)
+            velocity_now, place_now, gain_now = still[velocity], still[now], still[gain]
+            still[u] = 0.0
+            step(still)
+            motions[i] = (velocity_now + still[later] - place_now) / terms.pace
+            motions[i] *= gain_now / max(gain_now * gain_now, 1e-300)
+            copy(still, 0, record, d)
+            still[last] = still[older] = lasts[0]
+            left, push = max(1.0, seen[at.time_left] * ahead.samples), ahead.push
+            share = seen[at.time_left]
+            if ahead.energy < np.inf:
+                # What is still to come takes time and energy.
+                share = 0.5 * (share + seen[at.budget_left])
+                push = min(push, _THRIFT * np.sqrt(max(0.0, seen[at.budget_left]) * ahead.energy / left))
+            begin(W, record, lasts)
+            appraise(W, none, 0.0)
+            known = W[SCORE]
+            appraise(W, M, np.sqrt(share * ahead.samples))
+            to_come = W[SCORE]
+            fill(peaks, 0.0)
+            unforeseen, h = terms.shaken * record[noise + 1] / record[noise], 0
+            for t in range(HORIZONS[-1]):
+                choose(W, t, still, push, terms)
+                for _ in range(terms.pace):
+                    advance(W, record, terms)
+                    if t < _IN_REACH:
+                        for j in range(LANES):
+                            margin = min(terms.margin * np.sqrt(W[spread + j] + unforeseen), MOST_MARGIN * terms.limit)
+                            peaks[j] = max(peaks[j], abs(W[shown + j]) + margin)
+                if t < 3:
+                    for first in range(3):
+                        free[t, first] = W[shown + first * _CODES + _CODES - 1]
+                if t + 1 == HORIZONS[h]:
+                    rest = max(0.0, share * ahead.samples - (t + 1) * terms.pace)
+                    appraise(W, M, np.sqrt(rest))
+                    for j in range(LANES):
+                        brought[h, j] = W[SCORE + j]
+                    h += 1
+            sign = 1.0 if free[0, 1] >= 0.0 else -1.0
+            signs[i] = sign
+            motions[i] *= sign
+            up, down = (0, 2) if sign > 0.0 else (2, 0)
+            mean = widest = seen[at.log_std]
+            for a in range(1, k):
+                mean += seen[at.log_std + a]
+                widest = max(widest, seen[at.log_std + a])
+            told[0], told[1] = mean / k, widest
+            told[2], told[3] = sign * seen[at.last_input], sign * seen[at.last_output]
+            told[4], told[5] = seen[at.noise], seen[at.noise + 1]
+            told[6], told[7] = seen[at.time_left], seen[at.budget_left]
+            to = 8
+            for group in range(3):
+                for h in range(len(HORIZONS)):
+                    rise, calm = best(brought[h], up, group), best(brought[h], 1, group)
+                    fall = best(brought[h], down, group)
+                    told[to] = np.arcsinh(_NAT * (rise - fall))
+                    told[to + 1] = np.arcsinh(_NAT * (calm - max(rise, fall)))
+                    to += 2
+            for j in range(LANES):
+                peaks[j] = -peaks[j]
+            for group in range(3):
+                for first in (up, 1, down):
+                    told[to] = -best(peaks, first, group) / terms.limit
+                    to += 1
+            for t in range(3):
+                told[to + t] = sign * free[t, 1] / terms.limit
+            for t in range(2):
+                told[to + 3 + t] = (free[t, 0] - free[t, 2]) / terms.limit
+            most = max(best(brought[-1], 0, 0), best(brought[-1], 1, 0), best(brought[-1], 2, 0))
+            told[to + 5] = np.arcsinh(_NAT * (most - to_come))
+            told[to + 6] = to_come - known
+            lowest = np.inf
+            for first in range(3):
+                lowest = min(lowest, -best(peaks, first, 0))
+            for first in range(3):
+                peak = -max(best(peaks, first, 0), best(peaks, first, 1), best(peaks, first, 2))
+                safe[i, first if sign > 0.0 else 2 - first] = peak <= terms.limit or peak <= lowest
+            for j in range(len(told)):
+                # NaN becomes 0.
+                told[j] = max(-BOUND, min(told[j], BOUND)) if told[j] == told[j] else 0.0
+
+    return look

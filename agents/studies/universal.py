@@ -1,0 +1,136 @@
+"""What a policy for all oscillators is worth on unseen ones of the family, beside the planner and the fixed signals.
+
+    python -m agents.studies.universal --policies ppo/universal prbs prbs-4 uniform silverbox-multisine
+
+plays every policy on the same oscillators, one of each rig that is drawn (`agents.training.family`), in the branch
+``test`` of the seeds. D-efficiency is exp(2 (I - I_efe) / K), with I the information gained about the K coefficients
+and I_efe that of the planner on the same oscillator with the same noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from agents.cli import progress_bar, run_script
+from agents.evaluation.batch import TESTED, make
+from agents.policies import make_policy
+from agents.results import write_json
+from agents.training.family import Member, draw_member
+
+PLANNER = "efe"
+
+#: Of the family's draws: another word than that of any training.
+_BRANCH = 2
+
+
+@dataclass(frozen=True)
+class Config:
+    """Judge policies on the family of oscillators."""
+
+    policies: tuple[str, ...] = ("ppo/universal", "prbs", "prbs-4", "uniform", "silverbox-multisine")
+    """Names or run folders, beside the planner."""
+    systems: int = 256
+    """Rigs, one oscillator of each."""
+    seed: int = 0
+    """Of rigs, oscillators and noise."""
+    output: Path | None = None
+    """Folder for results as JSON."""
+
+    def __post_init__(self) -> None:
+        if not self.policies or self.systems < 2:
+            raise ValueError(f"policies must be some and systems at least 2, but are {self.policies}, {self.systems}")
+
+
+def unseen(count: int, seed: int = 0) -> list[Member]:
+    """Rigs of the family that no training draws."""
+    return [draw_member(np.random.default_rng((seed, _BRANCH, i))) for i in range(count)]
+
+
+def play(member: Member, policy: str, seed: int) -> tuple[float, float, float]:
+    """An episode: the information gained, 1 where a limit ended it, and the share of 90 % intervals with the truth."""
+    envs = make("duffing_env/Rig-v0", 1, member.options | TESTED)
+    chosen = make_policy(policy, envs, seed=seed)
+    observations, _ = envs.reset(seed=seed)
+    state, start = None, np.ones(1, dtype=np.bool_)
+    gained, terminated = 0.0, np.zeros(1, dtype=np.bool_)
+    for _ in range(envs.horizon):
+        actions, state = chosen.predict(observations, state, start, deterministic=True)
+        start = np.zeros(1, dtype=np.bool_)
+        observations, _, terminated, truncated, infos = envs.step(actions)
+        gained += float(infos["information_gain"][0])
+        if terminated[0] or truncated[0]:
+            break
+    belief, truth = infos["belief"][0], infos["truth"][0]
+    intervals = belief.interval(0.9)
+    covered = np.mean([low <= getattr(truth, name) <= high for name, (low, high) in intervals.items()])
+    envs.close()
+    return gained, float(terminated[0]), float(covered)
+
+
+def classes(members: Sequence[Member]) -> Iterator[tuple[str, npt.NDArray[np.bool_]]]:
+    """Name of a class of oscillators, and which of them are in it."""
+    kinds = np.array([member.kind for member in members])
+    yield "all", np.ones(len(members), dtype=np.bool_)
+    for kind in dict.fromkeys(kinds):
+        yield str(kind), kinds == kind
+    for name, values, edge in (
+        ("damping", [m.damping for m in members], 0.025),
+        ("drive", [m.drive for m in members], 0.14),
+    ):
+        yield f"weak {name}", np.array(values) < edge
+        yield f"strong {name}", np.array(values) >= edge
+    known = np.array([member.options.get("noise_range") == 1.0 for member in members])
+    frugal = np.array(["max_rms" in member.options for member in members])
+    yield "known noise", known
+    yield "unknown noise", ~known
+    yield "limited energy", frugal
+    yield "limited amplitude alone", ~frugal
+
+
+def main(config: Config) -> None:
+    """Play, and print the table."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    members = unseen(config.systems, config.seed)
+    names = (PLANNER, *config.policies)
+    gains, ended, covered = np.empty((3, len(names), len(members)))
+    with progress_bar() as bar:
+        task = bar.add_task("", total=len(names) * len(members))
+        for p, name in enumerate(names):
+            for i, member in enumerate(members):
+                bar.update(task, advance=1, description=f"{name}, {member.kind}")
+                gains[p, i], ended[p, i], covered[p, i] = play(member, name, config.seed + i)
+    console = Console(width=150)
+    groups = [(name, mask) for name, mask in classes(members) if mask.any()]
+    n_coefficients = 6
+    efficiency = np.exp(2.0 * (gains - gains[0]) / n_coefficients)
+    table = Table("oscillators", "number", *names, box=box.MARKDOWN)
+    for name, mask in groups:
+        cells = [f"{np.median(e[mask]):.2f} / {np.quantile(e[mask], 0.1):.2f}" for e in efficiency]
+        table.add_row(name, str(int(mask.sum())), *cells)
+    table.add_row("ended early", "", *(f"{100 * e.mean():.1f} %" for e in ended))
+    table.add_row("90 % intervals that cover", "", *(f"{c.mean():.3f}" for c in covered))
+    table.add_row("information / nat", "", *(f"{g.mean():.2f}" for g in gains))
+    console.print("D-efficiency beside efe: median / 10 % quantile")
+    console.print(table)
+    if config.output is not None:
+        config.output.mkdir(parents=True, exist_ok=True)
+        results: dict[str, Any] = {
+            "policies": names,
+            "gains": gains.tolist(),
+            "ended": ended.tolist(),
+            "covered": covered.tolist(),
+        }
+        write_json(config.output / "universal.json", results)
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__ or "")
