@@ -4,6 +4,7 @@ $ python train.py                                  PPO on Amplitude-v0, into run
 $ python train.py --steps 1000000 --seed 3         shorter, another seed
 $ python train.py --reward log_posterior           another reward
 $ python train.py --rig rig.toml                   on a rig of your own
+$ python train.py --env family                     on oscillators of all kinds, to play any
 $ python train.py --algo sac --help                another algorithm, and its hyperparameters
 $ python train.py --algo td3 --tune 50             search for its hyperparameters
 $ python train.py --resume runs/ppo-amplitude-v0-0 go on with a run that was stopped
@@ -17,6 +18,7 @@ import tyro
 
 from agents.cli import run_script
 from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, tune
+from agents.training.family import FAMILY
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,9 @@ def main(config: Config) -> None:
             raise ValueError("resume takes all settings but systems from the run; leave out the others")
         run = resume(config.resume)
     print(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
-    if config.systems:
+    if config.env == FAMILY:
+        print(f"python -m agents.studies.universal --policies {run.folder}")
+    elif config.systems:
         policies = (str(run.folder), *usual_policies(run.config.env, run.config.options))
         compare(policies, run.config.env, config.systems, run.config.options, run.folder)
     print(run.folder / "learning_curve.png")

@@ -108,6 +108,8 @@ def imaginer(view: View) -> Any:
     d, n_outputs, noise = n + k, model.n_outputs, belief_names(model).index("GAMMA_SHAPE")
     u, now, velocity, gain, later = (row[name] for name in ("INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN"))
     last, older = row["LAST_INPUT"], row["OLDER_INPUT"]
+    # An array, because an empty tuple has no type.
+    olders = np.array([place[x] * LANES for x in ("LAST_INPUT", "OLDER_INPUT") if x in place], dtype=np.int64)
     pairs = tuple(combinations(range(k), 2))
     kind = f"{model.name}_{model.digest}_{view.degree}_{view.lag}"
     inner, entry = part(kind), kernel(kind=kind)
@@ -142,6 +144,8 @@ def imaginer(view: View) -> Any:
         """The push of lane j along its motion, or against it where that would lead beyond the limit."""
         for a in range(n):
             still[a] = W[a * LANES + j]
+        for a in range(len(olders)):
+            still[last + a] = W[olders[a] + j]
         sense(still)
         way = push if still[velocity] >= 0.0 else -push
         still[u] = way

@@ -5,12 +5,19 @@
 plays every policy on the same oscillators, one of each rig that is drawn (`agents.training.family`), in the branch
 ``test`` of the seeds. D-efficiency is exp(2 (I - I_efe) / K), with I the information gained about the K coefficients
 and I_efe that of the planner on the same oscillator with the same noise.
+
+    python train.py --env family --steps 8000000
+    python -m agents.studies.universal --policies runs/ppo-family-0 --ship
+
+writes the run's policy into the package, as ppo/universal, with these figures on its card.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +26,13 @@ import numpy.typing as npt
 
 from agents.cli import progress_bar, run_script
 from agents.evaluation.batch import TESTED, make
-from agents.policies import make_policy
+from agents.policies import TRAINED, make_policy
+from agents.policies.learned import CARD, WEIGHTS
 from agents.results import write_json
 from agents.training.family import Member, draw_member
+from estimator.files import write_atomically
 
-PLANNER = "efe"
+PLANNER, SHIPPED = "efe", "ppo/universal"
 
 #: Of the family's draws: another word than that of any training.
 _BRANCH = 2
@@ -41,10 +50,14 @@ class Config:
     """Of rigs, oscillators and noise."""
     output: Path | None = None
     """Folder for results as JSON."""
+    ship: bool = False
+    """Whether the first of the policies, a run folder, becomes ppo/universal."""
 
     def __post_init__(self) -> None:
         if not self.policies or self.systems < 2:
             raise ValueError(f"policies must be some and systems at least 2, but are {self.policies}, {self.systems}")
+        if self.ship and not (Path(self.policies[0]) / CARD).is_file():
+            raise ValueError(f"policies must begin with a run folder to ship, but begin with {self.policies[0]!r}")
 
 
 def unseen(count: int, seed: int = 0) -> list[Member]:
@@ -130,6 +143,19 @@ def main(config: Config) -> None:
             "covered": covered.tolist(),
         }
         write_json(config.output / "universal.json", results)
+    if config.ship:
+        scores = {name: [float(np.median(efficiency[1][mask])), float(np.quantile(efficiency[1][mask], 0.1))]
+                  for name, mask in groups}  # fmt: skip
+        print(_ship(Path(config.policies[0]), {"systems": config.systems, "seed": config.seed, "efficiency": scores}))
+
+
+def _ship(run: Path, scores: dict[str, Any]) -> Path:
+    """Write a run's policy into the package."""
+    card = json.loads((run / CARD).read_text())
+    folder = TRAINED / SHIPPED
+    write_atomically(folder / WEIGHTS, (run / WEIGHTS).read_bytes())
+    write_json(folder / CARD, card | {"track": "family", "version": version("duffing-env"), "scores": scores})
+    return folder
 
 
 if __name__ == "__main__":

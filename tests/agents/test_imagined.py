@@ -1,0 +1,181 @@
+"""What all beliefs have in common: against plain NumPy, turned over, alone and in a batch, finite, and shielded."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from agents.evaluation.batch import make
+from agents.planner.motion import View
+from agents.policies import make_policy
+from agents.policies.foresight import CommonForesight
+from agents.policies.imagined import BOUND, FEATURES, imaginer
+from agents.training.family import draw_member
+from estimator.models.difference import difference
+
+
+def observations_of(envs, samples, seed=0):
+    """Observations on the way under random pushes."""
+    rng = np.random.default_rng(seed)
+    observations, _ = envs.reset(seed=seed)
+    for _ in range(samples):
+        actions = rng.choice([-0.6, 0.0, 0.6], (envs.num_envs, 1)).astype(np.float32)
+        observations, *_ = envs.step(actions)
+    return observations
+
+
+def reference(seen, ahead, terms):
+    """The features of one observation of Eq. (2), from its matrices, way by way."""
+    k, A, L = 4, terms.amplitude, terms.limit
+    std = ahead.std * np.exp(seen[4:8])
+    R = np.eye(k)
+    R[np.triu_indices(k, 1)] = seen[8:14]
+    R = R + np.triu(R, 1).T
+    theta = ahead.center + ahead.std * seen[:4]
+    q, r = ahead.process * np.exp(-seen[14]), ahead.sensor * np.exp(-seen[15])
+    P = np.zeros((6, 6))
+    P[:2, :2] = 0.5 * (q + r) * np.eye(2)
+    P[2:, 2:] = np.outer(std, std) * (R + 1e-6 * np.eye(k))
+    z = L * seen[16:18].astype(np.float64)
+    last_u, time_left = seen[18], seen[20]
+
+    def sample(z, P, u):
+        moved = np.array([theta[0] * z[0] + theta[1] * z[0] ** 3 + theta[2] * z[1] + theta[3] * u, z[0]])
+        S = np.eye(6)
+        S[0] = [theta[0] + 3 * theta[1] * z[0] ** 2, theta[2], z[0], z[0] ** 3, z[1], u]
+        S[1] = [1, 0, 0, 0, 0, 0]
+        P = S @ P @ S.T
+        P[0, 0] += q
+        spread = P[0, 0] + r
+        gain = P[:, 0] / spread
+        return moved, P - np.outer(gain, P[0]), spread
+
+    def worth(P, left):
+        return 0.5 * np.linalg.slogdet(np.linalg.inv(P[2:, 2:]) + left * ahead.rate)[1]
+
+    def way(first, code):
+        x, C, cost, peak, told, seen_at = z, P, 0.0, 0.0, [], []
+        for t in range(16):
+            if t == 0:
+                u = (1 - first) * A
+            elif code == 9:
+                u = 0.0
+            elif code < 8 and t <= 3:
+                u = A if (code >> (t - 1)) & 1 else -A
+            else:
+                along = A if x[0] - x[1] >= 0 else -A
+                then = theta[0] * x[0] + theta[1] * x[0] ** 3 + theta[2] * x[1] + theta[3] * along
+                pump = -along if abs(then + (terms.pace - 1) * (then - x[0])) > 0.95 * L else along
+                u = pump if code < 8 else -along
+            for _ in range(terms.pace):
+                x, C, spread = sample(x, C, u)
+                reach = abs(x[0]) + min(terms.margin * np.sqrt(spread + terms.shaken * q), 0.5 * L)
+                cost += 1e4 / L * max(0.0, reach - L)
+                peak = max(peak, reach) if t < 8 else peak
+            seen_at.append(x[0])
+            if t + 1 in (4, 8, 16):
+                told.append(worth(C, max(0.0, time_left * ahead.samples - (t + 1) * terms.pace)) - cost)
+        return told, peak, seen_at
+
+    ways = {(first, code): way(first, code) for first in range(3) for code in range(10)}
+    free = np.array([[ways[first, 9][2][t] for first in range(3)] for t in range(3)])
+    sign = 1.0 if free[0, 1] >= 0 else -1.0
+    up, down = (0, 2) if sign > 0 else (2, 0)
+    groups = [range(8), [8], [9]]
+    brought = lambda group, first, h: max(ways[first, code][0][h] for code in groups[group])  # noqa: E731
+    peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(3)] for codes in groups])
+    told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, seen[21]]
+    for group in range(3):
+        for h in range(3):
+            rise, calm, fall = (brought(group, first, h) for first in (up, 1, down))
+            told += [np.arcsinh(20 * (rise - fall)), np.arcsinh(20 * (calm - max(rise, fall)))]
+    told += [peaks[group, first] / L for group in range(3) for first in (up, 1, down)]
+    told += [*(sign * free[:, 1] / L), *((free[:2, 0] - free[:2, 2]) / L)]
+    now = worth(P, time_left * ahead.samples)
+    told += [np.arcsinh(20 * (max(brought(0, first, 2) for first in range(3)) - now)), now - worth(P, 0.0)]
+    allowed = peaks.min(axis=0) <= max(L, peaks[0].min())
+    return np.clip(told, -BOUND, BOUND), allowed if sign > 0 else allowed[::-1], sign
+
+
+@pytest.mark.parametrize("pace", [1, 2])
+def test_features_are_those_of_the_matrices(pace):
+    envs = make("duffing_env/Amplitude-v0", 12)
+    seen = observations_of(envs, 40)
+    foresight = CommonForesight(envs)
+    terms = foresight._terms._replace(pace=pace, shaken=3.0)
+    features, safe = np.empty((12, len(FEATURES)), np.float32), np.empty((12, 3), np.bool_)
+    signs, motions = np.empty((2, 12))
+    imaginer(View(difference()))(seen, foresight._ahead, terms, features, safe, signs, motions)
+    assert {*signs} == {-1.0, 1.0}
+    for i in range(12):
+        told, allowed, sign = reference(seen[i], foresight._ahead, terms)
+        np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
+        np.testing.assert_array_equal(safe[i], allowed)
+        assert signs[i] == sign
+
+
+def test_an_observation_looks_the_same_alone_and_any_is_finite():
+    envs = make("duffing_env/Amplitude-v0", 12)
+    foresight, rng = CommonForesight(envs), np.random.default_rng(1)
+    space = envs.single_observation_space
+    seen = rng.uniform(space.low, space.high, (200, len(space.low))).astype(np.float32)
+    view = foresight.look(seen)
+    assert np.isfinite(view.features).all() and (np.abs(view.features) <= BOUND).all()
+    assert view.safe.any(axis=1).all()
+    np.testing.assert_array_equal(foresight.look(seen[7][None]).features[0], view.features[7])
+
+
+def test_turning_the_task_over_turns_the_action_over():
+    envs = make("duffing_env/Amplitude-v0", 12)
+    seen = observations_of(envs, 40)
+    turned = seen.copy()
+    turned[:, 16:20] *= -1
+    foresight = CommonForesight(envs)
+    one, other = foresight.look(seen), foresight.look(turned)
+    np.testing.assert_allclose(one.features, other.features, atol=1e-5)
+    choices = np.linspace(-1, 1, 12)
+    np.testing.assert_allclose(foresight.act(choices, one), -foresight.act(choices, other), atol=1e-6)
+
+
+def test_it_refuses_what_it_cannot_look_at():
+    with pytest.raises(ValueError, match="env must be one of duffing_env"):
+        CommonForesight(SimpleNamespace())
+    with pytest.raises(ValueError, match="hold must be 1"):
+        CommonForesight(make("duffing_env/Amplitude-v0", 1, {"hold": 2}))
+
+
+def test_members_are_drawn_within_their_ranges_and_make_environments():
+    kinds = set()
+    for i in range(60):
+        member = draw_member(np.random.default_rng(i))
+        kinds.add(member.kind)
+        guess = member.options["rig"]["guess"]
+        assert 6 <= member.period <= 60 and 0.002 <= member.damping <= 0.3 and 0.02 <= member.drive <= 1
+        a, b = (np.mean(guess[name]) for name in "ab")
+        # The input limit of 1 is the drive's part of the static force at X = 1.
+        assert abs(a + b) * member.drive == pytest.approx(1.0, rel=1e-9)
+        assert 64 <= member.options["horizon"] <= 1024
+    assert kinds == {"hardening", "softening", "double-well"}
+    assert make("duffing_env/Rig-v0", 1, member.options).horizon == member.options["horizon"]
+
+
+def test_a_policy_for_all_oscillators_needs_an_environment_to_look_at():
+    policy = make_policy("ppo/universal")
+    with pytest.raises(ValueError, match="env must be given"):
+        policy.predict(np.zeros(22, dtype=np.float32))
+
+
+@pytest.mark.parametrize("env_id", ["duffing_env/Amplitude-v0", "duffing_env/Power-v0"])
+def test_it_plays_tracks_that_it_was_not_trained_on(env_id):
+    gains = {}
+    for name in ("ppo/universal", "prbs"):
+        envs = make(env_id, 16)
+        policy = make_policy(name, envs)
+        observations, _ = envs.reset(seed=3)
+        state, gains[name], running = None, 0.0, np.ones(16, dtype=np.bool_)
+        for _ in range(envs.horizon):
+            actions, state = policy.predict(observations, state, deterministic=True)
+            observations, _, terminated, truncated, infos = envs.step(actions)
+            gains[name] += np.where(running, infos["information_gain"], 0.0).mean()
+            running &= ~(terminated | truncated)
+    assert gains["ppo/universal"] > gains["prbs"] + 1.0
