@@ -120,7 +120,8 @@ def test_an_observation_looks_the_same_alone_and_any_is_finite():
     space = envs.single_observation_space
     seen = rng.uniform(space.low, space.high, (200, len(space.low))).astype(np.float32)
     view = foresight.look(seen)
-    assert np.isfinite(view.features).all() and (np.abs(view.features) <= BOUND).all()
+    assert np.isfinite(view.features).all()
+    assert (np.abs(view.features) <= BOUND).all()
     assert view.safe.any(axis=1).all()
     np.testing.assert_array_equal(foresight.look(seen[7][None]).features[0], view.features[7])
 
@@ -150,7 +151,9 @@ def test_members_are_drawn_within_their_ranges_and_make_environments():
         member = draw_member(np.random.default_rng(i))
         kinds.add(member.kind)
         guess = member.options["rig"]["guess"]
-        assert 6 <= member.period <= 60 and 0.002 <= member.damping <= 0.3 and 0.02 <= member.drive <= 1
+        assert 6 <= member.period <= 60
+        assert 0.002 <= member.damping <= 0.3
+        assert 0.02 <= member.drive <= 1
         a, b = (np.mean(guess[name]) for name in "ab")
         # The input limit of 1 is the drive's part of the static force at X = 1.
         assert abs(a + b) * member.drive == pytest.approx(1.0, rel=1e-9)
