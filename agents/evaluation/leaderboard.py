@@ -65,7 +65,8 @@ METRICS = {
     "crest_factor": Metric("crest factor", 2),
     "decision_time": Metric("time per decision / µs", 2, 1e6),
     "fisher_gain": Metric("Fisher information / nat", 2),
-    "efficiency": Metric("D-efficiency / %", 1, 100),
+    "efficiency": Metric("D-efficiency, of the best known / %", 1, 100),
+    "certified": Metric("at least, of what is possible / %", 1, 100),
     # Infinite where the whole regime tells less, so only a median says something of many.
     "silverbox_equivalent": Metric("Silverbox equivalent / samples", 0, 1.0, MEDIAN, MEDIAN),
     "full_peak_equivalent": Metric("the same at full peak / samples", 0, 1.0, MEDIAN, MEDIAN),

@@ -89,17 +89,22 @@ def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatA
     return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])
 
 
-def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> FloatArray | None:
-    """(n,) D-efficiency of the systems that the track's stored `Oracle` has; None without one."""
+def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> dict[str, FloatArray]:
+    """D-efficiency of the systems that the track's stored `Oracle` has, and what is certain of those with a bound.
+
+    The latter, ``certified``, is at least so much of what is possible. Without an oracle there is neither.
+    """
     from agents.evaluation.oracle import Oracle
     from agents.evaluation.systems import Systems
 
     try:
         oracle = Oracle.of(Systems.of(env_id, evaluation.inputs.shape[1], options))
     except FileNotFoundError:
-        return None
+        return {}
     n = len(oracle.values)
-    return oracle.efficiency(evaluation.inputs.T[:n], np.swapaxes(evaluation.outputs, 0, 1)[:n])
+    best, least = oracle.efficiency(evaluation.inputs.T[:n], np.swapaxes(evaluation.outputs, 0, 1)[:n])
+    certain = least[np.isfinite(least)]
+    return {"efficiency": best} | ({"certified": certain} if len(certain) else {})
 
 
 def regime_information(truth: Any, experiment: Any, seed: int, scale: float = 1.0) -> FloatArray:

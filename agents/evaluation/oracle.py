@@ -27,11 +27,14 @@ class Oracle:
         systems: that they are for.
         inputs: (n, samples) [V].
         values: (n,) their worth [nats].
+        bounds: (n,) what no admissible input is worth more than [nats] (`agents.evaluation.certificate`); NaN where
+            nobody has found one.
     """
 
     systems: Systems
     inputs: FloatArray
     values: FloatArray
+    bounds: FloatArray
 
     @classmethod
     def of(cls, systems: Systems) -> Oracle:
@@ -46,13 +49,13 @@ class Oracle:
             command = "python -m agents.evaluation.oracle_search --env ..."
             raise FileNotFoundError(f"no oracle is stored for {systems.description}; run {command}")
         with np.load(path, allow_pickle=False) as stored:
-            scaled, theta = stored["inputs"], stored["theta"]
+            scaled, theta, bounds = stored["inputs"], stored["theta"], stored["bounds"]
         n = min(len(theta), len(systems.theta))
         if not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
             raise ValueError(f"oracle must be for the systems at hand, but {path.name} is not; make it anew")
         chosen = systems.rows(0, n)
         inputs = systems.limits.amplitude * (scaled[:n] / LEVELS)
-        return cls(chosen, inputs, chosen.worth(inputs)[0])
+        return cls(chosen, inputs, chosen.worth(inputs)[0], bounds[:n])
 
     @staticmethod
     def stored(systems: Systems) -> int:
@@ -64,7 +67,7 @@ class Oracle:
 
     def first(self, count: int) -> Oracle:
         """That of the first systems."""
-        return Oracle(self.systems.rows(0, count), self.inputs[:count], self.values[:count])
+        return Oracle(self.systems.rows(0, count), self.inputs[:count], self.values[:count], self.bounds[:count])
 
     def save(self) -> Path:
         """Store it in the package, in one piece."""
@@ -74,13 +77,14 @@ class Oracle:
             inputs=_as_integers(self.inputs / self.systems.limits.amplitude),
             theta=self.systems.theta,
             values=self.values,
+            bounds=self.bounds,
             task=np.array(json.dumps(self.systems.description)),
         )
         write_atomically(self.systems.path, content.getvalue())
         return self.systems.path
 
-    def efficiency(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike) -> FloatArray:
-        """D-efficiency (n,) of an episode: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / K] for K coefficients.
+    def efficiency(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """D-efficiency of an episode: exp[(log det(Λ0+F) - log det(Λ0+F_oracle)) / K] for K coefficients.
 
         F is taken at the true coefficients along the outputs that were seen, because feedback keeps these within
         their limit, and not the response without noise to the same inputs, which drifts away from them. 0.5 means that
@@ -91,6 +95,9 @@ class Oracle:
             inputs: (n, samples) [V]; NaN from the end of an episode on.
             outputs: (n, samples) [V] that followed them; (n, samples, sensors) of several.
 
+        Returns:
+            (n,) against the stored inputs, and (n,) against the bounds: at least so much of what is possible.
+
         Raises:
             ValueError: for more rows than the oracle has systems, or as `estimator.fisher_information`.
         """
@@ -99,8 +106,10 @@ class Oracle:
             raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
         information = self.systems.information(u, outputs)
         values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]
-        efficiency: FloatArray = np.exp(2 * (values - self.values[: len(u)]) / information.shape[-1])
-        return efficiency
+        best, least = (
+            np.exp(2 * (values - top[: len(u)]) / information.shape[-1]) for top in (self.values, self.bounds)
+        )
+        return best, least
 
 
 #: Inputs are stored as whole numbers, of which this one stands for the largest.

@@ -120,12 +120,12 @@ def _burst(one: Systems, limits: Limits, words: np.ndarray) -> FloatArray:
 def begun(systems: Systems) -> Oracle:
     """The stored oracle, with systems that it lacks at rest and worth -inf."""
     n = len(systems.theta)
-    inputs, values = np.zeros((n, systems.samples)), np.full(n, -np.inf)
+    inputs, values, bounds = np.zeros((n, systems.samples)), np.full(n, -np.inf), np.full(n, np.nan)
     count = Oracle.stored(systems)
     if count:
         stored = Oracle.of(systems)
-        inputs[:count], values[:count] = stored.inputs, stored.values
-    return Oracle(systems, inputs, values)
+        inputs[:count], values[:count], bounds[:count] = stored.inputs, stored.values, stored.bounds
+    return Oracle(systems, inputs, values, bounds)
 
 
 def check(oracle: Oracle, tries: int, seed: int) -> str:

@@ -168,9 +168,8 @@ def _evaluate(
         gains = metrics.information(evaluation.inputs, truth, experiment, evaluation.outputs)
         found["fisher_gain"] = gains
         evaluation.estimators.update(_audit(evaluation, truth, experiment))
-        efficiency = metrics.efficiency(evaluation, env_id, options) if seed == 0 else None
-        if efficiency is not None:  # an oracle is stored, of the systems of seed 0 in this branch
-            found["efficiency"] = efficiency
+        if seed == 0:  # whose systems in this branch an oracle may be stored of
+            found |= metrics.efficiency(evaluation, env_id, options)
     if not record_available():  # what follows is measured by it
         return evaluation
     if stays and (is_difference or experiment.plant == duffing()):
