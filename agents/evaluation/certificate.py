@@ -21,7 +21,7 @@ fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), 
 
 **The grid.** The programme interpolates between nodes. What is stored is the larger of the bounds on the grid and on one
 of twice as many intervals, plus what they differ by. This allowance is no proof: on three and four times as many
-intervals the bounds of two systems of Output-v0, on which the grid tells most, lay at most 0.002 nats above it.
+intervals, the bounds of two systems of Output-v0, on which the grid tells most, lay at most 0.002 nats above it.
 """
 
 from __future__ import annotations
