@@ -19,7 +19,7 @@ state, and there is none yet: a price of energy instead bounds only mixtures of 
 **G and W** are those of the best mixture of the paths that the programme has found so far; W is then a least squares
 fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), until bound and mixture meet.
 
-**The grid.** The programme interpolates between nodes. What is stored is the larger of the bounds on the grid and on one
+**The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on one
 of twice as many intervals, plus what they differ by. This allowance is no proof: on three and four times as many
 intervals, the bounds of two systems of Output-v0, on which the grid tells most, lay at most 0.002 nats above it.
 """
