@@ -167,7 +167,9 @@ def test_stored_oracles_keep_the_limits_of_their_tracks(track):
     assert np.abs(oracle.inputs).max() <= limits.amplitude
     assert oracle.systems.worth(oracle.inputs)[1].max() <= limits.output
     assert np.all((oracle.inputs**2).sum(axis=1) <= limits.energy * (1 + 1e-9))
-    assert gains(oracle.systems, oracle.values).min() > (15.0 if track == POWER else 18.0)
+    # On Eq. (1) each system has noises of its own, over a decade, and the noisiest tell less.
+    floor = 10.0 if track.endswith("v1") else 15.0 if track == POWER else 18.0
+    assert gains(oracle.systems, oracle.values).min() > floor
 
 
 def test_tracks_without_an_oracle_say_so():
