@@ -16,10 +16,10 @@ is imagined too.
 What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then
 predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
 exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes
-true. Where hypotheses about the noises are weighed (``noise_hypotheses``), but on a rig, an
-output is believed to be a mixture, with heavier tails: the quantile is that of Student's t with `_TAILS` degrees of freedom. Where an input comes to act in full
-only a sample later, because it goes linearly from the last one to the new, the noise of the sample between moves the
-next output about as much again, and no input makes up for it: the margin is then twice as wide.
+true. Where hypotheses about the noises are weighed (``noise_hypotheses``), but on a rig, an output is believed to be a
+mixture, with heavier tails: the quantile is that of Student's t with `_TAILS` degrees of freedom. Where an input comes
+to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the sample
+between moves the next output about as much again, and no input makes up for it: the margin is then twice as wide.
 
 Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
 nothing helps: on a rig the limit is lower by what a swing at it can hide.
