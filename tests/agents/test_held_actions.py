@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.batch import make
+from agents.evaluation.batch import TESTED, make
 from agents.evaluation.rollout import evaluate
 from agents.policies import make_policy
 from estimator import SAMPLING_STEP
@@ -76,7 +76,7 @@ def test_every_sample_is_evaluated(monkeypatch):
     monkeypatch.setattr("agents.evaluation.rollout.record_available", lambda: False)
     options = {"hold": HOLD, "horizon": 50, "max_output": 0.3}
     (evaluation,) = evaluate(["uniform"], systems=6, seed=5, options=options)
-    envs = make(TRACK, 6, options)
+    envs = make(TRACK, 6, options | TESTED)
     policy, state = make_policy("uniform", envs, seed=5), None
     observations, _ = envs.reset(seed=5)
     gains, running, samples = np.zeros(6), np.ones(6, dtype=bool), np.zeros(6)

@@ -10,6 +10,7 @@ from agents.planner.motion import View
 from agents.policies import make_policy
 from agents.policies.foresight import CommonForesight
 from agents.policies.imagined import BOUND, FEATURES, imaginer
+from agents.studies.universal import play, unseen
 from agents.training.family import draw_member
 from estimator.models.difference import difference
 
@@ -166,6 +167,16 @@ def test_a_policy_for_all_oscillators_needs_an_environment_to_look_at():
     policy = make_policy("ppo/universal")
     with pytest.raises(ValueError, match="env must be given"):
         policy.predict(np.zeros(22, dtype=np.float32))
+
+
+def test_the_policy_that_ships_is_ahead_of_a_signal_on_unseen_members():
+    told = make_policy("ppo/universal").card["scores"]["efficiency"]
+    assert told["all"][0] > 0.7
+    members = [member for member in unseen(24) if member.options["horizon"] < 200]
+    ours, signal = (
+        [play(member, name, i)[0] for i, member in enumerate(members)] for name in ("ppo/universal", "prbs")
+    )
+    assert np.median(np.subtract(ours, signal)) > 0.5
 
 
 @pytest.mark.parametrize("env_id", ["duffing_env/Amplitude-v0", "duffing_env/Power-v0"])
