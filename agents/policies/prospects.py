@@ -65,11 +65,9 @@ _TRIED = 3
 #: Samples in which an output can still be kept within the limit: half a period of the tracks' slowest oscillators.
 _IN_REACH = 8
 
-#: Where ``pump`` turns, in parts of the limit; what twice the limit takes away, in parts of what an episode brings.
-_TURN, _BEYOND = 0.95, 500.0
-
-#: Covariances of float32 correlations are made positive definite by this much.
-_RIDGE = 1e-6
+#: Where ``pump`` turns, in parts of the limit; what twice the limit takes away, in parts of what an episode brings; by
+#: how much covariances of float32 correlations are made positive definite.
+_TURN, _BEYOND, _RIDGE = 0.95, 500.0, 1e-6
 
 #: A push lasts at most so many times longer than the energy that is left allows for the samples that are left.
 _THRIFT = 3.0
@@ -345,8 +343,7 @@ def look_at(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_], FloatArray, FloatArray]:
     """Features, safe, signs and motions of observations (n, entries); see `lookout`."""
     seen = np.ascontiguousarray(observations, dtype=np.float32)
-    n = len(seen)
-    features, safe = np.empty((n, len(feature_names(view.model))), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
-    signs, motions = np.empty(n), np.empty(n)
+    features = np.empty((len(seen), len(feature_names(view.model))), dtype=np.float32)
+    safe, (signs, motions) = np.empty((len(seen), 3), dtype=np.bool_), np.empty((2, len(seen)))
     lookout(view)(seen, outlook, features, safe, signs, motions)
     return features, safe, signs, motions
