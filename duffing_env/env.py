@@ -15,7 +15,9 @@ from duffing_env.batch import Batch
 from duffing_env.experiment import Experiment, SimulatedExperiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND
 from duffing_env.layout import SUMMED, observation_bounds
+from duffing_env.turns import in_turn
 from estimator.belief import Belief
+from estimator.checks import numbers, shown
 from estimator.models.model import Model
 from estimator.parameters import FloatArray, Parameters
 
@@ -189,6 +191,7 @@ class DuffingEnv(gym.Env[Any, Any]):
         self._sensor = next(iter(self.experiment.truth_model.outputs))
         self._streamed: np.random.Generator | None = None
         self._running = False
+        self._turn = [None]
         self._screen: Screen | None = None
 
     @property
@@ -216,6 +219,7 @@ class DuffingEnv(gym.Env[Any, Any]):
         """The oscillator that is to be identified."""
         return self._batch.true_of(0)
 
+    @in_turn
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -230,6 +234,7 @@ class DuffingEnv(gym.Env[Any, Any]):
             self._start_drawing()
         return self._batch.observations[0].copy(), {}
 
+    @in_turn
     def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one input for ``hold`` samples, or until the episode ends.
 
@@ -305,8 +310,11 @@ class DuffingEnv(gym.Env[Any, Any]):
 
 
 def _one_number(action: npt.ArrayLike) -> float:
-    given = action if isinstance(action, np.ndarray) else np.asarray(action, dtype=np.float64)
-    value = float(given.item()) if given.size == 1 else math.nan
+    try:
+        given = action if type(action) is np.ndarray else numbers("action", action)
+        value = float(given.item()) if given.size == 1 else math.nan
+    except (TypeError, ValueError, OverflowError):
+        value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"action must be one finite number in [-1, 1], but is {action!r}")
+        raise ValueError(f"action must be one finite number in [-1, 1], but is {shown(action)}")
     return min(max(value, -1.0), 1.0)

@@ -16,17 +16,24 @@ from duffing_env.layout import Kind, Setup, parameter_names
 from duffing_env.noise import BRANCHES
 from duffing_env.rewards import REWARDS, check_reward
 from estimator.belief import Belief
+from estimator.checks import LARGEST, number, shown, whole
 from estimator.ensemble import Hypotheses, priors, start
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
-from estimator.settings import checked_hypotheses
+from estimator.settings import MOST_ITERATIONS, checked_hypotheses
 from estimator.units import Scales
 
 #: More ratios of the noises, or values of each, than are worth their time.
 MOST_HYPOTHESES = 99
+
+#: Samples of an episode, or of an action, at most.
+MOST_SAMPLES = 10**9
+
+#: Smallest and largest relative half width of a range of parameters.
+SPREADS = 1e-6, 0.999
 
 
 @dataclass(frozen=True)
@@ -66,31 +73,20 @@ class Experiment:
         if self.factorisation not in list(DEFAULT_ITERATIONS):
             raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {self.factorisation!r}")
         if self.iterations is not None:
-            self._check_count("iterations")
+            whole("iterations", self.iterations, MOST_ITERATIONS)
         check_reward(self.reward)
-        self._check_positive("max_input")
-        self._check_positive("max_output")
-        self._check_count("hold")
+        for name in ("max_input", "max_output"):
+            number(name, getattr(self, name))
+        whole("hold", self.hold, MOST_SAMPLES)
         self._check_flag("terminal")
-        worth = self.terminated_return
-        if worth is not None and not (_is_number(worth) and np.isfinite(worth)):
-            raise ValueError(f"terminated_return must be a finite number, but is {worth!r}; None keeps what was gained")
+        if self.terminated_return is not None:
+            number("terminated_return", self.terminated_return, -LARGEST, LARGEST, "None keeps what was gained")
         hypotheses = checked_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MOST_HYPOTHESES)
         object.__setattr__(self, "noise_hypotheses", hypotheses)
 
-    def _check_positive(self, name: str) -> None:
-        value = getattr(self, name)
-        if not (_is_number(value) and 0 < value < np.inf):
-            raise ValueError(f"{name} must be a positive, finite number, but is {value!r}; pass a value above 0")
-
     def _check_flag(self, name: str) -> None:
         if not isinstance(getattr(self, name), bool):
-            raise ValueError(f"{name} must be True or False, but is {getattr(self, name)!r}")
-
-    def _check_count(self, name: str) -> None:
-        value = getattr(self, name)
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"{name} must be a whole number of at least 1, but is {value!r}")
+            raise ValueError(f"{name} must be True or False, but is {shown(getattr(self, name))}")
 
     @property
     def samples(self) -> int:
@@ -253,24 +249,18 @@ class SimulatedExperiment(Experiment):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_count("horizon")
-        for name in ("process_noise", "measurement_noise", "spread", "noise_shape"):
-            self._check_positive(name)
-        if self.spread >= 1:
-            raise ValueError(f"spread must be below 1, but is {self.spread!r}; masses are positive")
-        if self.plant_spread is not None and not (_is_number(self.plant_spread) and 0 <= self.plant_spread < 1):
-            raise ValueError(f"plant_spread must be in [0, 1), but is {self.plant_spread!r}; 0 is the twin itself")
+        whole("horizon", self.horizon, MOST_SAMPLES)
+        for name in ("process_noise", "measurement_noise", "noise_shape"):
+            number(name, getattr(self, name))
+        number("spread", self.spread, *SPREADS, "masses are positive, and none is known so well before")
+        if self.plant_spread is not None:
+            number("plant_spread", self.plant_spread, 0, SPREADS[1], "0 is the twin itself")
         for name in ("max_rms", "max_slew", "process_noise_guess", "measurement_noise_guess"):
             if getattr(self, name) is not None:
-                self._check_positive(name)
-        if not (_is_number(self.noise_range) and 1 <= self.noise_range < np.inf):
-            raise ValueError(
-                f"noise_range must be 1 or more and finite, but is {self.noise_range!r}; 1 draws no noises"
-            )
-        for name, limit in (("input_cost", np.inf), ("jump", 1.0), ("drift", np.inf)):
-            value = getattr(self, name)
-            if not (_is_number(value) and 0 <= value < limit):
-                raise ValueError(f"{name} must be in [0, {limit}), but is {value!r}; 0 does without it")
+                number(name, getattr(self, name))
+        number("noise_range", self.noise_range, 1, LARGEST, "1 draws no noises")
+        for name, limit in (("input_cost", LARGEST), ("jump", SPREADS[1]), ("drift", 1.0)):
+            number(name, getattr(self, name), 0, limit, "0 does without it")
         if self.drift and self.factorisation == "mean_field":
             raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {self.drift!r}")
 
@@ -336,7 +326,3 @@ def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experime
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"{name}={options[name]!r} is no option of this environment, which has {known}{hint}")
     return kind(**options)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)

@@ -14,6 +14,7 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
+from estimator.checks import LARGEST, SMALLEST, number, shown
 from estimator.models import MODELS
 from estimator.models.model import Model
 from estimator.priors import gaussian_moments, weak_prior
@@ -48,20 +49,19 @@ class ModelExperiment(SimulatedExperiment):
                 continue
             if not isinstance(given, Mapping) or set(given) != set(names):
                 raise ValueError(f"{name} must give the parameters {list(names)}, but is {given!r}")
-            if not all(np.isfinite(value) for value in given.values()):
-                raise ValueError(f"{name} must be finite, but is {dict(given)}")
-        if self.std is not None and not all(value > 0 for value in self.std.values()):
-            raise ValueError(
-                f"std must be positive, but is {dict(self.std)}; leave a parameter that is known to the model"
-            )
-        self._check_positive("sampling_step")
+            for parameter, value in given.items():
+                number(f"{name} of {parameter}", value, -LARGEST if name == "mean" else SMALLEST)
+        number("sampling_step", self.sampling_step)
         if self.interpolation not in ("zero_order", "linear"):
             raise ValueError(f"interpolation must be 'zero_order' or 'linear', but is {self.interpolation!r}")
         if self.factorisation != "structured":
             raise ValueError(f"factorisation must be 'structured' for a model, but is {self.factorisation!r}")
         others = self.sensor_noise
-        if others is not None and len(others) != self.plant.n_outputs - 1:
-            raise ValueError(f"sensor_noise must be for the sensors {list(self.plant.outputs)[1:]}, but is {others!r}")
+        if others is not None and (not isinstance(others, list | tuple) or len(others) != self.plant.n_outputs - 1):
+            sensors = list(self.plant.outputs)[1:]
+            raise ValueError(f"sensor_noise must be for the sensors {sensors}, but is {shown(others)}")
+        for std in others or ():
+            number("sensor_noise", std)
 
     @cached_property
     def plant(self) -> Model:

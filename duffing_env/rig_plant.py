@@ -11,9 +11,10 @@ from typing import Any, ClassVar, Protocol, SupportsFloat
 import numpy as np
 
 from duffing_env.env import DuffingEnv, Observation
-from duffing_env.experiment import Experiment
+from duffing_env.experiment import MOST_SAMPLES, Experiment
 from duffing_env.rewards import REWARDS
 from estimator.belief import Belief
+from estimator.checks import whole
 from estimator.ensemble import Hypotheses
 from estimator.models.model import Model
 from estimator.parameters import Parameters
@@ -129,7 +130,7 @@ class RigPlantExperiment(RigNumbers, Experiment):
             )
         super().__post_init__()
         self._check_parts()
-        self._check_count("horizon")
+        whole("horizon", self.horizon, MOST_SAMPLES)
         if REWARDS[self.reward].needs_truth:
             raise ValueError(
                 f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "

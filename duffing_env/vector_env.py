@@ -17,11 +17,13 @@ from gymnasium.vector.utils import batch_space
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv, action_space, observation_space
-from duffing_env.experiment import Experiment, make_experiment
+from duffing_env.experiment import MOST_SAMPLES, Experiment, make_experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import OUTCOME
 from duffing_env.replay import SilverboxReplayEnv
+from duffing_env.turns import in_turn
 from estimator.belief import Belief
+from estimator.checks import numbers, shown, whole
 from estimator.parameters import FloatArray, Parameters
 
 _RESET_MODES = {
@@ -33,6 +35,9 @@ _RESET_MODES = {
 #: Name of what a step leaves to its place in a batch's outcomes; the flags are the last of them.
 _PLACES = {name.lower(): place for place, name in enumerate(OUTCOME)}
 _FIRST_FLAG = _PLACES["terminated"]
+
+#: Rows at most, some gigabytes of them; and the largest seed.
+MOST_ENVS, MOST_SEED = 2**20, 2**128
 
 Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -82,14 +87,13 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        for name, value in (("num_envs", num_envs), ("threads", threads)):
-            if not isinstance(value, int | np.integer) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, but is {value!r}")
+        whole("num_envs", num_envs, MOST_ENVS)
+        available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+        whole("threads", threads, available)
+        if max_episode_steps is not None:
+            whole("max_episode_steps", max_episode_steps, MOST_SAMPLES)
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, but is {render_mode!r}; render a single environment")
-        available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-        if threads > available:
-            raise ValueError(f"threads must be at most {available}, but is {threads}; NUMBA_NUM_THREADS allows no more")
         try:
             self._autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -109,6 +113,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         reset_mode = _RESET_MODES[self._autoreset_mode]
         self._batch = Batch(self.experiment, self.num_envs, reset_mode, int(threads), self.experiment.hold)
         self._copy = copy
+        self._turn = [None]
         self._seeded: Flags = np.zeros(self.num_envs, dtype=np.bool_)
         self._finished: Flags = np.ones(self.num_envs, dtype=np.bool_)
         self._everywhere: Flags = np.ones(self.num_envs, dtype=np.bool_)
@@ -138,6 +143,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         """The posterior of row ``index`` now."""
         return self._batch.belief(index)
 
+    @in_turn
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
@@ -160,6 +166,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         self._any_due = bool(due.any())
         return self._batch.observations, {}
 
+    @in_turn
     def step(
         self, actions: npt.NDArray[np.float32]
     ) -> tuple[Observations, npt.NDArray[np.float64], Flags, Flags, dict[str, Any]]:
@@ -169,7 +176,8 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
             ValueError: if the actions are not finite numbers of shape (num_envs, 1); nothing has changed then.
             gymnasium.error.ResetNeeded: before the first reset; with ``DISABLED`` also for finished rows.
         """
-        actions = np.asarray(actions)
+        if type(actions) is not np.ndarray or actions.dtype.kind != "f":
+            actions = numbers("actions", actions)
         if actions.shape != (self.num_envs, 1):
             raise ValueError(f"actions must have shape {(self.num_envs, 1)}, but have {actions.shape}; one per row")
         given = actions[:, 0]
@@ -207,19 +215,25 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
 
     def _seed(self, seed: int | Sequence[int | None] | None, mask: Flags) -> None:
         """Start the rows' streams of random numbers, each from an ``np_random`` of its own."""
-        seeds: Sequence[int | None]
-        if seed is None:
-            seeds = [None] * self.num_envs
-        elif isinstance(seed, int | np.integer):
-            super().reset(seed=int(seed))
+        seeds: Sequence[int | None] = [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            whole("seed", seed, MOST_SEED, 0)
             seeds = spawn_seeds(int(seed), self.num_envs)
-        else:
-            seeds = [None if each is None else int(each) for each in seed]
+        elif seed is not None:
+            seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes) else []
             if len(seeds) != self.num_envs:
-                raise ValueError(f"seed must hold {self.num_envs} seeds, but holds {len(seeds)}; pass one for each row")
+                raise ValueError(
+                    f"seed must be a whole number or {self.num_envs} of them, one for each row, but is {shown(seed)}"
+                )
+            for row, each in enumerate(seeds):
+                if each is not None:
+                    whole(f"seed[{row}]", each, MOST_SEED, 0)
+        # All that can fail has been done.
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))
         for row in np.flatnonzero(mask).tolist():
             if seeds[row] is not None or not self._seeded[row]:
-                generator, _ = gym.utils.seeding.np_random(seeds[row])
+                generator, _ = gym.utils.seeding.np_random(None if seeds[row] is None else int(seeds[row]))
                 self._batch.seed(row, generator)
         self._seeded |= mask
 

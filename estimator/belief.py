@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from estimator.checks import number, numbers, shown
 from estimator.engine.rows import belief_names
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
@@ -38,6 +39,35 @@ def record_size(model: Model) -> int:
     return len(belief_names(model))
 
 
+def check_record(what: str, model: Model, record: FloatArray, rounding: float) -> None:
+    """Refuse numbers (size,) that are no belief of a model.
+
+    Args:
+        what: names them in the message.
+        model: whose belief.
+        record: the numbers.
+        rounding: what may be left below zero of a covariance's eigenvalues, in units of its standard deviations.
+
+    Raises:
+        ValueError: for numbers that are not finite, a shape or rate that is not positive, or a covariance that is not
+            positive semi-definite.
+    """
+    if not np.isfinite(record).all():
+        bad = belief_names(model)[int(np.argmin(np.isfinite(record)))]
+        raise ValueError(f"{what} must be finite, but {bad} is not; replace it")
+    noises = record[-2 - 2 * model.n_outputs :]
+    if (noises <= 0).any():
+        raise ValueError(f"{what} must have positive shapes and rates of the noises, but has {noises.tolist()}")
+    cov = record[covariance_places(model)]
+    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    unit = np.where(std > 0, std, 1.0)
+    with np.errstate(over="ignore"):
+        correlations = cov / unit[:, None] / unit
+    unsound = (np.diag(cov) < 0).any() or (cov[std == 0] != 0).any() or not (np.abs(correlations) < 2).all()
+    if unsound or np.linalg.eigvalsh(correlations)[0] < -rounding * len(cov):
+        raise ValueError(f"{what} must have a positive semi-definite covariance, but has {cov.tolist()}")
+
+
 @dataclass(frozen=True, eq=False)
 class Belief:
     """A prior or posterior: q(states, coefficients) Gaussian, q(γ) and q(ξ) of each sensor Gamma.
@@ -63,23 +93,13 @@ class Belief:
     factorisation: str = "structured"
 
     def __post_init__(self) -> None:
-        record = np.array(self.record, dtype=np.float64)
+        record = numbers("record", self.record)
         if record.shape != (record_size(self.model),):
             raise ValueError(
                 f"record must have shape {(record_size(self.model),)} for the model {self.model.name!r}, but has "
                 f"{record.shape}; make it with Belief.of"
             )
-        if not np.isfinite(record).all():
-            bad = belief_names(self.model)[int(np.argmin(np.isfinite(record)))]
-            raise ValueError(f"record must be finite, but {bad} is not; replace it")
-        noises = record[-2 - 2 * self.model.n_outputs :]
-        if (noises <= 0).any():
-            raise ValueError(f"shapes and rates of the noises must be positive, but are {noises.tolist()}")
-        cov = record[covariance_places(self.model)]
-        std = np.sqrt(np.maximum(np.diag(cov), 0.0))
-        unit = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
-        if (np.diag(cov) < 0).any() or np.linalg.eigvalsh(cov / unit)[0] < -1e-9 * len(cov):
-            raise ValueError(f"covariance must be positive semi-definite, but has the diagonal {np.diag(cov).tolist()}")
+        check_record("record", self.model, record, 1e-9)
         record.flags.writeable = False
         object.__setattr__(self, "record", record)
 
@@ -107,16 +127,19 @@ class Belief:
             ValueError: as the class, or for shapes that do not fit.
         """
         d = len(model.names)
-        first, second = np.array(mean, dtype=np.float64), np.array(cov, dtype=np.float64)
+        first, second = numbers("mean", mean), numbers("cov", cov)
         if first.shape != (d,) or second.shape != (d, d):
             raise ValueError(
                 f"mean and cov must have shapes {(d,)} and {(d, d)} for the model {model.name!r}, but have "
                 f"{first.shape} and {second.shape}"
             )
-        noises = np.ravel([gamma, *np.reshape(np.asarray(xi, dtype=np.float64), (-1, 2))])
+        noises = np.concatenate([numbers("gamma", gamma).ravel(), numbers("xi", xi).ravel()])
         record = np.empty(record_size(model))
-        if len(noises) != 2 + 2 * model.n_outputs:
-            raise ValueError(f"xi must have a pair for each of {list(model.outputs)}, but is {xi!r}")
+        if np.size(gamma) != 2 or len(noises) != 2 + 2 * model.n_outputs:
+            raise ValueError(
+                f"gamma must be a pair, and xi one for each of {list(model.outputs)}, but are {shown(gamma)} and "
+                f"{shown(xi)}"
+            )
         if not np.allclose(second, second.T, rtol=1e-9, atol=0):
             raise ValueError("cov must be symmetric; pass (C + C.T) / 2")
         record[:d] = first
@@ -239,7 +262,7 @@ class Belief:
         Raises:
             ValueError: for a wrong shape, or values that are not finite.
         """
-        points = np.asarray(coefficients, dtype=np.float64)
+        points = numbers("coefficients", coefficients)
         size = len(self.coefficients_mean)
         if points.ndim == 0 or points.shape[-1] != size:
             raise ValueError(f"coefficients must have shape (..., {size}), but has {points.shape}; pass one per name")
@@ -279,8 +302,7 @@ class Belief:
         Raises:
             ValueError: for a probability that is not between 0 and 1.
         """
-        if not 0 < probability < 1:
-            raise ValueError(f"probability must be between 0 and 1, but is {probability!r}; 0.9 is usual")
+        number("probability", probability, 1e-12, 1 - 1e-12, "0.9 is usual")
         from scipy.special import ndtri
 
         half = float(ndtri(0.5 + probability / 2))

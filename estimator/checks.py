@@ -2,23 +2,59 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
 from estimator.parameters import FloatArray
 
+#: Options that are sizes lie between these: squares and products of some of them neither overflow nor vanish.
+SMALLEST, LARGEST = 1e-12, 1e12
+
+
+def shown(value: object) -> str:
+    """A value as a message shows it, whatever it is."""
+    try:
+        return f"{value!r:.80}"
+    except Exception:  # such as a whole number of more digits than Python writes
+        return f"a {type(value).__name__}"
+
+
+def is_finite(value: object) -> bool:
+    """Whether it is one finite number, and no truth value."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond all floats
+        return False
+
+
+def number(name: str, value: object, low: float = SMALLEST, high: float = LARGEST, remedy: str = "") -> None:
+    """Refuse what is no number from ``low`` to ``high``; the remedy ends the message."""
+    if not (is_finite(value) and low <= value <= high):  # type: ignore[operator]
+        end = f"; {remedy}" if remedy else ""
+        raise ValueError(f"{name} must be a number from {low:.10g} to {high:.10g}, but is {shown(value)}{end}")
+
+
+def whole(name: str, value: object, most: int, least: int = 1) -> None:
+    """Refuse what is no whole number from ``least`` to ``most``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+        raise ValueError(f"{name} must be a whole number from {least} to {most}, but is {shown(value)}")
+
 
 def scalar(name: str, value: npt.ArrayLike) -> float:
     """One number."""
-    number = _numbers(name, value)
-    if number.size != 1:
-        raise ValueError(f"{name} must be one number, but has shape {number.shape}; use run() for many samples")
-    return float(number.reshape(()))
+    found = numbers(name, value)
+    if found.size != 1:
+        raise ValueError(f"{name} must be one number, but has shape {found.shape}; use run() for many samples")
+    return float(found.reshape(()))
 
 
 def series(name: str, values: npt.ArrayLike, missing: bool = False) -> FloatArray:
     """A finite series (T,), copied; with ``missing`` it may hold NaN."""
-    checked = _numbers(name, values)
+    checked = numbers(name, values)
     if checked.ndim != 1:
         raise ValueError(f"{name} must have shape (T,), but has {checked.shape}; pass one channel, e.g. {name}.ravel()")
     finite = np.isfinite(checked) | (missing & np.isnan(checked))
@@ -30,7 +66,7 @@ def series(name: str, values: npt.ArrayLike, missing: bool = False) -> FloatArra
     return checked
 
 
-def _numbers(name: str, values: npt.ArrayLike) -> FloatArray:
+def numbers(name: str, values: npt.ArrayLike) -> FloatArray:
     """A float64 copy: writeable, because read-only arrays are another type to Numba, and would compile kernels anew."""
     if isinstance(values, np.ma.MaskedArray):
         raise ValueError(
@@ -38,6 +74,8 @@ def _numbers(name: str, values: npt.ArrayLike) -> FloatArray:
             f"run(..., missing=True)"
         )
     try:
+        if np.iscomplexobj(values):
+            raise TypeError("they are complex")
         return np.array(values, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers, but is {values!r:.60}; {error}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name} must be numbers, but is {shown(values)}; {error}") from error

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from estimator.belief import Belief, covariance_places
+from estimator.belief import Belief, check_record, covariance_places
 from estimator.ensemble import NoiseRatio, log_ratio, priors, ratio_of, side_by_side
 from estimator.inference import samples
 from estimator.inference.mixture import mixture
@@ -254,7 +254,7 @@ class Filter:
             raise ValueError(f"walk must be at least 0, but is {given['walk'].tolist()}; use arrays() of an estimator")
         for name, records in (("records", given["records"][alive]), ("first", given["first"][None])):
             for record in records:
-                _check_record(name, self.model, record)
+                check_record(name, self.model, record, _ROUNDING)
         for name in ("weights", "first", "walk", "begun"):
             setattr(self, f"_{name}", given[name])
         self._inputs[:-1], self._outputs[:-1] = given["inputs"], given["outputs"]
@@ -275,19 +275,3 @@ def _checked(name: str, value: npt.ArrayLike, own: FloatArray) -> FloatArray:
     if name == "outputs" and np.isinf(array).any():
         raise ValueError(f"outputs must be finite or missing, but are {array.tolist()}; use arrays() of an estimator")
     return np.array(array, order="C")
-
-
-def _check_record(name: str, model: Model, record: FloatArray) -> None:
-    """A belief's record, of which later samples can make sense."""
-    if not np.isfinite(record).all():
-        raise ValueError(f"{name} must be finite, but has {record.tolist()}; use arrays() of an estimator")
-    noises = record[-2 - 2 * model.n_outputs :]
-    if (noises <= 0).any():
-        raise ValueError(f"{name} must have positive shapes and rates, but has {noises.tolist()}")
-    cov = record[covariance_places(model)]
-    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
-    unit = np.where(std > 0, std, 1.0)
-    known = std == 0
-    smallest = np.linalg.eigvalsh(cov / np.outer(unit, unit))[0]
-    if (np.diag(cov) < 0).any() or (cov[known] != 0).any() or smallest < -_ROUNDING * len(cov):
-        raise ValueError(f"{name} must have a positive definite covariance, but has {cov.tolist()}")

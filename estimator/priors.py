@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
+from estimator.checks import is_finite, number, numbers, shown
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -19,6 +20,9 @@ from estimator.units import VOLTS, Scales
 #: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
 #: converge to 1e-10 for every spread up to 0.999.
 _NODES, _POINTS = 20, 160_000
+
+#: Smallest and largest standard deviation: its square is a rate, of which precisions are made.
+_STDS = 1e-60, 1e60
 
 
 def log_uniform_moments(
@@ -42,11 +46,10 @@ def log_uniform_moments(
         ValueError: for a spread out of range, or a center that is 0, missing or not finite.
     """
     names = list(model.physical or model.coefficients)
-    if not 0 <= spread < 1:
-        raise ValueError(f"spread must be in [0, 1), but is {spread}; log-uniform intervals do not reach 0")
+    number("spread", spread, 0, 1 - 1e-9, "log-uniform intervals do not reach 0")
     for name in names:
-        if name not in center or not np.isfinite(center[name]) or center[name] == 0:
-            raise ValueError(f"center must have a finite {name} other than 0, but is {dict(center)}")
+        if name not in center or not is_finite(center[name]) or center[name] == 0:
+            raise ValueError(f"center must have a finite {name} other than 0, but is {shown(center)}")
     mean, cov = _log_uniform_moments(model, tuple(float(center[name]) for name in names), float(spread), scales)
     return mean.copy(), cov.copy()
 
@@ -138,11 +141,17 @@ def weak_prior(
         ("noise_shape", noise_shape),
         ("state_std", state_std),
     ):
-        if not (np.all(np.asarray(value) > 0) and np.all(np.isfinite(value))):
-            raise ValueError(f"{name} must be positive and finite, but is {value}; pass a value above 0")
+        for one in np.ravel(np.asarray(value, dtype=object)):
+            number(name, one, *_STDS)
     n, k = model.n_states, model.n_coefficients
     joint_mean, joint = np.zeros(n + k), np.zeros((n + k, n + k))
-    joint_mean[n:], joint[n:, n:] = mean, cov
+    given = numbers("mean", mean), numbers("cov", cov)
+    if given[0].shape != (k,) or given[1].shape != (k, k):
+        raise ValueError(f"mean and cov must have shapes {(k,)} and {(k, k)}, but have {[one.shape for one in given]}")
+    joint_mean[n:], joint[n:, n:] = given
+    for name, value, size in (("state_std", state_std, n), ("measurement_noise", measurement_noise, model.n_outputs)):
+        if np.shape(value) not in ((), (size,)):
+            raise ValueError(f"{name} must be one number or {size}, but has shape {np.shape(value)}")
     joint[:n, :n] = np.diag(np.broadcast_to(np.asarray(state_std, dtype=np.float64) ** 2, n))
     sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
     xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
@@ -177,8 +186,7 @@ def silverbox_prior(
     model = difference() if model is None else model
     if model.name not in _TWINS or not {"m", "c", "a"} <= set(model.physical) <= {"m", "c", "a", "b"}:
         raise ValueError(f"model must have the parameters m, c, a and b, but {model.name} has {list(model.physical)}")
-    if not 0 < spread < 1:
-        raise ValueError(f"spread must be above 0 and below 1, but is {spread}; pass the range's relative half width")
+    number("spread", spread, 1e-9, 1 - 1e-9, "pass the range's relative half width")
     return weak_prior(model, *_twin_moments(model, spread), process_noise, measurement_noise, noise_shape, state_std)
 
 

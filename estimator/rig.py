@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -13,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from estimator.checks import number, shown, whole
+from estimator.files import whole_file
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
-from estimator.units import Scales
+from estimator.units import SIZES, Scales
 
 #: How the input goes between samples, and the degree of the polynomial that each takes.
 INTERPOLATIONS = {"zero_order": 0, "linear": 1, "look_ahead": 5, "spline": 5}
@@ -61,12 +62,11 @@ class Channel:
             raise ValueError(f"unit must be a short text such as 'N', but is {self.unit!r:.60}; '1' is a pure number")
         for name in ("limit", "range", "noise"):
             value = getattr(self, name)
-            if value is not None and not (_is_number(value) and value > 0):
-                raise ValueError(f"{name} must be a positive, finite number or left out, but is {value!r}")
-        if self.kind not in KINDS:
-            raise ValueError(f"kind must be one of {list(KINDS)}, but is {self.kind!r}")
-        if not _is_number(self.offset):
-            raise ValueError(f"offset must be a finite number, but is {self.offset!r}; 0 where nothing is known")
+            if value is not None:
+                number(name, value, *SIZES, "leave it out where it is not known")
+        if self.kind not in list(KINDS):
+            raise ValueError(f"kind must be one of {list(KINDS)}, but is {shown(self.kind)}")
+        number("offset", self.offset, -SIZES[1], SIZES[1], "0 where nothing is known")
 
 
 @dataclass(frozen=True)
@@ -107,20 +107,11 @@ class Rig:
     guess: Mapping[str, tuple[float, float]] | None = None
 
     def __post_init__(self) -> None:
-        if not _is_number(self.step) or not self.step > 0:
-            raise ValueError(
-                f"step must be positive and finite, but is {self.step!r}; give the seconds between samples"
-            )
-        if self.interpolation not in INTERPOLATIONS:
-            raise ValueError(f"interpolation must be one of {list(INTERPOLATIONS)}, but is {self.interpolation!r}")
+        number("step", self.step, *SIZES, "give the seconds between samples")
+        if self.interpolation not in list(INTERPOLATIONS):
+            raise ValueError(f"interpolation must be one of {list(INTERPOLATIONS)}, but is {shown(self.interpolation)}")
         least = -1 if self.interpolation == "zero_order" else 0
-        if isinstance(self.delay, bool) or not isinstance(self.delay, int | np.integer):
-            raise ValueError(f"delay must be a whole number of samples, but is {self.delay!r}; shift u by the rest")
-        if not least <= self.delay <= _LONGEST_DELAY:
-            raise ValueError(
-                f"delay must be from {least} to {_LONGEST_DELAY} for interpolation={self.interpolation!r}, but is "
-                f"{self.delay!r}; shift u by the rest"
-            )
+        whole(f"delay (for {self.interpolation})", self.delay, _LONGEST_DELAY, least)
         for name, other in (("input", "range"), ("output", "limit")):
             channel = getattr(self, name)
             if isinstance(channel, Mapping):
@@ -173,19 +164,13 @@ class Rig:
             ValueError: naming the file and what is wrong in it.
             FileNotFoundError: if there is no such file.
         """
-        place = Path(path)
-        if not place.exists():
-            raise FileNotFoundError(
-                f"rig must be a file or one of {', '.join(SHIPPED)}, but there is no {place}; write it by hand, or by "
-                f"duffing-env rig init"
-            )
-        if not place.is_file() or place.stat().st_size > _LARGEST_FILE:
-            raise ValueError(f"path must be a rig file, a short TOML, but {place} is none; name the file itself")
+        must = f"rig must be a file, a short TOML, or one of {', '.join(SHIPPED)}"
+        place = whole_file(path, must, _LARGEST_FILE, "write it by hand, or by duffing-env rig init")
         try:
             described = tomllib.loads(place.read_text(encoding="utf-8"))
             described.pop("instrument", None)
             return cls.from_dict(described)
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{place}: {error}") from error
 
     @classmethod
@@ -232,10 +217,6 @@ def _read_shipped(name: str) -> Rig:
     return Rig.from_file(SHIPPED[name])
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _guessed(guess: object) -> dict[str, tuple[float, float]] | None:
     """Checked intervals; None where nothing is guessed."""
     if guess is None:
@@ -247,11 +228,14 @@ def _guessed(guess: object) -> dict[str, tuple[float, float]] | None:
     for name in _PARAMETERS:
         given = guess[name]
         ends = list(given) if isinstance(given, list | tuple | np.ndarray) else [given]
-        if len(ends) != 2 or not all(map(_is_number, ends)) or not ends[0] < ends[1]:
-            raise ValueError(f"guess of {name} must be two finite numbers, low < high, but is {guess[name]!r:.60}")
+        if len(ends) != 2:
+            raise ValueError(f"guess of {name} must be two numbers, low < high, but is {shown(given)}")
+        least = SIZES[0] if name == "m" else -SIZES[1]
+        for end in ends:
+            number(f"guess of {name}", end, least, SIZES[1], "a mass is above 0" if name == "m" else "")
+        if not ends[0] < ends[1]:
+            raise ValueError(f"guess of {name} must be two numbers, low < high, but is {shown(given)}")
         checked[name] = (float(ends[0]), float(ends[1]))
-    if checked["m"][0] <= 0:
-        raise ValueError(f"guess of m must be positive, but begins at {checked['m'][0]}; a mass is above 0")
     return checked
 
 

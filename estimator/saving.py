@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from estimator.belief import Belief, record_size
-from estimator.files import write_atomically
+from estimator.files import whole_file, write_atomically
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
 from estimator.rig import Rig
@@ -50,13 +50,7 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
         ValueError: for a file that is damaged, of another kind, or of a format that this version does not know.
         FileNotFoundError: if there is no such file.
     """
-    place = Path(path)
-    if not place.exists():
-        raise FileNotFoundError(f"path must be a file of save_estimator, but there is no {place}")
-    if not place.is_file():
-        raise ValueError(f"path must be a file of save_estimator, but {place} is none; name the file itself")
-    if place.stat().st_size > _LARGEST:
-        raise ValueError(f"path must be a file of save_estimator, but {place} is larger than any; name another")
+    place = whole_file(path, "path must be a file of save_estimator", _LARGEST)
     try:
         return _built(_read(place))
     except Exception as error:  # whatever a file that is none of ours makes of the readers

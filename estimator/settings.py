@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
+from estimator.checks import number, whole
 from estimator.ensemble import Hypotheses
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
@@ -16,7 +15,7 @@ from estimator.models.model import Model
 EXPECTATIONS = ("first_order", "sigma_points")
 
 #: More iterations per sample change nothing that shows.
-_MOST_ITERATIONS = 100
+MOST_ITERATIONS = 100
 
 #: More ratios of the noises than data could tell apart.
 _MOST_HYPOTHESES = 1000
@@ -56,7 +55,7 @@ def settled(model: Model, given: Settings) -> Settings:
         raise ValueError(
             f"factorisation must be 'structured' for {model.name}, but is 'mean_field'; that is for the paper's model"
         )
-    _whole("iterations", given.iterations, _MOST_ITERATIONS)
+    whole("iterations", given.iterations, MOST_ITERATIONS)
     if given.as_published and not published:
         raise ValueError(
             f"as_published goes with factorisation='mean_field', but factorisation is {given.factorisation!r}; the "
@@ -65,16 +64,14 @@ def settled(model: Model, given: Settings) -> Settings:
     if given.expectations not in EXPECTATIONS or (published and given.expectations != EXPECTATIONS[0]):
         allowed = EXPECTATIONS[:1] if published else EXPECTATIONS
         raise ValueError(f"expectations must be one of {list(allowed)}, but is {given.expectations!r}")
-    drift = given.drift
-    if not isinstance(drift, int | float | np.floating) or not 0 <= drift < np.inf:
-        raise ValueError(f"drift must be at least 0 and finite, but is {drift!r}; 0 is a system that stays")
-    if drift and published:
-        raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {drift!r}; use structured")
+    number("drift", given.drift, 0, 1, "0 is a system that stays, and of one that walks faster nothing is known")
+    if given.drift and published:
+        raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {given.drift!r}; use structured")
     return replace(
         given,
         iterations=int(given.iterations),
         as_published=bool(given.as_published),
-        drift=float(drift),
+        drift=float(given.drift),
         noise_hypotheses=checked_hypotheses(given.noise_hypotheses, given.factorisation, model),
     )
 
@@ -87,7 +84,7 @@ def checked_hypotheses(given: object, factorisation: str, model: Model, most: in
     """
     counts: list[Any] = list(given) if isinstance(given, tuple | list) and len(given) == 2 else [given]
     for count in counts:
-        _whole("noise_hypotheses", count, most)
+        whole("noise_hypotheses", count, most)
     published = factorisation == "mean_field"
     if given != 1 and (published or model.n_outputs > 1):
         what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"
@@ -95,8 +92,3 @@ def checked_hypotheses(given: object, factorisation: str, model: Model, most: in
             f"noise_hypotheses must be 1 for {what}, but is {given}; use factorisation='structured' and one sensor"
         )
     return (int(counts[0]), int(counts[1])) if len(counts) == 2 else int(counts[0])
-
-
-def _whole(name: str, value: object, most: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= most:
-        raise ValueError(f"{name} must be a whole number from 1 to {most}, but is {value!r}")

@@ -11,12 +11,14 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
+from estimator.checks import number
 from estimator.parameters import SAMPLING_STEP
 
 #: Powers of the input's unit, the displacement's unit and the second.
 Dimension = tuple[int, int, int]
+
+#: Smallest and largest size of anything, in its unit: products of several stay within what numbers can hold.
+SIZES = 1e-30, 1e30
 
 _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _DIGITS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
@@ -50,11 +52,9 @@ class Scales:
     output_unit: str = "V"
 
     def __post_init__(self) -> None:
-        if not 0 < self.step < np.inf:
-            raise ValueError(f"step must be positive and finite, but is {self.step}; give the seconds between samples")
+        number("step", self.step, *SIZES, "give the seconds between samples")
         for name in ("input", "output"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be a positive, finite scale, but is {getattr(self, name)}")
+            number(name, getattr(self, name), *SIZES)
 
     @property
     def displacement(self) -> float:

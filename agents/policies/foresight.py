@@ -25,7 +25,7 @@ import numpy.typing as npt
 from agents.planner.imagination import Terms
 from agents.planner.motion import View, places, survey, swing_of
 from agents.policies.imagined import FEATURES, Ahead, imaginer
-from agents.policies.prospects import MARGIN, Outlook, look_at
+from agents.policies.prospects import MARGIN, Outlook, feature_names, look_at
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -95,7 +95,13 @@ class Foresight:
         described = dict(view or {})
         model = Model(**described.pop("model")) if "model" in described else difference()
         k = model.n_coefficients
-        center, std, others, rate = np.split(np.asarray(numbers, dtype=np.float64), [k, 2 * k, 2 * k + 6])
+        flat = np.asarray(numbers, dtype=np.float64)
+        # All but the energy, which may be without limit, are finite; deviations, limits and noises are positive.
+        if flat.shape != (2 * k + 6 + k * k,) or not np.isfinite(np.delete(flat, 2 * k + 3)).all():
+            raise ValueError(f"foresight must be {2 * k + 6 + k * k} finite numbers, but is {flat.tolist()!r:.200}")
+        if not (flat[k : 2 * k + 6] > 0).all():
+            raise ValueError(f"foresight must have positive deviations and limits, but has {flat[k : 2 * k + 6]}")
+        center, std, others, rate = np.split(flat, [k, 2 * k, 2 * k + 6])
         max_input, max_output, samples, energy, process, sensor = others.tolist()
         seen = View(model, **described)
         sizes = swing_of(seen, center, max_input, max_output).scales
@@ -135,6 +141,11 @@ class Foresight:
     def observation_size(self) -> int:
         """Entries of the observations that it looks at."""
         return places(self._view.model).size
+
+    @property
+    def features(self) -> int:
+        """What a network sees."""
+        return len(feature_names(self._view.model))
 
     @property
     def is_drive(self) -> bool:

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.policies.foresight import CommonForesight, Foresight
-from estimator.files import write_atomically
+from agents.policies.imagined import FEATURES
+from estimator.files import whole_file, write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 WEIGHTS = "policy.safetensors"
 CARD = "policy.json"
 FORMAT = 3
+
+#: No file of a policy is larger [bytes].
+_LARGEST = 2**30
 
 FloatArray = npt.NDArray[np.float32]
 State = tuple[FloatArray, FloatArray]
@@ -71,28 +75,42 @@ class LearnedPolicy:
 
     Raises:
         KeyError: for a tensor that is missing, or an activation that is unknown.
+        ValueError: for a tensor that is not finite, or whose shape does not go with the others.
     """
 
     def __init__(
         self, network: Network, tensors: Mapping[str, FloatArray], card: dict[str, Any], seed: int = 0
     ) -> None:
-        def layer(name: str) -> tuple[FloatArray, FloatArray]:
-            return tensors[f"{name}.weight"], tensors[f"{name}.bias"]
+        def layer(name: str, inputs: int | None, outputs: int | None = None) -> tuple[FloatArray, FloatArray]:
+            weight = _tensor(tensors, f"{name}.weight", outputs, inputs)
+            return weight, _tensor(tensors, f"{name}.bias", len(weight))
 
         self.card = card
         self._squashed = network.squashed
-        self._levels = np.linspace(-1.0, 1.0, network.levels, dtype=np.float32) if network.levels else None
         self._activation = _ACTIVATIONS[network.activation]
-        self._layers = [layer(name) for name in network.layers]
         self._memory = None if network.memory is None else _Memory(network.memory, tensors)
+        width = None if self._memory is None else self._memory.units
+        self._layers = []
+        for name in network.layers[:-1]:
+            self._layers.append(layer(name, width))
+            width = len(self._layers[-1][0])
+        self._layers.append(layer(network.layers[-1], width, network.levels or 1))
+        self._levels = np.linspace(-1.0, 1.0, network.levels, dtype=np.float32) if network.levels else None
         self._spread: FloatArray | tuple[FloatArray, FloatArray] | None = None
         if network.spread is not None:
-            self._spread = tensors[network.spread] if network.spread in tensors else layer(network.spread)
+            is_tensor = network.spread in tensors
+            last = self._layers[-1][0].shape[1]
+            self._spread = _tensor(tensors, network.spread, 1) if is_tensor else layer(network.spread, last, 1)
         self._features = (self._layers[0][0] if self._memory is None else self._memory.from_input).shape[1]
         self._foresight: Foresight | CommonForesight | None = None
         self._is_common = bool((card.get("foresight") or {}).get("is_common"))
-        if network.foresight and not self._is_common:
-            self._foresight = Foresight.from_array(tensors["foresight"], card.get("foresight"))
+        if network.foresight:
+            seen = len(FEATURES)
+            if not self._is_common:
+                self._foresight = Foresight.from_array(tensors["foresight"], card.get("foresight"))
+                seen = self._foresight.features
+            if self._features != seen:
+                raise ValueError(f"the first layer must take {seen} features, but takes {self._features}")
         self._rng = np.random.default_rng(seed)
 
     def move_to(self, env: Any) -> None:
@@ -130,6 +148,8 @@ class LearnedPolicy:
         seen = self._features if self._foresight is None else self._foresight.observation_size
         if hidden.shape[-1:] != (seen,):
             raise ValueError(f"observation must have {seen} entries, but has shape {hidden.shape}")
+        if not np.isfinite(hidden).all():
+            raise ValueError(f"observation must be finite, but is {hidden[~np.isfinite(hidden)][0]} somewhere")
         if self._foresight is not None:
             view = self._foresight.look(np.atleast_2d(hidden))
             choices, state = self._choose(view.features, state, episode_start, deterministic)
@@ -164,17 +184,34 @@ class LearnedPolicy:
         return self._spread
 
 
+def _tensor(tensors: Mapping[str, FloatArray], name: str, *shape: int | None) -> FloatArray:
+    """A tensor that a network can calculate with; None stands for any length of a side."""
+    found = tensors[name]
+    fits = found.ndim == len(shape) and all(map(_fits, found.shape, shape))
+    if not fits or found.dtype != np.float32 or not np.isfinite(found).all():
+        wishes = tuple("any" if wish is None else wish for wish in shape)
+        raise ValueError(f"{name} must be finite float32 of shape {wishes}, but is {found.dtype} of {found.shape}")
+    return found
+
+
+def _fits(length: int, wish: int | None) -> bool:
+    return length > 0 and wish in (None, length)
+
+
 class _Memory:
     """An LSTM of one layer, with torch's tensors: gates in the order input, forget, cell, output."""
 
     def __init__(self, name: str, tensors: Mapping[str, FloatArray]) -> None:
-        self.from_input, self._from_hidden = tensors[f"{name}.weight_ih_l0"], tensors[f"{name}.weight_hh_l0"]
-        self._bias = tensors[f"{name}.bias_ih_l0"] + tensors[f"{name}.bias_hh_l0"]
+        self._from_hidden = _tensor(tensors, f"{name}.weight_hh_l0", None, None)
+        self.units = self._from_hidden.shape[1]
+        gates = 4 * self.units
+        _tensor(tensors, f"{name}.weight_hh_l0", gates, self.units)
+        self.from_input = _tensor(tensors, f"{name}.weight_ih_l0", gates, None)
+        self._bias = _tensor(tensors, f"{name}.bias_ih_l0", gates) + _tensor(tensors, f"{name}.bias_hh_l0", gates)
 
     def update(self, inputs: FloatArray, state: State | None, episode_start: npt.ArrayLike | None) -> State:
         """Hidden and cell values (1, n, units) after inputs (n, features)."""
-        units = self._from_hidden.shape[1]
-        zeros = np.zeros((1, len(inputs), units), dtype=np.float32)
+        zeros = np.zeros((1, len(inputs), self.units), dtype=np.float32)
         hidden, cell = (zeros, zeros) if state is None else state
         if hidden.shape != zeros.shape or cell.shape != zeros.shape:
             raise ValueError(f"state must be two arrays of shape {zeros.shape}, but has {hidden.shape}, {cell.shape}")
@@ -249,11 +286,13 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
     folder = Path(folder)
     if not (folder / WEIGHTS).is_file() or not (folder / CARD).is_file():
         raise ValueError(f"policy folder must hold {WEIGHTS} and {CARD}, but {folder} does not; pass a run folder")
+    for name in (WEIGHTS, CARD):
+        whole_file(folder / name, f"policy folder must hold {name}", _LARGEST)
     try:
         card = json.loads((folder / CARD).read_text())
         # Copies, because a tensor may lie unaligned in the file, and NumPy then multiplies in another order.
         tensors = {name: tensor.copy() for name, tensor in load_file(folder / WEIGHTS).items()}
-    except (ValueError, SafetensorError) as error:
+    except (ValueError, RecursionError, SafetensorError) as error:
         raise ValueError(
             f"policy folder must hold sound files, but {folder} does not: {error}; copy it anew"
         ) from error
@@ -262,5 +301,5 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
         raise ValueError(f"policy card must have format {FORMAT}, but {folder / CARD} has {found!r}; train anew")
     try:
         return LearnedPolicy(Network(**card["network"]), tensors, card, seed)
-    except (KeyError, TypeError, IndexError, ValueError) as error:
+    except Exception as error:  # whatever a card of somebody else's makes of the readers
         raise ValueError(f"policy must be what its card says, but {folder} is not: {error!r}; copy it anew") from error

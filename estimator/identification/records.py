@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.checks import series
+from estimator.files import whole_file
 from estimator.identification.tables import read_table
 from estimator.parameters import FloatArray
 
@@ -136,11 +137,7 @@ def read(path: str | Path, step: float) -> tuple[FloatArray, FloatArray]:
         ValueError: naming the file, the line and what is wrong.
         FileNotFoundError: if there is no such file.
     """
-    place = Path(path)
-    if not place.exists():
-        raise FileNotFoundError(f"record must be a CSV or MAT file, but there is no {place}")
-    if not place.is_file() or place.stat().st_size > _LARGEST_FILE:
-        raise ValueError(f"record must be a CSV or MAT file of at most 1 GiB, but {place} is none")
+    place = whole_file(path, "record must be a CSV or MAT file", _LARGEST_FILE)
     return _read_mat(place) if place.suffix.lower() == ".mat" else _read_csv(place, step)
 
 

@@ -3,6 +3,7 @@
 import ast
 import json
 import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from safetensors.numpy import load_file, save_file
 import agents
 from agents import make_policy
 from agents.evaluation.rollout import evaluate
-from agents.policies import trained_policies
+from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import CARD, WEIGHTS, load_policy, save_policy
 from agents.training import ALGORITHMS
 from agents.vec_env import DuffingVecEnv
@@ -290,6 +291,13 @@ def test_pickles_and_archives_are_refused_unopened(tmp_path):
         ('{"format": 3, "network": {"layers": ["action_net"], "depth": 3}}', "TypeError.*depth"),
         ('{"format": 3', "must hold sound files"),
         ("", "must hold sound files"),
+        ("[" * 100_000, "must hold sound files"),
+        ("\0\xff", "must hold sound files"),
+        (
+            '{"format": 3, "network": {"layers": ["action_net"], "levels": 1000000000000}}',
+            "must be finite float32 of shape",
+        ),
+        ('{"format": 3, "network": "action_net"}', "must be what its card says"),
     ],
 )
 def test_an_unknown_card_is_refused(tmp_path, card, message):
@@ -304,6 +312,64 @@ def test_cut_off_weights_are_refused(tmp_path):
     (folder / WEIGHTS).write_bytes((folder / WEIGHTS).read_bytes()[:-10])
     with pytest.raises(ValueError, match="must hold sound files"):
         load_policy(folder)
+
+
+CHANGED = {
+    "not a number": ("action_net.bias", lambda t: t * np.float32(np.nan)),
+    "infinite": ("mlp_extractor.policy_net.0.weight", lambda t: t / np.float32(0)),
+    "an empty bias": ("action_net.bias", lambda t: t[:0]),
+    "a bias that is too long": ("mlp_extractor.policy_net.0.bias", lambda t: np.tile(t, 2)),
+    "two actions": ("action_net.weight", lambda t: np.tile(t, (2, 1))),
+    "a weight that does not take what comes": ("mlp_extractor.policy_net.2.weight", lambda t: t[:, :-1]),
+    "a weight of three sides": ("action_net.weight", lambda t: t[None]),
+    "another kind of number": ("action_net.weight", lambda t: t.astype(np.float64)),
+    "a spread of no number": ("log_std", lambda t: t * np.float32(np.nan)),
+}
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero")
+@pytest.mark.parametrize("change", CHANGED)
+def test_tensors_that_cannot_act_are_refused(tmp_path, change):
+    folder, _ = saved(tmp_path)
+    name, changed = CHANGED[change]
+    tensors = load_file(folder / WEIGHTS)
+    save_file({**tensors, name: np.ascontiguousarray(changed(tensors[name]))}, folder / WEIGHTS)
+    with pytest.raises(ValueError, match=rf"must be what its card says, but .*{name} must be finite float32 of shape"):
+        load_policy(folder)
+
+
+@pytest.mark.parametrize("name", ["weight_ih_l0", "weight_hh_l0", "bias_ih_l0"])
+def test_a_memory_of_wrong_shape_is_refused(tmp_path, name):
+    folder, _ = saved(tmp_path, algo="recurrent_ppo")
+    tensors = load_file(folder / WEIGHTS)
+    save_file({**tensors, f"lstm_actor.{name}": tensors[f"lstm_actor.{name}"][:-1].copy()}, folder / WEIGHTS)
+    with pytest.raises(ValueError, match=r"lstm_actor.* must be finite float32 of shape"):
+        load_policy(folder)
+
+
+def test_what_is_ahead_of_a_policy_is_checked(tmp_path):
+    shutil.copytree(TRAINED / "ppo" / "short", tmp_path / "policy")
+    tensors, card = load_file(tmp_path / "policy" / WEIGHTS), (tmp_path / "policy" / CARD).read_text()
+    for foresight in (tensors["foresight"][:-1], tensors["foresight"] * np.nan, -tensors["foresight"]):
+        save_file({**tensors, "foresight": foresight}, tmp_path / "policy" / WEIGHTS)
+        with pytest.raises(ValueError, match="foresight must "):
+            load_policy(tmp_path / "policy")
+    weight = tensors["mlp_extractor.policy_net.0.weight"][:, 1:].copy()
+    save_file({**tensors, "mlp_extractor.policy_net.0.weight": weight}, tmp_path / "policy" / WEIGHTS)
+    with pytest.raises(ValueError, match="the first layer must take 65 features, but takes 64"):
+        load_policy(tmp_path / "policy")
+    for wrong in ('"foresight": 3', '"foresight": [1]', '"foresight": {"model": {"name": "x"}}'):
+        (tmp_path / "policy" / CARD).write_text(card.rstrip().removesuffix("}") + f", {wrong}}}")
+        with pytest.raises(ValueError, match="policy must be what its card says"):
+            load_policy(tmp_path / "policy")
+
+
+def test_an_observation_that_is_not_finite_is_refused(tmp_path):
+    folder, _ = saved(tmp_path)
+    observations = random_observations(3)
+    observations[1, 4] = np.nan
+    with pytest.raises(ValueError, match="observation must be finite, but is nan somewhere"):
+        load_policy(folder).predict(observations)
 
 
 def test_weights_of_something_else_are_refused(tmp_path):

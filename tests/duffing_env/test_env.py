@@ -5,6 +5,7 @@ import doctest
 import importlib
 import json
 import pickle
+import threading
 
 import gymnasium as gym
 import numpy as np
@@ -192,7 +193,13 @@ def test_steps_outside_an_episode_are_refused():
     env.step([0.0])
 
 
-@pytest.mark.parametrize("action", [[np.nan], [np.inf], -np.inf, [], [0.1, 0.2], np.zeros((2, 1)), None])
+NO_NUMBERS = [
+    "a", [None], {}, 1j, [10**400], np.array([None]), np.array(["x"]), np.array([1j]), np.array([{}]),
+    np.ma.masked, np.ma.masked_array([0.5], [True]), lambda: 0.5,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("action", [[np.nan], [np.inf], -np.inf, [], [0.1, 0.2], np.zeros((2, 1)), None, *NO_NUMBERS])
 def test_actions_that_are_no_number_are_refused_and_change_nothing(action):
     env, untouched = DuffingEnv(**SHORT), DuffingEnv(**SHORT)
     for each in (env, untouched):
@@ -393,3 +400,31 @@ def test_closing_twice_is_fine():
     env = gym.make(TRACK)
     env.close()
     env.close()
+
+
+def test_a_second_thread_is_refused_and_changes_nothing():
+    """The second call comes while the first is on its way: from within its drawing."""
+    env, untouched = DuffingEnv(**SHORT, render_mode="rgb_array"), DuffingEnv(**SHORT, render_mode="rgb_array")
+    refused = []
+
+    def call_from_another_thread():
+        for call in (lambda: env.step([1.0]), env.reset, lambda: env.reset(seed=3)):
+            with pytest.raises(RuntimeError, match=r"must wait until the last call .* an environment of its own"):
+                call()
+            refused.append(call)
+
+    draw = env._draw
+
+    def slow():
+        thread = threading.Thread(target=call_from_another_thread)
+        thread.start()
+        thread.join()
+        draw()
+
+    for each in (env, untouched):
+        each.reset(seed=0)
+    env._draw = slow
+    assert same(env.step([0.5]), untouched.step([0.5]))
+    assert len(refused) == 3
+    env._draw = draw
+    assert same(continue_with(env, random_actions(0, 40)), continue_with(untouched, random_actions(0, 40)))

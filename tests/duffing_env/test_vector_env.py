@@ -279,6 +279,10 @@ def test_bad_reset_masks_are_refused(mask):
         (np.zeros((2, 1)), r"actions must have shape \(3, 1\), but have \(2, 1\)"),
         ([[0.0], [np.nan], [0.0]], "actions must be finite, but row 1 is nan"),
         ([[0.0], [0.0], [-np.inf]], "actions must be finite, but row 2 is -inf"),
+        ("abc", "actions must be numbers, but is 'abc'"),
+        ([[0.0], [0.0], [None, 1.0]], "actions must be numbers, but is"),
+        ([[0.0], [0.0], [1j]], "actions must be numbers, but is"),
+        (np.ma.masked_array(np.zeros((3, 1)), True), "actions must not be a masked array"),
     ],
 )
 def test_bad_actions_are_refused_and_change_nothing(actions, message):
@@ -294,14 +298,16 @@ def test_bad_actions_are_refused_and_change_nothing(actions, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be a whole number of at least 1"),
-        ({"num_envs": 2.0}, "num_envs must be a whole number of at least 1"),
-        ({"threads": 0}, "threads must be a whole number of at least 1"),
-        ({"threads": 10_000}, "threads must be at most"),
+        ({"num_envs": 0}, "num_envs must be a whole number from 1 to 1048576, but is 0"),
+        ({"num_envs": 2.0}, "num_envs must be a whole number from 1 to 1048576, but is 2.0"),
+        ({"num_envs": 2**31}, "num_envs must be a whole number from 1 to 1048576, but is 2147483648"),
+        ({"threads": 0}, "threads must be a whole number from 1 to"),
+        ({"threads": 10_000}, "threads must be a whole number from 1 to"),
         ({"autoreset_mode": "later"}, r"autoreset_mode must be one of \['NextStep', 'SameStep', 'Disabled'\]"),
         ({"render_mode": "rgb_array"}, "render_mode must be None"),
         ({"horizn": 4}, "did you mean 'horizon'"),
-        ({"max_episode_steps": 0}, "horizon must be a whole number of at least 1"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be a whole number from 1"),
+        ({"max_episode_steps": "x"}, "max_episode_steps must be a whole number from 1 to 1000000000, but is 'x'"),
     ],
 )
 def test_bad_options_are_refused(options, message):
@@ -414,3 +420,19 @@ def test_the_same_seed_gives_other_experiments_in_each_branch():
     assert single.truth.m == told["test"].truth.m[3]
     with pytest.raises(ValueError, match="branch must be one of"):
         DuffingEnv(branch="exam")
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [[1, 2, -1], [1, 2, 2.5], [1, 2], -1, "seed", 2.5, [1, 2, True], [1, 2, 10**60], (1, 2, "3")],
+)
+def test_a_seed_that_is_none_changes_nothing(seed):
+    envs, untouched = DuffingVectorEnv(3, **BOTH_ENDS), DuffingVectorEnv(3, **BOTH_ENDS)
+    for each in (envs, untouched):
+        each.reset(seed=0)
+    with pytest.raises(ValueError, match=r"seed.* must be a whole number"):
+        envs.reset(seed=seed)
+    for action in random_actions(5, 3):
+        assert_same(envs.step(action), untouched.step(action))
+    np.testing.assert_array_equal(envs.reset()[0], untouched.reset()[0])
+    assert envs.np_random.bit_generator.state == untouched.np_random.bit_generator.state

@@ -392,10 +392,10 @@ def test_unchanged_after_a_run_that_raised(samples, change, message):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: Rig(1.0, "linear", 2000), "delay must be from 0 to 1000 for interpolation='linear', but is 2000"),
-        (lambda: Rig(1.0, "linear", -1), "delay must be from 0 to 1000 for interpolation='linear', but is -1"),
+        (lambda: Rig(1.0, "linear", 2000), "delay (for linear) must be a whole number from 0 to 1000, but is 2000"),
+        (lambda: Rig(1.0, "linear", -1), "delay (for linear) must be a whole number from 0 to 1000, but is -1"),
         (lambda: Rig(1.0, interpolation="cubic"), "interpolation must be one of ['zero_order', 'linear', 'look_ahead'"),
-        (lambda: Rig(step=0.0), "step must be positive and finite, but is 0.0"),
+        (lambda: Rig(step=0.0), "step must be a number from 1e-30 to 1e+30, but is 0.0"),
         (lambda: OnlineEstimator("duffing"), "model must be a Model, but is 'duffing'; use difference() or duffing()"),
         (lambda: OnlineEstimator(PENDULUM), "prior must be given for pendulum"),
         (lambda: OnlineEstimator(ODE, silverbox_prior()), "prior must be a Belief of the model, duffing with ('stiff"),
@@ -413,8 +413,8 @@ def test_unchanged_after_a_run_that_raised(samples, change, message):
             lambda: OnlineEstimator(iterations=2**31),
             "from 1 to 100, but is 2147483648",
         ),
-        (lambda: OnlineEstimator(drift=None), "drift must be at least 0 and finite, but is None"),
-        (lambda: OnlineEstimator(drift=np.inf), "drift must be at least 0 and finite, but is inf"),
+        (lambda: OnlineEstimator(drift=None), "drift must be a number from 0 to 1, but is None"),
+        (lambda: OnlineEstimator(drift=np.inf), "drift must be a number from 0 to 1, but is inf"),
         (lambda: OnlineEstimator(drift=0.1, factorisation="mean_field"), "drift must be 0 in mean field"),
         (lambda: OnlineEstimator(expectations="exact"), "expectations must be one of ['first_order', 'sigma_points']"),
         (

@@ -154,7 +154,7 @@ def test_a_model_without_parameters_has_its_coefficients():
 
 @pytest.mark.parametrize("step", [0.0, -1.0, np.inf, np.nan])
 def test_a_step_that_is_none_is_named(step):
-    message = f"step must be positive and finite, but is {step}; give the seconds"
+    message = f"step must be a number from 1e-30 to 1e+30, but is {step}; give the seconds"
     with pytest.raises(ValueError, match=re.escape(message)):
         Scales(step)
 

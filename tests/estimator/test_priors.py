@@ -22,7 +22,7 @@ from estimator import (
 )
 from estimator import priors as module
 from estimator.models.pendulum import PENDULUM
-from estimator.priors import log_uniform_moments
+from estimator.priors import log_uniform_moments, weak_prior
 
 PAPER = difference()
 OSCILLATOR = Parameters(m=5e-6, c=2e-4, a=1.0, b=4.0)
@@ -159,19 +159,36 @@ def test_mean_field_begins_without_correlations_of_states_theta_and_eta():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: silverbox_prior(process_noise=0.0), "process_noise must be positive and finite, but is 0.0"),
+        (lambda: silverbox_prior(process_noise=0.0), "process_noise must be a number from 1e-60 to 1e+60, but is 0.0"),
         (
             lambda: silverbox_prior(measurement_noise=np.nan),
-            "measurement_noise must be positive and finite, but is nan",
+            "measurement_noise must be a number from 1e-60 to 1e+60, but is nan",
         ),
-        (lambda: silverbox_prior(noise_shape=0.0), "noise_shape must be positive and finite, but is 0.0"),
-        (lambda: silverbox_prior(state_std=0.0), "state_std must be positive and finite, but is 0.0"),
-        (lambda: silverbox_prior(spread=1.0), "spread must be above 0 and below 1, but is 1.0"),
-        (lambda: silverbox_prior(spread=0.0), "spread must be above 0 and below 1, but is 0.0"),
+        (lambda: silverbox_prior(noise_shape=0.0), "noise_shape must be a number from 1e-60 to 1e+60, but is 0.0"),
+        (lambda: silverbox_prior(state_std=0.0), "state_std must be a number from 1e-60 to 1e+60, but is 0.0"),
+        (lambda: silverbox_prior(spread=1.0), "spread must be a number from 1e-09 to 0.999999999, but is 1.0"),
+        (lambda: silverbox_prior(spread=0.0), "spread must be a number from 1e-09 to 0.999999999, but is 0.0"),
         (lambda: silverbox_prior(PENDULUM), "model must have the parameters m, c, a and b, but pendulum has"),
         (lambda: silverbox_prior(duffing(offsets=True)), "model must have the parameters m, c, a and b, but duffing"),
-        (lambda: log_uniform_moments(PAPER, OSCILLATOR, 1.0), "spread must be in [0, 1), but is 1.0; log-uniform"),
-        (lambda: log_uniform_moments(PAPER, OSCILLATOR, np.nan), "spread must be in [0, 1), but is nan; log-uniform"),
+        (
+            lambda: log_uniform_moments(PAPER, OSCILLATOR, 1.0),
+            "from 0 to 0.999999999, but is 1.0",
+        ),
+        (lambda: log_uniform_moments(PAPER, OSCILLATOR, np.nan), "but is nan; log-uniform intervals do not reach 0"),
+        (
+            lambda: silverbox_prior(process_noise=1e300),
+            "process_noise must be a number from 1e-60",
+        ),
+        (
+            lambda: silverbox_prior(process_noise=1e-300),
+            "process_noise must be a number from 1e-60",
+        ),
+        (lambda: weak_prior(PAPER, "abc", np.eye(4)), "mean must be numbers, but is 'abc'"),
+        (lambda: weak_prior(PAPER, np.ones(3), np.eye(4)), "mean and cov must have shapes (4,) and (4, 4)"),
+        (
+            lambda: weak_prior(PAPER, np.ones(4), np.eye(4), state_std=[1.0, 2.0, 3.0]),
+            "state_std must be one number",
+        ),
         (lambda: log_uniform_moments(PAPER, {**OSCILLATOR, "b": 0.0}, 0.1), "center must have a finite b other than 0"),
         (lambda: log_uniform_moments(PAPER, {"m": 1.0}, 0.1), "center must have a finite c other than 0"),
     ],

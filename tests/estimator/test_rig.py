@@ -1,6 +1,7 @@
 """Rigs: what describes one, its units and scales, and the prior that its guess makes."""
 
 import json
+import os
 import re
 import tomllib
 from dataclasses import replace
@@ -49,20 +50,25 @@ def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
     [
         ({"stepp": 1.0}, "rig must have keys of"),
         ({"stepp": 1.0}, "did you mean 'step'?"),
-        ({"step": -1.0}, "step must be positive and finite, but is -1.0"),
-        ({"step": True}, "step must be positive"),
+        ({"step": -1.0}, "step must be a number from 1e-30 to 1e+30, but is -1.0; give the seconds"),
+        ({"step": True}, "step must be a number from 1e-30 to 1e+30, but is True"),
+        ({"step": 10**400}, "step must be a number from 1e-30 to 1e+30, but is 1000"),
+        ({"interpolation": []}, "interpolation must be one of"),
         ({"interpolation": "cubic"}, "interpolation must be one of"),
-        ({"delay": 0.5}, "delay must be a whole number of samples, but is 0.5"),
+        ({"delay": 0.5}, "delay (for zero_order) must be a whole number from -1 to 1000, but is 0.5"),
         ({"input": {"unit": "N", "range": 3.0}}, "input must have no range, but has 3.0; use limit"),
         ({"output": {"unit": "m", "limit": 3.0}}, "output must have no limit, but has 3.0; use range"),
         ({"input": {"unit": "N", "kind": "velocity"}}, "input must have no kind"),
         ({"output": {"kind": "jerk"}}, "kind must be one of ['displacement', 'velocity', 'acceleration']"),
-        ({"output": {"noise": 0}}, "noise must be a positive, finite number or left out, but is 0"),
+        ({"output": {"noise": 0}}, "noise must be a number from 1e-30 to 1e+30, but is 0; leave it out"),
         ({"output": {"unit": ""}}, "unit must be a short text"),
         ({"output": 3}, "output must be a Channel, but is 3"),
         ({"guess": {"m": [1, 2]}}, "guess must have intervals of ['m', 'c', 'a', 'b'], but is of ['m']"),
-        ({"guess": {**GUESS, "a": [2, 1]}}, "guess of a must be two finite numbers, low < high, but is [2, 1]"),
-        ({"guess": {**GUESS, "m": [-1, 1]}}, "guess of m must be positive, but begins at -1.0"),
+        ({"guess": {**GUESS, "a": [2, 1]}}, "guess of a must be two numbers, low < high, but is [2, 1]"),
+        (
+            {"guess": {**GUESS, "m": [-1, 1]}},
+            "from 1e-30 to 1e+30, but is -1; a mass is above 0",
+        ),
     ],
 )
 def test_errors_name_the_key_and_the_remedy(change, message):
@@ -74,8 +80,16 @@ def test_a_broken_file_is_named(tmp_path):
     (tmp_path / "rig.toml").write_text("step = ")
     with pytest.raises(ValueError, match=r"rig\.toml: Invalid"):
         Rig.from_file(tmp_path / "rig.toml")
+    for nested in ("[" * 100_000, "x = " + "[" * 100_000, "step = 1e999", "step = " + "9" * 400):
+        (tmp_path / "rig.toml").write_text(nested)
+        with pytest.raises(ValueError, match=r"rig\.toml: "):
+            Rig.from_file(tmp_path / "rig.toml")
     with pytest.raises(FileNotFoundError, match="there is no"):
         Rig.from_file(tmp_path / "none.toml")
+    os.mkfifo(tmp_path / "fifo")  # reading it would wait for a writer
+    for place in (tmp_path / "fifo", tmp_path, "/dev/zero", "a" * 300, "a\0b"):
+        with pytest.raises(ValueError, match=r"rig must be a file, a short TOML, or one of .* name"):
+            Rig.from_file(place)
     with pytest.raises(ValueError, match="rig must have a step"):
         Rig.from_dict({})
 
