@@ -75,8 +75,8 @@ class Experiment:
         if self.iterations is not None:
             whole("iterations", self.iterations, MOST_ITERATIONS)
         check_reward(self.reward)
-        for name in ("max_input", "max_output"):
-            number(name, getattr(self, name))
+        for name in ("max_input", "max_output"):  # what is far beyond lets an oscillator run away, and its episode end
+            number(name, getattr(self, name), high=1e300)
         whole("hold", self.hold, MOST_SAMPLES)
         self._check_flag("terminal")
         if self.terminated_return is not None:

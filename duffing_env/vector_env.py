@@ -177,7 +177,7 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
             gymnasium.error.ResetNeeded: before the first reset; with ``DISABLED`` also for finished rows.
         """
         if type(actions) is not np.ndarray or actions.dtype.kind != "f":
-            actions = numbers("actions", actions)
+            actions = numbers("actions", actions)  # type: ignore[assignment]
         if actions.shape != (self.num_envs, 1):
             raise ValueError(f"actions must have shape {(self.num_envs, 1)}, but have {actions.shape}; one per row")
         given = actions[:, 0]
@@ -232,8 +232,9 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         if isinstance(seed, int | np.integer):
             super().reset(seed=int(seed))
         for row in np.flatnonzero(mask).tolist():
-            if seeds[row] is not None or not self._seeded[row]:
-                generator, _ = gym.utils.seeding.np_random(None if seeds[row] is None else int(seeds[row]))
+            own = seeds[row]
+            if own is not None or not self._seeded[row]:
+                generator, _ = gym.utils.seeding.np_random(None if own is None else int(own))
                 self._batch.seed(row, generator)
         self._seeded |= mask
 

@@ -94,7 +94,7 @@ def test_help_explains_every_option(name):
         ("train.py", ["--systems", "1"], "systems must be 0 or at least 2, but is 1"),
         ("train.py", ["--ppo.batch-size", "0"], "batch_size must be at least 1, but is 0"),
         ("train.py", ["--options", '{"reward": "log_posterior"}'], "options must not hold reward"),
-        ("train.py", ["--options", '{"horizon": 0}'], "horizon must be a whole number of at least 1, but is 0"),
+        ("train.py", ["--options", '{"horizon": 0}'], "horizon must be a whole number from 1 to 1000000000, but is 0"),
         ("train.py", ["--env", "duffing_env/Amplitud-v0"], "Amplitud"),
         ("train.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
         ("train.py", ["--algo", "sacc"], "invalid choice 'sacc'"),

@@ -119,7 +119,7 @@ def test_warnings_are_told(run, folder, monkeypatch):
         (["rig", "init", "new.toml", "--from", "uneven.csv"], "samples must be evenly spaced"),
         (["rig", "init", "new.toml", "--from", "fortnights.csv"], "times must be in one of s, ms"),
         (["rig", "init", "new.toml", "--step", "1"], "step goes with a record"),
-        (["rig", "init", "new.toml", "--from", "plain.csv", "--step", "-1"], "step must be positive"),
+        (["rig", "init", "new.toml", "--from", "plain.csv", "--step", "-1"], "step must be a number from 1e-30"),
     ],
 )
 def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch, words, message):

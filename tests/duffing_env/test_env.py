@@ -376,7 +376,7 @@ def test_structured_beliefs_are_calibrated_and_precise():
         ({"horizn": 3}, "horizn=3 is no option .* did you mean 'horizon'"),
         ({"reward": "informationgain"}, "did you mean 'information_gain'"),
         ({"factorisation": "meanfield"}, "factorisation must be one of"),
-        ({"max_input": -1}, "max_input must be a positive"),
+        ({"max_input": -1}, "max_input must be a number from 1e-12 to 1e\\+300, but is -1"),
         ({"render_mode": "ansi"}, "render_mode must be one of"),
     ],
 )
