@@ -92,7 +92,7 @@ def check_track(env_id: str) -> None:
 def told_in_one_line(name: str) -> Iterator[None]:
     """End the process where the user can mend what went wrong, with one message and no traceback.
 
-    The exit status is 2 for a bad value or file, and 130 after Ctrl-C.
+    The exit status is 2 for a bad value or file, or a package of an extra that is missing; and 130 after Ctrl-C.
 
     Args:
         name: of the command, which stands before the message.
@@ -105,29 +105,29 @@ def told_in_one_line(name: str) -> Iterator[None]:
     except Exception as error:
         from gymnasium.error import Error as GymnasiumError
 
-        if not isinstance(error, ValueError | OSError | GymnasiumError):
+        from estimator.extras import EXTRAS, how_to_get
+
+        if isinstance(error, ModuleNotFoundError) and (package := str(error.name).split(".")[0]) in EXTRAS:
+            print(f"{name}: {how_to_get(package)}", file=sys.stderr)
+        elif isinstance(error, ValueError | OSError | GymnasiumError):
+            print(f"{name}: {error}", file=sys.stderr)
+        else:
             raise
-        print(f"{name}: {error}", file=sys.stderr)
         sys.exit(2)
 
 
 def run_script(
     main: Callable[[Config], None],
     config: type[Config],
-    description: str,
-    default: Callable[[], Config] | None = None,
+    description: str | None = None,
 ) -> None:
     """Parse the command line into ``config`` and call ``main`` with it, `told_in_one_line` where that fails.
 
     Args:
         main: what the script does.
         config: its settings, a dataclass.
-        description: stands above the list of settings in the help; lines that begin with $ stay so.
-        default: makes the settings that the command line changes, where they are not those of the class.
+        description: stands above the list of settings in the help; lines that begin with $ stay so. The docstring of
+            ``config`` where it is None.
     """
     with told_in_one_line(Path(sys.argv[0]).name):
-        if default is None:
-            main(tyro.cli(config, description=description))
-        else:
-            start = default()
-            main(tyro.cli(type(start), description=description, default=start))
+        main(tyro.cli(config, description=description))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from agents.evaluation.rollout import Evaluation, evaluate
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import load_policy
 from duffing_env.silverbox import record_available
+from estimator.extras import how_to_get, need
 
 #: What every input has to beat.
 SIGNALS = ("prbs", "uniform")
@@ -42,9 +44,15 @@ def compare(
     seed: int = 0,
     report: bool = False,
 ) -> list[Evaluation]:
-    """Evaluate policies; print the tables, and write ``evaluation.json`` and the figures or the report."""
+    """Evaluate policies; print the tables, and write ``evaluation.json`` and the figures or the report.
+
+    Raises:
+        ModuleNotFoundError: for a report without matplotlib. Figures are left out without it.
+    """
     from rich.console import Console
 
+    if report:
+        need("matplotlib")
     console = Console()
     with console.status("Evaluating") as status:
         evaluations = evaluate(
@@ -63,6 +71,8 @@ def compare(
 
         write_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
         written += ["report.html"]
+    elif find_spec("matplotlib") is None:
+        print(f"Figures are left out: {how_to_get('matplotlib')}")
     else:
         from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, save
 

@@ -1,23 +1,14 @@
-"""Write an excitation as CSV, for a real signal generator.
-
-$ python -m agents.policies.export prbs-4 --samples 1024 --output prbs.csv
-$ python -m agents.policies.export multisine --max-rms 0.0222 --output multisine.csv
-
-The file has the columns ``t [s]`` and ``u [V]``; each input is held for a sample of 1.6384 ms (610.35 Hz).
-"""
+"""Excitations as CSV, for a real signal generator: ``duffing-env export``."""
 
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
-from agents.cli import run_script
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_MAX_INPUT, DEFAULT_SAMPLES, Limits
@@ -88,34 +79,3 @@ def export_signal(name: str, path: str | Path, **limits: Any) -> NDArray[np.floa
     rows = [f"{time!r},{value!r}" for time, value in zip(times, volts.tolist(), strict=True)]
     write_atomically(Path(path), "\n".join(["t [s],u [V]", *rows, ""]))
     return volts
-
-
-@dataclass(frozen=True)
-class Config:
-    """Write an excitation as CSV, for a real signal generator."""
-
-    name: Annotated[str, tyro.conf.Positional]
-    """Name of the excitation."""
-    output: Path
-    """The file that is written."""
-    samples: int = DEFAULT_SAMPLES
-    """Its length."""
-    max_input: float = DEFAULT_MAX_INPUT
-    """The amplitude limit in volts."""
-    max_rms: float | None = None
-    """The largest root mean square in volts."""
-    seed: int = 0
-    """Seed of the draw."""
-
-
-def main(config: Config) -> None:
-    """Write it, and say what it is."""
-    limits = {name: value for name, value in vars(config).items() if name not in ("name", "output")}
-    volts = export_signal(config.name, config.output, **limits)
-    peak, rms = np.abs(volts).max(), np.sqrt(np.mean(volts**2))
-    seconds = volts.size * SAMPLING_STEP
-    print(f"{config.output}: {volts.size} samples, {seconds:.4g} s, peak {peak:.4g} V, RMS {rms:.4g} V")
-
-
-if __name__ == "__main__":
-    run_script(main, Config, __doc__)

@@ -56,12 +56,17 @@ class AlgorithmSettings(ABC):
 
     @property
     @abstractmethod
+    def samples_per_update(self) -> int:
+        """Samples that are collected between two updates, over all environments."""
+
+    @property
+    @abstractmethod
     def log_interval(self) -> int:
         """Updates (on-policy) or episodes (off-policy) between two rows of Stable-Baselines3's log."""
 
     @abstractmethod
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
-        """A model with these hyperparameters; ValueError where its package is not installed."""
+        """A model with these hyperparameters."""
 
     @classmethod
     def suggest(cls, trial: Any) -> dict[str, Any]:
@@ -109,6 +114,11 @@ class OnPolicySettings(AlgorithmSettings):
             raise ValueError("batch_size and num_envs * n_steps must be at least 2; PPO normalises over a batch")
 
     @property
+    def samples_per_update(self) -> int:
+        """The roll-out."""
+        return self.num_envs * self.n_steps
+
+    @property
     def log_interval(self) -> int:
         """Every update."""
         return 1
@@ -147,9 +157,11 @@ class RecurrentPPOSettings(OnPolicySettings):
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """sb3-contrib's RecurrentPPO."""
+        from sb3_contrib import RecurrentPPO
+
         arguments = self._on_policy(envs, seed)
         arguments["policy_kwargs"]["lstm_hidden_size"] = self.lstm_units
-        return _contrib().RecurrentPPO("MlpLstmPolicy", **arguments)
+        return RecurrentPPO("MlpLstmPolicy", **arguments)
 
 
 @dataclass(frozen=True)
@@ -170,6 +182,11 @@ class OffPolicySettings(AlgorithmSettings):
     """Gradient steps in an update."""
     tau: float = _searched(0.005, 2e-3, 2e-2, log=True)
     """How far the target networks follow in a gradient step."""
+
+    @property
+    def samples_per_update(self) -> int:
+        """What is put into the buffer before the next gradient steps."""
+        return self.num_envs * self.train_freq
 
     @property
     def log_interval(self) -> int:
@@ -207,7 +224,9 @@ class TQCSettings(SACSettings):
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """sb3-contrib's TQC."""
-        return _contrib().TQC(
+        from sb3_contrib import TQC
+
+        return TQC(
             "MlpPolicy",
             ent_coef=f"auto_{self.entropy_weight}",
             top_quantiles_to_drop_per_net=self.dropped_quantiles,
@@ -245,13 +264,3 @@ ALGORITHMS: dict[str, type[AlgorithmSettings]] = {
 def as_written(settings: AlgorithmSettings) -> dict[str, Any]:
     """Hyperparameters as JSON and TOML hold them."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(settings).items()}
-
-
-def _contrib() -> Any:
-    try:
-        import sb3_contrib
-    except ImportError as error:
-        raise ValueError(
-            "algo must be ppo, sac or td3 without sb3-contrib; install it with: pip install 'duffing-env[contrib]'"
-        ) from error
-    return sb3_contrib

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -31,6 +30,7 @@ from agents.training.checkpoints import (
 from agents.training.family import FAMILY
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import read_settings, settings_of, track_of
+from estimator.extras import need
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -43,7 +43,7 @@ class Subject:
     """What is trained on what; the hyperparameters follow from it, where they are not given."""
 
     algo: Literal["ppo", "sac", "td3", "tqc", "recurrent_ppo"] = "ppo"
-    """Algorithm; tqc and recurrent_ppo need the extra "contrib"."""
+    """Algorithm."""
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track; or family, the oscillators of all kinds that ppo/universal is trained on."""
     rig: str | None = None
@@ -77,7 +77,7 @@ class TrainConfig(Subject):
     eval_every: int = 0
     """Samples between evaluations on systems held out from training; 0 for none."""
     tensorboard: bool = False
-    """Whether to write the log for TensorBoard, too; it needs the extra "tensorboard"."""
+    """Whether to write the log for TensorBoard, too."""
     torch_threads: int = 1
     """Threads of torch; it moves the last digits. More than one gain little, and lose much on a busy machine."""
     hyperparameters: AlgorithmSettings = field(default=None)  # type: ignore[assignment]
@@ -93,8 +93,8 @@ class TrainConfig(Subject):
                 raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")
         if self.eval_every < 0:
             raise ValueError(f"eval_every must be at least 0, but is {self.eval_every}")
-        if self.tensorboard and find_spec("tensorboard") is None:
-            raise ValueError("tensorboard must be installed; do so with: pip install 'duffing-env[tensorboard]'")
+        if self.tensorboard:
+            need("tensorboard")
         if "reward" in self.options:
             raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
         if "branch" in self.options:
@@ -113,6 +113,17 @@ class TrainConfig(Subject):
                 f"hyperparameters must be {ALGORITHMS[self.algo].__name__} for {self.algo}, "
                 f"but are {type(self.hyperparameters).__name__}"
             )
+        if (first := getattr(self.hyperparameters, "learning_starts", 0)) >= self.steps:
+            raise ValueError(
+                f"learning_starts must be below steps, but is {first} of {self.steps}: nothing would be learned; "
+                "lower it, or take more steps"
+            )
+
+    @property
+    def samples(self) -> int:
+        """Samples that are learned from: ``steps``, up to a whole number of updates."""
+        each = self.hyperparameters.samples_per_update
+        return -(-self.steps // each) * each
 
 
 @dataclass(frozen=True)
@@ -153,8 +164,10 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     Until it is finished, the latest checkpoint also holds what `resume` goes on from.
 
     Raises:
+        ModuleNotFoundError: without the packages of the extra ``train``.
         ValueError: for settings that make no sense, before anything is written.
     """
+    need("torch", "stable_baselines3", "matplotlib", *_contrib(config))
     return _Training(config, _run_folder(config), on_evaluation).run()
 
 
@@ -328,12 +341,16 @@ def describe(config: TrainConfig) -> dict[str, Any]:
     """What a run was made from: the resolved configuration, the command and the versions."""
     resolved = asdict(config) | {"hyperparameters": as_written(config.hyperparameters)}
     resolved = {name: str(value) if isinstance(value, Path) else value for name, value in resolved.items()}
-    packages = _PACKAGES + (("sb3-contrib",) if config.algo in ("tqc", "recurrent_ppo") else ())
     return {
         "config": resolved,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions(*packages),
+        "versions": versions(*_PACKAGES, *_contrib(config)),
     }
+
+
+def _contrib(config: TrainConfig) -> tuple[str, ...]:
+    """sb3-contrib, where the algorithm is of it."""
+    return ("sb3_contrib",) if config.algo in ("tqc", "recurrent_ppo") else ()
 
 
 def _read_config(folder: Path) -> TrainConfig:

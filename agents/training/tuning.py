@@ -18,6 +18,7 @@ from agents.training.algorithms import as_written
 from agents.training.heldout import SCORE
 from agents.training.hyperparameters import track_of, write_settings
 from agents.training.runs import TrainConfig, describe, train
+from estimator.extras import need
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -43,7 +44,8 @@ def tune(config: TrainConfig, trials: int) -> Path:
         The file of the best hyperparameters.
 
     Raises:
-        ValueError: without Optuna, or where the folder holds another search.
+        ModuleNotFoundError: without Optuna.
+        ValueError: where the folder holds another search.
     """
     optuna = _optuna()
     folder = config.output or Path("runs") / f"tune-{config.algo}-{track_of(config.env).lower()}-{config.seed}"
@@ -120,9 +122,8 @@ def _print_table(study: Study) -> None:
 
 
 def _optuna() -> Any:
-    try:
-        import optuna
-        import optuna.storages.journal
-    except ImportError as error:
-        raise ValueError("tune must be 0 without Optuna; install it with: pip install 'duffing-env[tune]'") from error
+    need("optuna")
+    import optuna
+    import optuna.storages.journal
+
     return optuna

@@ -18,11 +18,11 @@ from agents.cli import JsonOptions, run_script
 ROOT = Path(__file__).parents[2]
 #: Where the options of each script are declared: file and class.
 DECLARED = {
-    "train.py": [("train.py", "Config", ""), ("agents/training/runs.py", "Subject", ""),
+    "train.py": [("agents/commands/train.py", "Config", ""), ("agents/training/runs.py", "Subject", ""),
                  ("agents/training/runs.py", "TrainConfig", ""),
                  ("agents/training/algorithms.py", "AlgorithmSettings", "ppo."),
                  ("agents/training/algorithms.py", "OnPolicySettings", "ppo.")],
-    "evaluate.py": [("evaluate.py", "Config", "")],
+    "evaluate.py": [("agents/commands/evaluate.py", "Evaluate", "")],
 }  # fmt: skip
 
 
@@ -100,6 +100,7 @@ def test_help_explains_every_option(name):
         ("train.py", ["--algo", "sacc"], "invalid choice 'sacc'"),
         ("train.py", ["--algo", "sac", "--sac.tau", "2"], "tau must be in [0, 1], but is 2.0"),
         ("train.py", ["--algo", "sac", "--ppo.gamma", "0.9"], "--ppo.gamma"),
+        ("train.py", ["--algo", "sac", "--steps", "5000"], "learning_starts must be below steps, but is 5000 of 5000"),
         ("train.py", ["--settings", "none.toml"], "none.toml"),
         ("train.py", ["--eval-every", "-1"], "eval_every must be at least 0, but is -1"),
         ("train.py", ["--tune", "-1"], "tune must be at least 0, but is -1"),
@@ -132,6 +133,51 @@ def test_a_bad_value_shows_no_traceback(name, arguments, tmp_path):
     assert line.startswith(f"{name}: ")
     assert "'foo'" in line
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "package", "extra"),
+    [
+        ("train.py", ["--output", "out"], "torch", "train"),
+        ("train.py", ["--tune", "2", "--output", "out"], "optuna", "tune"),
+        ("train.py", ["--algo", "tqc", "--output", "out"], "sb3_contrib", "train"),
+        ("evaluate.py", ["--policies", "prbs", "--report", "out"], "matplotlib", "report"),
+    ],
+)
+def test_a_missing_extra_is_one_line(script, name, arguments, package, extra, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, package, None)
+    status, messages = script(name, *arguments)
+    assert status == 2
+    assert messages == f"{name}: {package} is not installed; get it with: pip install 'duffing-env[{extra}]'\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_figures_are_left_out_without_matplotlib(script, monkeypatch, tmp_path, capfd):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    arguments = ["--policies", "prbs", "--systems", 2, "--options", '{"horizon": 4}', "--output", "out"]
+    assert script("evaluate.py", *arguments)[0] == 0
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["evaluation.json"]
+
+
+@pytest.mark.parametrize("name", ["train.py", "evaluate.py"])
+def test_examples_in_the_help_keep_lines_of_their_own(name, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    told = subprocess.run([sys.executable, ROOT / name, "--help"], capture_output=True, text=True).stdout
+    lines = [line.strip() for line in told.splitlines() if "duffing-env " in line]
+    assert len(lines) >= 7
+    assert all(line.startswith("$ duffing-env ") and line.count("$") == 1 and len(line) < 80 for line in lines)
+
+
+def test_help_of_the_command_is_quick():
+    """It imports nothing that computes."""
+    code = (
+        "import sys\nfrom agents.commands import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n"
+        "    print(*{'numba', 'scipy', 'torch', 'gymnasium', 'numpy', 'sympy'} & sys.modules.keys(), file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert "train" in done.stdout
+    assert done.stderr == "\n"
 
 
 def test_a_folder_that_is_a_file_is_one_message(script, tmp_path):

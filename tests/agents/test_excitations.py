@@ -1,8 +1,5 @@
 """Excitations and policies with feedback: spectra, limits, budgets, seeds, brakes, and the export."""
 
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -10,6 +7,7 @@ import numpy as np
 import pytest
 
 from agents import make_policy
+from agents.commands import main
 from agents.policies.excitations import EXCITATIONS, LEVELS, resonance
 from agents.policies.export import draw_signal, export_signal
 from agents.policies.feedback import FEEDBACK, TURN
@@ -334,10 +332,8 @@ def test_export_refuses_and_writes_nothing(tmp_path, name, options, message):
     assert not list(tmp_path.iterdir())
 
 
-def test_export_from_the_command_line(tmp_path):
+def test_export_from_the_command_line(tmp_path, capsys):
     path = tmp_path / "prbs.csv"
-    command = [sys.executable, "-m", "agents.policies.export", "prbs-4", "--samples", "32", "--output", str(path)]
-    root = Path(__file__).parents[2]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
-    assert "32 samples" in done.stdout
+    main(["export", "prbs-4", "--samples", "32", "--output", str(path)])
+    assert "32 samples" in capsys.readouterr().out
     np.testing.assert_array_equal(np.loadtxt(path, delimiter=",", skiprows=1)[:, 1], draw_signal("prbs-4", samples=32))

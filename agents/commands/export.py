@@ -1,0 +1,46 @@
+"""``duffing-env export``: an excitation as CSV."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write an excitation as CSV, for a real signal generator.
+
+    The file has the columns "t [s]" and "u [V]"; each input is held for a sample of 1.6384 ms (610.35 Hz).
+
+    $ duffing-env export prbs-4 --samples 1024 --output prbs.csv
+    $ duffing-env export multisine --max-rms 0.0222 --output multisine.csv
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Name of the excitation."""
+    output: Path
+    """The file that is written."""
+    samples: int = 1024
+    """Its length."""
+    max_input: float = 0.15
+    """The amplitude limit in volts."""
+    max_rms: float | None = None
+    """The largest root mean square in volts."""
+    seed: int = 0
+    """Seed of the draw."""
+
+    def run(self) -> None:
+        """Write it, and say what it is."""
+        import numpy as np
+
+        from agents.policies.export import export_signal
+        from estimator.parameters import SAMPLING_STEP
+
+        limits = {name: value for name, value in vars(self).items() if name not in ("name", "output")}
+        volts = export_signal(self.name, self.output, **limits)
+        peak, rms = np.abs(volts).max(), np.sqrt(np.mean(volts**2))
+        seconds = volts.size * SAMPLING_STEP
+        print(f"{self.output}: {volts.size} samples, {seconds:.4g} s, peak {peak:.4g} V, RMS {rms:.4g} V")

@@ -1,0 +1,33 @@
+"""Packages that only some tasks need, each brought by an extra: ``pip install 'duffing-env[train]'``."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+#: Name that a package is imported by, to the extra that brings it.
+EXTRAS = {
+    "matplotlib": "report",
+    "optuna": "tune",
+    "pygame": "human",
+    "pyvisa": "instrument",
+    "sb3_contrib": "train",
+    "stable_baselines3": "train",
+    "tensorboard": "train",
+    "torch": "train",
+}
+
+
+def need(*packages: str) -> None:
+    """Refuse to go on without packages that an extra brings, before the work begins.
+
+    Raises:
+        ModuleNotFoundError: of the first that is missing, naming its extra.
+    """
+    for package in packages:
+        if find_spec(package) is None:
+            raise ModuleNotFoundError(how_to_get(package), name=package)
+
+
+def how_to_get(package: str) -> str:
+    """One line that says which extra brings a package."""
+    return f"{package} is not installed; get it with: pip install 'duffing-env[{EXTRAS[package]}]'"
