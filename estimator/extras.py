@@ -17,6 +17,11 @@ EXTRAS = {
 }
 
 
+def is_missing(package: str) -> bool:
+    """Whether a package is not installed."""
+    return find_spec(package) is None
+
+
 def need(*packages: str) -> None:
     """Refuse to go on without packages that an extra brings, before the work begins.
 
@@ -24,7 +29,7 @@ def need(*packages: str) -> None:
         ModuleNotFoundError: of the first that is missing, naming its extra.
     """
     for package in packages:
-        if find_spec(package) is None:
+        if is_missing(package):
             raise ModuleNotFoundError(how_to_get(package), name=package)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from agents.evaluation.rollout import Evaluation, evaluate
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import load_policy
 from duffing_env.silverbox import record_available
-from estimator.extras import how_to_get, need
+from estimator.extras import how_to_get, is_missing, need
 
 #: What every input has to beat.
 SIGNALS = ("prbs", "uniform")
@@ -71,7 +70,7 @@ def compare(
 
         write_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
         written += ["report.html"]
-    elif find_spec("matplotlib") is None:
+    elif is_missing("matplotlib"):
         print(f"Figures are left out: {how_to_get('matplotlib')}")
     else:
         from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, save

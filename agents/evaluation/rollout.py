@@ -70,7 +70,7 @@ class Evaluation:
 
 
 def evaluate(
-    policies: Sequence[str],
+    policies: Sequence[Any],
     env_id: str = "duffing_env/Amplitude-v0",
     systems: int = 256,
     seed: int = 0,
@@ -94,7 +94,8 @@ def evaluate(
     entry and a pattern of their folders, such as ``ppo=runs/ppo-amplitude-v0-[0-4]``.
 
     Args:
-        policies: names or run folders, see `agents.policies.make_policy`, or patterns as above; at least one.
+        policies: at least one: what `agents.policies.make_policy` takes, or patterns as above. A thing of one's own
+            is titled by its ``name``, or that of its class.
         env_id: a registered track.
         systems: number of systems, at least 2.
         seed: of systems and noise; and of the policies' own randomness.
@@ -109,6 +110,9 @@ def evaluate(
         raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
     if systems < 2:
         raise ValueError(f"systems must be at least 2, but is {systems}; intervals need more than one")
+    own = [title_of(policy) for policy in policies if not isinstance(policy, str)]
+    if len(set(own)) < len(own):
+        raise ValueError(f"policies must differ by their names, but are called {own}; give each a name of its own")
     options = TESTED | (options or {})
     evaluations = []
     told: dict[str, FloatArray] = {}
@@ -117,14 +121,24 @@ def evaluate(
         each = []
         for member in members:
             if on_policy is not None:
-                on_policy(member)
+                on_policy(title_of(member))
             each.append(_evaluate(member, env_id, systems, seed, options, told))
         evaluations.append(each[0] if title is None else pooled(title, each))
     return evaluations
 
 
-def _members(name: str) -> tuple[str | None, list[str]]:
+def title_of(policy: Any) -> str:
+    """What a policy is called in tables."""
+    if isinstance(policy, str):
+        return policy
+    known = getattr(policy, "name", None) or getattr(policy, "__name__", None) or type(policy).__name__
+    return str(known)
+
+
+def _members(name: Any) -> tuple[str | None, list[Any]]:
     """The title of a group and the policies in it; without a title, the one policy of this name."""
+    if not isinstance(name, str):
+        return None, [name]
     title, equals, pattern = name.partition("=")
     if not equals or Path(name).exists():
         return None, [name]
@@ -156,7 +170,7 @@ def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
 
 
 def _evaluate(
-    name: str, env_id: str, systems: int, seed: int, options: dict[str, Any], told: dict[str, FloatArray]
+    name: Any, env_id: str, systems: int, seed: int, options: dict[str, Any], told: dict[str, FloatArray]
 ) -> Evaluation:
     """One policy; ``told`` keeps what the Silverbox regime tells of the systems, which are those of all policies."""
     evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
@@ -185,7 +199,7 @@ def _evaluate(
 
 
 def roll_out(
-    name: str, env_id: str, systems: int, seed: int, options: dict[str, Any]
+    name: Any, env_id: str, systems: int, seed: int, options: dict[str, Any]
 ) -> tuple[Evaluation, list[Belief], Any, Experiment]:
     """One episode of every system; the beliefs it ended with, the truth and the experiment."""
     envs = make(env_id, systems, options)
@@ -249,7 +263,7 @@ def roll_out(
         "decision_time": np.full(systems, np.mean(deciding[1:] or deciding) / systems),
     }
     seen = outputs[..., 0] if sensors == 1 else outputs
-    return Evaluation(name, values, curve, inputs, seen, prior.step), beliefs, truth, envs.experiment
+    return Evaluation(title_of(name), values, curve, inputs, seen, prior.step), beliefs, truth, envs.experiment
 
 
 def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:

@@ -15,9 +15,11 @@ from gymnasium import Env
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
+from agents.loading import load_object
 from agents.planner.policy import Planner
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
+from agents.policies.own import own_policy
 from agents.policies.signals import make_signal
 
 
@@ -63,12 +65,15 @@ def trained_policies() -> list[str]:
     return sorted(card.parent.relative_to(TRAINED).as_posix() for card in TRAINED.glob("*/*/policy.json"))
 
 
-def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0, **options: Any) -> Policy:
-    """Makes the policy of this name.
+def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0, **options: Any) -> Policy:
+    """Makes the policy of this name, or of a thing of your own.
 
     Args:
-        name: A name in `POLICIES`, one of `trained_policies()` such as `"ppo/amplitude"`, or the path of a
-            trained policy (`runs/...`).
+        name: A name in `POLICIES`, one of `trained_policies()` such as `"ppo/amplitude"`, the path of a
+            trained policy (`runs/...`), or `module:name` of a thing of your own; or that thing itself. It may be
+            an object that has `predict`, such as a model of Stable-Baselines3, whose `VecNormalize` is not
+            forgotten; a class, which is called with those of `env`, `seed` and the options that it takes by
+            name; or a function of observations (n, features) that gives actions (n, 1), such as a module of torch.
         env: The environment it is for, single or vector, wrapped or not: it gives the amplitude
             limit, the episode's length and, where it replays a record, the recorded input; to a
             trained policy with foresight what it imagines. None: the limit is 0.15 V, and a trained
@@ -81,9 +86,11 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0,
         The policy.
 
     Raises:
-        ValueError: There is neither a policy nor a file of this name, it has no such option, or
-            `env` is not one of duffing_env.
+        ValueError: There is neither a policy nor a file of this name, it has no such option, it is no
+            policy, or `env` is not one of duffing_env.
     """
+    if not isinstance(name, str):
+        return own_policy(name, env, seed, options)
     if name in POLICIES:
         make = POLICIES[name]
         known = [o for o in inspect.signature(make).parameters if o not in ("regime", "env", "seed")]
@@ -91,6 +98,8 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0,
             if option not in known:
                 raise ValueError(f"{option}={value!r} is no option of policy {name!r}, which has {known}")
         return make(env if env is None else env.unwrapped, seed, **options)
+    if ":" in name and not Path(name).exists():
+        return own_policy(load_object(name, "policy"), env, seed, options)
     if options:
         raise ValueError(f"options must be none for a trained policy, but are {options}; leave them out")
     if name in trained_policies() or Path(name).exists():
@@ -103,6 +112,6 @@ def make_policy(name: str, env: Env | VectorEnv | None = None, *, seed: int = 0,
     nearest = difflib.get_close_matches(name, [*POLICIES, *trained_policies()], n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     raise ValueError(
-        f"name must be one of {', '.join([*POLICIES, *trained_policies()])}, or the path of a trained policy, "
-        f"but it is {name!r}{hint}"
+        f"name must be one of {', '.join([*POLICIES, *trained_policies()])}, the path of a trained policy, or "
+        f"module:name of your own, but it is {name!r}{hint}"
     )

@@ -36,6 +36,7 @@ State = tuple[FloatArray, FloatArray]
 _ACTIVATIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, np.float32(0)),
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, np.float32(0)))),
 }
 
 
@@ -45,7 +46,7 @@ class Network:
 
     Attributes:
         layers: names of the linear layers, from the observation (or the memory) to the action.
-        activation: between them: tanh or relu.
+        activation: between them: tanh, relu or elu.
         squashed: whether the action is the tanh of the last layer, or else its clipped value.
         spread: name of the log standard deviation: a tensor, or a layer beside the last one; None for none.
         memory: name of the LSTM before the layers; None for none.
@@ -53,6 +54,8 @@ class Network:
             0 where it has the action itself.
         foresight: whether the layers see the features of `agents.policies.foresight`, and give what it acts on; the
             tensor ``foresight`` is that.
+        normalised: what the layers see is normalised, to at most so many standard deviations, with the tensors
+            ``normalizer.mean`` and ``normalizer.std``; 0 where it is seen as it is.
     """
 
     layers: tuple[str, ...]
@@ -62,6 +65,7 @@ class Network:
     memory: str | None = None
     levels: int = 0
     foresight: bool = False
+    normalised: float = 0.0
 
 
 class LearnedPolicy:
@@ -111,6 +115,10 @@ class LearnedPolicy:
                 seen = self._foresight.features
             if self._features != seen:
                 raise ValueError(f"the first layer must take {seen} features, but takes {self._features}")
+        self._normalizer: tuple[FloatArray, FloatArray, float] | None = None
+        if network.normalised:
+            mean, std = (_tensor(tensors, f"normalizer.{part}", self._features) for part in ("mean", "std"))
+            self._normalizer = mean, std, float(network.normalised)
         self._rng = np.random.default_rng(seed)
 
     def move_to(self, env: Any) -> None:
@@ -160,6 +168,9 @@ class LearnedPolicy:
         self, hidden: FloatArray, state: Any, episode_start: npt.ArrayLike | None, deterministic: bool
     ) -> tuple[FloatArray, Any]:
         """What the network gives for what it sees, (n, 1) or (1,), and the next state."""
+        if self._normalizer is not None:
+            mean, std, most = self._normalizer
+            hidden = np.clip((hidden - mean) / std, -most, most)
         if self._memory is not None:
             state = self._memory.update(np.atleast_2d(hidden), state, episode_start)
             hidden = state[0][-1].reshape(*hidden.shape[:-1], -1)
@@ -229,26 +240,42 @@ def _sigmoid(x: FloatArray) -> FloatArray:
     return np.float32(0.5) * (np.float32(1) + np.tanh(np.float32(0.5) * x))
 
 
-def save_policy(folder: Path, model: BaseAlgorithm, card: dict[str, Any]) -> None:
-    """Write a trained policy into a folder, each file in one piece.
+def save_policy(folder: str | Path, model: BaseAlgorithm, card: dict[str, Any] | None = None) -> None:
+    """Write a trained policy into a folder, each file in one piece; `make_policy` plays it, without torch.
+
+    The observations' normaliser goes with it, where the model's environment is a `VecNormalize`. An archive of
+    Stable-Baselines3 holds pickles, which can run any code when they are opened. So it is never opened here. Whoever
+    trusts one converts it: ``save_policy("runs/mine", PPO.load("model.zip", env))``, where ``env`` is
+    ``VecNormalize.load("vecnormalize.pkl", env)`` if it was trained with one.
 
     Args:
         folder: made where it is missing.
-        model: PPO, SAC or TD3 of Stable-Baselines3, TQC or RecurrentPPO of sb3-contrib. Of those that learn from a
-            buffer only the actor is written; the actor-critics are written whole.
-        card: what it was trained on: algorithm, track, options, seed, steps, versions.
+        model: PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, TQC or RecurrentPPO of sb3-contrib, with a network of
+            linear layers. Of those that learn from a buffer only the actor is written; the others are written whole.
+        card: what it was trained on: algorithm, track, options, seed, steps, versions; its algorithm and steps where
+            it is None.
+
+    Raises:
+        ValueError: for a model that `LearnedPolicy` could not play as it is; nothing is written then.
     """
     from safetensors.numpy import save
 
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = Path(folder)
+    card = {"algorithm": type(model).__name__.lower(), "steps": model.num_timesteps} if card is None else card
     tensors = {name: value.detach().cpu().numpy() for name, value in model.policy.state_dict().items()}
     if not hasattr(model.policy, "mlp_extractor"):
         tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
     network = _network_of(model.policy, tensors)
+    seen = _normalizer_of(model)
+    if seen is not None:
+        network = replace(network, normalised=float(seen.clip_obs))
+        tensors["normalizer.mean"] = seen.obs_rms.mean.astype(np.float32)
+        tensors["normalizer.std"] = np.sqrt(seen.obs_rms.var + seen.epsilon).astype(np.float32)
     foresight = getattr(model.get_env(), "foresight", None)
     if foresight is not None:
         network = replace(network, foresight=True)
         tensors |= foresight.to_tensors()
+    folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / WEIGHTS, save(tensors))
     described = {"format": FORMAT, "network": asdict(network), **card}
     if foresight is not None:
@@ -256,13 +283,48 @@ def save_policy(folder: Path, model: BaseAlgorithm, card: dict[str, Any]) -> Non
     write_atomically(folder / CARD, json.dumps(described, indent=2).encode())
 
 
+def _normalizer_of(model: BaseAlgorithm) -> Any:
+    """The `VecNormalize` that the model sees its environment through; None for none that normalises observations.
+
+    Raises:
+        ValueError: for another wrapper that changes observations, which is not written.
+    """
+    from stable_baselines3.common.vec_env import VecCheckNan, VecEnvWrapper, VecMonitor, VecNormalize
+
+    found, envs = None, model.get_env()
+    while isinstance(envs, VecEnvWrapper) and not hasattr(envs, "foresight"):
+        if isinstance(envs, VecNormalize):
+            found = envs if envs.norm_obs else found
+        elif not isinstance(envs, VecMonitor | VecCheckNan):
+            raise ValueError(
+                f"model must see its environment as it is or through VecNormalize, but sees it through "
+                f"{type(envs).__name__}; leave that out, or pass a policy of your own to make_policy"
+            )
+        envs = envs.venv
+    return found
+
+
 def _network_of(policy: Any, tensors: Mapping[str, Any]) -> Network:
-    """What the actor of a Stable-Baselines3 policy is made of."""
+    """What the actor of a Stable-Baselines3 policy is made of; ValueError where `LearnedPolicy` could not play it."""
 
     def layers(within: str) -> tuple[str, ...]:
         return tuple(n.removesuffix(".weight") for n in tensors if n.startswith(f"{within}.") and n.endswith(".weight"))
 
-    activation = policy.activation_fn.__name__.lower()
+    activation = getattr(getattr(policy, "activation_fn", None), "__name__", "none").lower()
+    actor = getattr(policy, "actor", policy)
+    faults = {
+        f"the activation {activation}": activation not in _ACTIVATIONS,
+        "a network for features": any("features_extractor." in name for name in tensors),
+        "exploration that depends on the state (use_sde)": getattr(actor, "use_sde", False),
+        "an LSTM of several layers": any(name.endswith("weight_ih_l1") for name in tensors),
+        "no actor": not (hasattr(policy, "mlp_extractor") or layers("actor.mu") or "actor.mu.weight" in tensors),
+        "normalised layers": any(name.endswith("running_mean") for name in tensors),
+    }
+    if any(faults.values()):
+        raise ValueError(
+            f"model must have linear layers with {', '.join(_ACTIVATIONS)} between them, but has "
+            f"{next(fault for fault, found in faults.items() if found)}; pass a policy of your own to make_policy"
+        )
     if hasattr(policy, "mlp_extractor"):  # PPO and RecurrentPPO
         memory = "lstm_actor" if hasattr(policy, "lstm_actor") else None
         levels = int(getattr(policy.action_space, "n", 0))
@@ -285,7 +347,11 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
 
     folder = Path(folder)
     if not (folder / WEIGHTS).is_file() or not (folder / CARD).is_file():
-        raise ValueError(f"policy folder must hold {WEIGHTS} and {CARD}, but {folder} does not; pass a run folder")
+        raise ValueError(
+            f"policy folder must hold {WEIGHTS} and {CARD}, but {folder} does not; pass a run folder. "
+            "Archives and pickles may run any code when they are opened, so they are not; convert one that you trust "
+            f"with agents.save_policy({str(folder.with_suffix(''))!r}, PPO.load(...))"
+        )
     for name in (WEIGHTS, CARD):
         whole_file(folder / name, f"policy folder must hold {name}", _LARGEST)
     try:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy.typing as npt
 
+from agents.loading import load_object
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
 
@@ -69,21 +67,7 @@ def load_plant(place: str, rig: Rig, settings: Mapping[str, Any] | None = None) 
     Raises:
         ValueError: naming what is wrong: no such module or factory, or no plant.
     """
-    module, _, factory = place.partition(":")
-    if not module or not factory:
-        raise ValueError(f"plant must be module:factory, but is {place!r}; such as lab:plant, for plant() in lab.py")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)
-    try:
-        make = getattr(importlib.import_module(module), factory)
-    except ModuleNotFoundError as error:
-        if error.name is None or not module.startswith(error.name):
-            raise
-        raise ValueError(f"plant must be module:factory, but there is no module {module!r}: {error}") from error
-    except AttributeError as error:
-        raise ValueError(f"plant must be module:factory, but {module} has no {factory!r}; name one it has") from error
-    return check_plant(make(rig, **(settings or {})))
+    return check_plant(load_object(place, "plant")(rig, **(settings or {})))
 
 
 def check_plant(plant: Any) -> Plant:

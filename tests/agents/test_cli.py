@@ -128,7 +128,7 @@ def test_a_bad_value_is_one_message_and_exit_status_2(script, name, arguments, m
 def test_a_bad_value_shows_no_traceback(name, arguments, tmp_path):
     finished = command(name, *arguments, folder=tmp_path)
     assert finished.returncode == 2
-    assert finished.stdout.strip() == ""
+    assert [line for line in finished.stdout.splitlines() if not line.startswith("An update takes ")] == []
     (line,) = (line for line in finished.stderr.splitlines() if not line.startswith("duffing-env is compiling"))
     assert line.startswith(f"{name}: ")
     assert "'foo'" in line
@@ -145,15 +145,15 @@ def test_a_bad_value_shows_no_traceback(name, arguments, tmp_path):
     ],
 )
 def test_a_missing_extra_is_one_line(script, name, arguments, package, extra, monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None if name == package else name)
     status, messages = script(name, *arguments)
     assert status == 2
     assert messages == f"{name}: {package} is not installed; get it with: pip install 'duffing-env[{extra}]'\n"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_figures_are_left_out_without_matplotlib(script, monkeypatch, tmp_path, capfd):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
+def test_figures_are_left_out_without_matplotlib(script, monkeypatch, tmp_path):
+    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None)
     arguments = ["--policies", "prbs", "--systems", 2, "--options", '{"horizon": 4}', "--output", "out"]
     assert script("evaluate.py", *arguments)[0] == 0
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["evaluation.json"]

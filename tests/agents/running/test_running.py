@@ -476,7 +476,7 @@ def test_the_command(folder, capsys):
 @pytest.mark.parametrize(
     ("plant", "message"),
     [
-        ("lab", "module:factory"),
+        ("lab", "module:name"),
         ("no_such_module:plant", "no module"),
         ("agents.running.simulated:plan", "has no 'plan'"),
         ("builtins:repr", "plant must have"),

@@ -1,0 +1,34 @@
+"""Things of a user's own, named ``module:name``."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def load_object(place: str, what: str) -> Any:
+    """What stands at ``module:name``; a module in the working directory is found, too.
+
+    Args:
+        place: such as ``lab:plant``, for ``plant`` in lab.py.
+        what: is looked for, in the messages.
+
+    Raises:
+        ValueError: naming what is wrong: no such module, or no such name in it.
+    """
+    module, _, name = place.partition(":")
+    if not module or not name:
+        raise ValueError(f"{what} must be module:name, but is {place!r}; such as lab:{what}, for {what} in lab.py")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    try:
+        return getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not module.startswith(error.name):
+            raise
+        raise ValueError(f"{what} must be module:name, but there is no module {module!r}: {error}") from error
+    except AttributeError as error:
+        raise ValueError(f"{what} must be module:name, but {module} has no {name!r}; name one it has") from error

@@ -1,0 +1,74 @@
+"""Policies of a user's own: objects with ``predict``, classes that make one, and functions of the observation."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+def own_policy(made: Any, env: Any, seed: int, options: dict[str, Any]) -> Any:
+    """The policy that a user's own thing is, or makes; see `agents.policies.make_policy`.
+
+    Raises:
+        ValueError: for options that it does not take, or a thing that is no policy.
+    """
+    if isinstance(made, type):
+        taken = inspect.signature(made).parameters
+        known = {"env": env, "seed": seed} | options
+        for option, value in options.items():
+            if option not in taken:
+                raise ValueError(f"{option}={value!r} is no option of {made.__name__}, which has {list(taken)}")
+        made = made(**{name: known[name] for name in taken if name in known})
+    elif options:
+        raise ValueError(f"options must be none for a policy that is made, but are {options}; leave them out")
+    if hasattr(made, "predict"):
+        seen = made.get_vec_normalize_env() if hasattr(made, "get_vec_normalize_env") else None
+        return made if seen is None else _Normalised(made, seen)
+    if not callable(made):
+        raise ValueError(f"policy must have predict, or be a function of observations, but is {made!r:.60}")
+    return _Function(made)
+
+
+class _Normalised:
+    """A model of Stable-Baselines3 that was trained through `VecNormalize`."""
+
+    def __init__(self, model: Any, normalizer: Any) -> None:
+        self._model, self._normalizer = model, normalizer
+
+    def predict(self, observation: npt.ArrayLike, *how: Any, **named: Any) -> Any:
+        """As the model's, of the observation itself."""
+        return self._model.predict(self._normalizer.normalize_obs(np.asarray(observation)), *how, **named)
+
+
+class _Function:
+    """A function of observations (n, features) that gives actions (n, 1) or (n,): NumPy's, or a module of torch."""
+
+    def __init__(self, function: Any) -> None:
+        self._function = function
+        torch = sys.modules.get("torch")
+        self._torch = torch if torch is not None and isinstance(function, torch.nn.Module) else None
+
+    def predict(
+        self, observation: npt.ArrayLike, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """As `agents.policies.Policy`; actions beyond the limits are cut."""
+        seen = np.asarray(observation, dtype=np.float32)
+        rows = np.atleast_2d(seen)
+        if self._torch is None:
+            chosen = self._function(rows)
+        else:
+            like = next(self._function.parameters(), self._torch.zeros(()))
+            with self._torch.no_grad():
+                chosen = self._function(self._torch.as_tensor(rows, dtype=like.dtype, device=like.device))
+        if hasattr(chosen, "detach"):
+            chosen = chosen.detach().cpu().numpy()
+        actions = np.asarray(chosen, dtype=np.float32)
+        if actions.size != len(rows) or not np.isfinite(actions).all():
+            raise ValueError(
+                f"policy must give a finite action for each of {len(rows)} observations, but gave {actions!r:.200}"
+            )
+        return np.clip(actions, -1.0, 1.0).reshape(*seen.shape[:-1], 1), state

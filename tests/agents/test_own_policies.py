@@ -1,0 +1,151 @@
+"""Policies of a user's own: made from instances, classes, functions and models, and evaluated as any other."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import A2C, PPO, SAC, TD3
+from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNormalize
+
+from agents import make_policy, save_policy
+from agents.evaluation.rollout import evaluate
+from agents.vec_env import DuffingVecEnv
+
+FEATURES = 22
+SHORT = {"env_id": "duffing_env/Short-v0", "systems": 4, "options": {"horizon": 6}}
+
+
+class Push:
+    """Pushes as hard as it is told, one way."""
+
+    def __init__(self, seed, strength=1.0):
+        self.seed, self.strength = seed, strength
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.full((*np.shape(observation)[:-1], 1), self.strength, dtype=np.float32), state
+
+
+def against_displacement(observations):
+    return -np.sign(observations[:, :1])
+
+
+def observations(count=50, seed=0):
+    return np.random.default_rng(seed).normal(0.0, 1.0, (count, FEATURES)).astype(np.float32)
+
+
+def test_an_object_that_predicts_is_a_policy():
+    policy = Push(seed=0)
+    assert make_policy(policy) is policy
+
+
+def test_a_class_is_called_with_what_it_takes():
+    policy = make_policy(Push, env=object(), seed=3, strength=0.5)
+    assert (policy.seed, policy.strength) == (3, 0.5)
+    with pytest.raises(ValueError, match=r"power=2 is no option of Push, which has \['seed', 'strength'\]"):
+        make_policy(Push, power=2)
+
+
+@pytest.mark.parametrize("function", [against_displacement, lambda x: against_displacement(x)[:, 0]])
+def test_a_function_of_observations_is_a_policy(function):
+    policy, seen = make_policy(function), observations()
+    actions, state = policy.predict(seen, "state")
+    np.testing.assert_array_equal(actions, -np.sign(seen[:, :1]))
+    assert (state, actions.dtype) == ("state", np.float32)
+    single, _ = policy.predict(seen[0])
+    np.testing.assert_array_equal(single, actions[0])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_module_of_torch_is_a_policy(dtype):
+    torch.manual_seed(0)
+    network, seen = torch.nn.Linear(FEATURES, 1, dtype=dtype), observations()
+    actions, _ = make_policy(network).predict(seen)
+    expected = network(torch.from_numpy(seen).to(dtype)).detach().numpy().clip(-1, 1)
+    np.testing.assert_allclose(actions, expected, atol=1e-6)
+    assert actions.dtype == np.float32
+    assert np.abs(actions).max() == 1
+
+
+@pytest.mark.parametrize("given", [np.zeros((3, 2)), np.zeros(2), np.array([0, np.nan, 0])])
+def test_a_function_that_gives_something_else_is_refused(given):
+    with pytest.raises(ValueError, match="policy must give a finite action for each of 3 observations"):
+        make_policy(lambda seen: given).predict(observations(3))
+
+
+@pytest.mark.parametrize(
+    ("thing", "options", "message"),
+    [(3, {}, "policy must have predict, or be a function"), (Push(0), {"strength": 1}, "options must be none")],
+)
+def test_what_is_no_policy_is_refused(thing, options, message):
+    with pytest.raises(ValueError, match=message):
+        make_policy(thing, **options)
+
+
+def test_policies_in_a_file_are_found_by_module_and_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "laboratory.py").write_text("def push(seen):\n    return seen[:, 0] * 0 + 1\n")
+    (push,) = evaluate(["laboratory:push"], **SHORT)
+    (named,) = evaluate([Push(0)], **SHORT)
+    assert (push.policy, named.policy) == ("laboratory:push", "Push")
+    np.testing.assert_array_equal(push.inputs, named.inputs)
+    with pytest.raises(ValueError, match="laboratory has no 'pull'"):
+        make_policy("laboratory:pull")
+    with pytest.raises(ValueError, match="policies must differ by their names"):
+        evaluate([Push(0), Push(1)], **SHORT)
+
+
+def normalised_model(kind=PPO, **settings):
+    envs = VecNormalize(VecCheckNan(DuffingVecEnv("duffing_env/Short-v0", 4, seed=0)), clip_obs=2.0)
+    steps = {"n_steps": 8} if kind in (PPO, A2C) else {"learning_starts": 4, "buffer_size": 100}
+    return kind("MlpPolicy", envs, seed=0, device="cpu", **steps, **settings).learn(32), envs
+
+
+@pytest.mark.parametrize("kind", [PPO, A2C, SAC, TD3])
+def test_the_normaliser_goes_with_the_policy(tmp_path, kind):
+    model, envs = normalised_model(kind, **({"batch_size": 32} if kind is PPO else {}))
+    save_policy(tmp_path / "mine", model)
+    saved, instance, seen = make_policy(str(tmp_path / "mine")), make_policy(model), 3 * observations()
+    expected, _ = model.predict(envs.normalize_obs(seen), deterministic=True)
+    forgotten, _ = model.predict(seen, deterministic=True)
+    assert np.abs(expected - forgotten).max() > 1e-3
+    np.testing.assert_array_equal(instance.predict(seen, deterministic=True)[0], expected)
+    np.testing.assert_allclose(saved.predict(seen, deterministic=True)[0], expected, atol=2e-6)
+    assert saved.card["algorithm"] == kind.__name__.lower()
+    assert saved.card["steps"] == model.num_timesteps
+
+
+def test_elu_is_played(tmp_path):
+    model, envs = normalised_model(batch_size=32, policy_kwargs={"activation_fn": torch.nn.ELU})
+    save_policy(tmp_path, model)
+    expected, _ = model.predict(envs.normalize_obs(observations()), deterministic=True)
+    np.testing.assert_allclose(
+        make_policy(str(tmp_path)).predict(observations(), deterministic=True)[0], expected, atol=2e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"policy_kwargs": {"activation_fn": torch.nn.GELU}}, "but has the activation gelu"),
+        ({"use_sde": True}, "but has exploration that depends on the state"),
+    ],
+)
+def test_what_cannot_be_played_is_not_saved(tmp_path, settings, message):
+    model = PPO("MlpPolicy", DuffingVecEnv("duffing_env/Short-v0", 4), device="cpu", **settings)
+    with pytest.raises(ValueError, match=message):
+        save_policy(tmp_path / "mine", model)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wrapper_that_is_not_written_is_refused(tmp_path):
+    model = PPO("MlpPolicy", VecFrameStack(DuffingVecEnv("duffing_env/Short-v0", 4), 3), device="cpu")
+    with pytest.raises(ValueError, match="but sees it through VecFrameStack"):
+        save_policy(tmp_path / "mine", model)
+
+
+def test_an_archive_says_how_it_is_converted(tmp_path):
+    (tmp_path / "model.zip").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"agents.save_policy\('.*/model', PPO.load"):
+        make_policy(str(tmp_path / "model.zip"))
