@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.learned import WEIGHTS, save_policy
+from agents.policies.learned import WEIGHTS
+from agents.policies.saving import save_policy
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

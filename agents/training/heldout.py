@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.evaluation.rollout import roll_out
-from agents.policies.learned import CARD, save_policy
+from agents.policies.learned import CARD
+from agents.policies.saving import save_policy
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:

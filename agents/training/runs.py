@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from agents.cli import RIG_TRACK, JsonOptions, check_track, with_rig
-from agents.policies.learned import CARD, save_policy
+from agents.policies.learned import CARD
+from agents.policies.saving import save_policy
 from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.checkpoints import (

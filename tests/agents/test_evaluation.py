@@ -18,7 +18,8 @@ from agents.evaluation.batch import TESTED, make
 from agents.evaluation.comparison import compare
 from agents.evaluation.rollout import evaluate
 from agents.evaluation.systems import Systems
-from agents.policies.learned import WEIGHTS, load_policy, save_policy
+from agents.policies.learned import WEIGHTS, load_policy
+from agents.policies.saving import save_policy
 from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
 from duffing_env.silverbox import Regime

@@ -18,7 +18,8 @@ import agents
 from agents import make_policy
 from agents.evaluation.rollout import evaluate
 from agents.policies import TRAINED, trained_policies
-from agents.policies.learned import CARD, WEIGHTS, load_policy, save_policy
+from agents.policies.learned import CARD, WEIGHTS, load_policy
+from agents.policies.saving import save_policy
 from agents.training import ALGORITHMS
 from agents.vec_env import DuffingVecEnv
 

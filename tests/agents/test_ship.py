@@ -8,7 +8,8 @@ from stable_baselines3 import PPO
 from agents import make_policy, policies
 from agents.evaluation.rollout import evaluate
 from agents.evaluation.systems import Systems
-from agents.policies.learned import load_policy, save_policy
+from agents.policies.learned import load_policy
+from agents.policies.saving import save_policy
 from agents.studies.ship import Config, median_index, ship
 from agents.vec_env import DuffingVecEnv
 

@@ -1,0 +1,113 @@
+"""Trained policies written: into a folder that `agents.policies.learned` reads."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.policies.learned import ACTIVATIONS, CARD, FORMAT, WEIGHTS, Network
+from estimator.files import write_atomically
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+
+def save_policy(folder: str | Path, model: BaseAlgorithm, card: dict[str, Any] | None = None) -> None:
+    """Write a trained policy into a folder, each file in one piece; `make_policy` plays it, without torch.
+
+    The observations' normaliser goes with it, where the model's environment is a `VecNormalize`. An archive of
+    Stable-Baselines3 holds pickles, which can run any code when they are opened. So it is never opened here. Whoever
+    trusts one converts it: ``save_policy("runs/mine", PPO.load("model.zip", env))``, where ``env`` is
+    ``VecNormalize.load("vecnormalize.pkl", env)`` if it was trained with one.
+
+    Args:
+        folder: made where it is missing.
+        model: PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, TQC or RecurrentPPO of sb3-contrib, with a network of
+            linear layers. Of those that learn from a buffer only the actor is written; the others are written whole.
+        card: what it was trained on: algorithm, track, options, seed, steps, versions; its algorithm and steps where
+            it is None.
+
+    Raises:
+        ValueError: for a model that `LearnedPolicy` could not play as it is; nothing is written then.
+    """
+    from safetensors.numpy import save
+
+    folder = Path(folder)
+    card = {"algorithm": type(model).__name__.lower(), "steps": model.num_timesteps} if card is None else card
+    tensors = {name: value.detach().cpu().numpy() for name, value in model.policy.state_dict().items()}
+    if not hasattr(model.policy, "mlp_extractor"):
+        tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
+    network = _network_of(model.policy, tensors)
+    seen = _normalizer_of(model)
+    if seen is not None:
+        network = replace(network, normalised=float(seen.clip_obs))
+        tensors["normalizer.mean"] = seen.obs_rms.mean.astype(np.float32)
+        tensors["normalizer.std"] = np.sqrt(seen.obs_rms.var + seen.epsilon).astype(np.float32)
+    foresight = getattr(model.get_env(), "foresight", None)
+    if foresight is not None:
+        network = replace(network, foresight=True)
+        tensors |= foresight.to_tensors()
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / WEIGHTS, save(tensors))
+    described = {"format": FORMAT, "network": asdict(network), **card}
+    if foresight is not None:
+        described["foresight"] = foresight.describe()
+    write_atomically(folder / CARD, json.dumps(described, indent=2).encode())
+
+
+def _normalizer_of(model: BaseAlgorithm) -> Any:
+    """The `VecNormalize` that the model sees its environment through; None for none that normalises observations.
+
+    Raises:
+        ValueError: for another wrapper that changes observations, which is not written.
+    """
+    from stable_baselines3.common.vec_env import VecCheckNan, VecEnvWrapper, VecMonitor, VecNormalize
+
+    found, envs = None, model.get_env()
+    while isinstance(envs, VecEnvWrapper) and not hasattr(envs, "foresight"):
+        if isinstance(envs, VecNormalize):
+            found = envs if envs.norm_obs else found
+        elif not isinstance(envs, VecMonitor | VecCheckNan):
+            raise ValueError(
+                f"model must see its environment as it is or through VecNormalize, but sees it through "
+                f"{type(envs).__name__}; leave that out, or pass a policy of your own to make_policy"
+            )
+        envs = envs.venv
+    return found
+
+
+def _network_of(policy: Any, tensors: Mapping[str, Any]) -> Network:
+    """What the actor of a Stable-Baselines3 policy is made of; ValueError where `LearnedPolicy` could not play it."""
+
+    def layers(within: str) -> tuple[str, ...]:
+        return tuple(n.removesuffix(".weight") for n in tensors if n.startswith(f"{within}.") and n.endswith(".weight"))
+
+    activation = getattr(getattr(policy, "activation_fn", None), "__name__", "none").lower()
+    actor = getattr(policy, "actor", policy)
+    faults = {
+        f"the activation {activation}": activation not in ACTIVATIONS,
+        "a network for features": any("features_extractor." in name for name in tensors),
+        "exploration that depends on the state (use_sde)": getattr(actor, "use_sde", False),
+        "an LSTM of several layers": any(name.endswith("weight_ih_l1") for name in tensors),
+        "no actor": not (hasattr(policy, "mlp_extractor") or layers("actor.mu") or "actor.mu.weight" in tensors),
+        "normalised layers": any(name.endswith("running_mean") for name in tensors),
+    }
+    if any(faults.values()):
+        raise ValueError(
+            f"model must have linear layers with {', '.join(ACTIVATIONS)} between them, but has "
+            f"{next(fault for fault, found in faults.items() if found)}; pass a policy of your own to make_policy"
+        )
+    if hasattr(policy, "mlp_extractor"):  # PPO and RecurrentPPO
+        memory = "lstm_actor" if hasattr(policy, "lstm_actor") else None
+        levels = int(getattr(policy.action_space, "n", 0))
+        spread = None if levels else "log_std"
+        names = (*layers("mlp_extractor.policy_net"), "action_net")
+        return Network(names, activation, spread=spread, memory=memory, levels=levels)
+    if "actor.log_std.weight" in tensors:  # SAC and TQC
+        return Network((*layers("actor.latent_pi"), "actor.mu"), activation, squashed=True, spread="actor.log_std")
+    return Network(layers("actor.mu"), activation, squashed=True, spread=None)  # TD3
