@@ -9,37 +9,60 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from duffing_env.vector_env import DuffingVectorEnv
+from estimator.parameters import Parameters
 
 
 class DuffingVecEnv(VecEnv):
     """Stable-Baselines3's view of a `DuffingVectorEnv` in mode ``SAME_STEP``.
 
-    A finished row's info holds ``terminal_observation``, ``TimeLimit.truncated`` (so that a time limit is not taken
-    for a terminal state), the ``belief`` it ended with, and ``episode`` (return, length, time), which is what
-    Stable-Baselines3 otherwise needs a `VecMonitor` for. All buffers that are handed out are copies.
+    A finished row's info holds what the environment tells of its last step, the ``belief`` and the ``truth`` it ended
+    with, ``terminal_observation``, ``TimeLimit.truncated`` (so that a time limit is not taken for a terminal state) and
+    ``episode`` (return, length, time), which is what Stable-Baselines3 otherwise needs a `VecMonitor` for. All buffers
+    that are handed out are copies.
 
     Args:
-        env_id: a registered track.
-        num_envs: number of rows.
+        env: the id of a registered track; or a vector environment that was made with
+            ``autoreset_mode="SameStep"``, wrapped or not, and then without further options.
+        num_envs: number of rows; that of ``env`` where it was made.
         seed: of the batch; the next reset uses it.
         levels: an action is one of so many evenly spaced inputs from -1 to 1, by its number; 0: any input between.
         options: of the environment, and ``threads``.
+
+    Raises:
+        ValueError: for an environment that was made otherwise.
     """
 
-    def __init__(self, env_id: str, num_envs: int, seed: int | None = None, *, levels: int = 0, **options: Any) -> None:
-        made = gym.make_vec(
-            env_id,
-            num_envs=num_envs,
-            vectorization_mode="vector_entry_point",
-            autoreset_mode=AutoresetMode.SAME_STEP,
-            **options,
-        )
-        assert isinstance(made, DuffingVectorEnv)
+    def __init__(
+        self,
+        env: str | VectorEnv[Any, Any, Any],
+        num_envs: int | None = None,
+        seed: int | None = None,
+        *,
+        levels: int = 0,
+        **options: Any,
+    ) -> None:
+        made: Any = env
+        if isinstance(env, str):
+            made = gym.make_vec(
+                env,
+                num_envs=1 if num_envs is None else num_envs,
+                vectorization_mode="vector_entry_point",
+                autoreset_mode=AutoresetMode.SAME_STEP,
+                **options,
+            )
+        elif options or num_envs not in (None, made.num_envs):
+            raise ValueError(f"num_envs and options must be left out for an environment that was made: {env}")
+        if not isinstance(made.unwrapped, DuffingVectorEnv) or made.unwrapped.autoreset_mode != AutoresetMode.SAME_STEP:
+            raise ValueError(
+                f"env must be the id of a track, or be made with gym.make_vec(id, num_envs=n, "
+                f"vectorization_mode='vector_entry_point', autoreset_mode='SameStep'), but is {env}"
+            )
+        num_envs = int(made.num_envs)
         self.envs = made
         self.render_mode = None
         self._levels = np.linspace(-1.0, 1.0, levels, dtype=np.float32) if levels else None
@@ -78,11 +101,10 @@ class DuffingVecEnv(VecEnv):
         rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if dones.any():
             elapsed = round(time.time() - self._started, 6)
-            for row in np.flatnonzero(dones):
-                rows[row] = {
+            for row in np.flatnonzero(dones).tolist():
+                rows[row] = told_of(infos["final_info"], row) | {
                     "terminal_observation": infos["final_obs"][row],
                     "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
-                    "belief": infos["final_info"]["belief"][row],
                     "episode": {"r": float(self._returns[row]), "l": int(self._lengths[row]), "t": elapsed},
                 }
             self._returns[dones] = 0.0
@@ -94,16 +116,24 @@ class DuffingVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the batch, once for every row asked for."""
-        return [getattr(self.envs, attr_name)] * len(self._rows(indices))
+        """An attribute of every row asked for: its part of what the batch has for each row, or what all have alike."""
+        envs: DuffingVectorEnv = self.envs.unwrapped
+        rows = self._rows(indices)
+        if attr_name == "belief":
+            return [envs.belief(row) for row in rows]
+        value = getattr(self.envs if hasattr(self.envs, attr_name) else envs, attr_name)
+        if isinstance(value, Parameters):
+            return [Parameters({name: numbers[row].item() for name, numbers in value.items()}) for row in rows]
+        each = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
+        return [value[row] if each else value for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the batch; it is one for all rows."""
-        setattr(self.envs, attr_name, value)
+        setattr(self.envs.unwrapped, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         """Call a method of the batch once; its result stands for every row asked for."""
-        return [getattr(self.envs, method_name)(*args, **kwargs)] * len(self._rows(indices))
+        return [getattr(self.envs.unwrapped, method_name)(*args, **kwargs)] * len(self._rows(indices))
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """No row is wrapped; their episodes are monitored here."""
@@ -113,3 +143,9 @@ class DuffingVecEnv(VecEnv):
 
     def _rows(self, indices: VecEnvIndices) -> list[int]:
         return list(self._get_indices(indices))
+
+
+def told_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
+    """What a vector environment's infos tell of a row, as a single environment's info."""
+    told = {name: values[row] for name, values in infos.items() if not name.startswith("_") and infos[f"_{name}"][row]}
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in told.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ class Batch:
         reset_mode: `duffing_env.kernel.RESET_BY_HAND`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
         threads: threads that step the blocks; results do not depend on it.
         hold: samples that a step plays, at most: an environment stops where its episode ends.
+        limit: samples after which episodes are cut off.
 
     Attributes:
         observations: (n, entries) float32, overwritten by every step, unless `renew` is called before.
@@ -36,7 +38,9 @@ class Batch:
         outcomes: (len(OUTCOME), n), as the observations.
     """
 
-    def __init__(self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1, hold: int = 1) -> None:
+    def __init__(
+        self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1, hold: int = 1, limit: float = np.inf
+    ) -> None:
         self.experiment = experiment
         self.size = size
         self._reset_mode = reset_mode
@@ -44,7 +48,7 @@ class Batch:
         self._kind = experiment.kind
         self._kernel = compiled(self._kind)
         self._place = layout_of(self._kind)
-        self._packed = pack(experiment.setup._replace(hold=hold))
+        self._packed = pack(experiment.setup._replace(hold=hold, limit=limit))
         self._prior = experiment.believed
         model, drawn = experiment.truth_model, experiment.setup.noise_range > 1
         self._truth = {name: f"PARAM_{name}" for name in parameter_names(model)} | (noise_rows(model) if drawn else {})
@@ -87,6 +91,55 @@ class Batch:
     def _reset(self) -> None:
         self._call(RESET_NOW)
 
+    def checked_truth(self, truth: Any) -> FloatArray:
+        """(size, quantities) what ``reset(options={"truth": ...})`` asks for, inside, for `choose`.
+
+        Raises:
+            ValueError: for what is no such truth, naming the parameter.
+        """
+        experiment = self.experiment
+        names, needed = list(self._truth), list(parameter_names(experiment.truth_model))
+        if experiment.plant is None:
+            raise ValueError("truth cannot be chosen here: no plant is simulated; leave it out")
+        if not isinstance(truth, Mapping) or set(truth) not in (set(names), set(needed)):
+            noises = f", or these and {names[len(needed) :]}" if len(names) > len(needed) else ""
+            raise ValueError(f"truth must give the parameters {needed}{noises}, but is {truth!r:.300}")
+        chosen = np.full((self.size, len(names)), np.nan)
+        for k, name in enumerate(names[: len(truth)]):
+            value = truth[name]
+            try:
+                chosen[:, k] = value
+            except (TypeError, ValueError):
+                raise ValueError(
+                    f"truth[{name!r}] must be a number, or {self.size} of them, but is {value!r:.200}"
+                ) from None
+            if not np.isfinite(chosen[:, k]).all():
+                raise ValueError(f"truth[{name!r}] must be finite, but is {value!r:.200}")
+            if (name == "m" or k >= len(needed)) and not (chosen[:, k] > 0).all():
+                raise ValueError(f"truth[{name!r}] must be positive, but is {value!r:.200}")
+        return chosen / self._worth
+
+    def choose(self, mask: npt.NDArray[np.bool_], truth: FloatArray) -> None:
+        """Begin the episodes of ``mask``, which were just reset, once more: with these systems, and the same noise.
+
+        Standard deviations that ``truth`` has as NaN stay as they were drawn.
+        """
+        setup, n = self.experiment.setup, len(parameter_names(self.experiment.truth_model))
+        kept = [place for name, place in self._place.items() if name.startswith(("STREAM_", "JUMP_"))]
+        noises = [self._place[row] for row in noise_rows(self.experiment.truth_model).values()]
+        for row in np.flatnonzero(mask).tolist():
+            b, lane = divmod(row, LANES)
+            drawn, stds = self._blocks[b, kept, lane], self._blocks[b, noises, lane]
+            if np.isfinite(truth[row]).all() and truth.shape[1] > n:
+                stds = truth[row, n:]
+            told = setup._replace(
+                center=truth[row, :n], width=np.zeros(n), spread=0.0,
+                process_noise=stds[0], measurement_noise=stds[1:], noise_range=1.0,
+            )  # fmt: skip
+            self._mask[: self.size] = np.arange(self.size) == row
+            self._call(RESET_NOW, pack(told), (b, b + 1))
+            self._blocks[b, kept, lane] = drawn
+
     def renew(self, *, observations: bool = True) -> None:
         """Keep the arrays of the last step as they are, for as long as anybody holds them: the next gets others.
 
@@ -104,12 +157,14 @@ class Batch:
         self._actions[: self.size] = actions
         self._call(self._reset_mode)
 
-    def _call(self, reset_mode: int) -> None:
+    def _call(self, reset_mode: int, packed: FloatArray | None = None, blocks: tuple[int, int] | None = None) -> None:
         told = (
-            self._actions, self._packed, self._recorded, reset_mode, self._mask, self._observations, self._outcomes,
-            self._final_observations, self._flat_ended,
+            self._actions, self._packed if packed is None else packed, self._recorded, reset_mode, self._mask,
+            self._observations, self._outcomes, self._final_observations, self._flat_ended,
         )  # fmt: skip
-        if self._threads > 1:
+        if blocks is not None:
+            self._kernel.step(*blocks, self._flat_blocks, self._members, self._saved[0], *told)
+        elif self._threads > 1:
             import numba
 
             numba.set_num_threads(self._threads)

@@ -131,9 +131,7 @@ class ContinuousEnv(DuffingEnv):
 
     ## Information
 
-    Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], ``diverged``. At the end of an
-    episode also ``belief`` (`estimator.Belief`) and ``truth`` (`estimator.Parameters`, with ``process_noise`` and
-    ``measurement_noise``). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+    As `DuffingEnv`; the truth has ``process_noise`` and ``measurement_noise``, too.
 
     ## Arguments
 
@@ -165,10 +163,11 @@ class ContinuousEnv(DuffingEnv):
     >>> truncated = False
     >>> while not truncated:
     ...     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-    >>> list(info["belief"].coefficients())
+    >>> belief = env.unwrapped.belief
+    >>> list(belief.coefficients())
     ['stiffness', 'cubic', 'damping', 'gain']
-    >>> m, c, a, b = info["belief"].physical()[0]
-    >>> bool(abs(m / info["truth"].m - 1) < 0.05)
+    >>> m, c, a, b = belief.physical()[0]
+    >>> bool(abs(m / env.unwrapped.truth.m - 1) < 0.05)
     True
 
     ## Version history

@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 from duffing_env.batch import Batch
-from duffing_env.experiment import Experiment, SimulatedExperiment, make_experiment
+from duffing_env.contract import Specified, action_space, checked_options, make_experiment, observation_space
+from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND
-from duffing_env.layout import SUMMED, observation_bounds
+from duffing_env.layout import SUMMED
 from duffing_env.turns import in_turn
 from estimator.belief import Belief
 from estimator.checks import numbers, shown
-from estimator.models.model import Model
 from estimator.parameters import FloatArray, Parameters
 
 if TYPE_CHECKING:
@@ -27,18 +26,7 @@ if TYPE_CHECKING:
 Observation = npt.NDArray[np.float32]
 
 
-def observation_space(model: Model) -> spaces.Box:
-    """The observation's space: a flat float32 Box with finite bounds (`duffing_env.layout.observation_bounds`)."""
-    low, high = np.array(list(observation_bounds(model).values()), dtype=np.float32).T
-    return spaces.Box(low.copy(), high.copy(), dtype=np.float32)
-
-
-def action_space() -> spaces.Box:
-    """The action's space: the input in parts of the largest."""
-    return spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
-
-
-class DuffingEnv(gym.Env[Any, Any]):
+class DuffingEnv(Specified, gym.Env[Any, Any]):
     r"""Choose the input of a Duffing oscillator so that its parameters are identified.
 
     ## Description
@@ -118,9 +106,14 @@ class DuffingEnv(gym.Env[Any, Any]):
 
     ## Information
 
-    Every step: ``information_gain`` and ``log_posterior_gain`` of the step [nats], summed over the samples that an
-    action is held for; ``diverged``. At the end of an episode also ``belief`` (`estimator.Belief`) and ``truth``
-    (`estimator.Parameters`). At any time: ``env.unwrapped.belief`` and ``env.unwrapped.truth``.
+    ``information_gain`` and ``log_posterior_gain`` of the step [nats], summed over the samples that an action is held
+    for, and ``diverged``; at a reset they are 0 and False. At any time, and after the end of an episode until the next
+    reset: ``env.unwrapped.belief`` (`estimator.Belief`) and ``env.unwrapped.truth`` (`estimator.Parameters`). A vector
+    environment tells both in the infos of the rows that finish.
+
+    ``reset(options={"truth": truth})`` begins with a system of choice: a dict or a `estimator.Parameters` of m, c, a
+    and b, and of the noises where they are drawn (without them they are drawn as ever). All other random numbers are
+    those that the seed gives without it.
 
     ## Arguments
 
@@ -167,9 +160,9 @@ class DuffingEnv(gym.Env[Any, Any]):
     ...     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     ...     total += reward
     >>> truncated, sorted(info)
-    (True, ['belief', 'diverged', 'information_gain', 'log_posterior_gain', 'truth'])
-    >>> m, c, a, b = info["belief"].physical()[0]
-    >>> bool(abs(m / info["truth"].m - 1) < 0.05)
+    (True, ['diverged', 'information_gain', 'log_posterior_gain'])
+    >>> m, c, a, b = env.unwrapped.belief.physical()[0]
+    >>> bool(abs(m / env.unwrapped.truth.m - 1) < 0.05)
     True
 
     ## Version history
@@ -223,16 +216,29 @@ class DuffingEnv(gym.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Draw an oscillator and start an episode; ``options`` has no keys."""
+        """Draw an oscillator and start an episode.
+
+        Args:
+            seed: of oscillator and noise; without it the random numbers go on.
+            options: may hold ``truth``, a system of choice.
+
+        Raises:
+            ValueError: for another option, or what is no such system; nothing has changed then.
+        """
+        options = checked_options(options, "truth")
+        chosen = self._batch.checked_truth(options["truth"]) if "truth" in options else None
         super().reset(seed=seed)
         if self.np_random is not self._streamed:
             self._streamed = self.np_random
             self._batch.seed(0, self.np_random)
-        self._batch.reset(np.ones(1, dtype=np.bool_))
+        everywhere = np.ones(1, dtype=np.bool_)
+        self._batch.reset(everywhere)
+        if chosen is not None:
+            self._batch.choose(everywhere, chosen)
         self._running = True
         if self.render_mode is not None:
             self._start_drawing()
-        return self._batch.observations[0].copy(), {}
+        return self._batch.observations[0].copy(), self._info(self._batch.outcome(0))
 
     @in_turn
     def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -246,16 +252,17 @@ class DuffingEnv(gym.Env[Any, Any]):
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
         outcome = self._play(_one_number(action))
         terminated, truncated = bool(outcome["terminated"]), bool(outcome["truncated"])
-        info: dict[str, Any] = {name: outcome[name] for name in self._reported}
-        for flag in self._flags:
-            info[flag] = bool(outcome[flag])
-        if terminated or truncated:
-            self._running = False
-            info |= self._final_info()
-        return self._batch.observations[0].copy(), outcome["reward"], terminated, truncated, info
+        self._running = not (terminated or truncated)
+        return self._batch.observations[0].copy(), outcome["reward"], terminated, truncated, self._info(outcome)
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)
+
+    def _info(self, outcome: dict[str, float]) -> dict[str, Any]:
+        info: dict[str, Any] = {name: outcome[name] for name in self._reported}
+        for flag in self._flags:
+            info[flag] = bool(outcome[flag])
+        return info
 
     def _play(self, action: float) -> dict[str, float]:
         """Let as many samples pass as the action holds: sums of what they earned, and how the last one left it."""
@@ -277,10 +284,6 @@ class DuffingEnv(gym.Env[Any, Any]):
     def _apply(self, action: float) -> None:
         """Let one sample pass; the action is in [-1, 1]."""
         self._batch.step(action)
-
-    def _final_info(self) -> dict[str, Any]:
-        """What is told at the end of an episode only."""
-        return {"belief": self.belief, "truth": self.truth}
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """Input, output and posterior so far: an RGB array (height, width, 3) in mode ``rgb_array``."""

@@ -5,8 +5,7 @@ The fields of these classes are the keyword arguments of `gymnasium.make`; all o
 
 from __future__ import annotations
 
-import difflib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -177,6 +176,7 @@ class Experiment:
             "max_output": float(self.max_output),
             "horizon": float(self.samples),
             "hold": 1,
+            "limit": np.inf,
             "iterations": self._iterations,
             "process_noise": 0.0,
             "measurement_noise": np.zeros(self.truth_model.n_outputs),
@@ -315,14 +315,3 @@ def twin_of(model: Model) -> dict[str, float]:
     """The Silverbox circuit as a model of it sees it; of other models the parameters are not known here: all 1."""
     twin = CONTINUOUS_TWIN if model.is_continuous else SILVERBOX_TWIN
     return {name: twin.get(name, 1.0) for name in parameter_names(model)}
-
-
-def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:
-    """An experiment from keyword arguments; ValueError for an unknown one, with the nearest known."""
-    known = [field.name for field in fields(kind)]
-    for name in options:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"{name}={options[name]!r} is no option of this environment, which has {known}{hint}")
-    return kind(**options)

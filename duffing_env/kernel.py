@@ -205,9 +205,12 @@ def compiled(kind: Kind) -> Kernel:
                     reset_lane(W, members, b, j, setup)
                     for k in range(n_outcome):
                         W[outcome + k * LANES + j] = 0.0
-                elif reset_mode != RESET_NOW and W[terminated + j] + W[truncated + j] != 0.0:
-                    W[waiting + j] = 1.0
-                    finished += 1
+                elif reset_mode != RESET_NOW:
+                    if W[elapsed + j] >= setup.limit:
+                        W[truncated + j] = 1.0
+                    if W[terminated + j] + W[truncated + j] != 0.0:
+                        W[waiting + j] = 1.0
+                        finished += 1
             for k in range(n_outcome):
                 for j in range(LANES):
                     outcomes[k, lane + j] = W[outcome + k * LANES + j]

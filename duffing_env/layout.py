@@ -74,6 +74,7 @@ class Setup(NamedTuple):
         max_output: limit of the first sensor.
         horizon: samples of an episode.
         hold: samples of an action.
+        limit: samples after which an episode is cut off from outside, as Gymnasium's ``TimeLimit`` does; inf for none.
         iterations: variational iterations per sample.
         process_noise: standard deviation of what a sample's process noise does to the first sensor.
         measurement_noise: (sensors,) standard deviations.
@@ -105,6 +106,7 @@ class Setup(NamedTuple):
     max_output: float
     horizon: float
     hold: int
+    limit: float
     iterations: int
     process_noise: float
     measurement_noise: npt.NDArray[np.float64]

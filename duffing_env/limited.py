@@ -137,7 +137,7 @@ class DriftEnv(DuffingEnv):
 
     ## Starting state, episode end
 
-    As `DuffingEnv`, truncated after 512 samples. ``info["truth"]`` is the oscillator after the jump.
+    As `DuffingEnv`, truncated after 512 samples. ``env.unwrapped.truth`` is then the oscillator after the jump.
 
     ## Arguments
 

@@ -213,8 +213,8 @@ class RigEnv(DuffingEnv):
     ...     action = [1.0 if observation[32] <= 0 else -1.0]
     ...     observation, reward, terminated, truncated, info = env.step(action)
     ...     done = terminated or truncated
-    >>> m, std, unit = info["belief"].parameters()["m"]
-    >>> bool(abs(m - info["truth"].m) < 4 * std), unit
+    >>> m, std, unit = env.unwrapped.belief.parameters()["m"]
+    >>> bool(abs(m - env.unwrapped.truth.m) < 4 * std), unit
     (True, 'kg')
 
     ## Version history

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Protocol, SupportsFloat
 
 import numpy as np
 
+from duffing_env.contract import checked_options
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import MOST_SAMPLES, Experiment
 from duffing_env.rewards import REWARDS
@@ -181,10 +182,10 @@ class RigPlantEnv(DuffingEnv):
     ``step`` is called for every sample, with the same input.
 
     Rewards that compare with the true oscillator are refused, because nobody knows it: there is no
-    ``log_posterior_gain`` and no ``truth`` in the info, and ``env.unwrapped.truth`` raises AttributeError. A plant that
-    raises an exception or gives something that is not a finite number ends the episode (``info["diverged"]``), and
-    leaves the belief as it was before that step; ``info["plant_error"]`` is the exception's type and message. An
-    exception in ``plant.reset()`` comes out of ``reset``, and no episode has begun.
+    ``log_posterior_gain`` in the info, and ``env.unwrapped.truth`` raises AttributeError. A plant that raises an
+    exception or gives something that is not a finite number ends the episode (``info["diverged"]``), and leaves the
+    belief as it was before that step; ``env.unwrapped.plant_error`` is the exception's type and message until the next
+    reset, and None otherwise. An exception in ``plant.reset()`` comes out of ``reset``, and no episode has begun.
 
     A plant and a prior are Python objects, so the specification of an environment made with them is not JSON-able; and
     an environment is copied and pickled with its plant, if the plant can be. One plant is one environment.
@@ -204,7 +205,7 @@ class RigPlantEnv(DuffingEnv):
                 raise ValueError(f"plant must have methods reset() and step(u), but {plant!r} has no {method}()")
         super().__init__(render_mode=render_mode, **options)
         self.plant = plant
-        self._plant_error: str | None = None
+        self.plant_error: str | None = None
         # A plant would wait for the compiler with its first input on.
         self._batch.step(0.0)
 
@@ -221,22 +222,18 @@ class RigPlantEnv(DuffingEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Bring the plant to rest and start an episode; ``options`` has no keys, and the plant is not told the seed."""
-        self._running = False
+        checked_options(options)
+        self._running, self.plant_error = False, None
         self.plant.reset()
         return super().reset(seed=seed, options=options)
 
     def _apply(self, action: float) -> None:
         scales = self.experiment.scales
         u = self.max_input * float(np.float32(action))
-        self._plant_error = None
         try:
             y = float(self.plant.step(scales.input * u)) / scales.output
         except Exception as error:  # whatever it is: the episode ends in order, and its belief is told
-            self._plant_error = f"{type(error).__name__}: {error}"
+            self.plant_error = f"{type(error).__name__}: {error}"
             y = np.nan
         self._batch.measure(u, y)
         self._batch.step(action)
-
-    def _final_info(self) -> dict[str, Any]:
-        failure = {} if self._plant_error is None else {"plant_error": self._plant_error}
-        return {"belief": self.belief, **failure}

@@ -9,7 +9,7 @@ from typing import Any
 _UNKNOWN = {"noise_range": 10.0, "noise_hypotheses": 7}
 
 #: Id of a track to what it is registered with. Any change of numbers or spaces is a new version. None registers
-#: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short, without the belief in the last info.
+#: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short (`duffing_env.env.Specified`).
 TRACKS: dict[str, dict[str, Any]] = {
     "duffing_env/Amplitude-v0": {
         "entry_point": "duffing_env.env:DuffingEnv",

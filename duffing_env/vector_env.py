@@ -16,8 +16,9 @@ from gymnasium.vector.utils import batch_space
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.continuous import ContinuousEnv
-from duffing_env.env import DuffingEnv, action_space, observation_space
-from duffing_env.experiment import MOST_SAMPLES, Experiment, make_experiment
+from duffing_env.contract import Specified, action_space, checked_options, make_experiment, observation_space
+from duffing_env.env import DuffingEnv
+from duffing_env.experiment import MOST_SAMPLES, Experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import OUTCOME
 from duffing_env.replay import SilverboxReplayEnv
@@ -43,7 +44,7 @@ Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 
 
-class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDArray[Any]]):
+class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32], npt.NDArray[Any]]):
     """Many `DuffingEnv` at once: the same numbers, row by row.
 
     Row i, reset with seed s, follows a single environment that is reset with ``spawn_seeds(s, num_envs)[i]``, bit for
@@ -52,7 +53,8 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
 
     Args:
         num_envs: number of rows.
-        max_episode_steps: sets ``horizon`` where that is longer; a record's length cannot be set.
+        max_episode_steps: cuts episodes off after so many steps, as `gymnasium.wrappers.TimeLimit` does, which
+            `gymnasium.make` puts around a single environment; None or -1: nothing does but the ``horizon``.
         autoreset_mode: when a finished row starts its next episode: in the step after (``NEXT_STEP``, the default),
             in the same step (``SAME_STEP``: ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended
             with), or by ``reset(options={"reset_mask": mask})`` (``DISABLED``).
@@ -61,9 +63,10 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         render_mode: None; render a single environment to look at one.
         options: those of the single environment.
 
-    Infos are arrays with masks under ``_key``: of every step ``information_gain`` and ``log_posterior_gain`` [nats]
-    and the flags; at the end of an episode ``belief`` and ``truth``. They say what `gymnasium.vector.SyncVectorEnv`
-    says of single environments, so a row's last step is told in ``final_info`` only under ``SAME_STEP``.
+    Infos are arrays with masks under ``_key``, as `gymnasium.vector.SyncVectorEnv` makes them of single environments:
+    of every step and reset ``information_gain`` and ``log_posterior_gain`` [nats] and the flags. A row that finishes
+    also has the ``belief`` and the ``truth`` it ended with. Under ``SAME_STEP`` its last step is told in
+    ``final_info``.
 
     >>> import gymnasium as gym
     >>> envs = gym.make_vec("duffing_env/Amplitude-v0", num_envs=4, vectorization_mode="vector_entry_point")
@@ -90,8 +93,9 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         whole("num_envs", num_envs, MOST_ENVS)
         available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
         whole("threads", threads, available)
-        if max_episode_steps is not None:
-            whole("max_episode_steps", max_episode_steps, MOST_SAMPLES)
+        limit = None if max_episode_steps == -1 else max_episode_steps
+        if limit is not None:
+            whole("max_episode_steps", limit, MOST_SAMPLES)
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, but is {render_mode!r}; render a single environment")
         try:
@@ -103,21 +107,25 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         self.metadata = {**type(self).metadata, "autoreset_mode": self._autoreset_mode}
         self.render_mode = None
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
-        if max_episode_steps is not None and max_episode_steps * self.experiment.hold < self.experiment.samples:
-            options["horizon"] = max_episode_steps * self.experiment.hold
-            self.experiment = make_experiment(self.single.experiment_kind, options)
         self.single_observation_space = observation_space(self.experiment.model)
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         reset_mode = _RESET_MODES[self._autoreset_mode]
-        self._batch = Batch(self.experiment, self.num_envs, reset_mode, int(threads), self.experiment.hold)
+        hold = self.experiment.hold
+        cut = math.inf if limit is None else float(limit * hold)
+        self._batch = Batch(self.experiment, self.num_envs, reset_mode, int(threads), hold, cut)
         self._copy = copy
         self._turn = [None]
         self._seeded: Flags = np.zeros(self.num_envs, dtype=np.bool_)
         self._finished: Flags = np.ones(self.num_envs, dtype=np.bool_)
         self._everywhere: Flags = np.ones(self.num_envs, dtype=np.bool_)
         self._any_due = True
+
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """When a finished row starts its next episode."""
+        return self._autoreset_mode
 
     @property
     def max_input(self) -> float:
@@ -152,19 +160,25 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         Args:
             seed: of the batch, from which `spawn_seeds` makes the rows'; or one seed for each row. The random numbers
                 of rows that get none go on; at first they come from the operating system.
-            options: may hold ``reset_mask``.
+            options: may hold ``reset_mask``, and ``truth``, systems of choice for this episode of the rows: as of the
+                single environment, each entry a number or (num_envs,) numbers.
 
         Raises:
-            ValueError: for a mask that is not one, or another number of seeds.
+            ValueError: for another option, a mask or a truth that is not one, or another number of seeds.
         """
+        options = checked_options(options, "reset_mask", "truth")
         mask = self._reset_mask(options)
+        chosen = self._batch.checked_truth(options["truth"]) if "truth" in options else None
         self._seed(seed, mask)
         self._batch.renew(observations=self._copy)
         self._batch.reset(mask)
+        if chosen is not None:
+            self._batch.choose(mask, chosen)
         self._finished[mask] = False
         due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
         self._any_due = bool(due.any())
-        return self._batch.observations, {}
+        nothing = np.zeros((_FIRST_FLAG, self.num_envs))
+        return self._batch.observations, self._step_infos(nothing, np.zeros((4, self.num_envs), dtype=np.bool_), mask)
 
     @in_turn
     def step(
@@ -197,14 +211,14 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         terminated, truncated = flags[0], flags[1]
         finished = terminated | truncated
         any_finished = bool(np.count_nonzero(finished))
-        infos = self._infos(outcomes, flags, self._finished, finished if any_finished else None)
+        infos = self._infos(outcomes, flags, finished if any_finished else None)
         self._finished = finished
         if self._autoreset_mode == AutoresetMode.DISABLED:
             self._any_due = any_finished
         return self._batch.observations, outcomes[0], terminated, truncated, infos
 
-    def _reset_mask(self, options: dict[str, Any] | None) -> Flags:
-        if not options or "reset_mask" not in options:
+    def _reset_mask(self, options: dict[str, Any]) -> Flags:
+        if "reset_mask" not in options:
             return self._everywhere
         mask = np.asarray(options["reset_mask"])
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
@@ -238,12 +252,9 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
                 self._batch.seed(row, generator)
         self._seeded |= mask
 
-    def _infos(
-        self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], was_finished: Flags, finished: Flags | None
-    ) -> dict[str, Any]:
-        """What is told of a step, by the rows that had finished before it and those that finished in it, if any."""
-        told = ~was_finished if self._autoreset_mode == AutoresetMode.NEXT_STEP else self._everywhere
-        infos = self._step_infos(outcomes, flags, told)
+    def _infos(self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], finished: Flags | None) -> dict[str, Any]:
+        """What is told of a step, and of the rows that finished in it, if any."""
+        infos = self._step_infos(outcomes, flags, self._everywhere)
         if finished is None:
             return infos
         if self._autoreset_mode != AutoresetMode.SAME_STEP:
@@ -252,7 +263,6 @@ class DuffingVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDAr
         for name in (*self.single._reported, *self.single._flags):
             final_infos[name][~finished] = 0
             infos[name][finished] = 0
-            infos[f"_{name}"][finished] = False
         final_observations = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(finished):
             final_observations[row] = self._batch.final_observations[row].copy()

@@ -222,7 +222,7 @@ def train_through_environment(setting: Setting, nonlinear: bool, data: Path | No
         observation, _, terminated, truncated, info = env.step(action)
     if terminated:
         raise RuntimeError(f"the episode must reach the end of the record, but was terminated before: {info}")
-    means: FloatArray = info["belief"].coefficients_mean
+    means: FloatArray = env.unwrapped.belief.coefficients_mean  # type: ignore[attr-defined]
     return means if nonlinear else np.insert(means, 1, 0.0)  # without the cubic term θ2 is no coefficient: it is 0
 
 

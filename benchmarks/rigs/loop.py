@@ -132,9 +132,9 @@ def _samples(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float
     while not done:
         action, state = player.predict(observation, state=state, episode_start=begins, deterministic=True)
         begins = np.zeros(1, dtype=bool)
-        observation, _, terminated, truncated, info = env.step(action)
+        observation, _, terminated, truncated, _ = env.step(action)
         done = terminated or truncated
-    return info["belief"], bool(terminated)
+    return env.unwrapped.belief, bool(terminated)
 
 
 def _blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float) -> tuple[Belief, bool]:

@@ -403,8 +403,8 @@ def test_the_continuous_track_is_evaluated_in_its_own_coefficients(without_recor
         env = gym.make(CONTINUOUS, branch="test", **options)
         env.reset(seed=seed)
         for t in range(HORIZON):
-            *_, info = env.step(actions[t][row])
-        belief, truth = info["belief"], info["truth"]
+            env.step(actions[t][row])
+        belief, truth = env.unwrapped.belief, env.unwrapped.truth
         stiffness, cubic, damping, gain = belief.coefficients_mean
         per_sample = SAMPLING_STEP**2 / truth.m
         true = [truth.a * per_sample, truth.b * per_sample, truth.c / truth.m * SAMPLING_STEP, per_sample]

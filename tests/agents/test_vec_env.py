@@ -12,12 +12,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from agents import make_policy
 from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
+from estimator import Parameters
 
 TRACK = "duffing_env/Amplitude-v0"
 CONTINUOUS = "duffing_env/Amplitude-v1"
 HORIZON = 24
 # A limit that about half of the episodes reach before their horizon.
 OPTIONS = {"horizon": HORIZON, "max_output": 0.22}
+GAINS = ("information_gain", "log_posterior_gain", "diverged")
 TIME_LEFT = 20  # entry of the observation
 
 
@@ -40,7 +42,7 @@ def test_steps_are_those_of_single_environments(track, rows, reward):
     ours = DuffingVecEnv(track, rows, seed=5, reward=reward, **OPTIONS)
     theirs = reference(rows, 5, track, reward=reward, **OPTIONS)
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
-    limits_reached, times_up = 0, 0
+    limits_reached, times_up, prior = 0, 0, ours.envs.belief(0)
     for actions in random_actions(rows, 3 * HORIZON):
         observations, rewards, dones, infos = ours.step(actions)
         expected_observations, expected_rewards, expected_dones, expected_infos = theirs.step(actions)
@@ -54,7 +56,9 @@ def test_steps_are_those_of_single_environments(track, rows, reward):
                 continue
             np.testing.assert_array_equal(info["terminal_observation"], expected["terminal_observation"])
             assert info["TimeLimit.truncated"] is expected["TimeLimit.truncated"]
-            np.testing.assert_array_equal(info["belief"].record, expected["belief"].record)
+            assert {name: info[name] for name in GAINS} == {name: expected[name] for name in GAINS}
+            assert isinstance(info["truth"], Parameters)
+            assert info["belief"].entropy() < prior.entropy()
             assert info["episode"]["l"] == expected["episode"]["l"]
             assert info["episode"]["r"] == pytest.approx(expected["episode"]["r"], abs=1e-6)  # Monitor rounds to that
             limits_reached += not info["TimeLimit.truncated"]
@@ -164,8 +168,37 @@ def test_what_stable_baselines_asks_of_its_environments():
     assert envs.env_is_wrapped(gym.Wrapper, indices=1) == [False]
     (belief,) = envs.env_method("belief", 3, indices=0)
     np.testing.assert_array_equal(belief.record, envs.envs.belief(3).record)
-    with pytest.raises(ValueError, match=r"max_inputs=3 is no option of this environment.*did you mean 'max_input'"):
+    with pytest.raises(ValueError, match=r"unexpected keyword argument 'max_inputs'.*did you mean 'max_input'"):
         DuffingVecEnv(TRACK, 4, max_inputs=3)
+
+
+def test_attributes_are_those_of_the_rows_that_are_asked_for():
+    envs = DuffingVecEnv(TRACK, 4, seed=0, **OPTIONS)
+    envs.reset()
+    (truth,) = envs.get_attr("truth", indices=2)
+    assert truth == envs.envs._batch.true_of(2)
+    assert type(truth.m) is float
+    assert [belief.record.tolist() for belief in envs.get_attr("belief", [1, 3])] == envs.envs.records[[1, 3]].tolist()
+    np.testing.assert_array_equal(envs.get_attr("records")[3], envs.envs.records[3])
+    with pytest.raises(AttributeError, match="nothing_like_it"):
+        envs.get_attr("nothing_like_it")
+
+
+def test_a_made_environment_may_be_wrapped():
+    made = gym.make_vec(TRACK, num_envs=3, autoreset_mode="SameStep", **OPTIONS)
+    wrapped = DuffingVecEnv(gym.wrappers.vector.TransformReward(made, lambda reward: 2 * reward), seed=5)
+    plain = DuffingVecEnv(TRACK, 3, seed=5, **OPTIONS)
+    np.testing.assert_array_equal(wrapped.reset(), plain.reset())
+    for actions in random_actions(3, 2 * HORIZON):
+        ours, theirs = wrapped.step(actions), plain.step(actions)
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        np.testing.assert_array_equal(ours[1], 2 * theirs[1])
+    assert wrapped.get_attr("horizon", 0) == [HORIZON]
+    for other, options in ((gym.make_vec(TRACK, num_envs=3), {}), (gym.make_vec("CartPole-v1", num_envs=2), {})):
+        with pytest.raises(ValueError, match=r"env must be the id of a track, or be made with gym\.make_vec"):
+            DuffingVecEnv(other, **options)
+    with pytest.raises(ValueError, match="num_envs and options must be left out"):
+        DuffingVecEnv(made, 4)
 
 
 def parameters(model):

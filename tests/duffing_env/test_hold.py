@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from rounding import U32
 from test_rig_plant import Difference, around
-from test_vector_env import assert_same, random_actions, roll_out, without_empty_keys
+from test_vector_env import assert_same, random_actions, roll_out, without_endings
 
 from duffing_env.batch import spawn_seeds
 from duffing_env.continuous import ContinuousEnv
@@ -85,7 +85,7 @@ def test_rows_are_single_environments(mode, kind, options):
     ours, theirs = roll_out(envs, actions, seed=7), roll_out(singles, actions, seed=spawn_seeds(7, 5))
     for told, expected in zip(ours, theirs, strict=True):
         assert_same(told[:-1], expected[:-1])
-        told, expected = without_empty_keys(told[-1]), expected[-1]
+        told, expected = without_endings(told[-1]), expected[-1]
         assert told.keys() == expected.keys()
         for name in (*GAINS, "diverged"):
             assert_same(told.get(name), expected.get(name))
@@ -113,9 +113,11 @@ def test_the_horizon_counts_samples():
         observation, _, _, truncated, _ = env.step([0.5])
         left.append(observation[20])
     np.testing.assert_allclose(left, 1 - np.array([0, 5, 10, 15, 20, 22]) / 22, rtol=2 * U32)
+    assert env.spec.max_episode_steps == 5
     # A limit of steps is one of actions.
-    assert gym.make_vec(TRACK, num_envs=2, max_episode_steps=9, hold=5).horizon == 45
-    assert gym.make_vec(TRACK, num_envs=2, max_episode_steps=52, hold=5).horizon == 256
+    envs = gym.make_vec(TRACK, num_envs=2, max_episode_steps=3, hold=5, max_input=1e-3)
+    envs.reset(seed=0)
+    assert [envs.step(np.zeros((2, 1)))[3].tolist() for _ in range(3)] == [[False] * 2, [False] * 2, [True] * 2]
 
 
 def test_limits_hold_for_every_sample():

@@ -213,12 +213,12 @@ def test_a_single_environment_is_a_row_to_the_bit():
         env = DuffingEnv(**options)
         env.reset(seed=seed)
         for t, action in enumerate(actions[:, row]):
-            observation, reward, terminated, truncated, info = env.step(action)
+            observation, reward, terminated, truncated, _ = env.step(action)
             observations, rewards, *_, infos = told[t + 1]
             assert reward == rewards[row]
             if terminated or truncated:
                 np.testing.assert_array_equal(observation, infos["final_obs"][row])
-                assert info["belief"] == infos["final_info"]["belief"][row]
+                assert env.belief == infos["final_info"]["belief"][row]
                 observation, _ = env.reset()
             np.testing.assert_array_equal(observation, observations[row])
 

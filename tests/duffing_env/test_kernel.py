@@ -9,7 +9,8 @@ from scipy import stats
 from twin import PAIRS, PARAMETERS, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
-from duffing_env.env import DuffingEnv, observation_space
+from duffing_env.contract import observation_space
+from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import observation_bounds

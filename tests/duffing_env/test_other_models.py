@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from test_vector_env import assert_same, random_actions, roll_out, without_empty_keys
+from test_vector_env import assert_same, random_actions, roll_out, without_endings
 
 from duffing_env.batch import spawn_seeds
 from duffing_env.env import DuffingEnv
@@ -58,7 +58,7 @@ def test_rows_are_single_environments(mode):
     ours, theirs = roll_out(envs, actions, seed=7), roll_out(singles, actions, seed=spawn_seeds(7, 5))
     for told, expected in zip(ours, theirs, strict=True):
         assert_same(told[:-1], expected[:-1])
-        assert without_empty_keys(told[-1]).keys() == expected[-1].keys()
+        assert without_endings(told[-1]).keys() == expected[-1].keys()
     steps = [told for told in ours if len(told) == 5]
     assert np.sum([step[2] for step in steps]) > 3
     assert np.sum([step[3] for step in steps]) > 3

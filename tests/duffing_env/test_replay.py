@@ -116,8 +116,8 @@ class TestWithTheRecord:
         assert (terminated, truncated, info["off_record"], info["diverged"]) == (True, False, True, False)
         assert reward == info["information_gain"] == info["log_posterior_gain"] == 0.0
         assert observation in env.observation_space
-        np.testing.assert_array_equal(info["belief"].record, before.record)
-        assert info["truth"] == SILVERBOX_TWIN
+        np.testing.assert_array_equal(env.belief.record, before.record)
+        assert env.truth == SILVERBOX_TWIN
 
     def test_the_regime_ends_by_truncation(self, record):
         for delay in (0, 1):
@@ -144,7 +144,7 @@ class TestWithTheRecord:
         singles = SyncVectorEnv([SilverboxReplayEnv] * 3)
         np.testing.assert_array_equal(envs.recorded_input, singles.envs[0].recorded_input)
         recorded = recorded_actions(envs, 60)
-        elapsed, ended = np.zeros(3, dtype=int), 0
+        elapsed, ended, waited = np.zeros(3, dtype=int), 0, np.zeros(3, dtype=bool)
         for each in (envs, singles):
             each.reset(seed=[0, 1, 2])
         rng = np.random.default_rng(0)
@@ -155,18 +155,20 @@ class TestWithTheRecord:
             for told, expected in zip(ours[:-1], theirs[:-1], strict=True):
                 np.testing.assert_array_equal(told, expected)
             for name, expected in theirs[-1].items():
-                if not name.startswith("_") and name not in ("belief", "truth"):
+                if not name.startswith("_"):
                     np.testing.assert_array_equal(ours[-1][name], expected)
             finished = ours[2] | ours[3]
             np.testing.assert_array_equal(finished, ours[-1]["off_record"])
-            waited = ~ours[-1]["_off_record"]
             elapsed = np.where(finished | waited, 0, elapsed + 1)
+            waited = finished
             ended += finished.sum()
         assert ended > 10
 
-    def test_a_record_has_no_limit_of_steps(self):
-        with pytest.raises(ValueError, match="horizon=10 is no option"):
-            gym.make_vec(TRACK, num_envs=2, max_episode_steps=10)
+    def test_a_record_is_cut_off_by_a_limit_of_steps(self):
+        envs = gym.make_vec(TRACK, num_envs=2, max_episode_steps=10)
+        envs.reset(seed=0)
+        flags = [envs.step(np.tile(action, (2, 1)))[3] for action in recorded_actions(envs, 10)]
+        np.testing.assert_array_equal(flags, np.arange(10)[:, None].repeat(2, 1) == 9)
 
     @pytest.mark.parametrize(
         "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"]

@@ -112,20 +112,18 @@ def test_around_the_plant_inputs_and_outputs_are_in_its_units():
     env.reset(seed=0)
     actions = np.repeat(np.random.default_rng(3).choice([-1.0, 1.0], 10), 6)
     for action in actions:
-        _, _, terminated, truncated, info = env.step([action])
+        _, _, terminated, truncated, _ = env.step([action])
     assert truncated
     assert not terminated
     assert set(np.abs(bench.told)) == {6.0}
     outputs = RIG.scales.output * free_run(RIG.model, bench.coefficients, np.array(bench.told) / RIG.scales.input)
-    mean, std, unit = info["belief"].parameters()["m"]
+    mean, std, unit = env.belief.parameters()["m"]
     assert abs(mean - 0.42) < 5 * std
     assert unit == "kg"
     # What the estimator of the same rig makes of the same pairs: those of an environment.
     estimator = OnlineEstimator(rig=Rig.from_dict(RIG.to_dict() | {"delay": -1}))
     estimator.run(bench.told, outputs)
-    np.testing.assert_allclose(
-        info["belief"].coefficients_mean, estimator.belief.coefficients_mean, rtol=1e-6, atol=1e-9
-    )
+    np.testing.assert_allclose(env.belief.coefficients_mean, estimator.belief.coefficients_mean, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow  # the planner's kernels of another model; those of two others are in the tests

@@ -17,7 +17,6 @@ from gymnasium.wrappers.vector import (
     NormalizeReward,
     RecordEpisodeStatistics,
 )
-from rounding import U32
 
 from duffing_env.batch import spawn_seeds
 from duffing_env.env import DuffingEnv
@@ -68,12 +67,12 @@ def assert_same(first, second):
         assert first == second
 
 
-def without_empty_keys(infos):
-    """Infos less the keys that no row has. Gymnasium leaves those out; we keep the keys of every step."""
+def without_endings(infos):
+    """Infos less the beliefs and truths of finished rows, and less the keys that no row has, as Gymnasium's."""
     told = {}
     for key, value in infos.items():
-        if not key.startswith("_") and infos[f"_{key}"].any():
-            told[key] = without_empty_keys(value) if isinstance(value, dict) else value
+        if not key.startswith("_") and key not in ("belief", "truth") and infos[f"_{key}"].any():
+            told[key] = without_endings(value) if isinstance(value, dict) else value
             told[f"_{key}"] = infos[f"_{key}"]
     return told
 
@@ -88,7 +87,7 @@ def play_beside_singles(rows, steps, *, mode=AutoresetMode.NEXT_STEP, **options)
     ours, theirs = roll_out(envs, actions, seed=7), roll_out(singles, actions, seed=spawn_seeds(7, rows))
     for told, expected in zip(ours, theirs, strict=True):
         assert_same(told[:-1], expected[:-1])
-        assert_same(without_empty_keys(told[-1]), expected[-1])
+        assert_same(without_endings(told[-1]), expected[-1])
     return [told for told in ours if len(told) == 5]
 
 
@@ -138,7 +137,8 @@ def test_rows_that_are_being_reset_wait():
         assert not (terminated | truncated)[being_reset].any()
         np.testing.assert_array_equal(observations[being_reset], first[being_reset])
         for name in ("information_gain", "log_posterior_gain", "diverged"):
-            np.testing.assert_array_equal(infos[f"_{name}"], ~being_reset)
+            assert infos[f"_{name}"].all()
+            assert not infos[name][being_reset].any()
         waited += being_reset.sum()
         being_reset = terminated | truncated
     assert waited > 100
@@ -188,6 +188,7 @@ def test_copies_are_given_out_unless_told_otherwise():
 def test_metadata_is_each_environments_own():
     with_modes = [DuffingVectorEnv(1, autoreset_mode=mode) for mode in MODES]
     assert [envs.metadata["autoreset_mode"] for envs in with_modes] == MODES
+    assert [envs.autoreset_mode for envs in with_modes] == MODES
     assert DuffingVectorEnv.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
     assert DuffingVectorEnv(1, autoreset_mode="SameStep").metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     with_modes[0].metadata["render_fps"] = 1
@@ -256,7 +257,9 @@ def test_finished_rows_are_reset_by_hand():
         envs.step(actions[0])
     options = {"reset_mask": np.array([True, False])}
     again, infos = envs.reset(options=options)
-    assert infos == {}
+    assert {name: value.tolist() for name, value in infos.items() if name[0] == "_"} == {
+        f"_{name}": [True, False] for name in ("information_gain", "log_posterior_gain", "diverged")
+    }
     assert list(options) == ["reset_mask"]
     np.testing.assert_array_equal(again[1], observations[1])
     assert again[:, 20].tolist() == [1.0, np.float32(1 / 3)]
@@ -332,14 +335,88 @@ def test_gymnasium_makes_it_without_a_warning():
         assert_same(ours[:-1], theirs[:-1])
 
 
-def test_a_limit_of_steps_is_the_horizon():
-    assert gym.make_vec(TRACK, num_envs=2, max_episode_steps=9).horizon == 9
-    assert gym.make_vec(TRACK, num_envs=2, max_episode_steps=900).horizon == 256
-    assert gym.make_vec(TRACK, num_envs=2, horizon=400).horizon == 400
-    assert DuffingVectorEnv(2, max_episode_steps=9).horizon == 9
-    envs = DuffingVectorEnv(2, max_episode_steps=9, horizon=7)
-    observations = [told[0] for told in roll_out(envs, random_actions(7, 2))]
-    np.testing.assert_allclose(np.array(observations)[:, 0, 20], 1 - np.arange(8) / 7, rtol=2 * U32)
+@pytest.mark.parametrize("limit", [9, 20, 400, -1])
+def test_a_limit_of_steps_is_that_of_gymnasium(limit):
+    ours = gym.make_vec(TRACK, num_envs=5, max_episode_steps=limit, **BOTH_ENDS)
+    theirs = gym.make_vec(TRACK, num_envs=5, max_episode_steps=limit, vectorization_mode="sync", **BOTH_ENDS)
+    flags = []
+    for told, expected in zip(
+        roll_out(ours, random_actions(100, 5), 7),
+        roll_out(theirs, random_actions(100, 5), spawn_seeds(7, 5)),
+        strict=True,
+    ):
+        assert_same(told[:-1], expected[:-1])
+        flags += [told[2:4]] if len(told) == 5 else []
+    assert np.sum(flags, axis=(0, 2))[1] > 0
+    assert gym.make(TRACK, max_episode_steps=9).spec.max_episode_steps == 9
+
+
+def test_the_specification_tells_the_limit_and_cuts_no_longer_horizon():
+    for horizon in (256, 400):
+        env = gym.make(TRACK, horizon=horizon, max_input=1e-3)
+        assert env.spec.max_episode_steps == gym.make_vec(TRACK, num_envs=2, horizon=horizon).spec.max_episode_steps
+        aware = gym.wrappers.TimeAwareObservation(env, flatten=False)
+        assert aware.max_timesteps == horizon
+        aware.reset(seed=0)
+        steps = [aware.step([0.0]) for _ in range(horizon)]
+        assert [step[3] for step in steps] == [False] * (horizon - 1) + [True]
+        assert gym.make(env.spec).unwrapped.experiment == env.unwrapped.experiment
+
+
+@pytest.mark.parametrize("options", [{}, {"noise_range": 10.0}, {"jump": 0.3, "horizon": 40}], ids=str)
+def test_a_system_of_choice(options):
+    drawn, single = DuffingVectorEnv(40, **options), DuffingEnv(**options)
+    actions = random_actions(30, 40)
+    expected = roll_out(drawn, actions, 3)
+    drawn.reset(seed=3)
+    truth = drawn.truth
+    # What the seed draws, chosen: the same to the bit, for all rows and for one.
+    drawn.reset(seed=99)
+    drawn.reset(seed=3, options={"truth": truth})
+    assert drawn.truth == truth
+    assert_same([drawn.step(action)[:4] for action in actions], [told[:4] for told in expected[1:]])
+    single.reset(seed=spawn_seeds(3, 40)[35], options={"truth": {name: truth[name][35] for name in truth}})
+    for action, told in zip(actions[:, 35], expected[1:], strict=True):
+        step = single.step(action)
+        np.testing.assert_array_equal(step[0], told[0][35])
+        assert step[1] == told[1][35]
+        if step[2] or step[3]:
+            break
+    # Another system, with the same noise; only of the rows that are reset, and without noises as they are drawn.
+    mask = np.arange(40) < 2
+    other = {"m": [7e-6] * 40, "c": 2e-4, "a": 1.0, "b": 0.0}
+    drawn.reset(seed=3)
+    drawn.reset(seed=3, options={"truth": other, "reset_mask": mask})
+    assert drawn.truth.m[:2].tolist() == [7e-6] * 2
+    assert drawn.truth.b[:2].tolist() == [0.0] * 2
+    for name in truth:
+        if name in other:
+            np.testing.assert_array_equal(drawn.truth[name][2:], truth[name][2:])
+        else:
+            np.testing.assert_array_equal(drawn.truth[name], truth[name])
+    assert np.isfinite(drawn.step(actions[0])[0]).all()
+    assert not drawn.step(actions[0])[4]["diverged"].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"foo": 1}, r"options of reset must be among .*'truth'\], but there is 'foo'"),
+        ({"truth": 1}, r"truth must give the parameters \['m', 'c', 'a', 'b'\], but is 1"),
+        ({"truth": {"m": 1.0}}, "truth must give the parameters"),
+        ({"truth": dict(m=1.0, c=1.0, a=1.0, b=np.inf)}, r"truth\['b'\] must be finite, but is inf"),
+        ({"truth": dict(m=1.0, c="x", a=1.0, b=1.0)}, r"truth\['c'\] must be a number, or \d of them, but is 'x'"),
+        ({"truth": dict(m=1.0, c=[1.0] * 2, a=1.0, b=1.0)}, r"truth\['c'\] must be a number, or \d of them"),
+        ({"truth": dict(m=0.0, c=1.0, a=1.0, b=1.0)}, r"truth\['m'\] must be positive, but is 0.0"),
+    ],
+)
+def test_bad_options_of_a_reset_are_refused_and_change_nothing(options, message):
+    for env in (DuffingEnv(), DuffingVectorEnv(3)):
+        env.reset(seed=0)
+        before = env.truth
+        with pytest.raises(ValueError, match=message):
+            env.reset(seed=1, options=options)
+        assert env.truth == before
 
 
 @pytest.mark.parametrize(
@@ -402,7 +479,7 @@ def test_final_infos_as_a_list():
     for *_, terminated, truncated, infos in roll_out(envs, random_actions(60, 4))[1:]:
         finished = (terminated | truncated).tolist()
         assert ["final_obs" in info for info in infos] == ["final_info" in info for info in infos] == finished
-        assert ["information_gain" not in info for info in infos] == finished
+        assert all("information_gain" in info for info in infos)
         endings += [sorted(info["final_info"]) for info in infos if "final_info" in info]
     assert len(endings) > 10
     assert endings == [["belief", "diverged", "information_gain", "log_posterior_gain", "truth"]] * len(endings)

@@ -496,6 +496,6 @@ def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
             np.testing.assert_allclose(told, gains, rtol=1e-9, atol=1e-9)
             assert [terminated, truncated] == flags
             assert not info["diverged"]
-        assert_beliefs_agree(info["belief"], twin.belief)
+        assert_beliefs_agree(env.belief, twin.belief)
         endings.append((terminated, truncated))
     return endings

@@ -1,0 +1,78 @@
+"""What single and vector environments share of Gymnasium's contract: spaces, options, specification."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+
+from duffing_env.experiment import Experiment
+from duffing_env.layout import observation_bounds
+from estimator.models.model import Model
+
+
+def observation_space(model: Model) -> spaces.Box:
+    """The observation's space: a flat float32 Box with finite bounds (`duffing_env.layout.observation_bounds`)."""
+    low, high = np.array(list(observation_bounds(model).values()), dtype=np.float32).T
+    return spaces.Box(low.copy(), high.copy(), dtype=np.float32)
+
+
+def action_space() -> spaces.Box:
+    """The action's space: the input in parts of the largest."""
+    return spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
+
+
+def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, Any]:
+    """The options of a reset; ValueError for one that is not known."""
+    for name in options or {}:
+        if name not in known:
+            raise ValueError(f"options of reset must be among {list(known)}, but there is {name!r}; remove it")
+    return options or {}
+
+
+class Specified:
+    """An environment whose specification says after how many steps an episode ends, as wrappers of Gymnasium ask.
+
+    It is not registered with them, because Gymnasium would then cut a longer ``horizon`` short.
+    """
+
+    experiment: Experiment
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What the environment was made from."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and spec.max_episode_steps is None:
+            spec = copy.copy(spec)
+            spec.max_episode_steps = -(-self.experiment.samples // self.experiment.hold)
+        self._spec = spec
+
+
+class UnknownOption(TypeError, ValueError):
+    """A keyword that is no option: in the words of Python's own TypeError, which some trainers look for."""
+
+
+def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experiment:
+    """An experiment from keyword arguments.
+
+    Raises:
+        UnknownOption: for an unknown one, with the nearest known.
+    """
+    known = [field.name for field in fields(kind)]
+    for name in options:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise UnknownOption(
+                f"got an unexpected keyword argument {name!r}: the options of this environment are {known}{hint}"
+            )
+    return kind(**options)
