@@ -8,6 +8,17 @@ from typing import Any
 #: On Eq. (1) the noises are drawn for every episode, over a decade each, and known to nobody.
 _UNKNOWN = {"noise_range": 10.0, "noise_hypotheses": 7}
 
+#: The pendulum of IO-SMC²: angle and velocity are seen without noise (here 1 µrad), every 0.05 s.
+_PENDULUM = {
+    "mean": {"p1": 14.7, "p2": 0.0, "p3": 3.0},
+    "std": {"p1": 0.1**0.5, "p2": 0.1, "p3": 0.1**0.5},
+    "sampling_step": 0.05,
+    "measurement_noise": 1e-6,
+    "noise_shape": 1e6,
+    "horizon": 50,
+    "max_input": 1.0,
+}
+
 #: Id of a track to what it is registered with. Any change of numbers or spaces is a new version. None registers
 #: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short (`duffing_env.env.Specified`).
 TRACKS: dict[str, dict[str, Any]] = {
@@ -49,23 +60,18 @@ TRACKS: dict[str, dict[str, Any]] = {
             ("Output", "ContinuousOutputEnv", {"max_output": 0.3}),
         )
     },
-    # The pendulum of IO-SMC²: angle and velocity are seen without noise (here 1 µrad), every 0.05 s.
-    "duffing_env/Pendulum-v0": {
-        "entry_point": "duffing_env.model_env:ModelEnv",
-        "vector_entry_point": "duffing_env.model_env:ModelVectorEnv",
-        "kwargs": {
-            "system": "pendulum",
-            "mean": {"p1": 14.7, "p2": 0.0, "p3": 3.0},
-            "std": {"p1": 0.1**0.5, "p2": 0.1, "p3": 0.1**0.5},
-            "sampling_step": 0.05,
+    **{
+        f"duffing_env/Pendulum-{version}": {
+            "entry_point": "duffing_env.model_env:ModelEnv",
+            "vector_entry_point": "duffing_env.model_env:ModelVectorEnv",
+            "kwargs": {"system": system, **_PENDULUM, "process_noise": process_noise, "max_output": limit},
+        }
+        for version, system, process_noise, limit in (
             # Diffusion 0.1 of q'', counted as what a sample of it does to q: 0.1 δ^1.5 / √3.
-            "process_noise": 6.454972e-4,
-            "measurement_noise": 1e-6,
-            "noise_shape": 1e6,
-            "horizon": 50,
-            "max_input": 1.0,
-            "max_output": 6.283185307179586,
-        },
+            ("v0", "pendulum", 6.454972e-4, 6.283185307179586),
+            # By Euler's rule, as published: what a sample does to the velocity in rad per sample, δ √(0.1² δ + 1e-8).
+            ("v1", "pendulum_map", 1.1180452e-3, 4.0),
+        )
     },
     "duffing_env/WienerHammerstein-v0": {
         "entry_point": "duffing_env.model_env:ModelEnv",

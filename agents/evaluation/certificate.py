@@ -14,10 +14,13 @@ with equality for one V. Let v_t = Wᵀ f(x_t, x_{t-1}, x_{t-2}), with odd monom
 so that the worth of every input is at most ½ [tr(G Λ0) - log det G - 4 + the most that Σ |φ_t - (A V)_t|²_G / q +
 |v_t|²_G / r comes to]. Each term depends on five displacements in a row, and so the most is found by a dynamic
 programme (`agents.evaluation.state_grid`). Under a limit of energy it would need the energy that is left as one more
-state, and there is none yet: a price of energy instead bounds only mixtures of inputs, which are worth much more.
+state, and there is none yet: a price of energy instead bounds only mixtures of inputs, of which those of rest and much
+energy are worth much more.
 
 **G and W** are those of the best mixture of the paths that the programme has found so far; W is then a least squares
-fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), until bound and mixture meet.
+fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), until bound and mixture meet. Between
+nodes from which one can stay within the limit there may be points from which one cannot: where a path comes to one, it
+is cut at the limit. The bound holds for any G and W.
 
 **The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on one
 of twice as many intervals, plus what they differ by. This allowance is no proof: on three and four times as many
@@ -103,9 +106,12 @@ class Certificate:
         slope: FloatArray = self.theta[0] + 3 * self.theta[1] * x**2
         return slope
 
-    def moments(self, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """C (4, 4), N (f, 4) and M (f, f) of an input (T,), where the information is at most C - WᵀN - NᵀW + WᵀMW."""
-        x = np.concatenate([np.zeros(4), free_run(difference(), self.theta, u)])
+    def moments(self, u: FloatArray, x: FloatArray | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """C (4, 4), N (f, 4) and M (f, f) of an input (T,), where the information is at most C - WᵀN - NᵀW + WᵀMW.
+
+        ``x`` (T,) are the displacements that follow each input, where they are not what the equation gives.
+        """
+        x = np.concatenate([np.zeros(4), free_run(difference(), self.theta, u) if x is None else x])
         back = [x[4 - lag : len(x) - lag] for lag in range(5)]  # x_{t+1}, x_t, ...
         phi = self.regressors(back[1], back[2], u)
         f, f1, f2 = (self.features(*back[lag : lag + 3]) for lag in range(3))
@@ -133,28 +139,27 @@ class Certificate:
         told = np.trace(multipliers.G) + most - np.linalg.slogdet(multipliers.G)[1] - 4.0
         return self.base + 0.5 * float(told), V
 
-    def path(self, multipliers: Multipliers, V: FloatArray) -> FloatArray:
-        """The input (T,) that the programme holds for the best, from rest."""
+    def path(self, multipliers: Multipliers, V: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The input (T,) that the programme holds for the best, from rest, and the displacements (T,) it leads to."""
         grid, root = self.grid, np.linalg.cholesky(multipliers.G)
-        W, u = multipliers.W @ root, np.zeros(self.samples)
+        W, u, x = multipliers.W @ root, np.zeros(self.samples), np.zeros(self.samples)
         now, last, older, v, v1 = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros((1, 4)), np.zeros((1, 4))
         for t in range(self.samples):
             inputs, after = grid.actions(now, last)
             allowed = ~np.isnan(inputs)
             if allowed.any():
                 inputs, after = inputs[allowed], after[allowed]
-            else:  # between nodes of which one can stay within the limit: as near to it as may be
-                t1, t2, t3, eta = self.theta
-                free = t1 * now + t2 * now**3 + t3 * last
-                inputs = -np.sign(free) * self.limits.amplitude
-                after = free + eta * inputs
+            else:
+                t1, t2, t3, _ = self.theta
+                beyond = np.sign(t1 * now + t2 * now**3 + t3 * last)
+                inputs, after = -beyond * self.limits.amplitude, beyond * self.limits.output
             next_v = self.features(after, now, last) @ W
             missed = self.regressors(now, last, inputs) @ root - next_v + self.slope(now) * v + self.theta[2] * v1
             told = (missed**2).sum(-1) / self.q + (next_v**2).sum(-1) / self.r
             best = int(np.argmax(told + self._between(V[t + 1], after, now, inputs, older)))
-            u[t] = inputs[best]
+            u[t], x[t] = inputs[best], after[best]
             v1, v, last, now, older = v, next_v[best : best + 1], now, after[best : best + 1], inputs[best : best + 1]
-        return u
+        return u, x
 
     def _between(self, V: FloatArray, *point: FloatArray) -> FloatArray:
         """The value (actions,) at points between nodes; of those that cannot stay within the limit, far below."""
@@ -190,10 +195,7 @@ class Certificate:
                 least, best = bound, multipliers
             if least < told + _CLOSE:
                 break
-            u = self.path(multipliers, V)
-            if not np.abs(free_run(difference(), self.theta, u)).max() < 2.0 * self.limits.output:
-                break  # between nodes it went where nothing keeps it
-            moments.append(self.moments(u))
+            moments.append(self.moments(*self.path(multipliers, V)))
             weights = np.append(0.9 * weights, 0.1)
         assert best is not None
         fine = replace(self.grid, n=2 * self.grid.n - 1)

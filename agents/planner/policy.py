@@ -88,8 +88,9 @@ class Planner:
         env: the unwrapped environment, single or vector, whose beliefs it reads: `predict` must be called between
             its steps, with its observations.
         seed: of the search.
-        horizon: moves to plan for, each held for ``terms.pace`` samples; by default 24, and the whole episode sample by
-            sample where the energy is limited. No more than 20 of the last 48 of an episode.
+        horizon: moves to plan for, each held for ``terms.pace`` samples, but no longer than the episode needs; by
+            default 24, and the whole episode sample by sample where the energy is limited. No more than 20 of the last
+            48 of an episode.
         rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 moves; of no
             effect on a plan of the whole episode.
         risk: upper bound of the probability that an episode ends early, in (0, 1), where the belief is right.
@@ -166,7 +167,7 @@ class Planner:
             * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
             scales=swing.scales,
-            pace=swing.pace,
+            pace=min(swing.pace, -(-env.horizon // horizon)),  # a plan need not look beyond the episode
             shaken=swing.shaken,
             price=float(input_cost),
             goal=float(goal),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
-from estimator.models.pendulum import PENDULUM
+from estimator.models.pendulum import PENDULUM, PENDULUM_MAP
 from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
 
 #: Name of a model to what makes it.
@@ -15,5 +15,6 @@ MODELS: dict[str, Callable[[], Model]] = {
     "difference": difference,
     "duffing": duffing,
     "pendulum": lambda: PENDULUM,
+    "pendulum_map": lambda: PENDULUM_MAP,
     "wiener_hammerstein": lambda: WIENER_HAMMERSTEIN,
 }

@@ -1,6 +1,12 @@
-"""The conditionally linear stochastic pendulum of IO-SMC² (Iqbal et al., ICML 2024): q'' = -p1 sin q - p2 q' + p3 u."""
+"""The conditionally linear stochastic pendulum of IO-SMC² (Iqbal et al., ICML 2024): q'' = -p1 sin q - p2 q' + p3 u.
+
+There it is stepped by Euler's rule, under which an oscillation grows by itself, here by 1.8 % a sample. `PENDULUM_MAP`
+is that rule, and so the published plant; `PENDULUM` is the differential equation.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from estimator.models.model import Model
 
@@ -23,4 +29,16 @@ PENDULUM = Model(
     physical={"p1": "gravity/step**2", "p2": "friction/step", "p3": "torque/step**2"},
     dimensions={"p1": (0, 0, -2), "p2": (0, 0, -1), "p3": (-1, 1, -2)},
     inverse={"gravity": "p1*step**2", "friction": "p2*step", "torque": "p3*step**2"},
+)
+
+#: The same by Euler's rule. Process noise of unit strength moves w by 1 rad per sample, and so the angle of the next
+#: sample, which the first sensor shows: of an angle alone the noise of this sample would not be seen.
+PENDULUM_MAP = replace(
+    PENDULUM,
+    name="pendulum_map",
+    rates=(),
+    next_state=("q + w", "w + torque*u - friction*w - gravity*sin(q)"),
+    noise=("0", "1"),
+    outputs={"ahead": "q + w", "velocity": "w"},
+    substeps=1,
 )

@@ -1,0 +1,108 @@
+"""What policies are worth where options differ from those that they were trained with, beside the planner there.
+
+    python -m agents.studies.robustness
+
+plays `efe`, the track's own policy and `ppo/universal` with other noises, a weaker input, more energy and a longer
+episode, on the tracks of both equations. D-efficiency is exp(2 (F - F_efe) / K), with F the Fisher information [nats]
+at the truth that each episode brought about the K coefficients (`fisher_gain` of `evaluate.py`), and F_efe that of the
+planner on the same system with the same noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.cli import progress_bar, run_script
+from agents.evaluation.batch import TESTED
+from agents.evaluation.leaderboard import METRICS, cell_of, center_and_interval
+from agents.evaluation.metrics import information
+from agents.evaluation.rollout import roll_out
+from agents.results import show, table, write_json
+
+#: What is compared: a title, the track without its version, the options.
+CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("σ_w ÷ 5, σ_v × 5", "Amplitude", {"process_noise": 1e-4, "measurement_noise": 2.5e-3}),
+    ("max_input 0.05", "Amplitude", {"max_input": 0.05}),
+    ("max_rms 0.05", "Power", {"max_rms": 0.05}),
+    ("horizon 512", "Power", {"horizon": 512}),
+)
+PLANNER, UNIVERSAL = "efe", "ppo/universal"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Compare policies with the planner under other options than they were trained with."""
+
+    systems: int = 256
+    """Systems of every case."""
+    cases: tuple[int, ...] = (1, 2, 3, 4)
+    """Which of the cases."""
+    versions: tuple[int, ...] = (0, 1)
+    """Of the tracks."""
+    output: Path | None = None
+    """File for the figures of every system, as JSON."""
+
+
+def own(track: str, version: int) -> str:
+    """The policy that ships for a track."""
+    return f"ppo/{track.lower()}" + ("" if version == 0 else f"-v{version}")
+
+
+def judge(track: str, options: dict[str, Any], policies: tuple[str, ...], systems: int) -> Iterator[dict[str, Any]]:
+    """What every policy is worth beside the planner, which comes first.
+
+    Yields:
+        ``policy``, and arrays (systems,): ``efficiency``, ``fisher_gain`` [nats], and 1 in ``ended_early`` where a
+        limit ended the episode.
+    """
+    best = None
+    for policy in (PLANNER, *policies):
+        played, _, truth, experiment = roll_out(policy, track, systems, 0, TESTED | options)
+        told = information(played.inputs, truth, experiment, played.outputs)
+        best = told if best is None else best
+        efficiency = np.exp(2.0 * (told - best) / experiment.plant.n_coefficients)
+        yield {
+            "policy": policy,
+            "efficiency": efficiency,
+            "fisher_gain": told,
+            "ended_early": played.metrics["ended_early"],
+        }
+
+
+def main(config: Config) -> None:
+    """Play, and print the table."""
+    rows, results = [], []
+    metrics = replace(METRICS["efficiency"], digits=3, scale=1.0), METRICS["fisher_gain"]
+    with progress_bar() as bar:
+        task = bar.add_task("", total=len(config.versions) * len(config.cases))
+        for version in config.versions:
+            for title, name, options in (CASES[case - 1] for case in config.cases):
+                track = f"{name}-v{version}"
+                bar.update(task, description=f"{track}, {title}")
+                policies = own(name, version), UNIVERSAL
+                for found in judge(f"duffing_env/{track}", options, policies, config.systems):
+                    cells = [
+                        cell_of(metric, center_and_interval(found[key][None], metric)).replace("\n", " ")
+                        for key, metric in zip(("efficiency", "fisher_gain"), metrics, strict=True)
+                    ]
+                    early = f"{int(found['ended_early'].sum())} of {config.systems}"
+                    rows.append([track, title, found["policy"], *cells, early])
+                    results.append({"track": track, "case": title, **{k: _plain(v) for k, v in found.items()}})
+                bar.advance(task)
+    heads = ("track", "options", "policy", "D-efficiency beside efe", "Fisher information / nat", "ended early")
+    show(table(heads, rows, markdown=True), width=150)
+    if config.output is not None:
+        write_json(config.output, results)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__ or "")
