@@ -63,6 +63,7 @@ def judge(track: str, options: dict[str, Any], policies: tuple[str, ...], system
     best = None
     for policy in (PLANNER, *policies):
         played, _, truth, experiment = roll_out(policy, track, systems, 0, TESTED | options)
+        assert experiment.plant is not None
         told = information(played.inputs, truth, experiment, played.outputs)
         best = told if best is None else best
         efficiency = np.exp(2.0 * (told - best) / experiment.plant.n_coefficients)
