@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 from agents.cli import told_in_one_line
+from agents.commands.design import Design
 from agents.commands.evaluate import Evaluate
 from agents.commands.export import Export
 from agents.commands.identify import Identify
@@ -32,6 +33,7 @@ class Train:
 #: What the command line chooses from: a name for each command, and commands of a group under one name.
 Command = (
     Annotated[Identify, _subcommand("identify")]
+    | Annotated[Design, _subcommand("design")]
     | Annotated[Run, _subcommand("run")]
     | Annotated[Train, _subcommand("train")]  # its settings follow from the algorithm: `agents.commands.train`
     | Annotated[Evaluate, _subcommand("evaluate")]

@@ -21,6 +21,7 @@ class Identify:
 
     $ duffing-env identify rig.toml data.csv
     $ duffing-env identify rig.toml monday.csv tuesday.csv --report out.html
+    $ duffing-env identify rig.toml data.csv --save posterior.npz
     $ duffing-env identify rig.toml data.csv --json > out.json
     """
 
@@ -32,6 +33,8 @@ class Identify:
     """CSV or MAT files with the columns or variables u and y."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """Write a page with figures here, which opens without a network."""
+    save: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Write what is known now here, for duffing-env design, and estimator.load_estimator."""
     json: bool = False
     """Print JSON instead of the table."""
 
@@ -48,6 +51,10 @@ class Identify:
         result = identify(self.rig, list(self.data), progress=sys.stderr.isatty())
         if self.report is not None:
             result.report(self.report, [shlex.join(["duffing-env", *sys.argv[1:]])])
+        if self.save is not None:
+            from estimator.saving import save_estimator
+
+            save_estimator(result.estimator, self.save)
         if self.json:
             print(json.dumps(described(result), indent=1))
             return

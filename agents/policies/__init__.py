@@ -16,6 +16,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from agents.loading import load_object
+from agents.planner.block_policy import BlockPlanner
 from agents.planner.policy import Planner
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
@@ -53,6 +54,7 @@ POLICIES: dict[str, Callable[..., Policy]] = {
     **FEEDBACK,
     "efe": Planner,
     "efe-myopic": partial(Planner, horizon=1),
+    **{f"efe-block-{n}": partial(BlockPlanner, block=n) for n in (16, 64, 256)},
 }
 
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from agents.running.clock import Clock
-from agents.running.designs import Design
+from agents.running.designs import Design, designed
 from agents.running.follower import Follower
 from agents.running.observed import Observed
 from agents.running.recording import Recording
-from agents.running.safety import Futures
-from agents.running.session import Session, Tripped
+from agents.running.session import Session
 from estimator.parameters import FloatArray
 
 
@@ -68,25 +68,10 @@ class Blocks:
         done = 0
         while done < samples:
             count = min(block, samples - done)
-            self._play(self._designed(design, count))
+            told_of = partial(self._recording.note, block=self._block)
+            self._play(designed(design, self._follower, self._observed, count, self._bound, self._rng, told_of))
             done += count
             told(done)
-
-    def _designed(self, design: Design, samples: int) -> FloatArray:
-        """A block that is safe enough, in the rig's unit."""
-        scales = self._follower.estimator.scales
-        self._observed.belief = self._follower.belief
-        u = np.clip(design.block(samples), -self._observed.max_input, self._observed.max_input)
-        futures = Futures(self._follower, self._observed.experiment.max_output, self._rng)
-        share, probability = futures.share(u, self._bound)
-        self._recording.note("design", block=self._block, share=share, probability=probability)
-        if share == 0.0 and probability >= self._bound:
-            raise Tripped(
-                "design",
-                f"even without input the output would leave its range with probability {probability:.2g}, and at most "
-                f"{self._bound:.2g} is allowed; give a narrower guess or a wider range",
-            )
-        return share * u * scales.input
 
     def _play(self, u: FloatArray) -> None:
         applied, y = self._session.play(u)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from agents.planner.futures import Drawn, drawn_from
 from agents.planner.motion import frequency, survey
-from agents.running.safety import drawn_from
 from estimator.arrays import copy as copy_numbers
 from estimator.belief import Belief, covariance_places
 from estimator.engine.motion import motion
@@ -93,7 +93,7 @@ class Follower:
         prior = rig_prior(rig) if prior is None else prior
         self._paused = 0
         self._starts: list[tuple[float, FloatArray, FloatArray]] = []
-        self._rung: tuple[FloatArray, FloatArray] | None = None
+        self._rung: Drawn | None = None
         self.estimator = OnlineEstimator(
             prior.model, prior, paired, noise_hypotheses=(7, 7), expectations="sigma_points"
         )
@@ -125,7 +125,7 @@ class Follower:
         else:
             self.estimator.restore(best)
 
-    def drawn(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def drawn(self, rng: np.random.Generator) -> Drawn:
         """States and coefficients (draws, d) and noises (draws, 2) of systems that are believed in now.
 
         After a pause they are those that rang: a Gaussian of their states would put many out of the range.

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from agents.planner.futures import Futures
 from agents.policies import make_policy
 from agents.policies.signals import SignalPolicy
 from agents.running.blocks import Blocks
 from agents.running.clock import Clock, RealClock
-from agents.running.designs import Design, design_of
+from agents.running.designs import Design, design_of, designed
 from agents.running.follower import Follower
 from agents.running.observed import Observed
 from agents.running.plan import Plan
 from agents.running.plant import Plant, check_plant
 from agents.running.recording import Recording
-from agents.running.safety import Futures
 from agents.running.samples import Chooser, PolicyChooser, Series, Ticker
 from agents.running.session import Session, Tripped, check_session
 from agents.running.stopping import Stopped
@@ -124,7 +124,7 @@ def run(
     observed = Observed(rig, follower.belief, plan.samples)
     policy = make_policy(plan.policy, observed, seed=plan.seed)  # type: ignore[arg-type]
     design = design_of(policy, observed) if plan.block or isinstance(policy, SignalPolicy) else None
-    chooser = None if design else PolicyChooser(policy, observed, follower)
+    chooser: Chooser | None = None if design else PolicyChooser(policy, observed, follower)
     silence = plan.silence(rig.step)
     _warm_up(follower, observed, design, policy, plan)
     described = {"command": sys.argv, "rig": rig.to_dict(), "plan": asdict(plan), "watchdog": silence}
@@ -142,9 +142,12 @@ def run(
                 ticker = Ticker(session, follower, recording, clock, rig.step)
                 try:
                     ticker.listen(plan.listen)
-                    chosen: Chooser = chooser or _series(design, follower, observed, recording, plan, rng)
+                    if design is not None:
+                        told_of = recording.note
+                        chooser = Series(designed(design, follower, observed, plan.samples, plan.bound, rng, told_of))
+                    assert chooser is not None
                     session.arm()
-                    ticker.play(chosen, plan.samples, told)
+                    ticker.play(chooser, plan.samples, told)
                 finally:
                     late = ticker.late
         ended, status = "complete", 0
@@ -165,28 +168,14 @@ def run(
 
 def _warm_up(follower: Follower, observed: Observed, design: Design | None, policy: Any, plan: Plan) -> None:
     """Compile what the run will call: a plant must not wait for the compiler with its input on."""
-    observed.belief = follower.ahead(0.0)
+    observed.belief, rng = follower.ahead(0.0), np.random.default_rng(0)
     if design is None:
         policy.predict(observed.observation(0.0, 0.0, 0), None, deterministic=True)
-    elif plan.block and not isinstance(policy, SignalPolicy):
-        design.block(plan.block)
-    Futures(follower, 1.0, np.random.default_rng(0)).probability(np.zeros(1))
-
-
-def _series(
-    design: Design | None, follower: Follower, observed: Observed, recording: Recording, plan: Plan, rng: Any
-) -> Series:
-    """A whole signal, at the share that is safe enough."""
-    assert design is not None
-    u = design.block(plan.samples)
-    futures = Futures(follower, observed.experiment.max_output, rng)
-    share, probability = futures.share(u, plan.bound)
-    recording.note("design", share=share, probability=probability)
-    if share == 0.0 and probability >= plan.bound:
-        raise Tripped(
-            "design", f"even without input the output would leave its range with probability {probability:.2g}"
-        )
-    return Series(share * u * follower.estimator.scales.input)
+        return
+    futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
+    if plan.block and not isinstance(policy, SignalPolicy):
+        design.block(plan.block, futures, plan.bound)
+    futures.probability(np.zeros(1))
 
 
 def _write(result: Run, follower: Follower) -> None:

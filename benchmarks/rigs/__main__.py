@@ -1,4 +1,4 @@
-"""Run a part: ``python -m benchmarks.rigs accuracy --seeds 200``; also ``faults``, ``peers``, ``sweep``, ``loop``."""
+"""Run a part: ``python -m benchmarks.rigs accuracy --seeds 200``; ``--help`` names the others."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.rigs import accuracy, faults, loop, peers, sweep
+from benchmarks.rigs import accuracy, experiment, faults, loop, peers, sweep
 from benchmarks.rigs.catalogue import BENCHES
 from estimator.files import write_atomically
 
@@ -92,12 +92,14 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Loop:
-    """256 samples on the integrator, through Rig-v0 and in blocks, by prbs and by the planner."""
+    """256 samples on the integrator, through Rig-v0 and in blocks, by signals and by the planner."""
 
     seeds: int = 100
     """Runs of each rig, policy and way."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
+    policies: tuple[str, ...] = loop.POLICIES
+    """Who chooses: the planner efe, and signals."""
     ways: tuple[str, ...] = loop.WAYS
     """Sample by sample, and in blocks of 64."""
     workers: int = CORES
@@ -107,9 +109,33 @@ class Loop:
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        runs = loop.run(self.rigs, self.ways, self.seeds, self.workers)
+        runs = loop.run(self.rigs, self.policies, self.ways, self.seeds, self.workers)
         written = {" ".join(cell): [vars(one) for one in found] for cell, found in runs.items()}
         return {"verdict": loop.show(runs), "runs": written}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The next experiment of 256 samples, designed on a record: what was expected of it beside what came."""
+
+    seeds: int = 20
+    """Experiments of each rig and policy."""
+    rigs: tuple[str, ...] = tuple(BENCHES)
+    """Names of rigs."""
+    policies: tuple[str, ...] = ("efe",)
+    """Who designs."""
+    samples: int = 512
+    """Of the record before; 0: designed on the guess, with the noises known."""
+    workers: int = CORES
+    """Processes."""
+    json: Path | None = None
+    """File for every experiment."""
+
+    def run(self) -> dict[str, Any]:
+        """Run, print, and return what goes into the file."""
+        found = experiment.run(self.rigs, self.policies, self.samples, self.seeds, self.workers)
+        written = {" ".join(cell): [vars(one) for one in trials] for cell, trials in found.items()}
+        return {"verdict": experiment.show(found), "trials": written}
 
 
 Part = (
@@ -118,6 +144,7 @@ Part = (
     | Annotated[Against, tyro.conf.subcommand("peers")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Loop, tyro.conf.subcommand("loop")]
+    | Annotated[Experiment, tyro.conf.subcommand("experiment")]
 )
 
 

@@ -1,4 +1,4 @@
-"""The closed loop: 256 samples on the adaptive integrator, by prbs and by the planner, one by one and in blocks."""
+"""The closed loop: 256 samples on the adaptive integrator, by signals and by the planner, one by one and in blocks."""
 
 from __future__ import annotations
 
@@ -87,12 +87,14 @@ class Run:
         gain: information about the coefficients that the posterior has gained [nats].
         inside: (4,) whether the 90 % intervals of m, c, a and b hold the truth.
         error: (4,) of the estimates, relative.
+        narrower: (4,) standard deviations before over those after.
         left: whether the output left its range, or the numbers ran away.
     """
 
     gain: float
     inside: list[bool]
     error: list[float]
+    narrower: list[float]
     left: bool
 
 
@@ -106,15 +108,17 @@ def trial(task: Task) -> Run:
     )  # fmt: skip
     plant = BenchPlant(bench, seed)
     # A signal sample by sample is scaled so that it stays in the range; blocks, and the planner, find out themselves.
-    largest = bench.amplitude / bench.limit if policy == "prbs" else 1.0
+    largest = bench.amplitude / bench.limit if policy != "efe" else 1.0
     play = _samples if way == "samples" else _blocks
     belief, left = play(rig, plant, policy, seed, largest)
-    mean = np.array([belief.parameters()[p][0] for p in PARAMETERS])
+    prior = rig_prior(rig)
+    mean, std = np.array([belief.parameters()[p][:2] for p in PARAMETERS]).T
+    before = np.array([prior.parameters()[p][1] for p in PARAMETERS])
     low, high = np.array([belief.interval(LEVEL)[p] for p in PARAMETERS]).T
     truth = np.array(bench.truth)
     return Run(
-        rig_prior(rig).entropy() - belief.entropy(), ((low <= truth) & (truth <= high)).tolist(),
-        (mean / truth - 1).tolist(), left,
+        prior.entropy() - belief.entropy(), ((low <= truth) & (truth <= high)).tolist(),
+        (mean / truth - 1).tolist(), (before / std).tolist(), left,
     )  # fmt: skip
 
 
@@ -150,9 +154,11 @@ def _blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float)
     return ran.belief, ran.ended == "range"
 
 
-def run(names: Sequence[str], ways: Sequence[str], seeds: int, workers: int) -> dict[tuple[str, str, str], list[Run]]:
+def run(
+    names: Sequence[str], policies: Sequence[str], ways: Sequence[str], seeds: int, workers: int
+) -> dict[tuple[str, str, str], list[Run]]:
     """Runs by rig, policy and way."""
-    cells = list(product(names, POLICIES, ways))
+    cells = list(product(names, policies, ways))
     runs = in_processes(trial, [(*cell, seed) for cell in cells for seed in range(seeds)], workers, "Playing")
     return {cell: [runs[*cell, seed] for seed in range(seeds)] for cell in cells}
 
@@ -165,13 +171,14 @@ def show(runs: dict[tuple[str, str, str], list[Run]]) -> dict[str, Any]:
 
     console = Console(width=160)
     table = Table("rig", "played by", "policy", "gained, nats", "median error of m, c, a, b, %", "coverage of 90 %",
-                  "left its range", box=box.MARKDOWN)  # fmt: skip
+                  "times narrower", "left its range", box=box.MARKDOWN)  # fmt: skip
     for (name, policy, way), found in runs.items():
         gains, number = np.array([one.gain for one in found]), len(found)
         table.add_row(
             name, way, policy, f"{gains.mean():.2f} ± {1.96 * gains.std(ddof=1) / np.sqrt(number):.2f}",
             percents(np.median(np.abs([one.error for one in found]), axis=0)),
             ", ".join(f"{share:.2f}" for share in np.mean([one.inside for one in found], axis=0)),
+            ", ".join(f"{times:.3g}" for times in np.median([one.narrower for one in found], axis=0)),
             f"{sum(one.left for one in found)} of {number}",
         )  # fmt: skip
     console.print(table)
@@ -191,8 +198,13 @@ def verdict(runs: dict[tuple[str, str, str], list[Run]], way: str) -> dict[str, 
         if policy == "efe":
             # One-sided: the upper end of the central 90 % interval.
             kept.append(binomial_interval(sum(one.left for one in found), len(found), 0.9)[1] < ASKED)
-            gains = [np.mean([one.gain for one in runs[name, each, way]]) for each in POLICIES]
-            ahead.append(bool(gains[1] > gains[0]))
+            means = {
+                each: np.mean([one.gain for one in played_by])
+                for (rig, each, how), played_by in runs.items()
+                if (rig, how) == (name, way)
+            }
+            chosen = means.pop("efe")
+            ahead.append(all(bool(chosen > gain) for gain in means.values()))
     pooled, meets = calibrated(hits, trials)
     return {
         "calibrated": POOLED[0] <= pooled <= POOLED[1] and all(meets),

@@ -1,0 +1,64 @@
+"""``duffing-env design``: the next experiment on a rig, as a signal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Design:
+    """Design the next experiment: a signal within the rig's limits, and the intervals to be expected after it.
+
+    $ duffing-env design rig.toml
+    $ duffing-env design rig.toml posterior.npz --policy efe --samples 256 -o next.csv
+    $ duffing-env design rig.toml posterior.npz --policy prbs -o next.csv
+    """
+
+    rig: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RIG")]
+    """Rig file, with input.limit and output.range, or the name of a rig that ships."""
+    posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="POSTERIOR")] = None
+    """What is known: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
+    policy: str = "efe"
+    """The planner, a signal, or a trained policy such as ppo/universal."""
+    samples: int = 256
+    """Of the experiment."""
+    bound: float = 0.05
+    """Largest probability that the output leaves its range, under all that is believed."""
+    seed: int = 0
+    """Of the policy, and of the systems that are drawn from what is believed."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
+    """CSV file for the signal, in the rig's units."""
+
+    def run(self) -> None:
+        """Design, print what is to be expected, and write the signal."""
+        from agents.running.experiment import design
+        from estimator.saving import load_estimator
+
+        prior = None if self.posterior is None else load_estimator(self.posterior).belief
+        found = design(self.rig, prior, self.policy, self.samples, self.bound, self.seed)
+        if self.output is not None:
+            found.write(self.output)
+        show(found)
+        if self.output is not None:
+            print(f"The signal is {self.output}")
+
+
+def show(found: Any) -> None:
+    """Print the intervals before and after, and how safe the signal is."""
+    from agents.results import show as print_all
+    from agents.results import table
+
+    rows = [
+        [name, f"{mean:.5g}", f"{low:.5g} to {high:.5g}", f"± {half:.2g}", f"{(high - low) / 2 / half:.3g}", unit]
+        for name, mean, (low, high), half, unit in found.rows()
+    ]
+    made = f"{len(found.u)} samples by {found.policy}, up to {abs(found.u).max():.3g} {found.rig.input.unit}"
+    made += f", made smaller to {found.share:.2g} of it" if found.share < 1 else ""
+    print_all(
+        table(("", "mean", "90 % interval now", "expected after", "times narrower", "unit"), rows),
+        f"{made}; {found.gain:.1f} nats more; out of the range with probability {found.probability:.1g}.",
+    )

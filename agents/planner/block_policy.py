@@ -1,0 +1,97 @@
+"""The planner in blocks: it decides on a whole block of inputs at once, and sees their outputs when all were played."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from agents.planner.blocks import best_block, drafts, systems_of
+from agents.planner.futures import Futures, drawn_from_records, draws_for
+from agents.planner.motion import places
+from agents.planner.policy import Planner
+from estimator.parameters import FloatArray
+
+#: Moves after a block that are planned with it, so that it ends where the next can go on.
+_AFTER = 9
+
+#: Of these, those that must be safe, too: what a block has begun the next one can stop only then.
+_MOMENTUM = 3
+
+
+class BlockState(NamedTuple):
+    """What `BlockPlanner.predict` goes on from, of n environments.
+
+    Attributes:
+        plans: (n, block) the blocks.
+        played: (n,) samples of these that were played.
+    """
+
+    plans: FloatArray
+    played: npt.NDArray[np.int64]
+
+
+class BlockPlanner:
+    """Expected free energy planning, a block at a time, on the beliefs of an environment (`agents.planner.blocks`).
+
+    Args:
+        env: as of `agents.planner.policy.Planner`.
+        seed: of the search, and of the systems that are drawn.
+        block: samples of a block.
+        risk: upper bound of the probability that an episode leaves its range; each block has its share of it.
+
+    Raises:
+        ValueError: as `Planner`; for a block below 1; or where the input's energy is limited.
+    """
+
+    def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 0.05) -> None:
+        self._planner = Planner(env, seed, risk=risk)
+        if not isinstance(block, int | np.integer) or block < 1:
+            raise ValueError(f"block must be a whole number of at least 1, but is {block!r}")
+        setup = env.experiment.setup
+        if np.isfinite(setup.budget):
+            raise ValueError(f"env must have no limit of energy for blocks, but has max_rms={env.experiment.max_rms!r}")
+        self._env, self.block, self._bound = env, int(block), risk / env.horizon
+        self._limit = float(setup.max_output)
+
+    def predict(
+        self,
+        observation: npt.ArrayLike,
+        state: BlockState | None = None,
+        episode_start: npt.ArrayLike | None = None,
+        deterministic: bool = False,
+    ) -> tuple[npt.NDArray[np.float32], BlockState]:
+        """The next inputs of the blocks, which are planned where one is at its end; as `Planner.predict`."""
+        observed, records = np.asarray(observation, dtype=np.float64), self._env.records
+        n, view = len(records), self._planner.view
+        if state is None:
+            state = BlockState(np.zeros((n, self.block)), np.full(n, self.block))
+        plans, played = state.plans.copy(), state.played.copy()
+        if episode_start is not None:
+            played[np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)] = self.block
+        at, rows = places(view.model), observed.reshape(n, -1)
+        left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
+        for i in np.flatnonzero(played >= self.block):
+            last = self._planner.terms.amplitude * rows[i, at.last_input]
+            plans[i] = self._plan(records[i], int(max(1, left[i])), float(last), int(i))
+            played[i] = 0
+        actions = (plans[np.arange(n), played] / self._planner.terms.amplitude).astype(np.float32)
+        return actions.reshape(*observed.shape[:-1], 1), BlockState(plans, played + 1)
+
+    def _plan(self, record: FloatArray, left: int, last: float, i: int) -> FloatArray:
+        """A block (block,), zeros beyond the end of the episode."""
+        planner, samples = self._planner, min(self.block, left)
+        view, terms = planner.view, planner.terms
+        seen = min(left, samples + _AFTER * terms.pace)
+        rng = np.random.default_rng([planner.seed, i, left])
+        (belief,) = self._env.experiment.believed.with_records(record[None])
+        bound = self._bound * samples
+        drawn = drawn_from_records(view.model, record[None], np.ones(1), rng, draws_for(bound))
+        futures = Futures(view.model, drawn, self._limit, rng, degree=view.degree)
+        systems = systems_of(view, belief, futures, seen, last)
+        u, *_ = best_block(
+            view, systems, futures, drafts(planner, record, seen, int(rng.integers(2**63))), terms.amplitude, bound,
+            min(seen, samples + _MOMENTUM * terms.pace),
+        )  # fmt: skip
+        return np.concatenate([u[:samples], np.zeros(self.block - samples)])

@@ -1,0 +1,182 @@
+"""Whole blocks of inputs, chosen on a belief before any of their outputs is seen.
+
+A block is planned for systems that are drawn from the belief, not for its means: it climbs the mean of what they tell,
+
+    J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / aim - 1)²],
+
+by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. The
+*aim* is the limit, and less where too many of some hundred further draws leave it (`agents.planner.futures`): a block
+is played only when at most a given share of them does. It begins as the planner's own plan for the belief's means.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.planner.ascent import PENALTY, Limits, project
+from agents.planner.design import Known, designer
+from agents.planner.futures import Futures
+from agents.planner.motion import View
+from agents.planner.policy import Planner
+from agents.planner.search import search
+from estimator.arrays import copy, fill
+from estimator.belief import Belief
+from estimator.lanes import kernel
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+
+#: Systems that a block is planned for.
+SYSTEMS = 24
+
+#: Steps of the gradient for a candidate, and after every change of the aim; and the first step (`ascent`).
+_STEPS, _MORE, _RATE = 24, 12, 0.2
+
+#: The aim in parts of the limit: at first, how it falls, and how often.
+_AIM, _LOWER, _AIMS = 0.99, 0.94, 10
+
+#: The second candidate in parts of the first.
+_WEAKER = 0.6
+
+
+class Systems(NamedTuple):
+    """Drawn systems, as compiled code takes them.
+
+    Attributes:
+        coefficients: (S, K).
+        starts: (S, size) what their paths start with (`agents.planner.design`).
+        noises: (S, 1 + sensors) variances.
+        shakes: (S, T) what process noise adds to the input.
+        precision: (K, K) what is known of the coefficients before.
+    """
+
+    coefficients: FloatArray
+    starts: FloatArray
+    noises: FloatArray
+    shakes: FloatArray
+    precision: FloatArray
+
+
+def systems_of(view: View, belief: Belief, futures: Futures, samples: int, last: float = 0.0) -> Systems:
+    """The first of drawn systems, before a block of so many samples; ``last`` is the input before it.
+
+    What is not known of a state is what the belief does not know of it.
+    """
+    found, n = designer(view.model, view.degree), view.model.n_states
+    precision: FloatArray = np.linalg.inv(belief.coefficients_cov)
+    Z = belief.cov[:n, n:] @ precision
+    V = belief.state_cov - Z @ belief.cov[n:, :n]
+    starts = np.zeros((SYSTEMS, found.start_size))
+    starts[:, :n] = futures.states[:SYSTEMS]
+    starts[:, n : found.n_path] = np.concatenate([V[np.triu_indices(n)], Z.ravel()])
+    starts[:, found.n_path : found.n_path + 1] = last
+    shakes = np.ascontiguousarray(futures.disturbances(samples)[0][:SYSTEMS])
+    coefficients = np.ascontiguousarray(futures.coefficients[:SYSTEMS])
+    return Systems(coefficients, starts, futures.noises[:SYSTEMS] ** 2, shakes, precision)
+
+
+@cache
+def _climber(model: Model, degree: int) -> Any:
+    """``ascend(systems, limits, rate, iterations, u)``: climb from u (T,); the best met overwrites it. Gives its J."""
+    found = designer(model, degree)
+    climb, memory_for, as_noises = found.climb, found.memory, found.code.noises
+
+    @kernel(kind=f"{model.name}_{model.digest}_{degree}")
+    def ascend(systems, limits, rate, iterations, u):
+        T, S = len(u), len(systems.coefficients)
+        memory, best, total, shaken = memory_for(T), np.empty(T), np.empty(T), np.empty(T)
+        copy(best, 0, u, T)
+        most = -np.inf
+        radius = min(np.sqrt(limits.energy), limits.amplitude * np.sqrt(T))
+        for i in range(iterations + 1):
+            fill(total, 0.0)
+            value = 0.0
+            for k in range(S):
+                for t in range(T):
+                    shaken[t] = u[t] + systems.shakes[k, t]
+                known = Known(systems.coefficients[k], systems.precision, as_noises(systems.noises[k]))
+                told, _ = climb(known, limits.aim, PENALTY, systems.starts[k], shaken, memory)
+                value += told / S
+                for t in range(T):
+                    total[t] += memory.gradient[t]
+            if value > most:
+                most = value
+                copy(best, 0, u, T)
+            power = 0.0
+            for t in range(T):
+                power += total[t] * total[t]
+            if i == iterations or not power > 0.0:
+                break
+            stride = rate * (1.0 - 0.95 * i / iterations) * radius / np.sqrt(power)
+            for t in range(T):
+                u[t] += stride * total[t]
+            project(u, limits.amplitude, limits.energy)
+        copy(u, 0, best, T)
+        return most
+
+    return ascend
+
+
+def best_block(
+    view: View, systems: Systems, futures: Futures, candidates: FloatArray, amplitude: float, bound: float,
+    played: int | None = None,
+) -> tuple[FloatArray, float, float]:  # fmt: skip
+    """The best input that is safe enough.
+
+    Args:
+        view: of the model.
+        systems: that it is planned for.
+        futures: that tell how safe it is.
+        candidates: (n, T) to begin from.
+        amplitude: limit of the input.
+        bound: of the probability.
+        played: samples that are asked to be safe; all where None.
+
+    Returns:
+        Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and the
+        probability that they leave the limit.
+    """
+    ascend = _climber(view.model, view.degree)
+    limits = Limits(futures.limit, _AIM * futures.limit, amplitude, np.inf)
+    climbed = [np.array(candidate) for candidate in candidates]
+    values = [ascend(systems, limits, _RATE, _STEPS, u) for u in climbed]
+    u = climbed[int(np.argmax(values))]
+    for _ in range(_AIMS):
+        probability = futures.probability(u[:played])
+        if probability < bound:
+            return u, 1.0, probability
+        limits = limits._replace(aim=_LOWER * limits.aim)
+        ascend(systems, limits, _RATE / 2, _MORE, u)
+    share, probability = futures.share(u[:played], bound)
+    return share * u, share, probability
+
+
+def drafts(planner: Planner, record: FloatArray, samples: int, seed: int) -> FloatArray:
+    """(2, samples) inputs to begin from: the planner's plan where a belief's means are the truth, and a weaker one."""
+    u = np.zeros(samples)
+    words = np.random.SFC64(seed).state["state"]["state"]
+    horizon = min(planner.horizon, samples)
+    search(*planner.view).play(record.copy(), 0, horizon, planner.rounds, planner.terms, u, words)
+    u = np.clip(u, -planner.terms.amplitude, planner.terms.amplitude)
+    return np.stack([u, _WEAKER * u])
+
+
+def expected(view: View, systems: Systems, limit: float, u: FloatArray) -> tuple[float, FloatArray]:
+    """What inputs (T,) are expected to tell: the mean of ½ log det(Λ + F) [nats], and (S, K, K) covariances after them.
+
+    Args:
+        view: of the model.
+        systems: that are believed in.
+        limit: of the first sensor's signal; what comes after it was left far does not count.
+        u: the inputs.
+    """
+    found = designer(view.model, view.degree)
+    memory, values, covs = found.memory(len(u)), [], []
+    for c, start, noises, shake in zip(*systems[:4], strict=True):
+        known = Known(c, systems.precision, tuple(noises.tolist()))
+        values.append(found.worth(known, limit, 0.0, start, u + shake[: len(u)], memory)[0])
+        factor = np.linalg.inv(np.tril(memory.F))
+        covs.append(factor.T @ factor)
+    return float(np.mean(values)), np.array(covs)

@@ -1,0 +1,145 @@
+"""Systems drawn from a belief, what they do with inputs, and how probable it is that an output leaves its range."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from estimator.belief import Belief, covariance_places
+from estimator.free_run import free_run
+from estimator.models.model import Model
+from estimator.online import OnlineEstimator
+from estimator.parameters import FloatArray
+
+#: Systems that are drawn from a belief, at least.
+DRAWS = 300
+
+#: An input that is too large is tried again at this share, so often: down to a thousandth.
+_LESS, _TRIALS = 0.8, 31
+
+#: From the standard deviation of the process noise to that of a force that is held over a sample.
+_HELD = np.sqrt(3.0)
+
+#: States and coefficients (draws, d), and standard deviations of both noises (draws, 2).
+Drawn = tuple[FloatArray, FloatArray]
+
+
+def draws_for(bound: float) -> int:
+    """Systems that can tell a probability below a bound."""
+    return max(DRAWS, math.ceil(2.0 / bound))
+
+
+def drawn_from_records(
+    model: Model, records: FloatArray, weights: FloatArray, rng: np.random.Generator, draws: int = DRAWS
+) -> Drawn:
+    """Systems from a mixture of beliefs, records (n, size) as `estimator.Belief` keeps them, with weights (n,)."""
+    weights = np.where(np.isfinite(records).all(axis=1), weights, 0.0)
+    counts = rng.multinomial(draws, weights / weights.sum())
+    d, places = len(model.names), covariance_places(model)
+    drawn, noises = [], []
+    for record, count in zip(records, counts.tolist(), strict=True):
+        if count:
+            drawn.append(rng.multivariate_normal(record[:d], record[places], count, method="eigh"))
+            shapes, rates = record[-4::2], record[-3::2]
+            noises.append(1.0 / np.sqrt(rng.gamma(shapes, 1.0 / rates, (count, 2))))
+    return np.concatenate(drawn), np.concatenate(noises)
+
+
+def drawn_from(estimator: OnlineEstimator, rng: np.random.Generator) -> Drawn:
+    """Systems from an estimator's posterior, its hypotheses as often as they are probable."""
+    arrays = estimator.arrays()
+    return drawn_from_records(estimator.model, arrays["records"], arrays["weights"], rng)
+
+
+def drawn_at_rest(belief: Belief, rng: np.random.Generator, draws: int = DRAWS) -> Drawn:
+    """Oscillators of Eq. (1) from a belief, each where it rests without input: of two wells, in either."""
+    drawn, noises = drawn_from_records(belief.model, belief.record[None], np.ones(1), rng, draws)
+    n = belief.model.n_states
+    drawn[:, :n] = 0.0
+    for system in drawn:
+        system[0] = rng.choice(rests(belief.model, system[n:]))
+    return drawn, noises
+
+
+def rests(model: Model, coefficients: FloatArray) -> list[float]:
+    """States x at which an oscillator of Eq. (1) rests without input: one, or that of each of two wells.
+
+    The origin, where there is none.
+    """
+    c = dict(zip(model.coefficients, coefficients.tolist(), strict=True))
+    shift = c.get("output_offset", 0.0) if "output_offset" in model.rates[1] else 0.0
+    # cubic s³ + stiffness (s + shift) = force, with s the displacement.
+    found = np.roots([c["cubic"], 0.0, c["stiffness"], c["stiffness"] * shift - c.get("force", 0.0)])
+    s = found.real[np.abs(found.imag) < 1e-9 * (1.0 + np.abs(found.real))]
+    stable = s[c["stiffness"] + 3.0 * c["cubic"] * s**2 > 0.0]
+    return [float(value + shift) for value in stable] or [0.0]
+
+
+class Futures:
+    """What drawn systems do with inputs, in their noises, which stay the same from input to input.
+
+    Args:
+        model: of the systems.
+        drawn: states, coefficients and noises.
+        limit: of the output, in the belief's scale.
+        rng: of the noises.
+        delay: samples by which inputs act later.
+        degree: of the input over a sample: 0 held, 1 linear.
+
+    Attributes:
+        states: (draws, n).
+        coefficients: (draws, K).
+        noises: (draws, 2) standard deviations of process and sensor noise.
+    """
+
+    def __init__(
+        self, model: Model, drawn: Drawn, limit: float, rng: np.random.Generator, delay: int = 0, degree: int = 0
+    ) -> None:
+        systems, self.noises = drawn
+        self.model, self.limit, self.delay = model, limit, delay
+        self.states, self.coefficients = systems[:, : model.n_states], systems[:, model.n_states :]
+        self.interpolation = ("zero_order", "linear")[degree]
+        self._seed = int(rng.integers(2**63))
+        self._disturbed: tuple[FloatArray, FloatArray] | None = None
+
+    def disturbances(self, samples: int) -> tuple[FloatArray, FloatArray]:
+        """(draws, samples) what process noise adds to the input, and what the sensor adds to the output."""
+        if self._disturbed is None or self._disturbed[0].shape[1] < samples:
+            rng = np.random.default_rng(self._seed)
+            process, sensor = rng.standard_normal((2, samples, len(self.noises))).swapaxes(1, 2)
+            names = list(self.model.coefficients)
+            gain = self.coefficients[:, names.index("gain" if "gain" in names else "eta")]
+            held = _HELD if self.model.is_continuous else 1.0
+            force = held * self.noises[:, 0] / np.maximum(np.abs(gain), 1e-12)
+            self._disturbed = force[:, None] * process, self.noises[:, 1:] * sensor
+        process, sensor = self._disturbed
+        return process[:, :samples], sensor[:, :samples]
+
+    def probability(self, u: FloatArray) -> float:
+        """That inputs (N,), in the belief's scale, take the output out of its limit at any of the samples.
+
+        The mean of what the draws tell of it, (k + 1) / (n + 2): it is never 0.
+        """
+        acting = np.concatenate([np.zeros(self.delay), u])[: len(u)]
+        process, sensor = self.disturbances(len(u))
+        left = 0
+        with np.errstate(over="ignore", invalid="ignore"):
+            for state, coefficients, w, v in zip(self.states, self.coefficients, process, sensor, strict=True):
+                y = free_run(self.model, coefficients, acting + w, state, self.interpolation) + v
+                left += not bool((np.abs(y) <= self.limit).all())
+        return (left + 1) / (len(self.states) + 2)
+
+    def share(self, u: FloatArray, bound: float) -> tuple[float, float]:
+        """The largest share of inputs whose probability of leaving the limit is below a bound, and that probability.
+
+        Returns:
+            The share, in (0, 1], or 0 where even no input is too much; and the probability at it.
+        """
+        share = 1.0
+        for _ in range(_TRIALS):
+            probability = self.probability(share * u)
+            if probability < bound:
+                return share, probability
+            share *= _LESS
+        return 0.0, self.probability(0.0 * u)

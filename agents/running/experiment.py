@@ -1,0 +1,207 @@
+"""The next experiment on a rig, as a whole: a signal, and what is to be expected after it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from agents.planner.blocks import Systems, best_block, drafts, expected, systems_of
+from agents.planner.futures import Futures, drawn_at_rest, draws_for, rests
+from agents.planner.motion import View
+from agents.planner.policy import Planner
+from agents.policies import make_policy
+from agents.policies.signals import SignalPolicy
+from agents.running.designs import Block, SignalDesign
+from agents.running.observed import Observed
+from estimator.belief import Belief, covariance_places
+from estimator.files import write_atomically
+from estimator.free_run import free_run
+from estimator.parameters import FloatArray
+from estimator.physical import propagate
+from estimator.rig import Rig
+from estimator.rig_prior import rig_prior
+
+#: Systems on which a policy that answers to outputs is played.
+_PLAYED = 4
+
+#: Standard deviation of a state at rest, where the planner's plan for the belief's means begins, in parts of its scale.
+_STILL = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Designed:
+    """An experiment to come.
+
+    Attributes:
+        rig: it is for.
+        policy: that chose it.
+        u: (T,) inputs in the rig's unit.
+        before: what is believed now.
+        after: parameter to the standard deviation that is to be expected after it: the median over the belief.
+        gain: nats that the coefficients are expected to gain.
+        share: of what the policy chose that is safe.
+        probability: that the output leaves the rig's range, under the belief.
+    """
+
+    rig: Rig
+    policy: str
+    u: FloatArray
+    before: Belief
+    after: Mapping[str, float]
+    gain: float
+    share: float
+    probability: float
+
+    def rows(self, level: float = 0.9) -> list[tuple[str, float, tuple[float, float], float, str]]:
+        """Of each parameter: name, mean, its interval now, the half width of that to be expected, and the unit."""
+        wide, intervals = float(ndtri(0.5 + level / 2)), self.before.interval(level)
+        return [
+            (name, mean, intervals[name], wide * self.after[name], unit)
+            for name, (mean, _, unit) in self.before.parameters().items()
+        ]
+
+    def write(self, path: Path) -> None:
+        """A CSV file with the columns time [s] and u, as `identify` reads them beside an output."""
+        lines = [f"time [s],u [{self.rig.input.unit}]"]
+        lines += [f"{k * self.rig.step:.9g},{value:.12g}" for k, value in enumerate(self.u.tolist())]
+        write_atomically(path, "\n".join(lines) + "\n")
+
+
+def design(
+    rig: Rig | Mapping[str, Any] | str | Path,
+    prior: Belief | None = None,
+    policy: str = "efe",
+    samples: int = 256,
+    bound: float = 0.05,
+    seed: int = 0,
+) -> Designed:
+    """Design the next experiment: a signal for an oscillator at rest.
+
+    ``efe`` climbs what is learned of systems drawn from the belief, on average (`agents.planner.blocks`). A policy that
+    answers to outputs is played on some of them, and the signal that tells most on average is taken. A signal is taken
+    as it is. What would leave the range with more than the bound is made smaller.
+
+    Args:
+        rig: with the limit of the input and the range of the output.
+        prior: what is believed, such as ``identify(...).belief``; the rig's guess where it is None.
+        policy: any that `agents.policies.make_policy` knows.
+        samples: of the experiment.
+        bound: of the probability that the output leaves its range, under the whole belief.
+        seed: of the policy, and of the systems that are drawn.
+
+    Raises:
+        ValueError: for a rig without limit or range, or without guess where there is no prior; a prior in other
+            scales; samples below 8; a bound that is no probability; or where even no input is safe.
+
+    Example:
+        >>> from agents.running.experiment import design
+        >>> from estimator import Channel, Rig
+        >>> rig = Rig(1e-3, input=Channel("N", limit=20.0, noise=0.02), output=Channel("m", range=0.03, noise=5e-6),
+        ...           guess={"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (0.0, 1e8)})
+        >>> found = design(rig, policy="prbs", samples=256)
+        >>> name, mean, (low, high), half, unit = found.rows()[0]
+        >>> bool(half < (high - low) / 2), unit, found.probability < 0.05, len(found.u)
+        (True, 'kg', True, 256)
+    """
+    if not isinstance(samples, int | np.integer) or samples < 8:
+        raise ValueError(f"samples must be a whole number of at least 8, but is {samples!r}")
+    if not 0 < bound < 1:
+        raise ValueError(f"bound must be a probability between 0 and 1, but is {bound!r}; 0.05 is usual")
+    rig = Rig.of(rig)
+    belief = rig_prior(rig) if prior is None else prior
+    observed = Observed(rig, belief, int(samples))
+    rng = np.random.default_rng(seed)
+    view, limit = View.of(observed.experiment), float(observed.experiment.max_output)
+    drawn = drawn_at_rest(belief, rng, draws_for(bound))
+    futures = Futures(view.model, drawn, limit, rng, max(0, rig.delay), view.degree)
+    systems = systems_of(view, belief, futures, int(samples))
+    chooser = make_policy(policy, observed, seed=seed)  # type: ignore[arg-type]
+    if isinstance(chooser, Planner):
+        begun = drafts(chooser, _at_rest(belief), int(samples), seed)
+        u, share, probability = best_block(view, systems, futures, begun, observed.max_input, bound)
+    elif isinstance(chooser, SignalPolicy):
+        u, share, probability = SignalDesign(chooser, observed).block(int(samples), futures, bound)
+    else:
+        found = [_played(policy, observed, futures, k, bound, seed) for k in range(_PLAYED)]
+        told = [expected(view, systems, limit, u)[0] for u, *_ in found]
+        u, share, probability = found[int(np.argmax(told))]
+    if share == 0.0 and probability >= bound:
+        raise ValueError(
+            f"rig must be known well enough to stay in its range, but even without input it leaves it with probability "
+            f"{probability:.2g}, and at most {bound:.2g} is allowed; give a narrower guess or a wider range"
+        )
+    u = np.clip(u, -observed.max_input, observed.max_input)
+    worth, covs = expected(view, systems, limit, u)
+    gain = worth + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1])
+    after = _expected_deviations(belief, systems, covs)
+    return Designed(rig, policy, u * belief.scales.input, belief, after, gain, share, probability)
+
+
+def _expected_deviations(belief: Belief, systems: Systems, covs: FloatArray) -> dict[str, float]:
+    """Parameter to the median over systems of its standard deviation with these covariances."""
+    found = [
+        propagate(belief.model, c, cov, belief.scales)[1] for c, cov in zip(systems.coefficients, covs, strict=True)
+    ]
+    stds = np.median(np.sqrt([np.diag(cov) for cov in found]), axis=0)
+    return dict(zip(belief.parameters(), stds.tolist(), strict=True))
+
+
+def _at_rest(belief: Belief) -> FloatArray:
+    """A belief's record, with the state at rest."""
+    n, places, record = belief.model.n_states, covariance_places(belief.model), belief.record.copy()
+    record[:n] = 0.0
+    record[0] = rests(belief.model, belief.coefficients_mean)[0]
+    record[places[:n]] = 0.0
+    record[np.diag(places)[:n]] = _STILL**2
+    return record
+
+
+class _Imagined:
+    """A drawn system as the plant of ``Rig-v0``, in the rig's units."""
+
+    def __init__(self, observed: Observed, futures: Futures, k: int) -> None:
+        self._scales, self._model = observed.experiment.scales, futures.model
+        self._system = futures.coefficients[k], futures.states[k]
+        self._noises = tuple(noise[k] for noise in futures.disturbances(observed.horizon))
+        self._interpolation = futures.interpolation
+        self._inputs: list[float] = []
+
+    def reset(self) -> None:
+        self._inputs = []
+
+    def step(self, u: float) -> float:
+        self._inputs.append(u / self._scales.input)
+        t, (coefficients, state) = len(self._inputs), self._system
+        acting = np.array(self._inputs) + self._noises[0][:t]
+        y = free_run(self._model, coefficients, acting, state, self._interpolation)[-1]
+        return float(self._scales.output * (y + self._noises[1][t - 1]))
+
+
+def _played(name: str, observed: Observed, futures: Futures, k: int, bound: float, seed: int) -> Block:
+    """What a policy answers to a drawn system, as large as it is safe on all."""
+    import gymnasium as gym
+
+    import duffing_env  # noqa: F401  registers the tracks
+
+    experiment = observed.experiment
+    env = gym.make(
+        "duffing_env/Rig-v0", rig=experiment.rig, prior=experiment.prior, horizon=observed.horizon,
+        plant=_Imagined(observed, futures, k),
+    )  # fmt: skip
+    policy = make_policy(name, env, seed=seed)
+    observation, _ = env.reset()
+    u, state, begins = np.zeros(observed.horizon), None, np.ones(1, dtype=bool)
+    for t in range(observed.horizon):
+        action, state = policy.predict(observation, state, begins, deterministic=True)
+        begins = np.zeros(1, dtype=bool)
+        observation, _, terminated, truncated, _ = env.step(action)
+        u[t] = observed.max_input * float(action[0])
+        if terminated or truncated:
+            break
+    share, probability = futures.share(u, bound)
+    return share * u, share, probability
