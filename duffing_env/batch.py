@@ -191,6 +191,15 @@ class Batch:
         # Of a single block that is a view, in another order, for which a kernel would be compiled once more.
         return np.array(records[: self.size], order="C")
 
+    def mixture(self, index: int) -> tuple[FloatArray, FloatArray]:
+        """Records (m, size) and weights (m,) of the beliefs that environment ``index`` weighs: one, or its members."""
+        size, count = record_size(self.experiment.model), len(self.experiment.setup.hypotheses) // 4
+        if not count:
+            return self.records()[index : index + 1], np.ones(1)
+        lanes = np.arange(index * count, (index + 1) * count)
+        members = self._members.reshape(len(self._members), -1, LANES)[lanes // LANES, :, lanes % LANES]
+        return members[:, :size].copy(), members[:, member_layout(self._kind)["WEIGHT"]].copy()
+
     def belief(self, index: int) -> Belief:
         """The belief of environment ``index``."""
         return self.beliefs(np.array([index]))[0]

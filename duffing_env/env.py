@@ -207,6 +207,10 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         """(1, size) the posterior now as the flat record of `estimator.Belief`, as the vector environment's."""
         return self._batch.records()
 
+    def mixture(self, index: int = 0) -> tuple[FloatArray, FloatArray]:
+        """Records (m, size) and weights (m,) of the beliefs that it weighs: one, or one for each hypothesis."""
+        return self._batch.mixture(0)
+
     @property
     def truth(self) -> Parameters:
         """The oscillator that is to be identified."""

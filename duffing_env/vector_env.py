@@ -142,6 +142,10 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         """(num_envs, size) the posteriors now, as the flat records of `estimator.Belief`; a copy."""
         return self._batch.records()
 
+    def mixture(self, index: int) -> tuple[FloatArray, FloatArray]:
+        """Records (m, size) and weights (m,) of the beliefs that one weighs: one, or one for each hypothesis."""
+        return self._batch.mixture(index)
+
     @property
     def truth(self) -> Parameters:
         """The oscillators that are to be identified, a batch of ``num_envs``."""

@@ -87,7 +87,8 @@ class BlockPlanner:
         rng = np.random.default_rng([planner.seed, i, left])
         (belief,) = self._env.experiment.believed.with_records(record[None])
         bound = self._bound * samples
-        drawn = drawn_from_records(view.model, record[None], np.ones(1), rng, draws_for(bound))
+        records, weights = self._env.mixture(i)
+        drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound))
         futures = Futures(view.model, drawn, self._limit, rng, degree=view.degree)
         systems = systems_of(view, belief, futures, seen, last)
         u, *_ = best_block(

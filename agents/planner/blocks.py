@@ -65,7 +65,7 @@ def systems_of(view: View, belief: Belief, futures: Futures, samples: int, last:
     What is not known of a state is what the belief does not know of it.
     """
     found, n = designer(view.model, view.degree), view.model.n_states
-    precision: FloatArray = np.linalg.inv(belief.coefficients_cov)
+    precision = np.asarray(np.linalg.inv(belief.coefficients_cov), dtype=np.float64)
     Z = belief.cov[:n, n:] @ precision
     V = belief.state_cov - Z @ belief.cov[n:, :n]
     starts = np.zeros((SYSTEMS, found.start_size))
@@ -106,6 +106,8 @@ def _climber(model: Model, degree: int) -> Any:
                 copy(best, 0, u, T)
             power = 0.0
             for t in range(T):
+                if abs(u[t]) >= limits.amplitude and u[t] * total[t] > 0.0:
+                    total[t] = 0.0  # the limit holds it where it is
                 power += total[t] * total[t]
             if i == iterations or not power > 0.0:
                 break

@@ -13,13 +13,13 @@ from loopback import RIG, RIG_FILE, TRUTH
 import duffing_env  # noqa: F401
 from agents import make_policy
 from agents.commands import main
+from agents.planner.futures import Futures
 from agents.policies.signals import holds
 from agents.running.clock import JumpingClock, RealClock
 from agents.running.follower import Follower
 from agents.running.observed import Observed
 from agents.running.plant import load_plant
 from agents.running.run import Plan, run
-from agents.running.safety import Futures
 from agents.running.session import Session, Tripped
 from agents.running.simulated import SimulatedPlant
 from estimator import OnlineEstimator, Rig, identify
@@ -255,7 +255,8 @@ def listened(rig, truth, seed):
 
 def test_the_probability_of_leaving_grows_with_the_input():
     follower, _ = listened(RIG, TRUTH, 0)
-    futures = Futures(follower, 1.0, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
     u = np.repeat([1.0, -1.0], 16)
     found = [futures.probability(share * u) for share in (0.0, 1.0, 5.0, 30.0)]
     assert found[0] < 0.01
@@ -290,9 +291,9 @@ def test_blocks_leave_the_range_as_rarely_as_asked(policy):
         truth["m"] = float(np.exp(np.log(low * high) / 2 + np.log(high / low) / 2 / HALF_WIDTH * rng.standard_normal()))
         follower, plant = listened(rig, truth, k)
         observed = Observed(rig, follower.belief, 64)
-        u = design_of(make_policy(policy, observed, seed=k), observed).block(64)
-        share, probability = Futures(follower, 1.0, rng).share(u, 0.05)
-        _, y = plant.play(share * 40.0 * u)
+        futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
+        u, _, probability = design_of(make_policy(policy, observed, seed=k), observed).block(64, futures, 0.05)
+        _, y = plant.play(40.0 * u)
         left += bool((np.abs(y) > 0.08).any())
         promised.append(probability)
     assert np.mean(promised) < 0.05

@@ -1,0 +1,91 @@
+"""The next experiment as a signal: within the limits, worth what is said of it, and readable again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loopback import RIG, RIG_FILE, TRUTH
+
+from agents.commands import main
+from agents.planner.futures import rests
+from agents.running.clock import JumpingClock
+from agents.running.experiment import design
+from agents.running.simulated import SimulatedPlant
+from estimator import identify, load_estimator
+from estimator.identification.tables import read_table
+from estimator.models.duffing import duffing
+
+
+@pytest.mark.parametrize("policy", ["prbs", "efe", "velocity-sign"])
+def test_what_is_stated_after_an_experiment_is_what_was_expected(policy):
+    found = design(RIG, policy=policy, samples=96)
+    assert np.abs(found.u).max() <= RIG.input.limit
+    assert found.probability < 0.05
+    plant = SimulatedPlant(RIG, TRUTH, seed=1, clock=JumpingClock())
+    plant.arm(None)
+    _, y = plant.play(found.u)
+    assert np.abs(y).max() < RIG.output.range
+    told = identify(RIG, (found.u, y)).parameters
+    for name in "mcab":
+        # The systems that are drawn differ by some tens of percent in what an input tells of each of their parameters.
+        assert 0.4 < told[name][1] / found.after[name] < 2.5
+
+
+def test_the_planner_expects_more_of_its_signal():
+    expected = {policy: design(RIG, policy=policy, samples=96).gain for policy in ("prbs", "efe")}
+    assert expected["efe"] > expected["prbs"]
+
+
+def test_an_oscillator_rests_where_its_forces_are_in_balance():
+    model = duffing(offsets=True)
+    names = list(model.coefficients)
+
+    def at(**values):
+        return sorted(rests(model, np.array([values.get(name, 0.0) for name in names])))
+
+    assert at(stiffness=0.1, cubic=1.0) == [0.0]
+    np.testing.assert_allclose(at(stiffness=-0.1, cubic=0.4, force=-0.02, output_offset=0.2), [-0.3, 0.7])
+    (x,) = at(stiffness=0.1, cubic=1.0, force=0.02, output_offset=0.1)
+    assert 0.1 * x + (x - 0.1) ** 3 == pytest.approx(0.02)
+    (x,) = at(stiffness=0.1, cubic=-1.0)  # softening: beyond the hilltops it does not rest
+    assert x == 0.0
+
+
+def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text(RIG_FILE)
+    plant = SimulatedPlant(RIG, TRUTH, clock=JumpingClock())
+    plant.arm(None)
+    u, y = plant.play(np.repeat(np.random.default_rng(0).choice([-3.0, 3.0], 16), 8))
+    np.savetxt("record.csv", np.column_stack([u, y]), delimiter=",", header="u,y", comments="")
+    main(["identify", "rig.toml", "record.csv", "--save", "posterior.npz"])
+    capsys.readouterr()
+    main(["design", "rig.toml", "posterior.npz", "--policy", "prbs", "--samples", "64", "-o", "next.csv"])
+    told = capsys.readouterr().out
+    assert "expected after" in told
+    assert "kg" in told
+    found = design(RIG, load_estimator("posterior.npz").belief, "prbs", 64)
+    written = np.loadtxt("next.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(written[:, 1], found.u, rtol=1e-9)
+    lines = (tmp_path / "next.csv").read_text().splitlines()
+    ends = [",displacement [m]", *(",0.001" for _ in lines[1:])]
+    (tmp_path / "answer.csv").write_text("\n".join(line + end for line, end in zip(lines, ends, strict=True)))
+    table = read_table(tmp_path / "answer.csv")
+    assert (table.step(), table.unit(table.u)) == (pytest.approx(RIG.step), "N")
+    np.testing.assert_allclose(table.columns[table.u], found.u, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"samples": 4}, "samples must be"),
+        ({"bound": 1.0}, "bound must be"),
+        ({"policy": "prsb"}, "did you mean 'prbs'"),
+        ({"rig": replace(RIG, guess=None)}, "rig must have a guess"),
+        ({"rig": replace(RIG, input=replace(RIG.input, limit=None))}, "rig must have a limit"),
+        ({"rig": replace(RIG, output=replace(RIG.output, range=1e-5))}, "even without input"),
+    ],
+)
+def test_experiments_that_cannot_be(given, message):
+    with pytest.raises(ValueError, match=message):
+        design(**{"rig": RIG, "policy": "prbs", **given})
