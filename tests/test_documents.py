@@ -10,10 +10,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 # Pages that the manual is built with, out of docstrings; `make docs` fails where a link among them leads nowhere.
-GENERATED = ("tracks/", "reference/", "rewards.md")
+GENERATED = ("tracks/", "reference/", "rewards.md", "leaderboard.md")
 WITH_EXAMPLES = ["README.md"]
 WITH_EXAMPLES += [f"docs/{name}.md" for name in ("estimators", "own_data", "own_model", "quickstart", "running")]
-WITH_EXAMPLES += ["docs/rig_electronic_duffing.md", "docs/rig_beam.md"]
+WITH_EXAMPLES += ["docs/extending.md", "docs/rig_electronic_duffing.md", "docs/rig_beam.md"]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 

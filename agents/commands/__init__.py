@@ -17,6 +17,7 @@ from agents.commands.design import Design
 from agents.commands.evaluate import Evaluate
 from agents.commands.export import Export
 from agents.commands.identify import Identify
+from agents.commands.report import Report
 from agents.commands.rig import Init, List
 from agents.commands.run import Run
 
@@ -38,6 +39,7 @@ Command = (
     | Annotated[Train, _subcommand("train")]  # its settings follow from the algorithm: `agents.commands.train`
     | Annotated[Evaluate, _subcommand("evaluate")]
     | Annotated[Export, _subcommand("export")]
+    | Annotated[Report, _subcommand("report")]
     | Annotated[
         Annotated[Init, _subcommand("init")] | Annotated[List, _subcommand("list")],
         _subcommand("rig", description="Describe your rig in a file; list the rigs that ship."),

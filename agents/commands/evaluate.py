@@ -19,6 +19,7 @@ class Evaluate:
     $ duffing-env evaluate --report runs/report                as an HTML page
     $ duffing-env evaluate --rig rig.toml --policies efe       on your own rig
     $ duffing-env evaluate --options '{"max_output": 0.3}'     another limit
+    $ duffing-env evaluate --protocol Short-v0 --policies lab:Mine --submit Mine
     """
 
     policies: tuple[str, ...] = ()
@@ -37,14 +38,29 @@ class Evaluate:
     """Folder for evaluation.json and the figures."""
     report: Path | None = None
     """Folder for a report instead: one HTML page, and evaluation.json."""
+    protocol: str | None = None
+    """Track, such as Short-v0, to measure one policy on by docs/protocol.md instead, which fixes all but the policy."""
+    submit: str | None = None
+    """Name to add what the protocol gives to the board under."""
+    samples: int | None = None
+    """Samples that the policy learned from, for the board; a run folder says it itself."""
+    board: Path = Path("runs/leaderboard.jsonl")
+    """File of the board."""
 
     def __post_init__(self) -> None:
         if self.rig is not None:
             object.__setattr__(self, "env", RIG_TRACK)
         check_track(self.env)
+        if self.protocol is not None and len(self.policies) != 1:
+            raise ValueError(f"policies must name one for the protocol, but are {list(self.policies)}; name one")
+        if self.protocol is None and self.submit is not None:
+            raise ValueError("submit goes with a protocol, but that is None; add e.g. --protocol Short-v0")
 
     def run(self) -> None:
-        """Compare, and say where everything is."""
+        """Compare or measure, and say where everything is."""
+        if self.protocol is not None:
+            self._measure(self.protocol)
+            return
         from agents.evaluation.comparison import compare, usual_policies
 
         options = with_rig(self.options, self.rig)
@@ -53,3 +69,20 @@ class Evaluate:
             self.policies or usual_policies(self.env, options), self.env, self.systems, options, folder,
             seed=self.seed, report=self.report is not None,
         )  # fmt: skip
+
+    def _measure(self, protocol: str) -> None:
+        from rich.console import Console
+
+        from agents.evaluation.board import CAPTION, TITLES, append, cells
+        from agents.evaluation.protocol import measure
+        from agents.results import show, table
+
+        (policy,) = self.policies
+        track = protocol if "/" in protocol else f"duffing_env/{protocol}"
+        with Console(stderr=True).status("Measuring") as status:
+            name = policy.partition("=")[0] if self.submit is None else self.submit
+            entry = measure(policy, track, name, self.samples, status.update)
+        show(track, table(TITLES, [cells(entry)]), CAPTION, width=130)
+        if self.submit is not None:
+            append(self.board, entry)
+            print(f"{self.submit} is on the board {self.board}: duffing-env report")

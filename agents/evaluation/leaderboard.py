@@ -24,6 +24,7 @@ Statistic = tuple[str, Callable[..., Any]]
 
 MEAN: Statistic = ("mean", np.mean)
 MEDIAN: Statistic = ("median", np.median)
+IQM: Statistic = ("iqm", partial(stats.trim_mean, proportiontocut=0.25))
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Metric:
     digits: int
     scale: float = 1.0
     center: Statistic = MEAN
-    center_of_seeds: Statistic = ("iqm", partial(stats.trim_mean, proportiontocut=0.25))
+    center_of_seeds: Statistic = IQM
 
 
 _share = partial(Metric, center_of_seeds=MEAN)

@@ -117,7 +117,7 @@ def evaluate(
     evaluations = []
     told: dict[str, FloatArray] = {}
     for name in policies:
-        title, members = _members(name)
+        title, members = members_of(name)
         each = []
         for member in members:
             if on_policy is not None:
@@ -135,7 +135,7 @@ def title_of(policy: Any) -> str:
     return str(known)
 
 
-def _members(name: Any) -> tuple[str | None, list[Any]]:
+def members_of(name: Any) -> tuple[str | None, list[Any]]:
     """The title of a group and the policies in it; without a title, the one policy of this name."""
     if not isinstance(name, str):
         return None, [name]

@@ -17,6 +17,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from agents import POLICIES
+from agents.evaluation import board
 from agents.policies import TRAINED, trained_policies
 from duffing_env import TRACKS, rewards
 
@@ -61,6 +62,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         **{_page(track): _track(track) for track in TRACKS},
         "rewards.md": f"# Rewards\n\n{_fenced(inspect.getdoc(rewards) or '')}",
         "reference/policies.md": _policies(),
+        "leaderboard.md": _leaderboard(),
         **{f"reference/{name}.md": _reference(name, objects) for name, objects in REFERENCE.items()},
     }
     for path, text in pages.items():
@@ -160,6 +162,14 @@ def _policies() -> str:
             ),
         ]
     )
+
+
+def _leaderboard() -> str:
+    parts = ["# Leaderboard", "By the [protocol](protocol.md). `duffing-env report` prints it.", board.CAPTION]
+    for track, rows in board.tables(board.read(board.SHIPPED)).items():
+        lines = [f"| {' | '.join(row)} |" for row in (board.TITLES, ["---"] * len(board.TITLES), *rows)]
+        parts += [f"## {_title(track)}", "\n".join(lines)]
+    return "\n\n".join(parts)
 
 
 def _shipped(name: str) -> str:

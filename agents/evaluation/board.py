@@ -1,0 +1,117 @@
+"""Boards: files of what policies are worth by the protocol, a line of JSON for each entry."""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation.leaderboard import METRICS, Metric
+from agents.evaluation.protocol import SCORE, TRACKS, VERSION
+from agents.results import finite
+from estimator.files import whole_file, write_atomically
+
+#: The board that ships with the package.
+SHIPPED = Path(__file__).parents[1] / "leaderboard.jsonl"
+
+#: Where one's own entries go.
+OWN = Path("runs/leaderboard.jsonl")
+
+_LARGEST = 2**26  # bytes
+_SHIFTS = ("parameters", "noises", "limits", "equation")
+
+TITLES = (
+    "", SCORE.title, "seeds", "budget", "information / nat", "covered / %", "ended early / %",
+    *(f"{shift} / nat" for shift in _SHIFTS),
+)  # fmt: skip
+
+
+def append(path: Path, entry: dict[str, Any]) -> None:
+    """Add an entry, in one piece: of two programs that add at once, each adds a whole line.
+
+    Raises:
+        OSError: where it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    line = json.dumps(finite(entry), ensure_ascii=False, allow_nan=False) + "\n"
+    place = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    try:
+        os.write(place, line.encode())
+    finally:
+        os.close(place)
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """The entries of this version of the protocol; of one name on one track the latest.
+
+    Raises:
+        ValueError: for a line that is no entry, saying which.
+        FileNotFoundError: if there is no such file.
+    """
+    text = whole_file(path, "board must be a file of entries", _LARGEST).read_text(encoding="utf-8")
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        try:
+            entry = json.loads(line)
+            key = str(entry["track"]), str(entry["name"])
+            cells(entry)
+        except (ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
+            raise ValueError(f"board must hold an entry a line, but {path}:{number} is none: {error!r}") from error
+        if entry.get("protocol") == VERSION:
+            found[key] = entry
+    return list(found.values())
+
+
+def tables(entries: Sequence[dict[str, Any]]) -> dict[str, list[list[str]]]:
+    """Rows under `TITLES` for each track, the best score first."""
+    ordered = sorted(entries, key=lambda entry: -entry["score"]["iqm"])
+    rows = {track: [cells(entry) for entry in ordered if entry["track"] == track] for track in TRACKS}
+    return {track: found for track, found in rows.items() if found}
+
+
+def cells(entry: dict[str, Any]) -> list[str]:
+    """The row of an entry."""
+    told = entry["metrics"]
+    shifted = [entry["shifted"].get(shift, {}).get("fisher_gain") for shift in _SHIFTS]
+    return [
+        str(entry["name"]),
+        _with_interval(SCORE, entry["score"]),
+        str(entry["seeds"]),
+        str(entry["budget"]),
+        *(_center(METRICS[name], told[name]) for name in ("information_gain", "coverage", "ended_early")),
+        *(_center(METRICS["fisher_gain"], found) for found in shifted),
+    ]
+
+
+def write_page(path: Path, entries: Sequence[dict[str, Any]]) -> None:
+    """Write a page of the boards, which opens without a network."""
+    from estimator.page import page, table
+
+    parts = ["<h1>Leaderboard</h1>", f"<p>{CAPTION}</p>"]
+    for track, rows in tables(entries).items():
+        told = [[html.escape(cell) for cell in row] for row in rows]
+        parts += [f"<h2>{html.escape(track)}</h2>", table(TITLES, told)]
+    write_atomically(path, page("Leaderboard", parts))
+
+
+CAPTION = (
+    "Score: interquartile mean over seeds and systems of the D-efficiency, against the certified optimum of each "
+    "system that has one and else the best input that is known, with its 95 % bootstrap interval over systems. The "
+    "others are means over 256 systems: information gained, 90 % intervals that cover, episodes that a limit ended, "
+    "and on shifted systems the Fisher information."
+)
+
+
+def _center(metric: Metric, entry: dict[str, Any] | None) -> str:
+    if entry is None:
+        return "-"
+    center = next(value for key, value in entry.items() if key in ("mean", "iqm", "median"))
+    return "-" if center is None else f"{metric.scale * center:.{metric.digits}f}"
+
+
+def _with_interval(metric: Metric, entry: dict[str, Any]) -> str:
+    low, high = (f"{metric.scale * entry[end]:.{metric.digits}f}" for end in ("low", "high"))
+    return f"{_center(metric, entry)} [{low}, {high}]"

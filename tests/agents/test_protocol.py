@@ -1,0 +1,166 @@
+"""The protocol, and the boards that its figures go into."""
+
+import json
+import multiprocessing
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.commands import main
+from agents.evaluation import board, protocol
+from agents.evaluation.oracle import Oracle
+from agents.evaluation.systems import Systems
+
+SHORT = "duffing_env/Short-v0"
+
+
+@pytest.fixture(scope="module")
+def entry():
+    """What uniform noise is worth, on few systems."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(protocol, "SYSTEMS", 8)
+        return protocol.measure("uniform", SHORT, "noise")
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(protocol, "SYSTEMS", 8)
+
+    def run(*words):
+        try:
+            main(list(words))
+        except SystemExit as stop:
+            return stop.code, *capsys.readouterr()
+        return 0, *capsys.readouterr()
+
+    return run
+
+
+def test_a_policy_of_one_s_own_reaches_the_board_with_one_command(command, tmp_path):
+    (tmp_path / "lab.py").write_text("def push(seen):\n    return seen[:, 0] * 0 + 1\n")
+    words = ("evaluate", "--protocol", "Short-v0", "--policies", "lab:push", "--submit", "push", "--samples", "90000")
+    status, told, messages = command(*words)
+    assert status == 0, messages
+    assert "push is on the board runs/leaderboard.jsonl" in told
+    (entry,) = board.read(tmp_path / "runs/leaderboard.jsonl")
+    assert (entry["name"], entry["track"], entry["budget"], entry["seeds"]) == ("push", SHORT, "0.1M", 1)
+    assert entry["policies"]["lab:push"].startswith("sha256:")
+    assert 0 < entry["score"]["low"] <= entry["score"]["iqm"] <= entry["score"]["high"] < 1
+    assert entry["shifted"].keys() == {"parameters", "noises", "limits", "equation"}
+    status, told, _ = command("report", "--output", "board.html")
+    assert status == 0
+    assert any(line.split()[:1] == ["push"] for line in told.splitlines())
+    assert "<td>push</td>" in (tmp_path / "board.html").read_text()
+
+
+def test_the_score_is_against_the_bound_where_there_is_one(entry):
+    oracle = Oracle.of(Systems.of(SHORT, 8))
+    evaluation = protocol._evaluation("uniform", SHORT, {"branch": "test"} | {})
+    rows = np.swapaxes(evaluation.outputs, 0, 1)[:8]
+    best, least = oracle.efficiency(evaluation.inputs.T[:8], rows)
+    certified = np.isfinite(oracle.bounds)
+    score = protocol._score(evaluation, oracle)
+    assert certified.any()
+    np.testing.assert_array_equal(score[certified], least[certified])
+    np.testing.assert_array_equal(score[~certified], best[~certified])
+    assert (least[certified] <= best[certified]).all()
+    assert entry["reference"]["systems"] == 8
+    assert entry["reference"]["certified"] == certified.sum()
+
+
+def test_what_is_measured_twice_is_the_same(entry, monkeypatch):
+    monkeypatch.setattr(protocol, "SYSTEMS", 8)
+    again = protocol.measure("uniform", SHORT, "noise")
+    for part in (entry, again):
+        part["metrics"].pop("decision_time", None)
+    assert again == entry
+
+
+@pytest.mark.parametrize("track", protocol.TRACKS)
+def test_shifted_sets_are_other_sets(track):
+    usual = gym.spec(track).kwargs
+    for env_id, options in protocol.shifts_of(track).values():
+        assert env_id != track or any(usual.get(name) != value for name, value in options.items())
+        gym.make_vec(env_id, num_envs=2, vectorization_mode="vector_entry_point", branch="test", **options)
+
+
+@pytest.mark.parametrize(
+    ("samples", "budget"),
+    [
+        (0, "none"),
+        (1, "0.1M"),
+        (100_352, "0.1M"),
+        (1_048_576, "1M"),
+        (1_060_000, "10M"),
+        (10_485_760, "10M"),
+        (12_058_624, "open"),
+    ],
+)
+def test_budgets(samples, budget):
+    assert protocol._budget(samples) == budget
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--protocol", "Short-v0"), "policies must name one for the protocol"),
+        (("--submit", "mine"), "submit goes with a protocol"),
+        (("--protocol", "Drift-v0", "--policies", "prbs"), "protocol must be one of duffing_env/Short-v0"),
+        (("--protocol", "Short-v0", "--policies", "prbs", "--submit", " "), "submit must be a name"),
+        (("--protocol", "Short-v0", "--policies", "prbz"), "did you mean 'prbs'"),
+    ],
+)
+def test_what_is_no_submission_is_refused(command, words, message, tmp_path):
+    status, _, messages = command("evaluate", *words)
+    assert status == 2
+    assert message in messages
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_latest_entry_of_a_name_counts(tmp_path, entry):
+    path = tmp_path / "made" / "board.jsonl"
+    for seeds in (1, 2):
+        board.append(path, entry | {"seeds": seeds})
+    board.append(path, entry | {"name": "other", "protocol": 0})
+    (found,) = board.read(path)
+    assert found["seeds"] == 2
+
+
+@pytest.mark.parametrize("line", ["", "{", "[]", '{"name": "x"}', '{"name": "x", "track": "y", "score": 3}'])
+def test_a_broken_board_is_told(tmp_path, entry, line):
+    path = tmp_path / "board.jsonl"
+    path.write_text(json.dumps(entry) + "\n" + line + "\n")
+    with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:2 is none"):
+        board.read(path)
+
+
+def _append(path, entry, name):
+    for k in range(50):
+        board.append(path, entry | {"name": f"{name}-{k}"})
+
+
+def test_two_programs_may_add_at_once(tmp_path, entry):
+    path = tmp_path / "board.jsonl"
+    context = multiprocessing.get_context("fork")
+    writers = [context.Process(target=_append, args=(path, entry, name)) for name in "ab"]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert len(board.read(path)) == 100
+
+
+def test_the_board_that_ships_is_of_what_ships():
+    entries = board.read(board.SHIPPED)
+    shown = {entry["name"] for entry in entries if entry["track"] == SHORT}
+    assert {"ppo/short", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
+    for entry in entries:
+        oracle = Systems.of(entry["track"], entry["reference"]["systems"]).path
+        assert entry["reference"]["oracle"] == protocol._digest(oracle), entry["track"]
+        for policy, found in entry["policies"].items():
+            if policy in protocol.trained_policies():
+                assert found == protocol.fingerprint(policy), policy
