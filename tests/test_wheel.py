@@ -12,7 +12,7 @@ MOST = 600  # MB
 
 #: Steps and identifies with README's lines, and plays what ships, with what the wheel brings alone.
 TRIED = """
-import doctest, re, sys
+import doctest, json, re, sys
 from importlib.util import find_spec
 from pathlib import Path
 assert not [name for name in ("torch", "stable_baselines3", "matplotlib") if find_spec(name)]
@@ -23,13 +23,12 @@ test = doctest.DocTestParser().get_doctest(text, {}, "README", "README", 0)
 print(doctest.DocTestRunner(optionflags=doctest.REPORT_ONLY_FIRST_FAILURE).run(test).attempted, "lines of README")
 import gymnasium as gym, numpy as np
 from agents import make_policy
-from agents.policies import trained_policies
+from agents.policies import TRAINED, trained_policies
 import agents
 assert Path(agents.__file__).is_relative_to(sys.prefix)
 for name in trained_policies():
-    track = "amplitude" if name == "ppo/universal" else name.removeprefix("ppo/")
-    track = track.capitalize() + ("" if track.endswith("-v1") else "-v0")
-    envs = gym.make_vec(f"duffing_env/{track}", num_envs=8, vectorization_mode="vector_entry_point")
+    track = json.loads((TRAINED / name / "policy.json").read_text())["track"]
+    envs = gym.make_vec(track if "/" in track else "duffing_env/Short-v0", num_envs=8, vectorization_mode="vector_entry_point")
     policy, (observations, _) = make_policy(name, envs), envs.reset(seed=0)
     for _ in range(3):
         observations, rewards, *_ = envs.step(policy.predict(observations, deterministic=True)[0])
