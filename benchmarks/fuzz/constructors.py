@@ -1,0 +1,110 @@
+"""Constructors and functions: with one to three arguments that are anything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from benchmarks.fuzz.estimators import RIG
+from benchmarks.fuzz.judge import Call
+from benchmarks.fuzz.values import anything, changed, options
+from estimator import (
+    PEMNARX,
+    SILVERBOX_TWIN,
+    Belief,
+    Channel,
+    OnlineEstimator,
+    Rig,
+    coefficients_of,
+    cramer_rao,
+    difference,
+    duffing,
+    fisher_information,
+    published_run_prior,
+    recorded_prior,
+    silverbox_prior,
+    to_physical,
+    weak_prior,
+)
+from estimator.models.model import Model
+from estimator.priors import gaussian_moments, log_uniform_moments
+from estimator.units import Scales
+
+_DECAY = {
+    "name": "decay", "states": {"x": "V"}, "coefficients": {"rate": "1"}, "noise": ("1",), "outputs": {"y": "x"},
+    "rates": ("u - rate*x",), "next_state": (), "held": False, "substeps": 1, "physical": {}, "dimensions": {},
+    "inverse": {},
+}  # fmt: skip
+_TWIN = {name: getattr(SILVERBOX_TWIN, name) for name in "mcab"}
+_POINT = coefficients_of(difference(), SILVERBOX_TWIN)
+_NOISES = {"process_noise": 5e-4, "measurement_noise": 5e-4, "noise_shape": 2.0, "state_std": 1e-3}
+_EYE = np.eye(4)
+
+#: What is called, with arguments that are right.
+MADE: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+    "OnlineEstimator": (
+        OnlineEstimator,
+        {"model": None, "prior": None, "rig": None, "factorisation": "structured", "iterations": 3,
+         "as_published": False, "drift": 0.0, "expectations": "first_order", "noise_hypotheses": 1},
+    ),
+    "Rig": (Rig, {"step": 1e-3, "interpolation": "linear", "delay": 0, "input": {}, "output": {}, "guess": None}),
+    "Channel": (Channel, {"unit": "N", "limit": 1.0, "range": None, "kind": "displacement", "noise": 1.0, "offset": 0}),
+    "Scales": (Scales, {"step": 1e-3, "input": 1.0, "output": 1.0, "order": 0, "input_unit": "N", "output_unit": "m"}),
+    "Belief": (Belief, {"model": difference(), "record": silverbox_prior().record}),
+    "Belief.of": (
+        Belief.of,
+        {"model": difference(), "mean": np.ones(6), "cov": np.eye(6), "gamma": (2.0, 1.0), "xi": (2.0, 1.0)},
+    ),
+    "weak_prior": (weak_prior, {"model": difference(), "mean": _POINT, "cov": _EYE, **_NOISES}),
+    "silverbox_prior": (silverbox_prior, {"model": difference(), "spread": 0.3, **_NOISES}),
+    "recorded_prior": (
+        recorded_prior,
+        {"model": duffing(), "spread": 0.3, "process_noise": 1e-3, "measurement_noise": 1e-3, "noise_shape": 2.0},
+    ),
+    "published_run_prior": (published_run_prior, {"nonlinear": True, "model": None}),
+    "log_uniform_moments": (log_uniform_moments, {"model": difference(), "center": _TWIN, "spread": 0.3}),
+    "gaussian_moments": (gaussian_moments, {"model": difference(), "mean": _TWIN, "std": {"m": 1e-7}}),
+    "Model": (Model, _DECAY),
+    "difference": (difference, {"terms": "paper"}),
+    "duffing": (duffing, {"offsets": True, "sensor": "velocity"}),
+    "fisher_information": (
+        fisher_information,
+        {"model": difference(), "coefficients": _POINT, "u": np.full(5, 0.1), "process_noise": 5e-4,
+         "measurement_noise": 5e-4, "interpolation": "zero_order", "state_std": 0.0},
+    ),
+    "cramer_rao": (cramer_rao, {"information": _EYE, "prior_precision": _EYE}),
+    "coefficients_of": (coefficients_of, {"model": difference(), "parameters": _TWIN}),
+    "to_physical": (to_physical, {"model": difference(), "coefficients": _POINT}),
+    "PEMNARX": (PEMNARX, {"units": 2, "input_delay": 0, "seed": 0, "restarts": 1}),
+}  # fmt: skip
+
+#: Numbers of these would each compile a kernel of their own, or be tried where nothing is wrong with them.
+_COSTLY = {"OnlineEstimator": ("iterations", "noise_hypotheses", "model", "prior")}
+
+
+def calls() -> st.SearchStrategy[Call]:
+    """Calls of constructors and functions."""
+
+    @st.composite
+    def call(draw: st.DrawFn) -> Call:
+        if draw(st.integers(0, 9)) == 0:
+            described = draw(changed(RIG.to_dict()))
+            return Call(
+                "Rig.of", lambda: Rig.of(described), ("rig", *Rig.__dataclass_fields__, *Channel.__dataclass_fields__)
+            )
+        if draw(st.integers(0, 19)) == 0:
+            value = draw(anything)
+            return Call("Rig.shipped", lambda: Rig.shipped(value), ("name",))
+        name = draw(st.sampled_from(list(MADE)))
+        function, good = MADE[name]
+        given = draw(options(good))
+        for costly in _COSTLY.get(name, ()):
+            number = given[costly]
+            if isinstance(number, int | np.integer) and not isinstance(number, bool) and 1 <= number <= 1000:
+                given[costly] = good[costly]
+        return Call(name, lambda: function(**given), tuple(given))
+
+    return call()
