@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from estimator.checks import number, numbers, shown
+from estimator.checks import number, numbers, one_of, shown
 from estimator.engine.rows import belief_names
+from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
@@ -93,6 +94,10 @@ class Belief:
     factorisation: str = "structured"
 
     def __post_init__(self) -> None:
+        Model.checked(self.model)
+        one_of("factorisation", self.factorisation, DEFAULT_ITERATIONS)
+        if not isinstance(self.scales, Scales):
+            raise ValueError(f"scales must be a Scales, but is {shown(self.scales)}; use a rig's")
         record = numbers("record", self.record)
         if record.shape != (record_size(self.model),):
             raise ValueError(
@@ -126,7 +131,7 @@ class Belief:
         Raises:
             ValueError: as the class, or for shapes that do not fit.
         """
-        d = len(model.names)
+        d = len(Model.checked(model).names)
         first, second = numbers("mean", mean), numbers("cov", cov)
         if first.shape != (d,) or second.shape != (d, d):
             raise ValueError(

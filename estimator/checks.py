@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import math
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +44,26 @@ def whole(name: str, value: object, most: int, least: int = 1) -> None:
     """Refuse what is no whole number from ``least`` to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
         raise ValueError(f"{name} must be a whole number from {least} to {most}, but is {shown(value)}")
+
+
+def flag(name: str, value: object) -> None:
+    """Refuse what is neither True nor False."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, but is {shown(value)}")
+
+
+def one_of(name: str, value: object, known: Collection[str]) -> None:
+    """Refuse what is no name among those that are known."""
+    if not isinstance(value, str) or value not in known:
+        near = difflib.get_close_matches(value, known, 1) if isinstance(value, str) else []
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"{name} must be one of {list(known)}, but is {shown(value)}{hint}")
+
+
+def mapping(name: str, value: object, kind: type = object) -> None:
+    """Refuse what is no dictionary from names to values of a kind."""
+    if not isinstance(value, Mapping) or not all(isinstance(k, str) and isinstance(v, kind) for k, v in value.items()):
+        raise ValueError(f"{name} must be a dictionary from names to values, but is {shown(value)}")
 
 
 def scalar(name: str, value: npt.ArrayLike) -> float:

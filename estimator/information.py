@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from estimator.checks import LARGEST, number, numbers
 from estimator.engine.feeding import input_degree
 from estimator.engine.rows import path_results
 from estimator.engine.tasks import path
@@ -62,12 +63,10 @@ def fisher_information(
     Raises:
         ValueError: naming the argument, for shapes that do not fit, or a number that is out of range.
     """
-    degree = input_degree(model, interpolation)
+    degree = input_degree(Model.checked(model), interpolation)
     noises = variances(model, process_noise, measurement_noise)
-    if not 0 <= state_std < np.inf:
-        raise ValueError(f"state_std must be 0 or more and finite, but is {state_std}; 0 is at rest")
-    points = np.asarray(coefficients, dtype=np.float64)
-    inputs = np.asarray(u, dtype=np.float64)
+    number("state_std", state_std, 0, LARGEST, "0 is at rest")
+    points, inputs = numbers("coefficients", coefficients), numbers("u", u)
     if points.ndim not in (1, 2) or points.shape[-1] != model.n_coefficients:
         raise ValueError(f"coefficients must be of {list(model.coefficients)}, but have shape {points.shape}")
     if inputs.ndim not in (1, 2):
@@ -102,12 +101,12 @@ def variances(model: Model, process_noise: npt.ArrayLike, measurement_noise: npt
     Raises:
         ValueError: for one that is out of range, or a number of sensors that is not the model's.
     """
-    process = np.asarray(process_noise, dtype=np.float64)
+    process = numbers("process_noise", process_noise)
     if process.ndim > 1 or not (np.all(process >= 0) and np.isfinite(process).all()):
         raise ValueError(
             f"process_noise must be 0 or more and finite, but is {process_noise!r}; pass a standard deviation"
         )
-    stds = np.asarray(measurement_noise, dtype=np.float64)
+    stds = numbers("measurement_noise", measurement_noise)
     if stds.ndim > 2 or (stds.ndim and stds.shape[-1] != model.n_outputs):
         raise ValueError(
             f"measurement_noise must be one number, or one for each of {list(model.outputs)}, but has shape "
@@ -128,7 +127,7 @@ def outputs_of(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> FloatArray
     Raises:
         ValueError: for another shape.
     """
-    outputs = np.asarray(y, dtype=np.float64)
+    outputs = numbers("y", y)
     if model.n_outputs == 1 and outputs.shape == inputs.shape:
         outputs = outputs[..., None]
     if outputs.shape != (*inputs.shape, model.n_outputs):
@@ -158,9 +157,14 @@ def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = Non
     Raises:
         ValueError: if Λ0 + F is not finite or not positive definite.
     """
-    total = np.asarray(information, dtype=np.float64)
-    if prior_precision is not None:
-        total = total + prior_precision
+    total = numbers("information", information)
+    prior = np.zeros((1, 1)) if prior_precision is None else numbers("prior_precision", prior_precision)
+    for name, matrix in (("information", total), ("prior_precision", prior)):
+        if matrix.ndim < 2 or 0 in matrix.shape or matrix.shape[-2] != matrix.shape[-1]:
+            raise ValueError(f"{name} must have shape (..., K, K), but has {matrix.shape}")
+    if prior_precision is not None and prior.shape != total.shape[-2:]:
+        raise ValueError(f"prior_precision must have shape {total.shape[-2:]}, but has {prior.shape}")
+    total = total + prior
     if not np.isfinite(total).all():
         raise ValueError("information must be finite, but has entries that are not; leave out systems that blew up")
     # In units in which the diagonal is 1, because a cubic coefficient is informed a hundred times less than the others.

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from estimator.checks import mapping, numbers
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.units import VOLTS, Scales
@@ -21,9 +22,12 @@ def to_physical(model: Model, coefficients: FloatArray, scales: Scales = VOLTS) 
         coefficients: (..., K), time counted in samples.
         scales: what one inside is worth.
     """
+    points = numbers("coefficients", coefficients)
+    if points.shape[-1:] != (Model.checked(model).n_coefficients,):
+        raise ValueError(f"coefficients must be of {list(model.coefficients)}, but have shape {points.shape}")
     if not model.physical:
-        return np.array(coefficients, dtype=np.float64)
-    return _evaluate(_code(model, "physical")[0], coefficients, scales.step) * _worth(model, scales)
+        return points
+    return _evaluate(_code(model, "physical")[0], points, scales.step) * _worth(model, scales)
 
 
 def physical_slopes(model: Model, coefficients: FloatArray, scales: Scales = VOLTS) -> FloatArray:
@@ -52,11 +56,12 @@ def coefficients_of(model: Model, parameters: Mapping[str, Any], scales: Scales 
     Raises:
         ValueError: for a parameter that is missing.
     """
-    names = list(model.physical if model.inverse else model.coefficients)
+    names = list(model.physical if Model.checked(model).inverse else model.coefficients)
+    mapping("parameters", parameters)
     missing = [name for name in names if name not in parameters]
     if missing:
         raise ValueError(f"parameters must have {names}, but {missing} are missing from {list(parameters)}; add them")
-    columns = [np.asarray(parameters[name], dtype=np.float64) for name in names]
+    columns = [numbers(f"parameters[{name!r}]", parameters[name]) for name in names]
     points = np.stack(np.broadcast_arrays(*columns), axis=-1)
     if not model.inverse:
         return points

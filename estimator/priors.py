@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.checks import is_finite, number, numbers, shown
+from estimator.checks import flag, is_finite, mapping, number, numbers, shown
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -45,7 +45,8 @@ def log_uniform_moments(
     Raises:
         ValueError: for a spread out of range, or a center that is 0, missing or not finite.
     """
-    names = list(model.physical or model.coefficients)
+    names = list(Model.checked(model).physical or model.coefficients)
+    mapping("center", center)
     number("spread", spread, 0, 1 - 1e-9, "log-uniform intervals do not reach 0")
     for name in names:
         if name not in center or not is_finite(center[name]) or center[name] == 0:
@@ -88,7 +89,11 @@ def gaussian_moments(
     Returns:
         Mean (K,) and covariance (K, K).
     """
-    names = list(model.physical or model.coefficients)
+    names = list(Model.checked(model).physical or model.coefficients)
+    for name, given in (("mean", mean), ("std", std)):
+        mapping(name, given)
+        for parameter in names if name == "mean" else given:
+            number(f"{name} of {parameter}", given.get(parameter), 0 if name == "std" else -_STDS[1], _STDS[1])
     nodes, weights = np.polynomial.hermite_e.hermegauss(max(2, min(7, int(_POINTS ** (1 / len(names))))))
     grid = np.stack(np.meshgrid(*[nodes] * len(names), indexing="ij")).reshape(len(names), -1)
     probabilities = np.ones(1)
@@ -135,10 +140,11 @@ def weak_prior(
     Raises:
         ValueError: for a value out of its range, or as `Belief`.
     """
+    Model.checked(model)
+    number("process_noise", process_noise, *_STDS)
+    number("noise_shape", noise_shape, *_STDS)
     for name, value in (
-        ("process_noise", process_noise),
         ("measurement_noise", measurement_noise),
-        ("noise_shape", noise_shape),
         ("state_std", state_std),
     ):
         for one in np.ravel(np.asarray(value, dtype=object)):
@@ -183,7 +189,7 @@ def silverbox_prior(
     Raises:
         ValueError: for a model with other parameters, or a value out of its range.
     """
-    model = difference() if model is None else model
+    model = difference() if model is None else Model.checked(model)
     if model.name not in _TWINS or not {"m", "c", "a"} <= set(model.physical) <= {"m", "c", "a", "b"}:
         raise ValueError(f"model must have the parameters m, c, a and b, but {model.name} has {list(model.physical)}")
     number("spread", spread, 1e-9, 1 - 1e-9, "pass the range's relative half width")
@@ -222,7 +228,8 @@ def _paper_prior(
     xi: tuple[float, float],
 ) -> Belief:
     """Means of 1 (of the states 0) and variances of 10, but for η."""
-    model = difference() if model is None else model
+    model = difference() if model is None else Model.checked(model)
+    flag("nonlinear", nonlinear)
     mean, variance = np.ones(len(model.names)), np.full(len(model.names), 10.0)
     mean[: model.n_states], mean[-1], variance[-1] = 0.0, eta_mean, eta_var
     if not nonlinear:
@@ -253,7 +260,11 @@ def recorded_prior(
     Raises:
         ValueError: for another model, or a value out of its range.
     """
-    if model.name not in _TWINS:
+    number("spread", spread, 0)
+    for name, value in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
+        number(name, value, *_STDS)
+    number("noise_shape", noise_shape, *_STDS)
+    if Model.checked(model).name not in _TWINS:
         raise ValueError(f"model must be a duffing or difference equation, but is {model.name}; use weak_prior")
     moments = _recorded_duffing(model, spread) if model.name == "duffing" else _recorded_difference(model, spread)
     mean, cov = moments

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from estimator.checks import number, shown, whole
+from estimator.checks import number, one_of, shown, whole
 from estimator.files import whole_file
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
@@ -64,8 +64,7 @@ class Channel:
             value = getattr(self, name)
             if value is not None:
                 number(name, value, *SIZES, "leave it out where it is not known")
-        if self.kind not in list(KINDS):
-            raise ValueError(f"kind must be one of {list(KINDS)}, but is {shown(self.kind)}")
+        one_of("kind", self.kind, KINDS)
         number("offset", self.offset, -SIZES[1], SIZES[1], "0 where nothing is known")
 
 
@@ -108,8 +107,7 @@ class Rig:
 
     def __post_init__(self) -> None:
         number("step", self.step, *SIZES, "give the seconds between samples")
-        if self.interpolation not in list(INTERPOLATIONS):
-            raise ValueError(f"interpolation must be one of {list(INTERPOLATIONS)}, but is {shown(self.interpolation)}")
+        one_of("interpolation", self.interpolation, INTERPOLATIONS)
         least = -1 if self.interpolation == "zero_order" else 0
         whole(f"delay (for {self.interpolation})", self.delay, _LONGEST_DELAY, least)
         for name, other in (("input", "range"), ("output", "limit")):
@@ -143,6 +141,7 @@ class Rig:
             >>> Rig.shipped("beam").output.unit
             'mm'
         """
+        one_of("name", name, SHIPPED)
         return _read_shipped(name)
 
     @classmethod
@@ -171,7 +170,7 @@ class Rig:
             described.pop("instrument", None)
             return cls.from_dict(described)
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{place}: {error}") from error
+            raise ValueError(f"{place} must be a rig file, but is not: {error}") from error
 
     @classmethod
     def of(cls, rig: Rig | Mapping[str, Any] | str | Path) -> Rig:
@@ -210,10 +209,6 @@ class Rig:
 
 @cache
 def _read_shipped(name: str) -> Rig:
-    if name not in SHIPPED:
-        near = difflib.get_close_matches(str(name), SHIPPED, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"name must be one of {', '.join(SHIPPED)}, but is {name!r:.60}{hint}")
     return Rig.from_file(SHIPPED[name])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from estimator.checks import number, whole
+from estimator.checks import flag, number, one_of, whole
 from estimator.ensemble import Hypotheses
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
@@ -48,8 +48,8 @@ def settled(model: Model, given: Settings) -> Settings:
     Raises:
         ValueError: naming the option, the value and the remedy.
     """
-    if given.factorisation not in tuple(DEFAULT_ITERATIONS):
-        raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {given.factorisation!r}")
+    one_of("factorisation", given.factorisation, DEFAULT_ITERATIONS)
+    flag("as_published", given.as_published)
     published = given.factorisation == "mean_field"
     if published and model != difference():
         raise ValueError(
@@ -61,9 +61,7 @@ def settled(model: Model, given: Settings) -> Settings:
             f"as_published goes with factorisation='mean_field', but factorisation is {given.factorisation!r}; the "
             f"published run was mean field"
         )
-    if given.expectations not in EXPECTATIONS or (published and given.expectations != EXPECTATIONS[0]):
-        allowed = EXPECTATIONS[:1] if published else EXPECTATIONS
-        raise ValueError(f"expectations must be one of {list(allowed)}, but is {given.expectations!r}")
+    one_of("expectations", given.expectations, EXPECTATIONS[:1] if published else EXPECTATIONS)
     number("drift", given.drift, 0, 1, "0 is a system that stays, and of one that walks faster nothing is known")
     if given.drift and published:
         raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {given.drift!r}; use structured")
@@ -86,7 +84,7 @@ def checked_hypotheses(given: object, factorisation: str, model: Model, most: in
     for count in counts:
         whole("noise_hypotheses", count, most)
     published = factorisation == "mean_field"
-    if given != 1 and (published or model.n_outputs > 1):
+    if list(counts) != [1] and (published or model.n_outputs > 1):
         what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"
         raise ValueError(
             f"noise_hypotheses must be 1 for {what}, but is {given}; use factorisation='structured' and one sensor"

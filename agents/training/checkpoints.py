@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from agents.policies.learned import WEIGHTS
 from agents.policies.saving import save_policy
+from estimator.files import whole_file
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -90,9 +91,9 @@ def load_progress(checkpoint: Path) -> Progress:
         ValueError: where the file is damaged.
     """
     try:
-        found = json.loads((checkpoint / STATE).read_text())
+        found = json.loads(whole_file(checkpoint / STATE, "checkpoint must be whole", 2**28).read_text())
         return Progress(**{**found, "curve": [tuple(point) for point in found["curve"]]})
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"checkpoint must hold a sound {STATE}, but {checkpoint} does not: {error!r}") from error
 
 

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
-from estimator.files import write_atomically
+from estimator.files import whole_file, write_atomically
 
 #: Folder of the files that come with the package, ``ALGORITHM.toml``.
 FILES = Path(__file__).parents[1] / "hyperparameters"
@@ -47,8 +47,8 @@ def read_settings(algo: str, env_id: str, path: Path | None = None) -> Algorithm
         raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, but is {algo}{_hint(algo, ALGORITHMS)}")
     path = FILES / f"{algo}.toml" if path is None else path
     try:
-        tables = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
+        tables = tomllib.loads(whole_file(path, "settings must be a TOML file", 2**20).read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"settings must be a TOML file, but {path} is not: {error}") from error
     for table, entries in tables.items():
         _check_table(table, entries, ALGORITHMS[algo], path)

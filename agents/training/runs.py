@@ -32,6 +32,7 @@ from agents.training.family import FAMILY
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import read_settings, settings_of, track_of
 from estimator.extras import need
+from estimator.files import whole_file
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -357,10 +358,11 @@ def _contrib(config: TrainConfig) -> tuple[str, ...]:
 def _read_config(folder: Path) -> TrainConfig:
     """The configuration that a run folder was made from; what only a script had in it is left out."""
     try:
-        found = json.loads((folder / "config.json").read_text())["config"]
+        place = whole_file(folder / "config.json", "resume must be a run folder, with a config.json", 2**20)
+        found = json.loads(place.read_text())["config"]
         known = {f.name: found[f.name] for f in fields(TrainConfig)}
-    except (ValueError, KeyError, TypeError) as error:
+        known |= {name: None if known[name] is None else Path(known[name]) for name in ("output", "settings", "begin")}
+        known["hyperparameters"] = settings_of(ALGORITHMS[known["algo"]], known["hyperparameters"])
+        return TrainConfig(**known)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"config.json must be that of a run, but that of {folder} is not: {error!r}") from error
-    known |= {name: None if known[name] is None else Path(known[name]) for name in ("output", "settings", "begin")}
-    known["hyperparameters"] = settings_of(ALGORITHMS[known["algo"]], known["hyperparameters"])
-    return TrainConfig(**known)

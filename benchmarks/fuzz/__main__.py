@@ -111,7 +111,7 @@ def _in_process(area: str, inputs: int, seed: int) -> dict[str, Any]:
             return tally
         last = path.with_suffix(".last")
         what = f"crash: {last.read_text() if last.exists() else 'before the first'}, exit status {done.returncode}"
-        return {"counts": {"crash": 1}, "faults": {what: 1}, "examples": {what: done.stderr[-2000:]}, "seconds": 0.0}
+        return {"counts": {"crash": 1}, "faults": {what: 1}, "examples": {what: done.stderr[-500:]}, "seconds": 0.0}
 
 
 def show(found: dict[str, dict[str, Any]], seed: int) -> int:

@@ -105,6 +105,6 @@ def calls() -> st.SearchStrategy[Call]:
             number = given[costly]
             if isinstance(number, int | np.integer) and not isinstance(number, bool) and 1 <= number <= 1000:
                 given[costly] = good[costly]
-        return Call(name, lambda: function(**given), tuple(given))
+        return Call(name, lambda: function(**given), (*given, "record"))
 
     return call()

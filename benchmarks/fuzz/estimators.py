@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,16 @@ def sound(estimator: OnlineEstimator) -> str:
     return ""
 
 
+@contextmanager
+def suppress_overflow() -> Iterator[None]:
+    """A belief that is one may still overflow later, and say so."""
+    try:
+        yield
+    except ValueError as error:
+        if "overflowed" not in str(error):
+            raise
+
+
 def calls() -> st.SearchStrategy[Call]:
     """Calls of an estimator's methods."""
     pool = {name: pickle.dumps(begun(name)) for name in MADE}
@@ -72,6 +83,7 @@ def calls() -> st.SearchStrategy[Call]:
         name = draw(st.sampled_from(list(MADE)))
         estimator: OnlineEstimator = pickle.loads(pool[name])
         method = draw(st.sampled_from(["update", "run", "run", "predict", "forecast", "simulate", "restore", "belief"]))
+        told: Any = None
         names: tuple[str, ...] = ("u", "y", "missing", "interpolation", "y_init")
         if method == "update":
             u, y = draw(series(1)), draw(series(1))
@@ -87,7 +99,8 @@ def calls() -> st.SearchStrategy[Call]:
             def function() -> None:
                 estimator.restore(given)
                 scale = estimator.scales
-                estimator.run(np.full(12, 0.1 * scale.input), np.full(12, 0.01 * scale.output))
+                with suppress_overflow():
+                    estimator.run(np.full(12, 0.1 * scale.input), np.full(12, 0.01 * scale.output))
         elif method == "belief":
             value, names = draw(anything), ("coefficients", "probability", "mean", "cov")
             asked = draw(st.sampled_from(["log_prob", "interval"]))
@@ -96,8 +109,11 @@ def calls() -> st.SearchStrategy[Call]:
             size = draw(st.integers(0, 12))
             other = size if draw(st.integers(0, 5)) else draw(st.integers(0, 12))
             u, y = draw(series(size)), draw(series(other))
+            told = (u, y)
             more = {"missing": True} if method == "run" and draw(st.booleans()) else {}
             function = lambda: getattr(estimator, method)(u, y, **more)  # noqa: E731
-        return Call(f"{name}: {method}", function, names, lambda: _state(estimator), lambda result: sound(estimator))
+        return Call(
+            f"{name}: {method}", function, names, lambda: _state(estimator), lambda result: sound(estimator), told
+        )
 
     return call()

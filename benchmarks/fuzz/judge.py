@@ -33,6 +33,7 @@ class Call:
         names: of the arguments, one of which a clear message has.
         state: gives what a failed call must not change.
         sound: whether a result is one; says what is wrong with it, or nothing.
+        given: arguments, to show with a fault.
     """
 
     what: str
@@ -40,6 +41,7 @@ class Call:
     names: tuple[str, ...]
     state: Callable[[], Any] | None = None
     sound: Callable[[Any], str] = lambda result: ""
+    given: Any = None
 
 
 @dataclass
@@ -92,7 +94,7 @@ class Judge:
         kind, fault, example = "result", "", ""
         try:
             fault = call.sound(call.function())
-            kind = "unsound result" if fault else "result"
+            kind, fault = ("unsound result", f"{call.what}: {fault}") if fault else ("result", "")
         except MemoryError:
             kind, fault = "crash", f"{call.what}: MemoryError"
         except Exception as error:
@@ -102,7 +104,7 @@ class Judge:
                 kind, fault = "state changed", f"{call.what}: {type(error).__name__}"
         if time.perf_counter() - began - (self._compiling.seconds - compiled) > PATIENCE:
             kind, fault = "hang", call.what
-        self.tally.add(kind, fault, example)
+        self.tally.add(kind, fault, f"{example} {call.given!r}" if fault else "")
 
 
 def _kind_of(error: Exception, names: tuple[str, ...]) -> str:

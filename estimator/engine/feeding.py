@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from estimator.checks import one_of
 from estimator.lanes import part
 from estimator.models.model import Model
 
@@ -18,8 +19,7 @@ def input_degree(model: Model, interpolation: str) -> int:
     Raises:
         ValueError: for an unknown interpolation, or one that is not ``zero_order`` for a difference equation.
     """
-    if interpolation not in INTERPOLATIONS:
-        raise ValueError(f"interpolation must be one of {list(INTERPOLATIONS)}, but is {interpolation!r}")
+    one_of("interpolation", interpolation, INTERPOLATIONS)
     if not model.is_continuous and interpolation != "zero_order":
         raise ValueError(
             f"interpolation must be 'zero_order' for the difference equation {model.name!r}, whose inputs are samples, "

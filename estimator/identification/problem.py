@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class Problem:
     @cached_property
     def model(self) -> Model:
         """The rig's own, with the terms."""
-        more = dict.fromkeys(self.terms, True)
+        more: dict[str, Any] = dict.fromkeys(self.terms, True)
         model = duffing(offsets=True, sensor=self.rig.output.kind, **more)
         return replace(model, substeps=self.substeps)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from functools import cache
 from typing import NamedTuple
 
+from estimator.checks import shown
 from estimator.models.duffing import DIMENSIONS
 from estimator.models.model import Model
 
@@ -69,7 +70,6 @@ _PHYSICAL = {
 }
 
 
-@cache
 def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
     """Eq. (2), or another difference equation that is linear in its coefficients.
 
@@ -81,8 +81,14 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
     Raises:
         ValueError: for an unknown preset, or terms that repeat or are none.
     """
-    if isinstance(preset, str) and preset not in PRESETS:
-        raise ValueError(f"preset must be one of {list(PRESETS)} or terms, but is {preset!r}")
+    is_terms = isinstance(preset, tuple) and all(isinstance(term, Term) for term in preset)
+    if not is_terms and not (isinstance(preset, str) and preset in PRESETS):
+        raise ValueError(f"preset must be one of {list(PRESETS)} or terms, but is {shown(preset)}")
+    return _difference(preset)
+
+
+@cache
+def _difference(preset: str | tuple[Term, ...]) -> Model:
     terms = PRESETS[preset] if isinstance(preset, str) else preset
     if not terms or len(set(terms)) < len(terms):
         raise ValueError(f"preset must have different terms, at least one, but is {preset!r}")

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from functools import cache
 
+from estimator.checks import flag, one_of
 from estimator.models.model import Model
 
 #: Of the parameters of Eq. (1): powers of the units of input and displacement, and of the second.
@@ -25,7 +26,6 @@ DIMENSIONS = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)
 KINDS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
-@cache
 def duffing(
     *,
     offsets: bool = False,
@@ -49,10 +49,18 @@ def duffing(
     Raises:
         ValueError: for another noise or sensor.
     """
-    if noise not in ("white", "held"):
-        raise ValueError(f"noise must be 'white' or 'held', but is {noise!r}")
-    if sensor not in KINDS:
-        raise ValueError(f"sensor must be one of {list(KINDS)}, but is {sensor!r}")
+    terms = {
+        "offsets": offsets, "cubic_damping": cubic_damping, "quintic": quintic, "feedthrough": feedthrough
+    }  # fmt: skip
+    for name, value in terms.items():
+        flag(name, value)
+    one_of("noise", noise, ("white", "held"))
+    one_of("sensor", sensor, KINDS)
+    return _duffing(*map(bool, terms.values()), noise, sensor)
+
+
+@cache
+def _duffing(offsets: bool, cubic_damping: bool, quintic: bool, feedthrough: bool, noise: str, sensor: str) -> Model:
     order = KINDS[sensor]
     # The state is the displacement with its offset, where that is what the sensor shows.
     x = "(x - output_offset)" if offsets and order == 0 else "x"

@@ -10,9 +10,11 @@ import hashlib
 import json
 import keyword
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
+
+from estimator.checks import flag, mapping, shown, whole
 
 #: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -74,6 +76,20 @@ class Model:
     inverse: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for given in ("states", "coefficients", "outputs", "physical", "inverse"):
+            mapping(given, getattr(self, given), str)
+        mapping("dimensions", self.dimensions, Sequence)
+        for given in ("noise", "rates", "next_state"):
+            texts = getattr(self, given)
+            if not isinstance(texts, tuple) or not all(isinstance(text, str) for text in texts):
+                raise ValueError(f"{given} must be a tuple of expressions, but is {shown(texts)}; ('1',) has one")
+        if not isinstance(self.name, str):
+            raise ValueError(f"name must be a text, but is {shown(self.name)}")
+        flag("held", self.held)
+        whole("substeps", self.substeps, 1000)
+        for given, powers in self.dimensions.items():
+            if len(powers) != 3 or not all(type(power) is int and abs(power) < 100 for power in powers):
+                raise ValueError(f"dimensions of {given} must be three whole numbers, but are {shown(powers)}")
         names = [*self.states, *self.coefficients, *self.outputs]
         for name in (self.name, *names):
             if not _NAME.fullmatch(name) or keyword.iskeyword(name) or name in RESERVED:
@@ -97,8 +113,6 @@ class Model:
                 )
         if not self.states or not self.outputs:
             raise ValueError("states and outputs must name at least one each, but one of them is empty")
-        if not isinstance(self.substeps, int) or not 1 <= self.substeps <= 1000:
-            raise ValueError(f"substeps must be a whole number from 1 to 1000, but is {self.substeps!r}")
         if self.held and not self.is_continuous:
             raise ValueError("held must be False for a difference equation, whose noise comes once a sample")
         if set(self.dimensions) != set(self.physical):
@@ -164,6 +178,17 @@ class Model:
 
     def __hash__(self) -> int:
         return hash(self.digest)
+
+    @classmethod
+    def checked(cls, value: object) -> Model:
+        """The value, which must be a model.
+
+        Raises:
+            ValueError: where it is none.
+        """
+        if not isinstance(value, cls):
+            raise ValueError(f"model must be a Model, but is {shown(value)}; use difference() or duffing()")
+        return value
 
     def to_dict(self) -> dict[str, object]:
         """The declaration as JSON can hold it; ``Model(**d)`` makes the same model again."""

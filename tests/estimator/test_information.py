@@ -162,7 +162,7 @@ def test_bounds():
     [
         ({"process_noise": -1.0}, "process_noise must be 0 or more"),
         ({"measurement_noise": -1.0}, "measurement_noise must be positive"),
-        ({"state_std": -1.0}, "state_std must be 0 or more"),
+        ({"state_std": -1.0}, "state_std must be a number from 0"),
         ({"measurement_noise": [1.0, 2.0]}, "measurement_noise must be one number, or one for each"),
         ({"y": np.zeros(3)}, "u and y must have one shape"),
         ({"interpolation": "linear"}, "interpolation must be 'zero_order' for the difference equation"),

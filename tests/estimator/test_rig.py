@@ -78,11 +78,11 @@ def test_errors_name_the_key_and_the_remedy(change, message):
 
 def test_a_broken_file_is_named(tmp_path):
     (tmp_path / "rig.toml").write_text("step = ")
-    with pytest.raises(ValueError, match=r"rig\.toml: Invalid"):
+    with pytest.raises(ValueError, match=r"rig\.toml must be a rig file, but is not: Invalid"):
         Rig.from_file(tmp_path / "rig.toml")
     for nested in ("[" * 100_000, "x = " + "[" * 100_000, "step = 1e999", "step = " + "9" * 400):
         (tmp_path / "rig.toml").write_text(nested)
-        with pytest.raises(ValueError, match=r"rig\.toml: "):
+        with pytest.raises(ValueError, match=r"rig\.toml must be a rig file, but is not: "):
             Rig.from_file(tmp_path / "rig.toml")
     with pytest.raises(FileNotFoundError, match="there is no"):
         Rig.from_file(tmp_path / "none.toml")
@@ -104,7 +104,7 @@ def test_rigs_that_ship():
     }
     assert Rig.silverbox() == Rig.shipped("silverbox") == Rig(SAMPLING_STEP, "spline", 0, Channel("V"), Channel("V"))
     assert Rig.silverbox("zero_order", 1) == Rig(SAMPLING_STEP, "zero_order", 1, Channel("V"), Channel("V"))
-    with pytest.raises(ValueError, match=r"name must be one of beam, .*, but is 'bea'; did you mean 'beam'\?"):
+    with pytest.raises(ValueError, match=r"name must be one of .*, but is 'bea'; did you mean 'beam'\?"):
         Rig.shipped("bea")
 
 

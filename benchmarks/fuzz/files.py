@@ -1,0 +1,156 @@
+"""Files of every kind: cut, with bits turned over, with other arrays or entries, or of another kind altogether."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from agents.commands.rig_file import text_of
+from agents.policies.learned import CARD, WEIGHTS, load_policy
+from agents.training.checkpoints import STATE, Progress, load_progress
+from agents.training.hyperparameters import FILES, read_settings
+from agents.training.runs import TrainConfig, _read_config, describe
+from benchmarks.fuzz.estimators import RIG, begun, sound, suppress_overflow
+from benchmarks.fuzz.judge import Call
+from benchmarks.fuzz.values import another_array, changed, damaged
+from estimator import OnlineEstimator, Rig, load_estimator, save_estimator
+from estimator.identification.records import read
+
+_RECORD = b"time [s],force [N],displacement [m]\n" + b"".join(
+    f"{k * 1e-3:.3f},{k % 7 - 3},{1e-3 * (k % 5)}\n".encode() for k in range(60)
+)
+
+
+def _go_on(path: Path) -> str:
+    """Load an estimator, let it learn, and judge it."""
+    estimator: OnlineEstimator = load_estimator(path)
+    scale = estimator.scales
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((2, 25))
+    with suppress_overflow():
+        estimator.run(0.1 * scale.input * u, 0.01 * scale.output * y)
+    return sound(estimator)
+
+
+def _act(folder: Path) -> str:
+    """Load a policy, and let it act; it is finite, and within bounds."""
+    policy = load_policy(folder)
+    try:
+        actions, _ = policy.predict(np.zeros((2, 22), dtype=np.float32), deterministic=True)
+    except ValueError as error:  # a network that is sound, for other observations
+        if "observation must have" in str(error):
+            return ""
+        raise
+    fine = actions.shape == (2, 1) and np.isfinite(actions).all() and np.abs(actions).max() <= 1
+    return "" if fine else f"actions {actions!r}"
+
+
+def _archive(arrays: dict[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def calls() -> st.SearchStrategy[Call]:
+    """Calls that read a file."""
+    from safetensors.numpy import load_file, save
+
+    place = Path(tempfile.mkdtemp(prefix="fuzz-"))
+    shipped = Path(str(__import__("agents").__file__)).parent / "policies" / "trained" / "ppo" / "short"
+    card, tensors = json.loads((shipped / CARD).read_text()), load_file(shipped / WEIGHTS)
+    kinds = ("paper", "look-ahead", "ensemble", "rig")
+    estimators = {}
+    for name in kinds:
+        save_estimator(begun(name), place / "estimator.npz")
+        with np.load(place / "estimator.npz") as archive:
+            estimators[name] = ((place / "estimator.npz").read_bytes(), {key: archive[key] for key in archive.files})
+    matlab = io.BytesIO()
+    __import__("scipy.io").io.savemat(matlab, {"u": np.arange(60.0), "y": np.sin(np.arange(60.0))})
+    config = json.dumps(describe(TrainConfig()), default=str)
+    progress = json.dumps(vars(Progress(steps=5, curve=[(1, 0.5, None)])))
+    counter = iter(range(10**9))
+
+    @st.composite
+    def call(draw: st.DrawFn) -> Call:
+        kind = draw(st.sampled_from(
+            ["estimator", "estimator", "estimator", "policy", "rig", "csv", "mat", "run", "checkpoint", "settings"]
+        ))  # fmt: skip
+        number = next(counter) % 4
+        if kind == "mat" and draw(st.integers(0, 9)):  # a process each
+            kind = "csv"
+        function: Callable[[], Any]
+        folder = place / f"{kind}{number}"
+        folder.mkdir(exist_ok=True)
+        path = folder / "file"
+        names: tuple[str, ...] = ("path", "rig", "record", "policy", str(path))
+        if kind == "estimator":
+            whole, arrays = estimators[draw(st.sampled_from(kinds))]
+            way = draw(st.integers(0, 2))
+            if way == 0:
+                content = draw(damaged(whole))
+            elif way == 1:
+                key = draw(st.sampled_from(sorted(arrays)))
+                content = _archive({**arrays, key: draw(another_array(arrays[key]))})
+            else:
+                described = draw(changed(json.loads(arrays["description"].tobytes())))
+                text = np.frombuffer(json.dumps(described).encode(), dtype=np.uint8)
+                content = _archive({**arrays, "description": text})
+            path.write_bytes(content)
+            return Call("load_estimator", lambda: _go_on(path), names, sound=str)
+        if kind == "policy":
+            way = draw(st.integers(0, 3))
+            weights, described = dict(tensors), card
+            if way == 0:
+                key = draw(st.sampled_from(sorted(weights)))
+                other = draw(another_array(weights[key]))
+                if np.asarray(other).dtype.str[1:] in ("f4", "f8", "i8", "b1"):
+                    weights[key] = np.ascontiguousarray(other, dtype=np.asarray(other).dtype.newbyteorder("="))
+            elif way == 1:
+                described = draw(
+                    changed({name: card[name] for name in ("format", "network", "foresight") if name in card})
+                )
+            (folder / WEIGHTS).write_bytes(draw(damaged(save(weights))) if way == 2 else save(weights))
+            (folder / CARD).write_bytes(
+                draw(damaged(json.dumps(card).encode())) if way == 3 else json.dumps(described).encode()
+            )
+            return Call("load_policy", lambda: _act(folder), names, sound=str)
+        if kind == "rig":
+            text = text_of(RIG, "").encode()
+            path.write_bytes(draw(damaged(text)))
+            function = lambda: Rig.from_file(path)  # noqa: E731
+        elif kind == "csv":
+            path = folder / "record.csv"
+            path.write_bytes(draw(damaged(_RECORD)))
+            function, names = lambda: read(path, 1e-3), (*names, str(path))
+        elif kind == "mat":
+            path = folder / "record.mat"
+            path.write_bytes(draw(damaged(matlab.getvalue())))
+            function, names = lambda: read(path, 1e-3), (*names, str(path))
+        elif kind == "run":
+            described = draw(changed(json.loads(config)))
+            (folder / "config.json").write_bytes(
+                draw(damaged(config.encode())) if draw(st.booleans()) else json.dumps(described).encode()
+            )
+            names = (*names, "config", *TrainConfig.__dataclass_fields__, "hyperparameter")
+            function = lambda: _read_config(folder)  # noqa: E731
+        elif kind == "checkpoint":
+            described = draw(changed(json.loads(progress)))
+            (folder / STATE).write_bytes(
+                draw(damaged(progress.encode())) if draw(st.booleans()) else json.dumps(described).encode()
+            )
+            names, function = (*names, "checkpoint"), lambda: load_progress(folder)
+        else:
+            text = (FILES / "ppo.toml").read_bytes()
+            path.write_bytes(draw(damaged(text)))
+            names = (*names, "settings", "hyperparameter")
+            function = lambda: read_settings("ppo", "duffing_env/Short-v0", path)  # noqa: E731
+        return Call(f"read a {kind}", function, names)
+
+    return call()
