@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -184,12 +184,26 @@ class Batch:
         """(n,) current values of a row, such as what the last step left behind; a copy."""
         return self._blocks[:, self._place[name]].flatten()[: self.size]
 
-    def records(self) -> FloatArray:
-        """(n, size) the beliefs now, as flat records (`estimator.Belief`); a copy."""
-        size = record_size(self.experiment.model)
-        records = self._blocks[:, :size].swapaxes(1, 2).reshape(-1, size)
+    def records(self, ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+        """(n, size) the beliefs now, as flat records (`estimator.Belief`); a copy. ``ended`` as of `rows`."""
+        return self._columns(slice(record_size(self.experiment.model)), ended)
+
+    def rows(self, names: Sequence[str], ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+        """(n, k) values of some rows; a copy.
+
+        Args:
+            names: of the k rows.
+            ended: (n,) environments of which those are meant that their last episode ended with, if any.
+        """
+        return self._columns([self._place[name] for name in names], ended)
+
+    def _columns(self, places: slice | list[int], ended: npt.NDArray[np.bool_] | None) -> FloatArray:
+        found = self._blocks[:, places].swapaxes(1, 2).reshape(len(self._blocks) * LANES, -1)[: self.size]
+        if ended is not None:
+            last = self._ended[:, places].swapaxes(1, 2).reshape(len(self._blocks) * LANES, -1)[: self.size]
+            found = np.where(ended[:, None], last, found)
         # Of a single block that is a view, in another order, for which a kernel would be compiled once more.
-        return np.array(records[: self.size], order="C")
+        return np.array(found, order="C")
 
     def mixture(self, index: int) -> tuple[FloatArray, FloatArray]:
         """Records (m, size) and weights (m,) of the beliefs that environment ``index`` weighs: one, or its members."""
@@ -210,12 +224,12 @@ class Batch:
         records.flags.writeable = False
         return self._prior.with_records(records)
 
-    def truth(self) -> Parameters:
-        """The true plants, a batch of n; where a record is replayed, the twin of its circuit.
+    def truth(self, ended: npt.NDArray[np.bool_] | None = None) -> Parameters:
+        """The true plants, a batch of n; where a record is replayed, the twin of its circuit. ``ended`` as of `rows`.
 
         With the standard deviations of their noises, where those are drawn.
         """
-        values = (worth * self.quantity(row) for worth, row in zip(self._worth, self._truth.values(), strict=True))
+        values = self._worth[:, None] * self.rows(list(self._truth.values()), ended).T
         return Parameters(zip(self._truth, values, strict=True))
 
     def true_of(self, index: int) -> Parameters:

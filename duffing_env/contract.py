@@ -12,13 +12,12 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from duffing_env.experiment import Experiment
-from duffing_env.layout import observation_bounds
-from estimator.models.model import Model
+from duffing_env.own import bounds_of
 
 
-def observation_space(model: Model) -> spaces.Box:
-    """The observation's space: a flat float32 Box with finite bounds (`duffing_env.layout.observation_bounds`)."""
-    low, high = np.array(list(observation_bounds(model).values()), dtype=np.float32).T
+def observation_space(experiment: Experiment) -> spaces.Box:
+    """The observation's space: a flat float32 Box with finite bounds."""
+    low, high = bounds_of(experiment).T.astype(np.float32)
     return spaces.Box(low.copy(), high.copy(), dtype=np.float32)
 
 

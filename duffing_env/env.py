@@ -15,6 +15,7 @@ from duffing_env.contract import Specified, action_space, checked_options, make_
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND
 from duffing_env.layout import SUMMED
+from duffing_env.own import Own
 from duffing_env.turns import in_turn
 from estimator.belief import Belief
 from estimator.checks import numbers, shown
@@ -62,6 +63,11 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     | 19 | last output in parts of ``max_output`` | -2 | 2 |
     | 20 | time left, in parts of the horizon | 0 | 1 |
     | 21 | part of the input's energy budget that is left; 1 without a budget (``max_rms``) | 0 | 1 |
+
+    That is ``observation="posterior"``. ``"privileged"`` adds the true coefficients, as entries 0-3 show the means:
+    for training and for tests. ``"history"`` shows no belief, but the last ``history`` inputs and outputs, each step's
+    input before its outputs, the oldest first, as entries 18 and 19, and then entries 20 and 21. A function of the
+    beliefs shows what it gives (docs/extending.md).
 
     ## Reward
 
@@ -121,7 +127,9 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     |----------|---------|---------|
     | ``factorisation`` | ``structured`` | the estimator's: ``structured`` or ``mean_field`` |
     | ``iterations`` | 3 or 10 | variational iterations per sample (structured, mean field) |
-    | ``reward`` | ``information_gain`` | see above |
+    | ``reward`` | ``information_gain`` | see above; or a function of one's own (`duffing_env.own`) |
+    | ``observation`` | ``posterior`` | or ``history``, ``privileged``, or a function of one's own |
+    | ``history`` | 16 | steps that the observation ``history`` shows |
     | ``max_input`` | 0.15 | input limit [V] |
     | ``max_output`` | 0.6 | displacement limit [V] |
     | ``horizon`` | 256 | samples of an episode |
@@ -137,6 +145,8 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     | ``noise_shape`` | 2 | shape of these Gamma priors |
     | ``noise_hypotheses`` | 1 | ratios of the noises to weigh by their evidence; see below |
     | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
+    | ``mean`` | None | parameter to the middle of its range, of some or all; the twin's where None |
+    | ``prior`` | None | a `estimator.Belief` to start from; None: the one that fits plants and noises |
     | ``max_rms`` | None | largest RMS input over a whole episode [V]; see `PowerEnv` |
     | ``max_slew`` | None | largest change of the input between samples [V]; a larger one is cut |
     | ``input_cost`` | 0 | taken off the reward for every (u / ``max_input``)² |
@@ -177,10 +187,11 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be one of {self.metadata['render_modes']}, but is {render_mode!r}")
         self.experiment = make_experiment(self.experiment_kind, options)
-        self.observation_space = observation_space(self.experiment.model)
+        self.observation_space = observation_space(self.experiment)
         self.action_space = action_space()
         self.render_mode = render_mode
         self._batch = Batch(self.experiment, 1, RESET_BY_HAND)
+        self._own = Own.of(self._batch)
         self._sensor = next(iter(self.experiment.truth_model.outputs))
         self._streamed: np.random.Generator | None = None
         self._running = False
@@ -239,10 +250,12 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         self._batch.reset(everywhere)
         if chosen is not None:
             self._batch.choose(everywhere, chosen)
+        if self._own is not None:
+            self._own.begin(everywhere)
         self._running = True
         if self.render_mode is not None:
             self._start_drawing()
-        return self._batch.observations[0].copy(), self._info(self._batch.outcome(0))
+        return self._observation(), self._info(self._batch.outcome(0))
 
     @in_turn
     def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -254,10 +267,20 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         """
         if not self._running:
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        outcome = self._play(_one_number(action))
+        given, own = _one_number(action), self._own
+        if own is not None:
+            own.before()
+        outcome = self._play(given)
+        if own is not None:
+            outcome["reward"] += float(own.rewards(None)[0])
+            own.observe(None)
         terminated, truncated = bool(outcome["terminated"]), bool(outcome["truncated"])
         self._running = not (terminated or truncated)
-        return self._batch.observations[0].copy(), outcome["reward"], terminated, truncated, self._info(outcome)
+        return self._observation(), outcome["reward"], terminated, truncated, self._info(outcome)
+
+    def _observation(self) -> Observation:
+        seen: Observation = (self._batch if self._own is None else self._own).observations[0].copy()
+        return seen
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)

@@ -1,19 +1,23 @@
 """What is fixed about an experiment: limits, noises, priors, the estimator and the reward.
 
-The fields of these classes are the keyword arguments of `gymnasium.make`; all of them are JSON-able.
+The fields of these classes are the keyword arguments of `gymnasium.make`; all but functions and beliefs of one's own
+are JSON-able.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from duffing_env.checked import check_mean, check_prior
 from duffing_env.layout import Kind, Setup, parameter_names
 from duffing_env.noise import BRANCHES
-from duffing_env.rewards import REWARDS, check_reward
+from duffing_env.own import Beliefs, check_observation
+from duffing_env.rewards import check_reward, rewarding
 from estimator.belief import Belief
 from estimator.checks import LARGEST, number, shown, whole
 from estimator.ensemble import Hypotheses, priors, start
@@ -42,7 +46,9 @@ class Experiment:
     Attributes:
         factorisation: of the estimator: ``structured`` or ``mean_field``.
         iterations: variational iterations per sample; 3 structured and 10 mean field where it is None.
-        reward: its name, see `duffing_env.rewards`.
+        reward: its name, see `duffing_env.rewards`; or a function of one's own (`duffing_env.own`).
+        observation: a name of `duffing_env.own.OBSERVATIONS`, or a function of one's own.
+        history: steps that the observation ``history`` shows.
         max_input: input of the action 1 [V].
         max_output: displacement limit [V]: the episode ends at \|y\| above it.
         hold: samples that an action is applied for; a step's reward is the sum of theirs. An episode may end within.
@@ -57,7 +63,9 @@ class Experiment:
 
     factorisation: str = "structured"
     iterations: int | None = None
-    reward: str = "information_gain"
+    reward: str | Callable[..., Any] = "information_gain"
+    observation: str | Callable[[Beliefs], Any] = "posterior"
+    history: int = 16
     max_input: float = 0.15
     max_output: float = 0.6
     hold: int = 1
@@ -74,6 +82,9 @@ class Experiment:
         if self.iterations is not None:
             whole("iterations", self.iterations, MOST_ITERATIONS)
         check_reward(self.reward)
+        if callable(self.reward) and (self.terminal or self.terminated_return is not None):
+            raise ValueError("terminal and terminated_return must be left out with a reward of one's own")
+        check_observation(self.observation, self.history)
         for name in ("max_input", "max_output"):  # what is far beyond lets an oscillator run away, and its episode end
             number(name, getattr(self, name), high=1e300)
         whole("hold", self.hold, MOST_SAMPLES)
@@ -106,6 +117,11 @@ class Experiment:
     def truth_model(self) -> Model:
         """The model whose parameters the truth has."""
         return self.plant or self.model
+
+    @property
+    def knows_truth(self) -> bool:
+        """Whether there is a true plant to compare with."""
+        return True
 
     @property
     def degree(self) -> int:
@@ -157,7 +173,7 @@ class Experiment:
         return Kind(
             self.model, self.plant, self.degree, self.factorisation,
             self._iterations if self.factorisation == "structured" else 0,
-            self.reward if REWARDS[self.reward].hooks is not None else "",
+            str(self.reward) if rewarding(self.reward).hooks is not None else "",
             self.noise_hypotheses != 1, self.points and self.noise_hypotheses != 1,
         )  # fmt: skip
 
@@ -191,7 +207,7 @@ class Experiment:
             "jump": 0.0,
             "drifts": False,
             "walk": np.zeros(model.n_coefficients),
-            "weights": np.array(REWARDS[self.reward].weights),
+            "weights": np.array(rewarding(self.reward).weights),
             "terminal": self.terminal,
             "forfeits": self.terminated_return is not None,
             "terminated_return": float(self.terminated_return or 0.0),
@@ -220,6 +236,9 @@ class SimulatedExperiment(Experiment):
         process_noise_guess: standard deviation at which the prior of γ is centred [V]; ``process_noise`` where None.
         measurement_noise_guess: the same of ξ; ``measurement_noise`` where None.
         noise_shape: shape of the Gamma priors of γ and ξ; 2 is weak.
+        mean: parameter to the middle of its range, of some or all; the twin's where it is None.
+        prior: the belief that every episode starts from; where it is None, the one that fits plants so drawn, and the
+            noises.
         plant_spread: as ``spread``, for the plant alone, whose range the prior then does not match: with 0 every
             oscillator is the twin itself. That of the prior where it is None.
         max_rms: the input's root mean square over a whole episode [V]: the energy horizon * max_rms² is a budget, and
@@ -240,6 +259,8 @@ class SimulatedExperiment(Experiment):
     process_noise_guess: float | None = None
     measurement_noise_guess: float | None = None
     noise_shape: float = 2.0
+    mean: Mapping[str, float] | None = None
+    prior: Belief | None = None
     plant_spread: float | None = None
     max_rms: float | None = None
     max_slew: float | None = None
@@ -261,6 +282,9 @@ class SimulatedExperiment(Experiment):
         number("noise_range", self.noise_range, 1, LARGEST, "1 draws no noises")
         for name, limit in (("input_cost", LARGEST), ("jump", SPREADS[1]), ("drift", 1.0)):
             number(name, getattr(self, name), 0, limit, "0 does without it")
+        check_mean(self.mean, parameter_names(self.plant))
+        if self.prior is not None:
+            check_prior(self.prior, self.scales, self.model)
         if self.drift and self.factorisation == "mean_field":
             raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {self.drift!r}")
 
@@ -274,9 +298,16 @@ class SimulatedExperiment(Experiment):
         """The paper's difference equation."""
         return difference()
 
+    @property
+    def center(self) -> dict[str, float]:
+        """The twin, or the means of one's own."""
+        return super().center | {name: float(value) for name, value in (self.mean or {}).items()}
+
     @cached_property
     def believed(self) -> Belief:
-        """The prior that fits plants so drawn, and the noises."""
+        """The prior of one's own, or the one that fits plants so drawn, and the noises."""
+        if self.prior is not None:
+            return self.prior.factorised(self.factorisation)
         return self.prior_of(self.model, self.factorisation)
 
     def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:

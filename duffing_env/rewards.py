@@ -132,10 +132,15 @@ REWARDS = {
 }
 
 
-def check_reward(name: str) -> str:
-    """The name itself; ValueError for an unknown one."""
-    if name not in list(REWARDS):
+def rewarding(reward: str | Callable[..., Any]) -> Reward:
+    """What the kernel computes of a reward: of a function of one's own nothing."""
+    return Reward((0.0, 0.0, 0.0, 0.0)) if callable(reward) else REWARDS[reward]
+
+
+def check_reward(name: str | Callable[..., Any]) -> str | Callable[..., Any]:
+    """The name, or the function, itself; ValueError for an unknown one."""
+    if not callable(name) and name not in list(REWARDS):
         near = difflib.get_close_matches(str(name), REWARDS, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"reward must be one of {list(REWARDS)}, but is {name!r}{hint}")
+        raise ValueError(f"reward must be one of {list(REWARDS)} or a function, but is {name!r}{hint}")
     return name

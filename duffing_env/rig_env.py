@@ -58,7 +58,7 @@ class RigExperiment(RigNumbers, SimulatedExperiment):
                 object.__setattr__(self, name, NOISE if channel.noise is None else channel.noise / scale)
         super().__post_init__()
         self._check_parts()
-        for name, usual in (("spread", 0.3), ("plant_spread", None), ("jump", 0.0)):
+        for name, usual in (("spread", 0.3), ("plant_spread", None), ("jump", 0.0), ("mean", None), ("prior", None)):
             if getattr(self, name) != usual:
                 raise ValueError(f"{name} must be left out for a rig, whose guess says the range")
 

@@ -10,10 +10,11 @@ from typing import Any, ClassVar, Protocol, SupportsFloat
 
 import numpy as np
 
+from duffing_env.checked import check_prior
 from duffing_env.contract import checked_options
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import MOST_SAMPLES, Experiment
-from duffing_env.rewards import REWARDS
+from duffing_env.rewards import rewarding
 from estimator.belief import Belief
 from estimator.checks import whole
 from estimator.ensemble import Hypotheses
@@ -123,20 +124,17 @@ class RigPlantExperiment(RigNumbers, Experiment):
         object.__setattr__(self, "rig", checked_rig(self.rig, self.prior is None))
         if self.prior is None:
             object.__setattr__(self, "prior", rig_prior(self.described))
-        if not isinstance(self.prior, Belief):
-            raise ValueError(f"prior must be an estimator.Belief or None, but is {self.prior!r:.60}")
-        if self.prior.scales != self.scales:
-            raise ValueError(
-                f"prior must have the scales of the rig, {self.scales}, but has {self.prior.scales}; give it those"
-            )
+        check_prior(self.prior, self.scales)
         super().__post_init__()
         self._check_parts()
         whole("horizon", self.horizon, MOST_SAMPLES)
-        if REWARDS[self.reward].needs_truth:
+        if rewarding(self.reward).needs_truth:
             raise ValueError(
                 f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "
                 "use 'information_gain', 'expected_free_energy' or 'free_energy'"
             )
+        if self.observation == "privileged":
+            raise ValueError("observation must not be 'privileged' for a plant of one's own, whose truth nobody knows")
         if self.model.n_outputs != 1:
             raise ValueError(
                 f"prior must be of a model with one sensor, but {self.model.name!r} has {self.model.n_outputs}; "
@@ -147,6 +145,11 @@ class RigPlantExperiment(RigNumbers, Experiment):
     def samples(self) -> int:
         """The horizon."""
         return self.horizon
+
+    @property
+    def knows_truth(self) -> bool:
+        """Nobody does."""
+        return False
 
     @property
     def model(self) -> Model:

@@ -21,6 +21,7 @@ from duffing_env.env import DuffingEnv
 from duffing_env.experiment import MOST_SAMPLES, Experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import OUTCOME
+from duffing_env.own import Own
 from duffing_env.replay import SilverboxReplayEnv
 from duffing_env.turns import in_turn
 from estimator.belief import Belief
@@ -107,7 +108,7 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         self.metadata = {**type(self).metadata, "autoreset_mode": self._autoreset_mode}
         self.render_mode = None
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
-        self.single_observation_space = observation_space(self.experiment.model)
+        self.single_observation_space = observation_space(self.experiment)
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -115,6 +116,7 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         hold = self.experiment.hold
         cut = math.inf if limit is None else float(limit * hold)
         self._batch = Batch(self.experiment, self.num_envs, reset_mode, int(threads), hold, cut)
+        self._own = Own.of(self._batch)
         self._copy = copy
         self._turn = [None]
         self._seeded: Flags = np.zeros(self.num_envs, dtype=np.bool_)
@@ -181,8 +183,10 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         self._finished[mask] = False
         due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
         self._any_due = bool(due.any())
+        if self._own is not None:
+            self._own.begin(mask)
         nothing = np.zeros((_FIRST_FLAG, self.num_envs))
-        return self._batch.observations, self._step_infos(nothing, np.zeros((4, self.num_envs), dtype=np.bool_), mask)
+        return self._seen.observations, self._step_infos(nothing, np.zeros((4, self.num_envs), dtype=np.bool_), mask)
 
     @in_turn
     def step(
@@ -209,17 +213,29 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
             rows = np.flatnonzero(due).tolist()
             raise ResetNeeded(f"rows {rows} have finished or not begun: reset them with options={{'reset_mask': mask}}")
         self._batch.renew(observations=self._copy)
+        own = self._own
+        if own is not None:
+            own.before()
         self._batch.step(given)
         outcomes = self._batch.outcomes
         flags = outcomes[_FIRST_FLAG:] != 0.0
         terminated, truncated = flags[0], flags[1]
         finished = terminated | truncated
         any_finished = bool(np.count_nonzero(finished))
+        if own is not None:
+            ended = finished if any_finished and self._autoreset_mode == AutoresetMode.SAME_STEP else None
+            outcomes[0] += own.rewards(ended)
+            own.observe(ended)
         infos = self._infos(outcomes, flags, finished if any_finished else None)
         self._finished = finished
         if self._autoreset_mode == AutoresetMode.DISABLED:
             self._any_due = any_finished
-        return self._batch.observations, outcomes[0], terminated, truncated, infos
+        return self._seen.observations, outcomes[0], terminated, truncated, infos
+
+    @property
+    def _seen(self) -> Batch | Own:
+        """What has the observations."""
+        return self._batch if self._own is None else self._own
 
     def _reset_mask(self, options: dict[str, Any]) -> Flags:
         if "reset_mask" not in options:
@@ -269,7 +285,7 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
             infos[name][finished] = 0
         final_observations = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(finished):
-            final_observations[row] = self._batch.final_observations[row].copy()
+            final_observations[row] = self._seen.final_observations[row].copy()
         return infos | {
             "final_obs": final_observations,
             "_final_obs": finished.copy(),

@@ -9,7 +9,6 @@ from scipy import stats
 from twin import PAIRS, PARAMETERS, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
-from duffing_env.contract import observation_space
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
@@ -72,7 +71,6 @@ def test_the_length_of_an_observation_follows_from_the_model(model):
     k = model.n_coefficients
     expected = 2 * k + k * (k - 1) // 2 + model.n_states + 2 * model.n_outputs + 4
     assert len(observation_bounds(model)) == expected
-    assert observation_space(model).shape == (expected,)
 
 
 @pytest.mark.parametrize("spread", [0.3, 0.9])

@@ -203,7 +203,11 @@ def test_nobody_knows_the_truth():
         (Difference(), {"horizon": 0}, "horizon must be a whole number"),
         (Difference(), {"spread": 0.1}, "unexpected keyword argument 'spread'"),
         (Difference(), {"max_input": 1.5}, "max_input must be at most 1, the rig's own limit"),
-        (Difference(), {"prior": rig_prior(replace(VOLTS, step=1.0, guess=GUESS))}, "prior must have the scales of"),
+        (
+            Difference(),
+            {"prior": rig_prior(replace(VOLTS, step=1.0, guess=GUESS))},
+            "prior must have the scales Scales",
+        ),
         (Difference(), {"prior": None}, "rig must have a guess for an environment, but has none"),
     ],
 )

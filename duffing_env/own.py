@@ -1,0 +1,233 @@
+"""Observations and rewards beside the kernel's own: what an agent sees, and what it is paid for, by functions.
+
+They are computed with NumPy, for all environments at once, from what the kernel leaves in its blocks. Both faces of the
+environment call them once a step, however many samples that holds.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from duffing_env.layout import observation_bounds
+from estimator.belief import covariance_places
+from estimator.checks import shown, whole
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+
+if TYPE_CHECKING:
+    from duffing_env.batch import Batch
+    from duffing_env.experiment import Experiment
+
+Flags: TypeAlias = npt.NDArray[np.bool_]
+
+#: Observations by name; see `duffing_env.env.DuffingEnv`.
+OBSERVATIONS = ("posterior", "history", "privileged")
+
+#: Steps that the observation ``history`` shows, at most.
+MOST_STEPS = 10_000
+
+#: Entries of an observation that is a function of the belief are clipped to this.
+BOUND = 10.0
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """What n environments believe: `estimator.Belief`, as arrays.
+
+    Attributes:
+        model: whose states and coefficients these are.
+        records: (n, size) their records.
+    """
+
+    model: Model
+    records: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """(n, d) means of states and coefficients."""
+        return self.records[:, : len(self.model.names)]
+
+    @property
+    def cov(self) -> FloatArray:
+        """(n, d, d) their covariances."""
+        return self.records[:, covariance_places(self.model)]
+
+    @property
+    def coefficients_mean(self) -> FloatArray:
+        """(n, K) means of the coefficients."""
+        return self.mean[:, self.model.n_states :]
+
+    @property
+    def coefficients_cov(self) -> FloatArray:
+        """(n, K, K) covariances of the coefficients."""
+        n = self.model.n_states
+        return self.records[:, covariance_places(self.model)[n:, n:]]
+
+    @property
+    def noises(self) -> FloatArray:
+        """(n, 2 + 2 sensors) shape and rate of γ, then of each ξ."""
+        return self.records[:, -2 - 2 * self.model.n_outputs :]
+
+
+def check_observation(chosen: Any, history: int) -> None:
+    """Refuse what is neither an observation's name nor a function, and a history that is no number of steps."""
+    if not callable(chosen) and chosen not in list(OBSERVATIONS):
+        raise ValueError(f"observation must be one of {list(OBSERVATIONS)} or a function, but is {shown(chosen)}")
+    whole("history", history, MOST_STEPS)
+
+
+def bounds_of(experiment: Experiment) -> FloatArray:
+    """(entries, 2) bounds of an experiment's observation."""
+    model, chosen = experiment.model, experiment.observation
+    posterior = list(observation_bounds(model).values())
+    if chosen == "posterior":
+        told = posterior
+    elif chosen == "privileged":
+        told = posterior + [(-BOUND, BOUND)] * model.n_coefficients
+    elif chosen == "history":
+        last = posterior[-3 - model.n_outputs : -2]
+        told = last * experiment.history + posterior[-2:]
+    else:
+        told = [(-BOUND, BOUND)] * _called(chosen, model, experiment.believed.record[None]).shape[1]
+    return np.array(told)
+
+
+def _called(function: Any, model: Model, records: FloatArray) -> FloatArray:
+    seen = np.asarray(function(Beliefs(model, records)), dtype=np.float64)
+    if seen.ndim != 2 or len(seen) != len(records) or not np.isfinite(seen).all():
+        raise ValueError(
+            f"observation must give finite numbers of shape (n, entries) for the beliefs of n environments, but gave "
+            f"{seen!r:.200} for {len(records)}"
+        )
+    return seen
+
+
+class Row(NamedTuple):
+    """One of `Beliefs`, for a compiled reward: the same attributes, without the first axis."""
+
+    mean: FloatArray
+    cov: FloatArray
+    coefficients_mean: FloatArray
+    coefficients_cov: FloatArray
+    noises: FloatArray
+
+    @classmethod
+    def columns(cls, beliefs: Beliefs) -> tuple[FloatArray, ...]:
+        """The arrays of all, in the order of the fields."""
+        return tuple(np.ascontiguousarray(getattr(beliefs, name)) for name in cls._fields)
+
+
+@cache
+def _looped(function: Any, parameters: tuple[str, ...]) -> Any:
+    """``loop(before, after, u, y, truth, paid)``: a compiled reward for one environment after the other."""
+    import numba
+
+    fields = range(len(Row._fields))
+    row = {who: ", ".join(f"{who}[{k}][i]" for k in fields) for who in ("before", "after")}
+    truth = ", ".join(f"truth[i, {k}]" for k in range(len(parameters)))
+    source = "def loop(before, after, u, y, truth, paid):\n    for i in range(len(paid)):\n"
+    source += f"        one, other = Row({row['before']}), Row({row['after']})\n"
+    source += f"        paid[i] = function(one, other, u[i], y[i], {f'Truth({truth})' if parameters else None})\n"
+    names: dict[str, Any] = {"Row": Row, "Truth": namedtuple("Truth", parameters), "function": function}
+    exec(source, names)
+    return numba.njit(names["loop"])
+
+
+class Own:
+    """What a batch shows and pays by functions.
+
+    Args:
+        batch: what it shows and pays for.
+
+    Attributes:
+        observations: (n, entries) float32, after `begin` and `observe`.
+        final_observations: the same, of the environments that were reset within the step.
+    """
+
+    def __init__(self, batch: Batch) -> None:
+        experiment = batch.experiment
+        self._batch, self._model = batch, experiment.model
+        self._chosen, self._reward = experiment.observation, experiment.reward
+        self._low, self._high = bounds_of(experiment).T.astype(np.float32)
+        self._samples = np.zeros((batch.size, experiment.history, 1 + self._model.n_outputs), dtype=np.float32)
+        self._prior, self._inverse_std = experiment.believed.coefficients_mean, experiment.setup.inverse_std
+        self._true = [f"TRUE_{c}" for c in self._model.coefficients]
+        self._waiting = np.zeros(batch.size, dtype=np.bool_)
+        self.observations = self.final_observations = np.zeros((batch.size, len(self._low)), dtype=np.float32)
+
+    @staticmethod
+    def of(batch: Batch) -> Own | None:
+        """That of a batch; None where the kernel does all."""
+        own = batch.experiment.observation != "posterior" or callable(batch.experiment.reward)
+        return Own(batch) if own else None
+
+    def begin(self, mask: Flags) -> None:
+        """See environments of ``mask`` (n,) whose episodes begin."""
+        self._samples[mask] = 0.0
+        self.observations = self._seen(self._batch.observations, None)
+
+    def before(self) -> None:
+        """Remember what is believed before a step."""
+        self._waiting = self._batch.quantity("WAITING") != 0.0
+        self._before = self._batch.records()
+
+    def rewards(self, ended: Flags | None) -> FloatArray:
+        """(n,) what a step paid, after it; 0 without a function.
+
+        Args:
+            ended: (n,) environments that were reset within the step, if any.
+        """
+        batch, n = self._batch, self._batch.size
+        if not callable(self._reward):
+            return np.zeros(n)
+        before, after = (Beliefs(self._model, records) for records in (self._before, batch.records(ended)))
+        scales, first = batch.experiment.scales, next(iter(batch.experiment.truth_model.outputs))
+        u, y = (batch.rows(["INPUT", f"Y_{first}"], ended) * (scales.input, scales.output)).T
+        truth = batch.truth(ended) if batch.experiment.knows_truth else None
+        if hasattr(self._reward, "py_func"):  # compiled by Numba
+            paid = np.empty(n)
+            told = np.stack([*(truth or {}).values(), u], axis=1)
+            loop = _looped(self._reward, tuple(truth or ()))
+            loop(Row.columns(before), Row.columns(after), u.copy(), y.copy(), told, paid)
+        else:
+            paid = np.asarray(self._reward(before, after, u, y, truth), dtype=np.float64)
+        idle = self._waiting | (batch.outcomes[-2:] != 0.0).any(axis=0)
+        if paid.shape != (n,) or not np.isfinite(paid[~idle]).all():
+            raise ValueError(f"reward must give {n} finite numbers for {n} environments, but gave {paid!r:.200}")
+        return np.where(idle, 0.0, paid)
+
+    def observe(self, ended: Flags | None) -> None:
+        """See what a step left; ``ended`` as of `rewards`."""
+        batch, now = self._batch, self._batch.observations
+        if ended is not None:
+            last = np.where(ended[:, None], batch.final_observations, now)
+            self._remember(last)
+            self.final_observations = self._seen(last, ended)
+            self._samples[ended] = 0.0
+        else:
+            self._remember(now)
+        self._samples[self._waiting] = 0.0
+        self.observations = self._seen(now, None)
+
+    def _remember(self, observations: npt.NDArray[np.float32]) -> None:
+        if self._chosen == "history":
+            self._samples = np.roll(self._samples, -1, axis=1)
+            self._samples[:, -1] = observations[:, -3 - self._model.n_outputs : -2]
+
+    def _seen(self, observations: npt.NDArray[np.float32], ended: Flags | None) -> npt.NDArray[np.float32]:
+        if self._chosen == "posterior":
+            return observations
+        if self._chosen == "history":
+            seen = np.concatenate([self._samples.reshape(len(observations), -1), observations[:, -2:]], axis=1)
+        elif self._chosen == "privileged":
+            true = (self._batch.rows(self._true, ended) - self._prior) * self._inverse_std
+            seen = np.concatenate([observations, true], axis=1)
+        else:
+            seen = _called(self._chosen, self._model, self._batch.records(ended))
+        return np.clip(seen, self._low, self._high).astype(np.float32)
