@@ -28,7 +28,8 @@ import agents
 assert Path(agents.__file__).is_relative_to(sys.prefix)
 for name in trained_policies():
     track = json.loads((TRAINED / name / "policy.json").read_text())["track"]
-    envs = gym.make_vec(track if "/" in track else "duffing_env/Short-v0", num_envs=8, vectorization_mode="vector_entry_point")
+    track = track if "/" in track else "duffing_env/Short-v0"
+    envs = gym.make_vec(track, num_envs=8, vectorization_mode="vector_entry_point")
     policy, (observations, _) = make_policy(name, envs), envs.reset(seed=0)
     for _ in range(3):
         observations, rewards, *_ = envs.step(policy.predict(observations, deterministic=True)[0])
