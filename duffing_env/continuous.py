@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import Experiment, SimulatedExperiment
+from estimator.checks import one_of
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -28,8 +29,7 @@ class ContinuousExperiment(SimulatedExperiment):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.estimator not in ["ode", "nlarx"]:
-            raise ValueError(f"estimator must be one of ['ode', 'nlarx'], but is {self.estimator!r}")
+        one_of("estimator", self.estimator, ("ode", "nlarx"))
         if self.reward == "fisher" and self.estimator != "ode":
             raise ValueError(
                 "reward must not be 'fisher' for estimator='nlarx', whose equation the plant does not obey"

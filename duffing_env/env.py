@@ -18,7 +18,7 @@ from duffing_env.layout import SUMMED
 from duffing_env.own import Own
 from duffing_env.turns import in_turn
 from estimator.belief import Belief
-from estimator.checks import numbers, shown
+from estimator.checks import numbers, one_of, shown
 from estimator.parameters import FloatArray, Parameters
 
 if TYPE_CHECKING:
@@ -184,8 +184,8 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     experiment_kind: ClassVar[type[Experiment]] = SimulatedExperiment
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode must be one of {self.metadata['render_modes']}, but is {render_mode!r}")
+        if render_mode is not None:
+            one_of("render_mode", render_mode, self.metadata["render_modes"])
         self.experiment = make_experiment(self.experiment_kind, options)
         self.observation_space = observation_space(self.experiment)
         self.action_space = action_space()

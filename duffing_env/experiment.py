@@ -19,7 +19,7 @@ from duffing_env.noise import BRANCHES
 from duffing_env.own import Beliefs, check_observation
 from duffing_env.rewards import check_reward, rewarding
 from estimator.belief import Belief
-from estimator.checks import LARGEST, number, shown, whole
+from estimator.checks import LARGEST, flag, number, one_of, whole
 from estimator.ensemble import Hypotheses, priors, start
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
@@ -75,10 +75,8 @@ class Experiment:
     branch: str = "train"
 
     def __post_init__(self) -> None:
-        if self.branch not in list(BRANCHES):
-            raise ValueError(f"branch must be one of {list(BRANCHES)}, but is {self.branch!r}")
-        if self.factorisation not in list(DEFAULT_ITERATIONS):
-            raise ValueError(f"factorisation must be one of {list(DEFAULT_ITERATIONS)}, but is {self.factorisation!r}")
+        one_of("branch", self.branch, BRANCHES)
+        one_of("factorisation", self.factorisation, DEFAULT_ITERATIONS)
         if self.iterations is not None:
             whole("iterations", self.iterations, MOST_ITERATIONS)
         check_reward(self.reward)
@@ -95,8 +93,7 @@ class Experiment:
         object.__setattr__(self, "noise_hypotheses", hypotheses)
 
     def _check_flag(self, name: str) -> None:
-        if not isinstance(getattr(self, name), bool):
-            raise ValueError(f"{name} must be True or False, but is {shown(getattr(self, name))}")
+        flag(name, getattr(self, name))
 
     @property
     def samples(self) -> int:

@@ -14,7 +14,7 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
-from estimator.checks import LARGEST, SMALLEST, number, shown
+from estimator.checks import LARGEST, SMALLEST, number, one_of, shown
 from estimator.models import MODELS
 from estimator.models.model import Model
 from estimator.priors import gaussian_moments, weak_prior
@@ -52,8 +52,7 @@ class ModelExperiment(SimulatedExperiment):
             for parameter, value in given.items():
                 number(f"{name} of {parameter}", value, -LARGEST if name == "mean" else SMALLEST)
         number("sampling_step", self.sampling_step)
-        if self.interpolation not in ("zero_order", "linear"):
-            raise ValueError(f"interpolation must be 'zero_order' or 'linear', but is {self.interpolation!r}")
+        one_of("interpolation", self.interpolation, ("zero_order", "linear"))
         if self.factorisation != "structured":
             raise ValueError(f"factorisation must be 'structured' for a model, but is {self.factorisation!r}")
         others = self.sensor_noise
@@ -70,9 +69,10 @@ class ModelExperiment(SimulatedExperiment):
         if isinstance(given, Model):
             return given
         if isinstance(given, str):
-            if given not in MODELS:
-                raise ValueError(f"system must be one of {list(MODELS)} or a Model, but is {given!r}")
+            one_of("system", given, MODELS)
             return MODELS[given]()
+        if not isinstance(given, Mapping) or not set(given) <= set(Model.__dataclass_fields__):
+            raise ValueError(f"system must be one of {list(MODELS)}, a Model or its fields, but is {shown(given)}")
         fields: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value for key, value in given.items()
         }

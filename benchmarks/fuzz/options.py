@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 from hypothesis import strategies as st
 
 from benchmarks.fuzz.estimators import RIG
@@ -23,10 +24,11 @@ _COSTLY = {"iterations", "factorisation", "reward", "estimator", "system", "inte
 def calls() -> st.SearchStrategy[Call]:
     """Calls that make an environment, and play."""
     tracks = [track for track in TRACKS if record_available() or "Replay" not in track]
-    known = {}
+    known, made = {}, {}
     for track in tracks:
         given = {"rig": RIG} if "Rig" in track else {}
         env: Any = gym.make(track, disable_env_checker=True, **given).unwrapped
+        made[track] = load_env_creator(gym.spec(track).entry_point)  # type: ignore[arg-type]
         known[track] = ({one.name: getattr(env.experiment, one.name) for one in fields(env.experiment)}, given)
 
     @st.composite
@@ -40,7 +42,7 @@ def calls() -> st.SearchStrategy[Call]:
                 asked[name] = [asked[name]]
 
         def function() -> str:
-            env: Any = gym.make(track, disable_env_checker=True, **{**given, **asked}).unwrapped
+            env: Any = made[track](**{**gym.spec(track).kwargs, **given, **asked})
             fault = unsound(env, env.reset(seed=1))
             for action in (1.0, -1.0, 0.0, 1.0, 1.0):
                 told = env.step([action])
@@ -49,6 +51,6 @@ def calls() -> st.SearchStrategy[Call]:
                     env.reset()
             return fault
 
-        return Call(f"{track}: {', '.join(sorted(asked))}", function, (*usual, *asked), sound=str)
+        return Call(track, function, (*usual, *asked), sound=str, given=asked)
 
     return call()
