@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from signal import SIGINT
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -14,12 +15,20 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from tyro.constructors import PrimitiveConstructorSpec
 
+from agents.running.stopping import Stopped, stopped_by_sigterm
+
 
 def _parse_options(words: list[str]) -> dict[str, Any]:
     """The object that the first of the words holds as JSON; ValueError where it is none."""
-    options = json.loads(words[0])
+    try:
+        options = json.loads(words[0])
+    except RecursionError:
+        raise ValueError("options must be a JSON object, but are nested too deeply") from None
     if not isinstance(options, dict):
         raise ValueError(f"options must be a JSON object, but are {words[0]}; write e.g. '{{\"spread\": 0.2}}'")
+    for name in ("num_envs", "autoreset_mode", "max_episode_steps", "threads", "copy", "render_mode"):
+        if name in options:
+            raise ValueError(f"options must not hold {name}, but are {words[0]}; the command chooses that itself")
     return options
 
 
@@ -92,16 +101,19 @@ def check_track(env_id: str) -> None:
 def told_in_one_line(name: str) -> Iterator[None]:
     """End the process where the user can mend what went wrong, with one message and no traceback.
 
-    The exit status is 2 for a bad value or file, or a package of an extra that is missing; and 130 after Ctrl-C.
+    The exit status is 2 for a bad value or file, or a package of an extra that is missing; 130 after Ctrl-C, and 143
+    after SIGTERM.
 
     Args:
         name: of the command, which stands before the message.
     """
     try:
-        yield
-    except KeyboardInterrupt:
-        print(f"{name}: stopped", file=sys.stderr)
-        sys.exit(130)
+        with stopped_by_sigterm():
+            yield
+    except (KeyboardInterrupt, Stopped) as stopped:
+        left = f"; {stopped.left}" if isinstance(stopped, Stopped) and stopped.left else ""
+        print(f"{name}: stopped{left}", file=sys.stderr)
+        sys.exit(128 + (stopped.signum if isinstance(stopped, Stopped) else SIGINT))
     except Exception as error:
         from gymnasium.error import Error as GymnasiumError
 

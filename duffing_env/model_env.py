@@ -73,10 +73,7 @@ class ModelExperiment(SimulatedExperiment):
             return MODELS[given]()
         if not isinstance(given, Mapping) or not set(given) <= set(Model.__dataclass_fields__):
             raise ValueError(f"system must be one of {list(MODELS)}, a Model or its fields, but is {shown(given)}")
-        fields: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in given.items()
-        }
-        return Model(**fields)
+        return Model(**given)
 
     @property
     def model(self) -> Model:

@@ -79,10 +79,7 @@ def _built(arrays: dict[str, Any]) -> OnlineEstimator:
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         found = description.get("format") if isinstance(description, dict) else None
         raise ValueError(f"it is of format {found!r}, not {FORMAT}")
-    declared: dict[str, Any] = {
-        name: tuple(v) if isinstance(v, list) else v for name, v in description["model"].items()
-    }
-    model, settings = Model(**declared), description["settings"]
+    model, settings = Model(**description["model"]), description["settings"]
     rig, scales = Rig.from_dict(description["rig"]), Scales(**description["scales"])
     first = arrays.get("first")
     if first is None or first.dtype != np.float64 or first.shape != (record_size(model),):

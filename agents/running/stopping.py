@@ -1,9 +1,11 @@
-"""Signals that end a run in order: the input is zeroed, and what was measured is kept."""
+"""Signals that end a run, or a command, in order: the input is zeroed, and what was measured or learned is kept."""
 
 from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -15,21 +17,27 @@ _PATIENCE = 1.0
 
 
 class Stopped(BaseException):
-    """A signal came."""
+    """A signal came.
 
-    def __init__(self, signum: int) -> None:
+    Args:
+        signum: its number.
+        left: what is left of the work, and how to go on.
+    """
+
+    def __init__(self, signum: int, left: str = "") -> None:
         super().__init__(signal.Signals(signum).name)
-        self.signum = signum
+        self.signum, self.left = signum, left
 
 
 class Stopper:
     """Catches signals while it is entered, in the main thread.
 
     A signal is noticed by `check`, between two commands to the plant, so that none is cut in two. A command or a
-    policy that does not come back within a second is interrupted.
+    policy that does not come back within ``patience`` seconds is interrupted.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, patience: float = _PATIENCE) -> None:
+        self._patience = patience
         self._came: int | None = None
         self._former: dict[int, Any] = {}
 
@@ -45,11 +53,16 @@ class Stopper:
         for signum, handler in self._former.items():
             signal.signal(signum, handler)
 
-    def check(self) -> None:
-        """Raise `Stopped` where a signal came."""
+    @property
+    def is_asked(self) -> bool:
+        """Whether a signal came."""
+        return self._came is not None
+
+    def check(self, left: str = "") -> None:
+        """Raise `Stopped` where a signal came; ``left`` says what is left."""
         if self._came is not None:
             self._calm()
-            raise Stopped(self._came)
+            raise Stopped(self._came, left)
 
     def ignore(self) -> None:
         """From now on no signal is noticed: the input is being zeroed."""
@@ -60,7 +73,7 @@ class Stopper:
     def _note(self, signum: int, frame: FrameType | None) -> None:
         self._came = signum
         if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, _PATIENCE)
+            signal.setitimer(signal.ITIMER_REAL, self._patience)
 
     def _force(self, signum: int, frame: FrameType | None) -> None:
         if self._came is not None:
@@ -69,3 +82,19 @@ class Stopper:
     def _calm(self) -> None:
         if self._former and hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+@contextmanager
+def stopped_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM raise `Stopped`, as Ctrl-C raises KeyboardInterrupt, in the main thread, which alone is told."""
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        raise Stopped(signum)
+
+    is_main = threading.current_thread() is threading.main_thread()
+    former = signal.signal(signal.SIGTERM, stop) if is_main else None
+    try:
+        yield
+    finally:
+        if is_main:
+            signal.signal(signal.SIGTERM, former)

@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,6 +18,7 @@ from agents.cli import RIG_TRACK, JsonOptions, check_track, with_rig
 from agents.policies.learned import CARD
 from agents.policies.saving import save_policy
 from agents.results import versions, write_json
+from agents.running.stopping import Stopper
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.checkpoints import (
     Progress,
@@ -38,6 +39,10 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 _PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy", "stable-baselines3", "torch")
+
+
+#: After a signal, the update that is on its way may take so many seconds, before nothing more is saved.
+_PATIENCE = 60.0
 
 
 @dataclass(frozen=True)
@@ -252,7 +257,8 @@ class _Training:
 
         columns = (TextColumn("Training"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn())
         total, begun = self._config.steps, self._progress.steps
-        with Progress(*columns) as bar:
+        with ExitStack() as stack:
+            bar = stack.enter_context(Progress(*columns))
             task = bar.add_task("", total=total, completed=begun, status="compiling")
             started = time.perf_counter()
 
@@ -262,11 +268,16 @@ class _Training:
                 status = f"{steps:,} samples, {rate:,.0f}/s, return {mean_return:.2f}"
                 bar.update(task, completed=min(steps, total), status=status)
 
+            def on_update() -> None:
+                self._on_update()
+                if stopper.is_asked and self._model.num_timesteps < total:
+                    self._save()
+                    stopper.check(f"go on with: duffing-env train --resume {self._folder}")
+
+            stopper = stack.enter_context(Stopper(_PATIENCE))
             self._model.learn(
                 total - begun,
-                callback=Watch(
-                    on_rollout, self._on_update, getattr(self._config.hyperparameters, "entropy_bonus", 0.0)
-                ),
+                callback=Watch(on_rollout, on_update, getattr(self._config.hyperparameters, "entropy_bonus", 0.0)),
                 log_interval=self._config.hyperparameters.log_interval,
                 reset_num_timesteps=begun == 0,
             )
@@ -281,11 +292,15 @@ class _Training:
             self._evaluated(self._model.num_timesteps, found)
         if self._due_checkpoints() > self._checkpoints:
             self._checkpoints = self._due_checkpoints()
-            model, progress = self._model, self._progress
-            progress.steps, progress.updates = model.num_timesteps, model._n_updates
-            progress.episodes, progress.seconds = model._episode_num, self._seconds()
-            unfinished = model.num_timesteps < self._config.steps
-            save_checkpoint(self._folder, model, self._card(), progress if unfinished else None)
+            self._save()
+
+    def _save(self) -> None:
+        """Write a checkpoint."""
+        model, progress = self._model, self._progress
+        progress.steps, progress.updates = model.num_timesteps, model._n_updates
+        progress.episodes, progress.seconds = model._episode_num, self._seconds()
+        unfinished = model.num_timesteps < self._config.steps
+        save_checkpoint(self._folder, model, self._card(), progress if unfinished else None)
 
     def _due_evaluation(self) -> bool:
         """Whether the next multiple of ``eval_every`` is reached, or the end."""

@@ -81,6 +81,9 @@ class Model:
         mapping("dimensions", self.dimensions, Sequence)
         for given in ("noise", "rates", "next_state"):
             texts = getattr(self, given)
+            if isinstance(texts, list):  # as JSON holds it
+                texts = tuple(texts)
+                object.__setattr__(self, given, texts)
             if not isinstance(texts, tuple) or not all(isinstance(text, str) for text in texts):
                 raise ValueError(f"{given} must be a tuple of expressions, but is {shown(texts)}; ('1',) has one")
         if not isinstance(self.name, str):

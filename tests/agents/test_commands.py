@@ -237,7 +237,8 @@ def test_nothing_heavy_is_imported_for_the_help():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no such signal")
-def test_ctrl_c_is_one_line_and_exit_status_130(tmp_path):
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_is_one_line_and_its_exit_status(tmp_path, number, status):
     # A process that was started in the background ignores the signal.
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     code += "from agents.commands import main; main(['rig', 'init'])"
@@ -249,8 +250,8 @@ def test_ctrl_c_is_one_line_and_exit_status_130(tmp_path):
     assert asking.stdout is not None
     assert "Ctrl-C" in asking.stdout.readline()
     time.sleep(0.2)
-    asking.send_signal(signal.SIGINT)
+    asking.send_signal(number)
     _, messages = asking.communicate(timeout=60)
-    assert asking.returncode == 130
+    assert asking.returncode == status
     assert messages.strip() == "duffing-env: stopped"
     assert list(tmp_path.iterdir()) == []

@@ -18,6 +18,7 @@ from safetensors.numpy import load_file, save_file
 
 import agents
 from agents import make_policy
+from agents.running.stopping import Stopped
 from agents.training import ALGORITHMS, TrainConfig, resume, train
 from agents.training.checkpoints import (
     STATE,
@@ -249,3 +250,20 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
         (checkpoint / STATE).write_text(damage)
         with pytest.raises(ValueError, match=r"checkpoint must hold a sound training.json"):
             resume(folder)
+
+
+@pytest.mark.parametrize(("number", "algo"), [(signal.SIGINT, "ppo"), (signal.SIGTERM, "sac")])
+def test_after_a_signal_the_update_is_finished_and_all_is_kept(tmp_path, number, algo):
+    """The signal comes while it learns: what is left is said, nothing is lost, and the run goes on from there."""
+
+    def send(steps, found):
+        if steps == 384:
+            os.kill(os.getpid(), number)
+
+    with pytest.raises(Stopped) as caught:
+        train(replace(config(algo, tmp_path / "run", eval_every=128), checkpoints=1), send)
+    assert caught.value.signum == number
+    assert caught.value.left == f"go on with: duffing-env train --resume {tmp_path / 'run'}"
+    checkpoint = latest_checkpoint(tmp_path / "run")
+    assert load_progress(checkpoint).steps == 384
+    assert resume(tmp_path / "run").curve[-1][0] == STEPS
