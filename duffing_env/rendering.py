@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from duffing_env.panels import GREY, INK, NAMES, RULE, ParameterPanel, SignalPanel, labels
 from estimator.belief import Belief
+from estimator.extras import need
 from estimator.files import write_atomically
 from estimator.parameters import FloatArray, Parameters
 from estimator.physical import propagate
@@ -135,6 +136,7 @@ class _Picture:
     """
 
     def __init__(self, max_input: float, max_output: float, scales: Scales, believed: FloatArray) -> None:
+        need("matplotlib")
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 

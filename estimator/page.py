@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.extras import need
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -58,6 +60,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def svg(figure: Figure) -> str:
     """A figure as an element of the page."""
+    need("matplotlib")
     from matplotlib import rc_context
 
     buffer = io.StringIO()

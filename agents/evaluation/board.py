@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.leaderboard import METRICS, Metric
-from agents.evaluation.protocol import SCORE, TRACKS, VERSION
+from agents.evaluation.protocol import SCORE, TRACKS, VERSION, digest
+from agents.evaluation.systems import FOLDER
 from agents.results import finite
 from estimator.files import whole_file, write_atomically
 
@@ -65,10 +66,20 @@ def read(path: Path) -> list[dict[str, Any]]:
     return list(found.values())
 
 
+def stored_oracles() -> set[str]:
+    """Digests of the oracles of this version."""
+    return {digest(path) for path in FOLDER.glob("*.npz")}
+
+
 def tables(entries: Sequence[dict[str, Any]]) -> dict[str, list[list[str]]]:
     """Rows under `TITLES` for each track, the best score first."""
     ordered = sorted(entries, key=lambda entry: -entry["score"]["iqm"])
-    rows = {track: [cells(entry) for entry in ordered if entry["track"] == track] for track in TRACKS}
+    present = stored_oracles()
+    rows: dict[str, list[list[str]]] = {track: [] for track in TRACKS}
+    for entry in ordered:
+        name, score, *others = cells(entry)
+        earlier = "" if entry["reference"]["oracle"] in present else " *"
+        rows.setdefault(entry["track"], []).append([name, score + earlier, *others])
     return {track: found for track, found in rows.items() if found}
 
 
@@ -101,7 +112,7 @@ CAPTION = (
     "Score: interquartile mean over seeds and systems of the D-efficiency, against the certified optimum of each "
     "system that has one and else the best input that is known, with its 95 % bootstrap interval over systems. The "
     "others are means over 256 systems: information gained, 90 % intervals that cover, episodes that a limit ended, "
-    "and on shifted systems the Fisher information."
+    "and on shifted systems the Fisher information. * is against an earlier oracle: measure it again."
 )
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.extras import need
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ def save(figure: Figure, path: Path) -> None:
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of this size [inch], for any backend."""
+    need("matplotlib")
     from matplotlib.figure import Figure
 
     return Figure((width, height), layout="constrained", dpi=120)

@@ -128,7 +128,7 @@ def measure(
         "metrics": _summary(evaluations, BESIDE),
         "shifted": shifted,
         "reference": {
-            "oracle": _digest(oracle.systems.path),
+            "oracle": digest(oracle.systems.path),
             "systems": len(oracle.values),
             "certified": int(np.isfinite(oracle.bounds).sum()),
         },
@@ -182,12 +182,13 @@ def fingerprint(policy: str) -> str:
     """What tells a policy from another of its name: of its weights, or its source; one of ours has the version."""
     folder = _folder_of(policy)
     if folder is not None:
-        return _digest(folder / WEIGHTS)
+        return digest(folder / WEIGHTS)
     if ":" in policy:
         source = inspect.getsourcefile(load_object(policy, "policy"))
-        return "" if source is None else _digest(Path(source))
+        return "" if source is None else digest(Path(source))
     return ""
 
 
-def _digest(path: Path) -> str:
+def digest(path: Path) -> str:
+    """Of a file's content."""
     return f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from estimator.extras import need
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
 
@@ -86,6 +87,7 @@ class Instrument:
     """
 
     def __init__(self, rig: Rig, commands: Commands) -> None:
+        need("pyvisa")
         import pyvisa
 
         self._commands, self._step = commands, rig.step

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from estimator.extras import need
 from estimator.files import write_atomically
 from estimator.identification.records import Record, residuals
 from estimator.page import page, svg, table
@@ -104,6 +105,7 @@ def _about(result: Result, record: Record) -> str:
 
 
 def _figure(rows: int, columns: int, height: float, **settings: Any) -> tuple[Figure, Any]:
+    need("matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
