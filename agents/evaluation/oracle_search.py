@@ -5,7 +5,8 @@
 takes many ways through the map of each system's states (`agents.planner.search`), polishes each to a summit of
 ½ log det(Λ0 + F(u)) under the track's limits (`agents.planner.polish`), and keeps what is better than what is stored. F
 is the Fisher information at the true coefficients along the response without noise, Λ0 the inverse of the prior's
-covariance of the coefficients. What is stored is a start.
+covariance of the coefficients. What is stored is a start. A search ends after so many starts, but goes on, to eight
+times as many, until three that began anew have come to the highest summit.
 
 With `--check` nothing is stored: three searches from independent starts, and one twice as long, say by how much they
 differ, and what the latter gains over what is stored.
@@ -33,17 +34,15 @@ from agents.planner.pursuit import pursuit
 from estimator.belief import Belief
 from estimator.parameters import FloatArray
 
-#: Starts of a search.
-_TRIES = 24
+#: Starts of a search at least; it goes on to so many times as many, until so many that began anew agree within [nats].
+_TRIES, _LONGER, _AGREED, _SAME = 24, 8, 3, 0.002
 
-#: Cells of the map along each axis, one of which is drawn for every start.
-_CELLS = (24, 32, 48, 64)
+#: Cells of the map along each axis, and the spread of the factors by which starts change the rate of information that
+#: they expect: one of each is drawn for every start.
+_CELLS, _DOUBTS = (24, 32, 48, 64, 96), (0.1, 0.3, 0.8)
 
 #: Share of the limits of signal and energy that is aimed at, because what is stored is rounded.
 _AIM = 1.0 - 1e-4
-
-#: Spread of the factors by which starts change the rate of information that they expect.
-_DOUBT = 0.3
 
 
 def search(
@@ -60,7 +59,7 @@ def search(
         row: the system.
         given: (k, samples) inputs to start from besides [V].
         rng: of the starts.
-        tries: starts besides those given.
+        tries: starts besides those given, at least.
 
     Returns:
         The best input (samples,) [V] that keeps all limits also as it is stored, and its worth [nats]; -inf if none.
@@ -70,19 +69,26 @@ def search(
     limits = exact._replace(aim=_AIM * exact.output, energy=_AIM * exact.energy)
     sizes = swing_of(View(model, systems.degree), one.theta[0], limits.amplitude, limits.output).scales
     words = rng.integers(0, 2**64, 4, dtype=np.uint64)
-    best, best_value = np.zeros(systems.samples), -np.inf
-    for k in range(len(given) + tries):
+    best, best_value, anew = np.zeros(systems.samples), -np.inf, np.empty(0)
+    for k in range(len(given) + _LONGER * tries):
+        if k >= len(given) + tries and (anew > best_value - _SAME).sum() >= _AGREED:
+            break
+        keeps = k % 2 == 1 and bool(np.isfinite(best_value)) and not np.isfinite(limits.energy)
         if k < len(given):
             start = given[k]
         elif np.isfinite(limits.energy):
             start = _burst(one, limits, words)
         else:
-            start = _way(one, limits, sizes, best, k % 2 == 1 and np.isfinite(best_value), rng, words)
+            start = _way(one, limits, sizes, best, keeps, rng, words)
         start = as_stored(np.clip(start / limits.amplitude, -1.0, 1.0)) * limits.amplitude
         u, _ = polish(model, systems.degree, one.known(0), limits, sizes, start, limits.amplitude / LEVELS)
         u = as_stored(u / limits.amplitude) * limits.amplitude
         value, peak = (float(found[0]) for found in one.worth(u[None]))
-        if peak <= exact.output and u @ u <= exact.energy and value > best_value:
+        if not (peak <= exact.output and u @ u <= exact.energy):
+            continue
+        if k >= len(given) and not keeps:
+            anew = np.append(anew, value)
+        if value > best_value:
             best, best_value = u, value
     return best, best_value
 
@@ -99,7 +105,7 @@ def _way(
     noises = [(1.0, variance) for variance in one.variances[0]]
     record = Belief.of(model, mean, cov, noises[0], noises[1:]).record.copy()
     told = one.information(best[None])[0]
-    doubts = np.exp(_DOUBT * rng.standard_normal(len(told)))
+    doubts = np.exp(rng.choice(_DOUBTS) * rng.standard_normal(len(told)))
     rate = told * np.outer(doubts, doubts) / one.samples
     u = best.copy()
     first = int(rng.integers(one.samples // 16, one.samples * 7 // 8)) if keeps else 0

@@ -179,6 +179,8 @@ def polish(
 
     def judge(inputs: FloatArray, found: Line) -> tuple[float, float, float]:
         value, peak = line(known, limits.aim, inputs, found)
+        if not np.isfinite(found.slopes).all():  # so far beyond the limit that the equation has blown up
+            return -np.inf, np.inf, -np.inf
         excess = float(np.maximum(0.0, np.abs(found.shown) / limits.aim - 1.0).sum())
         overspent = max(0.0, float(inputs @ inputs) / limits.energy - 1.0)
         return value, peak, value - _PENALTY * excess - _OVERSPENT * overspent

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from agents.evaluation import oracle_search
 from agents.evaluation import systems as module_of_systems
 from agents.evaluation.oracle import Oracle, as_stored
 from agents.evaluation.oracle_search import Config, main, search
@@ -61,6 +62,24 @@ def test_the_search_keeps_the_limits_and_beats_a_random_signal():
     assert peaks[0] <= 0.6
     assert value == values[0]
     assert value > systems.worth(given)[0][0] + 2.0
+
+
+@pytest.mark.slow  # the search is seconds of compilation
+@pytest.mark.parametrize(("same", "tried"), [(np.inf, 6), (-1.0, 48)])
+def test_the_search_goes_on_until_three_starts_agree(same, tried, monkeypatch):
+    calls = []
+    monkeypatch.setattr(oracle_search, "_SAME", same)
+    monkeypatch.setattr(oracle_search, "polish", lambda *given: (calls.append(given), polish(*given))[1])
+    search(Systems.of(SHORT, 1, {"horizon": 32}), 0, np.empty((0, 32)), np.random.default_rng(0), 6)
+    assert len(calls) == tried
+
+
+@pytest.mark.slow  # the search is seconds of compilation
+def test_what_blows_up_is_not_polished():
+    systems = Systems.of(SHORT, 1)
+    limits = systems.limits._replace(output=50.0, aim=50.0, amplitude=5.0)
+    _, value = polish(systems.plant.model, 0, systems.known(0), limits, np.ones(2), np.full(48, 5.0), 5.0 / 32767)
+    assert value == -np.inf
 
 
 @pytest.mark.slow  # the search is seconds of compilation
