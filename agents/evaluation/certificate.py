@@ -18,9 +18,9 @@ state, and there is none yet: a price of energy instead bounds only mixtures of 
 energy are worth much more.
 
 **G and W** are those of the best mixture of the paths that the programme has found so far; W is then a least squares
-fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), until bound and mixture meet. Between
-nodes from which one can stay within the limit there may be points from which one cannot: where a path comes to one, it
-is cut at the limit. The bound holds for any G and W.
+fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), until bound and mixture meet. The bound
+holds for any G and W. A path keeps the displacements that it was found with, since rounding may lead its inputs
+elsewhere; between nodes it may come to where one cannot stay within the limit, and is cut there.
 
 **The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on one
 of twice as many intervals, plus what they differ by. This allowance is no proof: on three and four times as many
@@ -109,7 +109,7 @@ class Certificate:
     def moments(self, u: FloatArray, x: FloatArray | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
         """C (4, 4), N (f, 4) and M (f, f) of an input (T,), where the information is at most C - WᵀN - NᵀW + WᵀMW.
 
-        ``x`` (T,) are the displacements that follow each input, where they are not what the equation gives.
+        ``x`` (T,) are the displacements that follow each input; they are calculated where they are not given.
         """
         x = np.concatenate([np.zeros(4), free_run(difference(), self.theta, u) if x is None else x])
         back = [x[4 - lag : len(x) - lag] for lag in range(5)]  # x_{t+1}, x_t, ...
