@@ -44,6 +44,7 @@ from agents.planner.imagination import Terms
 from agents.planner.motion import View, places, seen, swing_of
 from agents.planner.pursuit import Rule, pursuit
 from agents.planner.search import search
+from estimator.checks import LARGEST, SMALLEST, number, shown
 from estimator.parameters import FloatArray
 
 
@@ -126,14 +127,13 @@ class Planner:
                 "the planner needs its beliefs: pass it to make_policy"
             )
         for name, count in (("horizon", 1 if horizon is None else horizon), ("rounds", rounds)):
-            if not isinstance(count, int | np.integer) or count < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, but is {count!r}")
-        if not 0 < risk < 1:
-            raise ValueError(f"risk must be a probability between 0 and 1, but is {risk!r}")
-        if not 0 <= input_cost < np.inf:
-            raise ValueError(f"input_cost must be 0 or more and finite, but is {input_cost!r}")
-        if goal_std is not None and not 0 < goal_std < np.inf:
-            raise ValueError(f"goal_std must be positive and finite, but is {goal_std!r}; None is no goal")
+            if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= 10**6:
+                raise ValueError(f"{name} must be a whole number from 1 to 1000000, but is {shown(count)}")
+        number("risk", risk, SMALLEST, 1 - SMALLEST)
+        number("input_cost", input_cost, 0)
+        number("goal", goal, -LARGEST)
+        if goal_std is not None:
+            number("goal_std", goal_std, remedy="None is no goal")
         experiment = env.experiment
         if experiment.hold != 1:
             raise ValueError(

@@ -22,6 +22,7 @@ from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.own import own_policy
 from agents.policies.signals import make_signal
+from estimator.checks import shown, whole
 
 
 class Policy(Protocol):
@@ -67,6 +68,14 @@ def trained_policies() -> list[str]:
     return sorted(card.parent.relative_to(TRAINED).as_posix() for card in TRAINED.glob("*/*/policy.json"))
 
 
+def exists(name: str) -> bool:
+    """Whether there is a file or folder of this name; none has one that no file can have."""
+    try:
+        return Path(name).exists()
+    except (OSError, ValueError):
+        return False
+
+
 def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0, **options: Any) -> Policy:
     """Makes the policy of this name, or of a thing of your own.
 
@@ -91,6 +100,8 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
         ValueError: There is neither a policy nor a file of this name, it has no such option, it is no
             policy, or `env` is not one of duffing_env.
     """
+    whole("seed", seed, 2**128, 0)
+    name = str(name) if isinstance(name, Path) else name
     if not isinstance(name, str):
         return own_policy(name, env, seed, options)
     if name in POLICIES:
@@ -100,11 +111,11 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             if option not in known:
                 raise ValueError(f"{option}={value!r} is no option of policy {name!r}, which has {known}")
         return make(env if env is None else env.unwrapped, seed, **options)
-    if ":" in name and not Path(name).exists():
+    if ":" in name and not exists(name):
         return own_policy(load_object(name, "policy"), env, seed, options)
     if options:
         raise ValueError(f"options must be none for a trained policy, but are {options}; leave them out")
-    if name in trained_policies() or Path(name).exists():
+    if name in trained_policies() or exists(name):
         from agents.policies.learned import load_policy
 
         policy = load_policy(TRAINED / name if name in trained_policies() else name, seed)
@@ -115,5 +126,5 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     raise ValueError(
         f"name must be one of {', '.join([*POLICIES, *trained_policies()])}, the path of a trained policy, or "
-        f"module:name of your own, but it is {name!r}{hint}"
+        f"module:name of your own, but it is {shown(name)}{hint}"
     )

@@ -21,8 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.planner.motion import places, resonances, survey
 from agents.policies.excitations import BAND
-from agents.policies.signals import Limits, check_rows, limits_of
+from agents.policies.signals import Limits, check_rows, check_state, limits_of
 from duffing_env.experiment import Experiment, SimulatedExperiment
+from estimator.checks import numbers
 from estimator.parameters import SAMPLING_STEP
 
 TURN = 0.7
@@ -108,6 +109,8 @@ class FeedbackPolicy:
                 of environments.
         """
         rows = self._rows(observation)
+        if state is not None:
+            check_state(state, 1)
         phase = np.zeros(len(rows)) if state is None else state
         starts = np.zeros(len(rows), dtype=bool) if episode_start is None else np.atleast_1d(episode_start)
         check_rows("state", len(phase), len(rows))
@@ -126,7 +129,7 @@ class FeedbackPolicy:
 
     def _rows(self, observation: ArrayLike) -> NDArray[np.float64]:
         """The observations as a batch `(n, features)`."""
-        observed = np.asarray(observation, dtype=np.float64)
+        observed = numbers("observation", observation)
         size = self._places.size
         if observed.ndim not in (1, 2) or observed.shape[-1] != size:
             raise ValueError(

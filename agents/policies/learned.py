@@ -18,6 +18,8 @@ import numpy.typing as npt
 
 from agents.policies.foresight import CommonForesight, Foresight
 from agents.policies.imagined import FEATURES
+from agents.policies.signals import check_state
+from estimator.checks import numbers
 from estimator.files import whole_file
 
 WEIGHTS = "policy.safetensors"
@@ -149,6 +151,8 @@ class LearnedPolicy:
         """
         if self._is_common and self._foresight is None:
             raise ValueError("env must be given to a policy for all oscillators, but is None; pass it to make_policy")
+        if type(observation) is not np.ndarray or observation.dtype.kind != "f":
+            observation = numbers("observation", observation)
         hidden = np.asarray(observation, dtype=np.float32)
         seen = self._features if self._foresight is None else self._foresight.observation_size
         if hidden.shape[-1:] != (seen,):
@@ -220,6 +224,8 @@ class _Memory:
     def update(self, inputs: FloatArray, state: State | None, episode_start: npt.ArrayLike | None) -> State:
         """Hidden and cell values (1, n, units) after inputs (n, features)."""
         zeros = np.zeros((1, len(inputs), self.units), dtype=np.float32)
+        if state is not None:
+            check_state(state, 2)
         hidden, cell = (zeros, zeros) if state is None else state
         if hidden.shape != zeros.shape or cell.shape != zeros.shape:
             raise ValueError(f"state must be two arrays of shape {zeros.shape}, but has {hidden.shape}, {cell.shape}")

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from agents.planner.motion import frequency
 from agents.policies.excitations import EXCITATIONS, Draw, draw_recorded
 from estimator.belief import Belief
+from estimator.checks import shown
 from estimator.parameters import SAMPLING_STEP
 
 # Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
@@ -178,6 +179,7 @@ class SignalPolicy:
             position = np.full(rows, self.actions)
             signals = np.empty((rows, self.actions), dtype=np.float32)
         else:
+            check_state(state, 2)
             position, signals = state
             check_rows("state", len(position), rows)
         due = position == self.actions
@@ -199,6 +201,13 @@ class SignalPolicy:
         if missing > 0:
             self._generators += map(np.random.default_rng, self._seeds.spawn(missing))
         return self.limits.fit(self._draw(self._generators[row], self.samples))
+
+
+def check_state(state: Any, arrays: int) -> None:
+    """Refuse what no policy of so many arrays returned."""
+    parts = state if isinstance(state, tuple) else (state,)
+    if len(parts) != arrays or not all(isinstance(part, np.ndarray) and part.ndim for part in parts):
+        raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
 
 
 def check_rows(name: str, given: int, expected: int) -> None:

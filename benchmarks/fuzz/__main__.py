@@ -27,9 +27,9 @@ from agents.cli import run_script
 #: Area to its module here, and the share of the inputs that it gets.
 AREAS = {
     "estimators": 0.25,
-    "constructors": 0.25,
+    "constructors": 0.32,
     "files": 0.2,
-    "options": 0.12,
+    "options": 0.05,
     "worlds": 0.1,
     "policies": 0.06,
     "commands": 0.02,

@@ -19,7 +19,7 @@ PATIENCE = 10.0
 #: How a message of this project, of Gymnasium, or of Python about a call's arguments, says what is wrong.
 _CLEAR = re.compile(
     r"\bmust\b|\bis no option\b|\bgoes? (with|together)\b|unexpected keyword argument|required positional argument"
-    r"|\bis out of date\b|no hyperparameter"
+    r"|\bis out of date\b|no hyperparameter|\bis for\b"
 )
 
 

@@ -293,6 +293,17 @@ def test_the_drive_pushes_along_the_motion_within_the_budget():
     assert gains.mean() > 16.0  # the multisine of the record gains 11.2
 
 
+def test_at_rest_it_is_pushed_as_if_it_moved_by_a_twentieth_of_the_limit():
+    """A choice of 0 is 6 % of that motion and one of 1 is 16 %, from what an input of 1 V moves it by in a sample."""
+    envs = make(POWER, 1)
+    foresight = Foresight.of(envs, RATE)
+    observations, _ = envs.reset(seed=0)
+    eta = envs.belief(0).coefficients()["eta"][0]
+    for choice, part in ((0.0, 0.06), (1.0, 0.16)):
+        action = float(foresight.act([choice], foresight.look(observations))[0, 0])
+        assert abs(action) * envs.max_input * eta == pytest.approx(part * 0.05 * 0.6, rel=1e-6)
+
+
 def test_it_survives_being_written():
     for env_id in (AMPLITUDE, POWER):
         envs, observations = observations_of(env_id, samples=8)

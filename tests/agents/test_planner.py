@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.stats import norm, t
 
 import duffing_env
 from agents.planner.motion import View, swing_of
@@ -111,9 +112,9 @@ def test_single_environments_are_planned_for_as_rows_are():
     [
         ({"horizon": 0}, "horizon must be a whole number"),
         ({"rounds": 1.5}, "rounds must be a whole number"),
-        ({"risk": 0.0}, "risk must be a probability"),
-        ({"input_cost": float("inf")}, "input_cost must be 0 or more and finite"),
-        ({"goal_std": 0.0}, "goal_std must be positive"),
+        ({"risk": 0.0}, "risk must be a number from 1e-12"),
+        ({"input_cost": float("inf")}, "input_cost must be a number from 0"),
+        ({"goal_std": 0.0}, "goal_std must be a number from 1e-12"),
         ({"horizn": 3}, "horizn=3 is no option of policy 'efe'"),
     ],
 )
@@ -211,3 +212,12 @@ def test_under_a_budget_plans_follow_the_differential_equation_too():
     # A burst: half of the energy within a third of the time.
     windows = [(inputs[t : t + 43] ** 2).sum(axis=0) for t in range(86)]
     assert np.all(np.max(windows, axis=0) > 0.5 * (inputs**2).sum(axis=0))
+
+
+@pytest.mark.parametrize(("track", "tail"), [("Short-v0", norm), ("Short-v1", t(16))])
+def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track, tail):
+    """As the module says: exceeded with probability ``risk`` by outputs that all are at the margin."""
+    env = gym.make(f"duffing_env/{track}")
+    for risk in (0.05, 0.5):
+        margin = make_policy("efe", env, risk=risk).terms.margin
+        assert margin == pytest.approx(tail.isf(risk / 48), rel=1e-12)

@@ -5,6 +5,7 @@ import doctest
 import importlib
 import json
 import pickle
+import re
 import threading
 
 import gymnasium as gym
@@ -425,3 +426,15 @@ def test_a_second_thread_is_refused_and_changes_nothing():
     assert len(refused) == 3
     env._draw = draw
     assert same(continue_with(env, random_actions(0, 40)), continue_with(untouched, random_actions(0, 40)))
+
+
+def test_the_observation_has_the_bounds_of_the_documentation():
+    """The table of the class's docstring, row by row."""
+    space = DuffingEnv().observation_space
+    table = DuffingEnv.__doc__.split("## Observation space")[1].split("## Reward")[0]
+    rows = re.findall(r"^ *\| ([\d, -]+?) \|.*\| (\S+) \| (\S+) \|$", table, flags=re.MULTILINE)
+    found = {}
+    for places, low, high in rows:
+        first, last = (re.findall(r"\d+", places) * 2)[:2] if "," not in places else re.findall(r"\d+", places)
+        found |= dict.fromkeys(range(int(first), int(last) + 1), (float(low), float(high)))
+    assert found == dict(enumerate(zip(space.low.tolist(), space.high.tolist(), strict=True)))
