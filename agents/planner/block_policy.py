@@ -16,6 +16,9 @@ from estimator.parameters import FloatArray
 #: Moves after a block that are planned with it, so that it ends where the next can go on.
 _AFTER = 9
 
+#: No block is asked to be safer: systems that tell it must be drawn.
+_FINEST = 5e-4
+
 #: Of these, those that must be safe, too: what a block has begun the next one can stop only then.
 _MOMENTUM = 3
 
@@ -45,7 +48,7 @@ class BlockPlanner:
         ValueError: as `Planner`; for a block below 1; or where the input's energy is limited.
     """
 
-    def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 0.05) -> None:
+    def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 0.004) -> None:
         self._planner = Planner(env, seed, risk=risk)
         if not isinstance(block, int | np.integer) or block < 1:
             raise ValueError(f"block must be a whole number of at least 1, but is {block!r}")
@@ -86,7 +89,7 @@ class BlockPlanner:
         seen = min(left, samples + _AFTER * terms.pace)
         rng = np.random.default_rng([planner.seed, i, left])
         (belief,) = self._env.experiment.believed.with_records(record[None])
-        bound = self._bound * samples
+        bound = max(_FINEST, self._bound * samples)
         records, weights = self._env.mixture(i)
         drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound))
         futures = Futures(view.model, drawn, self._limit, rng, degree=view.degree)

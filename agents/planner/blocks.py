@@ -11,12 +11,13 @@ is played only when at most a given share of them does. It begins as the planner
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.planner.ascent import PENALTY, Limits, project
+from agents.planner.ascent import Limits, project
 from agents.planner.design import Known, designer
 from agents.planner.futures import Futures
 from agents.planner.motion import View
@@ -29,13 +30,24 @@ from estimator.models.model import Model
 from estimator.parameters import FloatArray
 
 #: Systems that a block is planned for.
-SYSTEMS = 24
+SYSTEMS = 32
 
-#: Steps of the gradient for a candidate, and after every change of the aim; and the first step (`ascent`).
-_STEPS, _MORE, _RATE = 24, 12, 0.2
+#: Steps of the gradient for a candidate, besides one for each sample and up to so many in all; and after every change
+#: of the aim.
+_STEPS, _MOST_STEPS, _MORE = 24, 128, 32
+
+#: The first step (`agents.planner.ascent`), the part of a step that goes into the next, and the last step in parts of
+#: the first.
+_RATE, _KEPT, _LAST = 0.05, 0.8, 0.05
+
+#: Runge-Kutta steps of a sample that are enough to plan by; how safe a block is, is judged with all.
+_COARSE = 2
 
 #: The aim in parts of the limit: at first, how it falls, and how often.
-_AIM, _LOWER, _AIMS = 0.99, 0.94, 10
+_AIM, _LOWER, _AIMS = 0.985, 0.97, 16
+
+#: Penalty [nats] of what goes beyond the aim: one system of all must not leave it far for what the others tell.
+_PENALTY = 3e4
 
 #: The second candidate in parts of the first.
 _WEAKER = 0.6
@@ -79,15 +91,16 @@ def systems_of(view: View, belief: Belief, futures: Futures, samples: int, last:
 
 @cache
 def _climber(model: Model, degree: int) -> Any:
-    """``ascend(systems, limits, rate, iterations, u)``: climb from u (T,); the best met overwrites it. Gives its J."""
+    """``ascend(systems, limits, iterations, u)``: climb from u (T,); the best met overwrites it. Gives its J."""
     found = designer(model, degree)
     climb, memory_for, as_noises = found.climb, found.memory, found.code.noises
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}")
-    def ascend(systems, limits, rate, iterations, u):
+    def ascend(systems, limits, iterations, u):
         T, S = len(u), len(systems.coefficients)
         memory, best, total, shaken = memory_for(T), np.empty(T), np.empty(T), np.empty(T)
         copy(best, 0, u, T)
+        moving = np.zeros(T)
         most = -np.inf
         radius = min(np.sqrt(limits.energy), limits.amplitude * np.sqrt(T))
         for i in range(iterations + 1):
@@ -97,7 +110,7 @@ def _climber(model: Model, degree: int) -> Any:
                 for t in range(T):
                     shaken[t] = u[t] + systems.shakes[k, t]
                 known = Known(systems.coefficients[k], systems.precision, as_noises(systems.noises[k]))
-                told, _ = climb(known, limits.aim, PENALTY, systems.starts[k], shaken, memory)
+                told, _ = climb(known, limits.aim, _PENALTY, systems.starts[k], shaken, memory)
                 value += told / S
                 for t in range(T):
                     total[t] += memory.gradient[t]
@@ -111,9 +124,10 @@ def _climber(model: Model, degree: int) -> Any:
                 power += total[t] * total[t]
             if i == iterations or not power > 0.0:
                 break
-            stride = rate * (1.0 - 0.95 * i / iterations) * radius / np.sqrt(power)
+            stride = _RATE * (1.0 - (1.0 - _LAST) * i / iterations) * radius / np.sqrt(power)
             for t in range(T):
-                u[t] += stride * total[t]
+                moving[t] = _KEPT * moving[t] + stride * total[t]
+                u[t] += moving[t]
             project(u, limits.amplitude, limits.energy)
         copy(u, 0, best, T)
         return most
@@ -140,17 +154,19 @@ def best_block(
         Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and the
         probability that they leave the limit.
     """
-    ascend = _climber(view.model, view.degree)
+    model = replace(view.model, substeps=_COARSE) if view.model.is_continuous else view.model
+    ascend = _climber(model, view.degree)
+    steps = min(_MOST_STEPS, _STEPS + candidates.shape[1])
     limits = Limits(futures.limit, _AIM * futures.limit, amplitude, np.inf)
     climbed = [np.array(candidate) for candidate in candidates]
-    values = [ascend(systems, limits, _RATE, _STEPS, u) for u in climbed]
+    values = [ascend(systems, limits, steps, u) for u in climbed]
     u = climbed[int(np.argmax(values))]
     for _ in range(_AIMS):
-        probability = futures.probability(u[:played])
+        probability = futures.probability(u[:played], bound)
         if probability < bound:
             return u, 1.0, probability
         limits = limits._replace(aim=_LOWER * limits.aim)
-        ascend(systems, limits, _RATE / 2, _MORE, u)
+        ascend(systems, limits, _MORE, u)
     share, probability = futures.share(u[:played], bound)
     return share * u, share, probability
 

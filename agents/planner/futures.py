@@ -116,19 +116,23 @@ class Futures:
         process, sensor = self._disturbed
         return process[:, :samples], sensor[:, :samples]
 
-    def probability(self, u: FloatArray) -> float:
+    def probability(self, u: FloatArray, bound: float = 1.0) -> float:
         """That inputs (N,), in the belief's scale, take the output out of its limit at any of the samples.
 
-        The mean of what the draws tell of it, (k + 1) / (n + 2): it is never 0.
+        The mean of what the draws tell of it, (k + 1) / (n + 2): it is never 0. Draws are counted until it is not below
+        the bound any more.
         """
         acting = np.concatenate([np.zeros(self.delay), u])[: len(u)]
         process, sensor = self.disturbances(len(u))
-        left = 0
+        most = bound * (len(self.states) + 2)
+        left = 1
         with np.errstate(over="ignore", invalid="ignore"):
             for state, coefficients, w, v in zip(self.states, self.coefficients, process, sensor, strict=True):
                 y = free_run(self.model, coefficients, acting + w, state, self.interpolation) + v
                 left += not bool((np.abs(y) <= self.limit).all())
-        return (left + 1) / (len(self.states) + 2)
+                if left >= most:
+                    break
+        return left / (len(self.states) + 2)
 
     def share(self, u: FloatArray, bound: float) -> tuple[float, float]:
         """The largest share of inputs whose probability of leaving the limit is below a bound, and that probability.
@@ -138,7 +142,7 @@ class Futures:
         """
         share = 1.0
         for _ in range(_TRIALS):
-            probability = self.probability(share * u)
+            probability = self.probability(share * u, bound)
             if probability < bound:
                 return share, probability
             share *= _LESS
