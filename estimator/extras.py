@@ -6,7 +6,9 @@ from importlib.util import find_spec
 
 #: Name that a package is imported by, to the extra that brings it.
 EXTRAS = {
+    "h5py": "datasets",
     "matplotlib": "report",
+    "minari": "datasets",
     "optuna": "tune",
     "pygame": "human",
     "pyvisa": "instrument",
