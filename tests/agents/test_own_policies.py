@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNorm
 
 from agents import make_policy, save_policy
 from agents.evaluation.rollout import evaluate
+from agents.studies import baselines
 from agents.vec_env import DuffingVecEnv
 
 FEATURES = 22
@@ -149,3 +150,11 @@ def test_an_archive_says_how_it_is_converted(tmp_path):
     (tmp_path / "model.zip").write_bytes(b"")
     with pytest.raises(ValueError, match=r"agents.save_policy\('.*/model', PPO.load"):
         make_policy(str(tmp_path / "model.zip"))
+
+
+def test_an_algorithm_as_it_comes_is_trained_and_saved(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    baselines.main(baselines.Config("ppo", steps=100))
+    policy = make_policy("runs/sb3-ppo-short-v0-0")
+    assert policy.card["steps"] == 2048  # a roll-out of PPO as it comes
+    assert policy.predict(observations(), deterministic=True)[0].shape == (50, 1)
