@@ -5,7 +5,7 @@ READY := .venv/.ready
 # Processes that run the tests. A file's tests stay together, so that few kernels are compiled twice.
 WORKERS ?= 2
 
-.PHONY: demo test docs lint format bench evidence portability lock clean
+.PHONY: demo test docs lint format bench evidence portability compat lock clean
 
 demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
 	rm -rf runs/demo
@@ -27,6 +27,14 @@ portability: $(READY)  ## the tests that compute, under several instruction sets
 
 bench: $(READY)  ## timed comparisons, with peers in .venv-peers; about 15 minutes
 	$(BIN)/python -m benchmarks --json runs/benchmarks/results.json
+
+# The newest Gymnasium lies beside the one that RLlib asks for.
+compat: $(READY)  ## what other RL libraries make of the environments, in .venv-compat; a quarter of an hour
+	$(BIN)/python -m venv .venv-compat
+	.venv-compat/bin/python -m pip install --quiet --requirement benchmarks/compat.lock
+	.venv-compat/bin/python -m pip install --quiet --no-deps --upgrade --target .venv-compat/newest gymnasium==1.4.0
+	.venv-compat/bin/python -m benchmarks.compat
+	PYTHONPATH=.venv-compat/newest .venv-compat/bin/python -m benchmarks.compat
 
 lint: $(READY)  ## style, format and types
 	$(BIN)/ruff check .

@@ -175,7 +175,8 @@ class Own:
     def before(self) -> None:
         """Remember what is believed before a step."""
         self._waiting = self._batch.quantity("WAITING") != 0.0
-        self._before = self._batch.records()
+        if callable(self._reward):
+            self._before = self._batch.records()
 
     def rewards(self, ended: Flags | None) -> FloatArray:
         """(n,) what a step paid, after it; 0 without a function.

@@ -1,0 +1,61 @@
+"""`python -m benchmarks.compat`: see the package."""
+
+# The libraries are not installed where types are checked.
+# mypy: ignore-errors
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from importlib.metadata import version
+
+from benchmarks.compat.collectors import Gymnasium, Tianshou, TorchRL
+from benchmarks.compat.common import CELLS
+from benchmarks.compat.trainers import Minari, RLlib, StableBaselines3
+
+LIBRARIES = {kind.__name__: kind for kind in (Gymnasium, TorchRL, Tianshou, StableBaselines3, RLlib, Minari)}
+
+
+def cell(run: Callable[[], None] | None) -> str:
+    """How a cell went."""
+    if run is None:
+        return "-"
+    try:
+        run()
+    except Exception as error:
+        return f"{type(error).__name__}: {error}".split("\n")[0][:100]
+    return "yes"
+
+
+def row(name: str) -> list[str]:
+    """A library's cells, run in this process."""
+    warnings.simplefilter("ignore")
+    library = LIBRARIES[name]()
+    return [f"{name} {version(library.package)}", *(cell(getattr(library, each)) for each in CELLS)]
+
+
+def main() -> int:
+    """Print the table; the exit status is the number of cells that failed."""
+    if len(sys.argv) == 3 and sys.argv[1] == "--row":
+        print("\n" + json.dumps(row(sys.argv[2])))
+        return 0
+    print(f"| with Gymnasium {version('gymnasium')} | {' | '.join(CELLS)} |\n|---|{'---|' * len(CELLS)}", flush=True)
+    failed = 0
+    for name in sys.argv[1:] or LIBRARIES:
+        with tempfile.TemporaryDirectory() as folder:  # of Minari's data sets
+            command = [sys.executable, "-m", "benchmarks.compat", "--row", name]
+            told = {**os.environ, "MINARI_DATASETS_PATH": folder}
+            done = subprocess.run(command, capture_output=True, text=True, check=False, env=told)
+        told = json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else [name, *[done.stderr[-100:]] * 4]
+        failed += sum(each not in ("yes", "-") for each in told[1:])
+        print(f"| {' | '.join(told)} |", flush=True)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,207 @@
+"""Gymnasium, TorchRL and Tianshou."""
+
+# The libraries are not installed where types are checked.
+# mypy: ignore-errors
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.compat.common import ID, KEYS, ROWS, made
+
+
+class Gymnasium:
+    """Its checker, wrappers and vector environments."""
+
+    package = "gymnasium"
+
+    def single(self):
+        """Checked, with its time limit and time, and remade from its specification."""
+        import gymnasium as gym
+        from gymnasium.utils.env_checker import check_env
+
+        check_env(gym.make(ID).unwrapped, skip_render_check=True)
+        env = gym.wrappers.TimeAwareObservation(gym.make(gym.make(ID, max_episode_steps=20).spec))
+        env.reset(seed=0)
+        steps = [env.step(env.action_space.sample()) for _ in range(20)]
+        assert [step[3] for step in steps] == [False] * 19 + [True]
+
+    def vector(self):
+        """Ours and its own, in all modes, under wrappers."""
+        import gymnasium as gym
+        from gymnasium.vector import AutoresetMode
+        from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
+
+        for mode in AutoresetMode:
+            envs = gym.make_vec(ID, num_envs=ROWS, vectorization_mode="vector_entry_point", autoreset_mode=mode)
+            envs = NormalizeReward(RecordEpisodeStatistics(envs))
+            envs.reset(seed=0)
+            for _ in range(48):
+                *_, infos = envs.step(envs.action_space.sample())
+            assert "episode" in infos
+        for way in ("sync", "async"):
+            envs = gym.make_vec(ID, num_envs=2, vectorization_mode=way)
+            envs.reset(seed=0)
+            envs.step(envs.action_space.sample())
+            envs.close()
+
+    train = None
+
+    def infos(self):
+        """The same keys at a reset and every step; belief and truth at the end."""
+        import gymnasium as gym
+
+        env = gym.make(ID)
+        told = [env.reset(seed=0)[1], *(env.step(env.action_space.sample())[4] for _ in range(48))]
+        assert all(info.keys() == KEYS for info in told)
+        assert env.unwrapped.belief.physical()[0].shape == (len(env.unwrapped.truth),)
+        envs = made()
+        envs.reset(seed=0)
+        for _ in range(48):
+            *_, infos = envs.step(envs.action_space.sample())
+        assert {"belief", "truth"} | KEYS <= infos["final_info"].keys()
+
+
+class TorchRL:
+    """``GymEnv``, ``GymWrapper``, its collector and PPO."""
+
+    package = "torchrl"
+
+    def single(self):
+        """By its id, checked."""
+        from torchrl.envs import GymEnv
+        from torchrl.envs.utils import check_env_specs
+
+        env = GymEnv(ID)
+        check_env_specs(env)
+        assert env.rollout(100)["next", "done"].sum() == 1
+
+    def vector(self):
+        """Ours, wrapped; it takes no ``NextStep``."""
+        from torchrl.envs import GymWrapper
+
+        rolled = GymWrapper(made("Disabled")).rollout(100, break_when_any_done=False)
+        assert rolled["next", "done"].sum() == 2 * ROWS
+
+    def train(self):
+        """Its collector, advantage and clipped loss."""
+        import torch
+        from tensordict.nn import TensorDictModule
+        from torchrl.collectors import Collector
+        from torchrl.envs import GymEnv
+        from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+        from torchrl.objectives import ClipPPOLoss
+        from torchrl.objectives.value import GAE
+
+        env = GymEnv(ID)
+        net = torch.nn.Sequential(MLP(22, 2, num_cells=[16]), NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]), in_keys=["loc", "scale"],
+            distribution_class=TanhNormal, return_log_prob=True, spec=env.action_spec,
+        )  # fmt: skip
+        critic = ValueOperator(MLP(22, 1, num_cells=[16]), in_keys=["observation"])
+        advantage = GAE(gamma=1.0, lmbda=0.95, value_network=critic)
+        loss = ClipPPOLoss(actor, critic)
+        optimiser = torch.optim.Adam(loss.parameters())
+        iterations = 0
+        for batch in Collector(env, actor, frames_per_batch=96, total_frames=288):
+            advantage(batch)
+            terms = loss(batch.reshape(-1))
+            optimiser.zero_grad()
+            sum(value for name, value in terms.items() if name.startswith("loss_")).backward()
+            optimiser.step()
+            iterations += 1
+        assert iterations == 3
+
+    def infos(self):
+        """Of many by its own reader; of one by a reader that makes arrays of Python's numbers."""
+        from torchrl.data import Unbounded
+        from torchrl.envs import GymEnv, GymWrapper, default_info_dict_reader
+
+        class Reader(default_info_dict_reader):
+            def __call__(self, info, tensordict):
+                return super().__call__({name: np.asarray(value) for name, value in info.items()}, tensordict)
+
+        numbers = dict.fromkeys(sorted(KEYS), Unbounded((ROWS,)))
+        many = GymWrapper(made("Disabled"))
+        many.set_info_dict_reader(default_info_dict_reader(sorted(KEYS), numbers))
+        for envs in (GymEnv(ID).auto_register_info_dict(info_dict_reader=Reader()), many):
+            rolled = envs.rollout(10)
+            assert set(rolled["next"].keys()) >= KEYS
+            assert float(rolled["next", "information_gain"].sum()) != 0
+
+
+class Tianshou:
+    """Its vector environments, collector and PPO."""
+
+    package = "tianshou"
+
+    def _envs(self):
+        import gymnasium as gym
+        from tianshou.env import DummyVectorEnv
+
+        return DummyVectorEnv([lambda: gym.make(ID)] * ROWS)
+
+    def _algorithm(self):
+        import torch
+        from tianshou.algorithm import PPO
+        from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
+        from tianshou.algorithm.optim import AdamOptimizerFactory
+        from tianshou.utils.net.common import Net
+        from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
+
+        envs = self._envs()
+        space, actions = envs.observation_space[0], envs.action_space[0]
+        actor = ContinuousActorProbabilistic(
+            preprocess_net=Net(state_shape=space.shape, hidden_sizes=[16]), action_shape=actions.shape, unbounded=True
+        )
+        critic = ContinuousCritic(preprocess_net=Net(state_shape=space.shape, hidden_sizes=[16]))
+        policy = ProbabilisticActorPolicy(
+            actor=actor, action_space=actions,
+            dist_fn=lambda told: torch.distributions.Independent(torch.distributions.Normal(*told), 1),
+        )  # fmt: skip
+        return PPO(policy=policy, critic=critic, optim=AdamOptimizerFactory(lr=1e-3))
+
+    def single(self):
+        """One environment in its collector."""
+        import gymnasium as gym
+        from tianshou.data import Collector, VectorReplayBuffer
+        from tianshou.env import DummyVectorEnv
+
+        collector = Collector(self._algorithm(), DummyVectorEnv([lambda: gym.make(ID)]), VectorReplayBuffer(100, 1))
+        collector.reset()
+        assert collector.collect(n_episode=1).lens[0] == 48
+
+    def vector(self):
+        """Several environments in its collector."""
+        from tianshou.data import Collector, VectorReplayBuffer
+
+        collector = Collector(self._algorithm(), self._envs(), VectorReplayBuffer(1000, ROWS))
+        collector.reset()
+        assert collector.collect(n_episode=8).n_collected_episodes == 8
+
+    def train(self):
+        """Three rounds of collecting and updating."""
+        from tianshou.data import Collector, VectorReplayBuffer
+        from tianshou.utils.torch_utils import policy_within_training_step
+
+        algorithm, buffer = self._algorithm(), VectorReplayBuffer(400, ROWS)
+        collector = Collector(algorithm, self._envs(), buffer)
+        collector.reset()
+        for _ in range(3):
+            with policy_within_training_step(algorithm.policy):
+                collector.collect(n_step=192)
+                algorithm.update(buffer=buffer, batch_size=64, repeat=2)
+            collector.reset_buffer(keep_statistics=True)
+
+    def infos(self):
+        """In its replay buffer."""
+        from tianshou.data import Collector, VectorReplayBuffer
+
+        buffer = VectorReplayBuffer(400, ROWS)
+        collector = Collector(self._algorithm(), self._envs(), buffer)
+        collector.reset()
+        collector.collect(n_episode=4)
+        told = buffer.sample(0)[0].info
+        assert set(told.keys()) >= KEYS
+        assert np.count_nonzero(told.information_gain)
