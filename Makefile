@@ -81,5 +81,19 @@ lock: $(LOCKED)  ## write the versions that are installed now into the lock, kee
 lock-check: $(READY)  ## every line of the lock has a binary file for every Python version
 	$(BIN)/python .ci/check_lock.py $(VERSIONS)
 
+.PHONY: fuzz soak release licences
+INPUTS ?= 50000
+fuzz: $(READY)  ## bad inputs by the thousand; fails where one is not refused clearly
+	$(BIN)/python -m benchmarks.fuzz --inputs $(INPUTS)
+
+soak: $(READY)  ## long runs on every track
+	$(BIN)/python -m benchmarks.soak --steps 10000000
+
+release: $(READY)  ## wheel and sdist into dist, built twice and compared
+	$(BIN)/python .ci/release.py
+
+licences: $(READY)  ## of every installed package
+	$(BIN)/python .ci/licences.py
+
 clean:
 	rm -rf .venv build dist

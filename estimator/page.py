@@ -58,6 +58,11 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 
+def plain(text: str) -> str:
+    """Text that matplotlib takes as it is: a name or a unit may hold dollar signs, which are no formula."""
+    return text.replace("$", r"\$")
+
+
 def svg(figure: Figure) -> str:
     """A figure as an element of the page."""
     need("matplotlib")

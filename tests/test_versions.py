@@ -110,3 +110,8 @@ def test_lock_check_finds_what_is_missing():
     found = {fault for fault in faults if not fault.startswith("pyproject.toml")}
     assert found == {"a needs a>=2, not 1.0", 'b needs d; extra == "x"'}
     assert set(check_lock.missing(packages, "3.13")) - faults == {'a needs c; python_version >= "3.13"'}
+
+
+def test_the_citation_has_the_version_of_the_package():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()

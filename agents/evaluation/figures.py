@@ -11,6 +11,7 @@ import numpy as np
 
 from estimator.extras import need
 from estimator.files import write_atomically
+from estimator.page import plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +70,7 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
         lowest = min(lowest, low.min())
         samples = np.arange(len(median))
         axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
-        axes.plot(samples, median, stroke, color=colour, label=evaluation.title)
+        axes.plot(samples, median, stroke, color=colour, label=plain(evaluation.title))
     axes.set_xlabel("samples")
     axes.set_ylabel("log posterior gain of the truth / nat")
     axes.set_title(title)
@@ -102,7 +103,7 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
             axes.plot(x, y, color=colour, linewidth=0.8)
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
-        row[0].set_title(evaluation.title, loc="left", fontsize=9)
+        row[0].set_title(plain(evaluation.title), loc="left", fontsize=9)
     for axes, label in zip(grid[-1], ("time / ms", "time / ms", "frequency / Hz"), strict=True):
         axes.set_xlabel(label)
     return figure
@@ -118,7 +119,7 @@ def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
         errors = np.mean([v for name, v in evaluation.metrics.items() if name.startswith("error_")], axis=0)
         axes.semilogy(
             evaluation.metrics["fisher_gain"], 100 * errors, ".", color=colour, alpha=0.5, markersize=4,
-            label=evaluation.title,
+            label=plain(evaluation.title),
         )  # fmt: skip
     axes.set_xlabel("Fisher information / nat")
     axes.set_ylabel("mean error of the parameters / %")
@@ -139,7 +140,7 @@ def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
         axes.plot([0, 100], [0, 100], color="#888888", linewidth=1)
         for evaluation, values, colour in zip(evaluations, found, cycle(_COLOURS), strict=False):
             covered = [100 * float(np.mean(values[estimator][name])) for name in LEVELS]
-            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=evaluation.title)
+            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=plain(evaluation.title))
         axes.set_title(estimator.replace("_", " "), fontsize=9)
         axes.set_xlabel("nominal level / %")
         axes.grid(alpha=0.3)

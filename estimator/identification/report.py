@@ -12,7 +12,7 @@ import numpy as np
 from estimator.extras import need
 from estimator.files import write_atomically
 from estimator.identification.records import Record, residuals
-from estimator.page import page, svg, table
+from estimator.page import page, plain, svg, table
 from estimator.parameters import FloatArray
 
 if TYPE_CHECKING:
@@ -143,19 +143,19 @@ def _draw_fit(result: Result, record: Record, forecast: FloatArray) -> Figure:
         run = result.simulate(record.u[:count], given)
     driven, shown, far, near = axes[:, 0]
     driven.step(seconds, record.u[:count], where="post", color="#555", linewidth=0.8)
-    driven.set_ylabel(_plain(f"input [{result.rig.input.unit}]"))
+    driven.set_ylabel(plain(f"input [{result.rig.input.unit}]"))
     shown.plot(seconds, measured, color="#bbb", linewidth=4, label="measured")
     shown.plot(seconds, forecast[:count, 0], color="#06c", linewidth=1.2, label="forecast, one sample ahead")
     shown.plot(seconds, run, color="#c40", linewidth=0.9, linestyle="--", label=f"free run after {_GIVEN} samples")
-    shown.set_ylabel(_plain(f"{output.kind} [{output.unit}]"))
+    shown.set_ylabel(plain(f"{output.kind} [{output.unit}]"))
     shown.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8)
     far.plot(seconds, measured - run, color="#c40", linewidth=0.8)
-    far.set_ylabel(_plain(f"free run's error [{output.unit}]"))
+    far.set_ylabel(plain(f"free run's error [{output.unit}]"))
     near.plot(seconds, measured - forecast[:count, 0], color="#06c", linewidth=0.8)
     std = np.sqrt(forecast[:count, 1])
     near.fill_between(seconds, -1.645 * std, 1.645 * std, color="#06c", alpha=0.2, label="90 % of the forecast")
     near.set_ylim(*(6 * float(np.nanmedian(std)) * np.array([-1, 1])))
-    near.set_ylabel(_plain(f"forecast's error [{output.unit}]"))
+    near.set_ylabel(plain(f"forecast's error [{output.unit}]"))
     near.set_xlabel("time [s]")
     near.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8)
     for axis in (driven, shown, far, near):
@@ -187,8 +187,3 @@ def _draw_residuals(record: Record, forecast: FloatArray) -> Figure:
     right.set_xlabel("lag [samples]; between the dashed lines 95 % if white")
     right.set_ylabel("autocorrelation")
     return figure
-
-
-def _plain(text: str) -> str:
-    """Text that matplotlib takes as it is: a unit may hold a dollar sign."""
-    return text.replace("$", r"\$")

@@ -1,0 +1,65 @@
+"""Build wheel and sdist from the commit that is checked out, twice, in two clones: `make release`.
+
+They must be the same, byte for byte, and go into ``dist``. All times in them are that of the commit. The wheel must
+hold the packages, the trained policies, the rigs and the licence, and have the version of ``pyproject.toml``.
+"""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+WANTED = ("estimator/py.typed", "estimator/rigs/beam.toml", "agents/policies/trained/ppo/short/policy.json")
+
+
+def git(*words: str) -> str:
+    """What git says of this checkout."""
+    return subprocess.run(["git", "-C", str(ROOT), *words], check=True, capture_output=True, text=True).stdout.strip()
+
+
+def build(folder: Path) -> dict[str, bytes]:
+    """Clone the commit into a folder and build there: name of a file to its content."""
+    subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
+    subprocess.run(["git", "-C", str(folder), "checkout", "--quiet", git("rev-parse", "HEAD")], check=True)
+    environment = os.environ | {"SOURCE_DATE_EPOCH": git("log", "-1", "--format=%ct")}
+    subprocess.run([sys.executable, "-m", "hatchling", "build"], check=True, cwd=folder, env=environment)
+    return {path.name: path.read_bytes() for path in sorted((folder / "dist").iterdir())}
+
+
+def check(wheel: Path) -> None:
+    """Refuse a wheel that lacks something, or has another version."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    missing = [name for name in (*WANTED, f"duffing_env-{version}.dist-info/licenses/LICENSE") if name not in names]
+    if missing:
+        sys.exit(f"{wheel.name} must hold {missing}, but does not")
+
+
+def main() -> None:
+    """Build twice, compare, check, and put the files into ``dist``."""
+    if git("status", "--porcelain"):
+        sys.exit("the checkout must be clean, but has changes: commit them, for a release is a commit")
+    with tempfile.TemporaryDirectory() as folder:
+        first, second = (build(Path(folder) / name) for name in ("first", "second"))
+    if first != second:
+        sys.exit(
+            f"two builds must be the same, but differ: {[name for name in first if first[name] != second.get(name)]}"
+        )
+    shutil.rmtree(ROOT / "dist", ignore_errors=True)
+    (ROOT / "dist").mkdir()
+    for name, content in first.items():
+        (ROOT / "dist" / name).write_bytes(content)
+        print(f"{hashlib.sha256(content).hexdigest()}  dist/{name}")
+    check(next((ROOT / "dist").glob("*.whl")))
+    print("two builds in two clones gave the same files")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""Long runs on every track: is every number finite and in bounds, every covariance one, and memory flat?
+
+$ python -m benchmarks.soak --steps 10000000
+$ python -m benchmarks.soak --steps 1000000 --tracks Short-v0 Rig-v0
+
+A track's samples are shared among four kinds of actions (random, constant, alternating, at the believed resonance) and
+as many with extreme options. The exit status is 1 where a number was not finite or out of bounds, a covariance none, or
+memory grew by more than 2 MB.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import duffing_env  # noqa: F401  registers the tracks
+from agents.cli import run_script
+from duffing_env.silverbox import record_available
+from duffing_env.tracks import TRACKS
+from estimator import Channel, Rig
+from estimator.belief import check_record
+
+_ROWS = 256
+
+#: Extreme, but no kernel of their own.
+_EXTREME = {"max_input": 300.0, "max_output": 4000.0, "process_noise": 0.3, "noise_shape": 0.1}
+_RIG = Rig(
+    1e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03, noise=5e-6),
+    guess={"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)},
+)  # fmt: skip
+
+#: Samples of half a period of the tracks' middle oscillator.
+_HALF = 4
+
+ACTIONS: dict[str, Callable[[int, np.random.Generator], Any]] = {
+    "random": lambda t, rng: rng.uniform(-1, 1, (_ROWS, 1)),
+    "constant": lambda t, rng: np.ones((_ROWS, 1)),
+    "alternating": lambda t, rng: np.full((_ROWS, 1), 1.0 if t % 2 else -1.0),
+    "resonant": lambda t, rng: np.full((_ROWS, 1), 1.0 if t // _HALF % 2 else -1.0),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Long runs on every track."""
+
+    steps: int = 1_000_000
+    """Samples of each track."""
+    tracks: tuple[str, ...] = ()
+    """Names of tracks; all if none."""
+    json: Path | None = None
+    """File for the counts."""
+
+
+def main(config: Config) -> None:
+    """Run, and print the table."""
+    from agents.results import show, table
+
+    names = [name.split("/")[1] for name in TRACKS if record_available() or "Replay" not in name]
+    unknown = set(config.tracks) - set(names)
+    if unknown:
+        raise ValueError(f"tracks must be of {names}, but are {sorted(unknown)}")
+    found = {name: soak(name, config.steps) for name in config.tracks or names}
+    rows = [[name, *(f"{value:,}" for value in counts.values())] for name, counts in found.items()]
+    heads = ("track", "samples", "episodes", "not finite", "out of bounds", "no covariance", "growth / kB")
+    show(table(heads, rows, markdown=True), width=120)
+    if config.json is not None:
+        config.json.write_text(json.dumps(found, indent=2))
+    bad = [name for name, c in found.items() if c["not finite"] + c["out of bounds"] + c["no covariance"]]
+    bad += [name for name, c in found.items() if c["growth"] > 2000]
+    sys.exit(bool(bad))
+
+
+def soak(name: str, steps: int) -> dict[str, int]:
+    """What a track's samples came to."""
+    counts = dict.fromkeys(("samples", "episodes", "not finite", "out of bounds", "no covariance", "growth"), 0)
+    given: dict[str, Any] = {"rig": _RIG} if "Rig" in name else {}
+    extreme = {} if given or "Replay" in name else _EXTREME
+    rng = np.random.default_rng(0)
+    for options in (given, {**given, **extreme}):
+        envs: Any = gym.make_vec(f"duffing_env/{name}", _ROWS, vectorization_mode="vector_entry_point", **options)
+        for play in ACTIONS.values():
+            _play(envs, play, max(1, steps // (_ROWS * 2 * len(ACTIONS))), rng, counts)
+        envs.close()
+    return counts
+
+
+def _play(envs: Any, play: Callable[..., Any], rounds: int, rng: np.random.Generator, counts: dict[str, int]) -> None:
+    """Some rounds of all rows, counted."""
+    envs.reset(seed=int(rng.integers(2**31)))
+    low, high = envs.observation_space.low, envs.observation_space.high
+    model, before = envs.experiment.model, 0
+    for t in range(rounds):
+        observations, rewards, terminated, truncated, _ = envs.step(play(t, rng))
+        counts["samples"] += _ROWS
+        counts["episodes"] += int((terminated | truncated).sum())
+        counts["not finite"] += int((~np.isfinite(rewards)).sum() + (~np.isfinite(observations)).sum())
+        counts["out of bounds"] += int(((observations < low) | (observations > high)).sum())
+        if t % 64 == 0:
+            for record in envs.records[:: _ROWS // 8]:
+                try:
+                    check_record("belief", model, record, 1e-5)
+                except ValueError:
+                    counts["no covariance"] += 1
+        if t == min(64, rounds - 1):
+            before = _memory()
+    counts["growth"] = max(counts["growth"], _memory() - before)
+
+
+def _memory() -> int:
+    """Largest memory of this process so far [kB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__)
