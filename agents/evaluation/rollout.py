@@ -65,8 +65,9 @@ class Evaluation:
 
     @property
     def title(self) -> str:
-        """The name, and of several the number of seeds."""
-        return self.policy if self.seeds == 1 else f"{self.policy} ({self.seeds} seeds)"
+        """The name, without control codes, which a terminal would obey; and of several the number of seeds."""
+        name = "".join(letter if letter.isprintable() else "?" for letter in self.policy)
+        return name if self.seeds == 1 else f"{name} ({self.seeds} seeds)"
 
 
 def evaluate(
