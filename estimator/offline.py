@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from estimator.checks import series
+from estimator.checks import series, whole
 from estimator.lanes import kernel
 from estimator.parameters import FloatArray
 
@@ -80,11 +80,8 @@ class PEMNARX:
 
     def __post_init__(self) -> None:
         for name, least in (("units", 0), ("seed", 0), ("restarts", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-                raise ValueError(f"{name} must be a whole number of at least {least}, but is {value!r}")
-        if self.input_delay not in (0, 1):
-            raise ValueError(f"input_delay must be 0 or 1, but is {self.input_delay!r}; the published run had 0")
+            whole(name, getattr(self, name), 10**9 if name == "seed" else 1000, least)
+        whole("input_delay (the published run had 0)", self.input_delay, 1, 0)
 
     def fit(self, u: npt.ArrayLike, y: npt.ArrayLike) -> PEMNARX:
         """Fits the network to one record. An earlier fit is replaced.

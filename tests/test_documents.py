@@ -136,5 +136,5 @@ def test_nothing_else_stands_at_the_top():
     top = {line.split("/")[0] for line in listed.stdout.splitlines()}
     expected = {"estimator", "duffing_env", "agents", "tests", "benchmarks", "docs"}
     expected |= {"train.py", "evaluate.py", "reproduce.py", "pyproject.toml", "requirements.lock", "Makefile"}
-    expected |= {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE"}
+    expected |= {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "CITATION.cff", "SECURITY.md"}
     assert {name for name in top if not name.startswith(".")} <= expected

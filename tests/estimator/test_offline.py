@@ -160,11 +160,11 @@ def test_steep_units_saturate():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"units": -1}, "units must be a whole number of at least 0, but is -1"),
-        ({"units": 2.5}, "units must be a whole number of at least 0, but is 2.5"),
-        ({"restarts": 0}, "restarts must be a whole number of at least 1, but is 0"),
-        ({"seed": None}, "seed must be a whole number of at least 0, but is None"),
-        ({"input_delay": 2}, "input_delay must be 0 or 1, but is 2"),
+        ({"units": -1}, "units must be a whole number from 0"),
+        ({"units": 2.5}, "units must be a whole number from 0"),
+        ({"restarts": 0}, "restarts must be a whole number from 1"),
+        ({"seed": None}, "seed must be a whole number from 0"),
+        ({"input_delay": 2}, "must be a whole number from 0 to 1, but is 2"),
     ],
 )
 def test_bad_configuration(arguments, message):
