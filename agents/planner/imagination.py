@@ -24,6 +24,9 @@ _BEYOND = 1e4
 #: A margin is no wider than this part of the limit: where noise alone leads beyond it, no plan is safe.
 MOST_MARGIN = 0.5
 
+#: Degrees of freedom of what is predicted where the noises are not known.
+TAILS = 16.0
+
 
 class Terms(NamedTuple):
     """What a plan is judged by besides the belief, and what bounds its inputs.

@@ -17,7 +17,7 @@ What the first sensor shows must stay within the limit by a margin of standard d
 predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
 exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes
 true. Where hypotheses about the noises are weighed (``noise_hypotheses``), but on a rig, an output is believed to be a
-mixture, with heavier tails: the quantile is that of Student's t with `_TAILS` degrees of freedom. Where an input comes
+mixture, with heavier tails: the quantile is that of Student's t with `TAILS` degrees of freedom. Where an input comes
 to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the sample
 between moves the next output about as much again, and no input makes up for it: the margin is then twice as wide.
 
@@ -40,7 +40,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri, stdtrit
 
-from agents.planner.imagination import Terms
+from agents.planner.imagination import TAILS, Terms
 from agents.planner.motion import View, places, seen, swing_of
 from agents.planner.pursuit import Rule, pursuit
 from agents.planner.search import search
@@ -74,9 +74,6 @@ _HORIZON = 24
 #: Part of the limit that is left to the imagination of a differential equation: its two Runge-Kutta steps a sample err
 #: by up to 2.1 mV at 0.6 V and 0.5 V a sample.
 _COARSE = 0.004
-
-#: Degrees of freedom of what is predicted where the noises are not known.
-_TAILS = 16.0
 
 
 class Planner:
@@ -163,7 +160,7 @@ class Planner:
             amplitude=setup.max_input,
             slew=setup.max_slew,
             limit=setup.max_output * (room * (1 - _COARSE * (self.view.model.is_continuous and not of_rig))),
-            margin=float(-stdtrit(_TAILS, chance) if weighs else -ndtri(chance))
+            margin=float(-stdtrit(TAILS, chance) if weighs else -ndtri(chance))
             * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
             scales=swing.scales,

@@ -21,11 +21,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr, stdtrit
 
-from agents.planner.imagination import Terms
+from agents.planner.imagination import TAILS, Terms
 from agents.planner.motion import View, places, survey, swing_of
-from agents.policies.imagined import FEATURES, Ahead, imaginer
-from agents.policies.prospects import MARGIN, Outlook, feature_names, look_at
+from agents.policies.imagined import BOUND, FEATURES, Ahead, imaginer
+from agents.policies.prospects import EXPECTED, MARGIN, Outlook, feature_names, look_at
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -148,6 +149,11 @@ class Foresight:
         return len(feature_names(self._view.model))
 
     @property
+    def to_come(self) -> int:
+        """Which of the features is what is still to come."""
+        return self.features - len(EXPECTED) + EXPECTED.index("to_come")
+
+    @property
     def is_drive(self) -> bool:
         """Whether an action is how hard to push along the motion."""
         return bool(np.isfinite(self._outlook.energy))
@@ -175,16 +181,20 @@ class Foresight:
 class CommonForesight:
     """What a policy for all oscillators looks with in an environment, single or vector, of whatever model.
 
-    What it sees is `agents.policies.imagined`; nothing of it is of the systems that a policy was trained on.
+    What it sees is `agents.policies.imagined`; nothing of it is of the systems that a policy was trained on. So with
+    that alone a policy plays any environment. Beside the observation itself it tells more of one model, and a policy
+    plays environments of that. Outputs keep `agents.policies.prospects.MARGIN` standard deviations from the limit; where
+    noises are weighed, as many as make the same chance under Student's t.
 
     Args:
         env: the unwrapped environment.
+        own: whether the observation stands behind the features, turned upright.
 
     Raises:
         ValueError: where an action is held for several samples, or ``env`` is not one of duffing_env.
     """
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: Any, *, own: bool = False) -> None:
         experiment: Experiment | None = getattr(env, "experiment", None)
         if experiment is None:
             raise ValueError(
@@ -199,17 +209,22 @@ class CommonForesight:
         rate = swing.taught / (process + sensor)
         gain = abs(survey(self._view.model, center, np.zeros(self._view.model.n_states)).gains[0]) * swing.pace**2
         push = min(setup.max_input, _LEAP * setup.max_output / gain)
+        weighs = experiment.noise_hypotheses != 1 and getattr(experiment, "rig", None) is None
         self._ahead = Ahead(center, 1.0 / setup.inverse_std, push, process, sensor, setup.horizon, setup.budget, rate)
         self._terms = Terms(
             setup.max_input,
             np.inf,
             setup.max_output,
-            MARGIN,
+            float(-stdtrit(TAILS, ndtr(-MARGIN)) if weighs else MARGIN),
             np.zeros(len(center)),
             swing.scales,
             swing.pace,
             swing.shaken,
         )
+        at, model = places(self._view.model), self._view.model
+        odd = (*range(at.state, at.state + model.n_states), at.last_input)
+        self._odd = (*odd, *range(at.last_output, at.last_output + model.n_outputs))
+        self._own = own
         self._nudge, self._push = _NUDGE * setup.max_output / gain, push / setup.max_input
 
     def to_tensors(self) -> dict[str, FloatArray]:
@@ -226,6 +241,16 @@ class CommonForesight:
         return places(self._view.model).size
 
     @property
+    def features(self) -> int:
+        """What a network sees."""
+        return len(FEATURES) + self._own * self.observation_size
+
+    @property
+    def to_come(self) -> int:
+        """As `Foresight.to_come`."""
+        return FEATURES.index("to_come")
+
+    @property
     def is_drive(self) -> bool:
         """Whether an action is how hard to push along the motion."""
         return bool(np.isfinite(self._ahead.energy))
@@ -237,6 +262,10 @@ class CommonForesight:
         features, safe = np.empty((n, len(FEATURES)), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
         signs, motions = np.empty(n), np.empty(n)
         imaginer(self._view)(seen, self._ahead, self._terms, features, safe, signs, motions)
+        if self._own:
+            upright = np.clip(seen, -BOUND, BOUND)
+            upright[:, self._odd] *= signs[:, None].astype(np.float32)
+            features = np.concatenate([features, upright], axis=1)
         return Sight(features, safe, signs, motions)
 
     def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:

@@ -112,7 +112,7 @@ class LearnedPolicy:
             if not self._is_common:
                 self._foresight = Foresight.from_array(tensors["foresight"], card.get("foresight"))
                 seen = self._foresight.features
-            if self._features != seen:
+            if self._features != seen and not (self._is_common and self._features > seen):
                 raise ValueError(f"the first layer must take {seen} features, but takes {self._features}")
         self._normalizer: tuple[FloatArray, FloatArray, float] | None = None
         if network.normalised:
@@ -124,10 +124,17 @@ class LearnedPolicy:
         """Let a foresight look out in this unwrapped environment, instead of that which it was trained in.
 
         Raises:
-            ValueError: for a policy with foresight and an environment that is not one of duffing_env.
+            ValueError: for a policy with foresight and an environment that is not one of duffing_env, or is of another
+                model than a policy was trained on that sees its observations too.
         """
         if self._is_common:
-            self._foresight = CommonForesight(env)
+            foresight = CommonForesight(env, own=self._features > len(FEATURES))
+            if foresight.features != self._features:
+                raise ValueError(
+                    f"env must show {self._features} features to this policy, but shows {foresight.features}: it is of "
+                    "another model than the policy was trained on; play ppo/universal there"
+                )
+            self._foresight = foresight
         if not isinstance(self._foresight, Foresight):
             return
         if not hasattr(env, "experiment"):
@@ -150,7 +157,7 @@ class LearnedPolicy:
         forgets them where ``episode_start``; None is a memory of nothing. Without a memory it is handed on unused.
         """
         if self._is_common and self._foresight is None:
-            raise ValueError("env must be given to a policy for all oscillators, but is None; pass it to make_policy")
+            raise ValueError("env must be given to a policy that imagines there, but is None; pass it to make_policy")
         if type(observation) is not np.ndarray or observation.dtype.kind != "f":
             observation = numbers("observation", observation)
         hidden = np.asarray(observation, dtype=np.float32)

@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from agents.evaluation.batch import make
 from agents.policies import make_policy
-from agents.policies.foresight import Foresight
-from agents.policies.prospects import BOUND, EXPECTED, feature_names
+from agents.policies.foresight import CommonForesight, Foresight
+from agents.policies.prospects import BOUND, EXPECTED
 from agents.vec_env import DuffingVecEnv
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
@@ -29,8 +29,8 @@ IN_NATS = ("information_gain", "log_posterior", "fisher", "expected_free_energy"
 #: Systems whose episodes show how much a sample brings.
 _EXAMPLES = 64
 
-# Places in the features; what is expected stands behind the observation, which is longer or shorter by the model.
-_TO_COME, _BEST = (EXPECTED.index(name) - len(EXPECTED) for name in ("to_come", "best_up_4"))
+# Its place in the features; what is expected stands behind the observation, which is longer or shorter by the model.
+_BEST = EXPECTED.index("best_up_4") - len(EXPECTED)
 
 
 class ForesightVecEnv(VecEnvWrapper):
@@ -52,11 +52,13 @@ class ForesightVecEnv(VecEnvWrapper):
         in_nats: whether the reward counts information, so that Ψ is added to it.
     """
 
-    def __init__(self, venv: DuffingVecEnv, foresight: Foresight, levels: int = 0, *, in_nats: bool = True) -> None:
+    def __init__(
+        self, venv: DuffingVecEnv, foresight: Foresight | CommonForesight, levels: int = 0, *, in_nats: bool = True
+    ) -> None:
         self.foresight = foresight
         self._weight = np.float32(in_nats)
         self._levels = np.linspace(-1.0, 1.0, levels) if levels else None
-        space = gym.spaces.Box(-BOUND, BOUND, (len(feature_names(venv.envs.experiment.model)),), np.float32)
+        space = gym.spaces.Box(-BOUND, BOUND, (foresight.features,), np.float32)
         super().__init__(venv, space, gym.spaces.Discrete(levels) if levels else venv.action_space)
 
     def reset(self) -> VecEnvObs:
@@ -70,7 +72,7 @@ class ForesightVecEnv(VecEnvWrapper):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows."""
-        before = self._view.features[:, _TO_COME]
+        before = self._view.features[:, self.foresight.to_come]
         observations, rewards, dones, infos = self.venv.step_wait()
         ended = np.flatnonzero(dones)
         if len(ended):
@@ -78,12 +80,28 @@ class ForesightVecEnv(VecEnvWrapper):
             for row, features in zip(ended, last, strict=True):
                 infos[row] |= {"terminal_observation": features, "TimeLimit.truncated": False}
         features = self._see(observations)
-        to_come = np.where(dones, np.float32(0), features[:, _TO_COME])
+        to_come = np.where(dones, np.float32(0), features[:, self.foresight.to_come])
         return features, _SCALE * (rewards + self._weight * (to_come - before)), dones, infos
 
     def _see(self, observations: Any) -> npt.NDArray[np.float32]:
         self._view = self.foresight.look(observations)
         return self._view.features
+
+
+def foresight_of(
+    envs: DuffingVectorEnv, env_id: str, options: dict[str, Any], seed: int
+) -> Foresight | CommonForesight:
+    """What a policy is trained with: of Eq. (2) its own foresight, which is better there; else that of all oscillators.
+
+    Args:
+        envs: the environments.
+        env_id: of their track.
+        options: of theirs.
+        seed: of the example that `Foresight` needs.
+    """
+    if envs.experiment.model.is_continuous:
+        return CommonForesight(envs, own=True)
+    return Foresight.of(envs, example_rate(env_id, options, seed))
 
 
 def example_rate(env_id: str, options: dict[str, Any], seed: int) -> FloatArray:

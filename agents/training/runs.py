@@ -78,7 +78,8 @@ class TrainConfig(Subject):
     output: Path | None = None
     """Run folder; runs/ALGO-TRACK-SEED where it is not given, with a number where that exists."""
     begin: Path | None = None
-    """Policy folder whose network to begin with, of the same algorithm and shape; at random where it is not given."""
+    """Policy folder whose network to begin with, of the same algorithm and shape. Where it is not given: at the rule
+    that its features tell (`agents.training.rule`), where they are those of all oscillators, or else at random."""
     checkpoints: int = 5
     """Checkpoints over the run, evenly spaced."""
     eval_every: int = 0
@@ -221,6 +222,10 @@ class _Training:
             restore(checkpoint, self._model)
         elif config.begin is not None:
             begin_with(config.begin, self._model)
+        else:
+            from agents.training.rule import begin_with_rule
+
+            begin_with_rule(self._model, self._envs, seed)
         self._checkpoints = self._due_checkpoints()
         self._held_out = HeldOut(folder, config, begun)
         self._evaluated = on_evaluation
@@ -332,12 +337,11 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
         return FamilyVecEnv(asked.num_envs, seed, reward=config.reward, levels=levels)
     if not asked.foresight:
         return DuffingVecEnv(config.env, asked.num_envs, seed=seed, levels=levels, **options)
-    from agents.policies.foresight import Foresight
-    from agents.training.foresight_env import IN_NATS, ForesightVecEnv, example_rate
+    from agents.training.foresight_env import IN_NATS, ForesightVecEnv, foresight_of
 
-    rate = example_rate(config.env, config.options, config.seed)
     envs = DuffingVecEnv(config.env, asked.num_envs, seed=seed, **options)
-    return ForesightVecEnv(envs, Foresight.of(envs.envs, rate), levels, in_nats=config.reward in IN_NATS)
+    foresight = foresight_of(envs.envs, config.env, config.options, config.seed)
+    return ForesightVecEnv(envs, foresight, levels, in_nats=config.reward in IN_NATS)
 
 
 def _run_folder(config: TrainConfig) -> Path:

@@ -1,9 +1,12 @@
 """What all beliefs have in common: against plain NumPy, turned over, alone and in a batch, finite, and shielded."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
+from scipy.stats import t as student_t
 
 from agents.evaluation.batch import make
 from agents.planner.motion import View
@@ -11,7 +14,9 @@ from agents.policies import make_policy
 from agents.policies.foresight import CommonForesight
 from agents.policies.imagined import BOUND, FEATURES, imaginer
 from agents.studies.universal import play, unseen
+from agents.training import PPOSettings, TrainConfig, train
 from agents.training.family import draw_member
+from agents.training.rule import rule
 from estimator.models.difference import difference
 
 
@@ -193,3 +198,38 @@ def test_it_plays_tracks_that_it_was_not_trained_on(env_id):
             gains[name] += np.where(running, infos["information_gain"], 0.0).mean()
             running &= ~(terminated | truncated)
     assert gains["ppo/universal"] > gains["prbs"] + 1.0
+
+
+def test_beside_the_observation_it_is_turned_upright():
+    envs = make("duffing_env/Amplitude-v0", 12)
+    seen = observations_of(envs, 40)
+    common, own = CommonForesight(envs).look(seen), CommonForesight(envs, own=True).look(seen)
+    np.testing.assert_array_equal(own.features[:, : len(FEATURES)], common.features)
+    upright = own.features[:, len(FEATURES) :].copy()
+    upright[:, 16:20] *= own.signs[:, None]
+    np.testing.assert_allclose(upright, seen, atol=1e-6)
+    assert {*own.signs} == {-1.0, 1.0}
+
+
+def test_where_noises_are_weighed_it_keeps_further_from_the_limit():
+    margins = [CommonForesight(make(f"duffing_env/Amplitude-{v}", 1))._terms.margin for v in ("v0", "v1")]
+    assert margins[0] == 4.0
+    # Student's t with 16 degrees of freedom, as often exceeded as a Gaussian's four standard deviations.
+    assert student_t(16).sf(margins[1]) == pytest.approx(norm.sf(4.0), rel=1e-6)
+
+
+def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path):
+    settings = PPOSettings(foresight=True, levels=3, num_envs=512, n_steps=2, batch_size=512)
+    settings = replace(settings, learning_rate=1e-9)
+    run = train(
+        TrainConfig(env="duffing_env/Amplitude-v1", steps=1024, output=tmp_path / "r", hyperparameters=settings)
+    )
+    envs = make("duffing_env/Amplitude-v1", 32)
+    policy = make_policy(str(run.folder), envs)
+    seen = observations_of(envs, 30)
+    view = CommonForesight(envs).look(seen)
+    expected = CommonForesight(envs).act(rule(view.features, 3) - 1, view)
+    agrees = np.isclose(policy.predict(seen, deterministic=True)[0], expected)
+    assert agrees.mean() > 0.75
+    with pytest.raises(ValueError, match="another model than the policy was trained on"):
+        make_policy(str(run.folder), make("duffing_env/Pendulum-v0", 1))
