@@ -183,8 +183,8 @@ class CommonForesight:
 
     What it sees is `agents.policies.imagined`; nothing of it is of the systems that a policy was trained on. So with
     that alone a policy plays any environment. Beside the observation itself it tells more of one model, and a policy
-    plays environments of that. Outputs keep `agents.policies.prospects.MARGIN` standard deviations from the limit; where
-    noises are weighed, as many as make the same chance under Student's t.
+    plays environments of that. Outputs keep `agents.policies.prospects.MARGIN` standard deviations from the limit;
+    where noises are weighed, as many as make the same chance under Student's t.
 
     Args:
         env: the unwrapped environment.
