@@ -9,7 +9,8 @@ from agents.training.algorithms import (
     TD3Settings,
     TQCSettings,
 )
-from agents.training.runs import Run, Subject, TrainConfig, resume, train
+from agents.training.config import Subject, TrainConfig
+from agents.training.runs import Run, resume, train
 from agents.training.tuning import tune
 
 __all__ = [

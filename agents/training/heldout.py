@@ -17,7 +17,7 @@ from estimator.files import write_atomically
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    from agents.training.runs import TrainConfig
+    from agents.training.config import TrainConfig
 
 #: The metrics, each the mean over the systems; the score is what policies are ranked by.
 METRICS = ("information_gain", "log_posterior_gain", "coverage", "ended_early")

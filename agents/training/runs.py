@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.cli import RIG_TRACK, JsonOptions, check_track, with_rig
 from agents.policies.learned import CARD
 from agents.policies.saving import save_policy
-from agents.results import versions, write_json
+from agents.results import write_json
 from agents.running.stopping import Stopper
-from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.checkpoints import (
     Progress,
     begin_with,
@@ -29,109 +25,17 @@ from agents.training.checkpoints import (
     restore,
     save_checkpoint,
 )
+from agents.training.config import TrainConfig, contrib, describe, read_config
 from agents.training.family import FAMILY
 from agents.training.heldout import METRICS, HeldOut
-from agents.training.hyperparameters import read_settings, settings_of, track_of
+from agents.training.hyperparameters import track_of
 from estimator.extras import need
-from estimator.files import whole_file
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-_PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy", "stable-baselines3", "torch")
-
-
 #: After a signal, the update that is on its way may take so many seconds, before nothing more is saved.
 _PATIENCE = 60.0
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What is trained on what; the hyperparameters follow from it, where they are not given."""
-
-    algo: Literal["ppo", "sac", "td3", "tqc", "recurrent_ppo"] = "ppo"
-    """Algorithm."""
-    env: str = "duffing_env/Amplitude-v0"
-    """Id of the track; or family, the oscillators of all kinds that ppo/universal is trained on."""
-    rig: str | None = None
-    """Rig file; the track is then Rig-v0."""
-    settings: Path | None = None
-    """File of hyperparameters, TOML; the one that comes with the package where it is not given."""
-
-    def __post_init__(self) -> None:
-        if self.rig is not None:
-            object.__setattr__(self, "env", RIG_TRACK)
-
-
-@dataclass(frozen=True)
-class TrainConfig(Subject):
-    """What a training run is made from. Written to ``config.json`` of its folder."""
-
-    reward: str = "information_gain"
-    """Name of the reward, such as information_gain, log_posterior or fisher (`duffing_env.rewards` has all)."""
-    steps: int = 5_000_000
-    """Samples to learn from, over all environments."""
-    seed: int = 0
-    """Seed of systems, noise, weights and exploration; the same seed gives the same policy."""
-    options: JsonOptions = field(default_factory=dict)
-    """Further options of the environment, as JSON."""
-    output: Path | None = None
-    """Run folder; runs/ALGO-TRACK-SEED where it is not given, with a number where that exists."""
-    begin: Path | None = None
-    """Policy folder whose network to begin with, of the same algorithm and shape. Where it is not given: at the rule
-    that its features tell (`agents.training.rule`), where they are those of all oscillators, or else at random."""
-    checkpoints: int = 5
-    """Checkpoints over the run, evenly spaced."""
-    eval_every: int = 0
-    """Samples between evaluations on systems held out from training; 0 for none."""
-    tensorboard: bool = False
-    """Whether to write the log for TensorBoard, too."""
-    torch_threads: int = 1
-    """Threads of torch; it moves the last digits. More than one gain little, and lose much on a busy machine."""
-    hyperparameters: AlgorithmSettings = field(default=None)  # type: ignore[assignment]
-    """Hyperparameters; those that the file has for the track where they are not given."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        # A run has its rig in itself, and not the name of a file that may change.
-        object.__setattr__(self, "options", with_rig(self.options, self.rig))
-        object.__setattr__(self, "rig", None)
-        for name in ("steps", "checkpoints", "torch_threads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")
-        if self.eval_every < 0:
-            raise ValueError(f"eval_every must be at least 0, but is {self.eval_every}")
-        if self.tensorboard:
-            need("tensorboard")
-        if "reward" in self.options:
-            raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
-        if "branch" in self.options:
-            raise ValueError(f"options must not hold branch, but are {self.options}; the others are to compare on")
-        if self.env != FAMILY:
-            check_track(self.env)
-        elif self.options or self.eval_every or self.algo != "ppo":
-            raise ValueError(
-                f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare with "
-                "python -m agents.studies.universal"
-            )
-        if self.hyperparameters is None:
-            object.__setattr__(self, "hyperparameters", read_settings(self.algo, self.env, self.settings))
-        if type(self.hyperparameters) is not ALGORITHMS[self.algo]:
-            raise ValueError(
-                f"hyperparameters must be {ALGORITHMS[self.algo].__name__} for {self.algo}, "
-                f"but are {type(self.hyperparameters).__name__}"
-            )
-        if (first := getattr(self.hyperparameters, "learning_starts", 0)) >= self.steps:
-            raise ValueError(
-                f"learning_starts must be below steps, but is {first} of {self.steps}: nothing would be learned; "
-                "lower it, or take more steps"
-            )
-
-    @property
-    def samples(self) -> int:
-        """Samples that are learned from: ``steps``, up to a whole number of updates."""
-        each = self.hyperparameters.samples_per_update
-        return -(-self.steps // each) * each
 
 
 @dataclass(frozen=True)
@@ -175,7 +79,7 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
         ModuleNotFoundError: without the packages of the extra ``train``.
         ValueError: for settings that make no sense, before anything is written.
     """
-    need("torch", "stable_baselines3", "matplotlib", *_contrib(config))
+    need("torch", "stable_baselines3", "matplotlib", *contrib(config))
     return _Training(config, _run_folder(config), on_evaluation).run()
 
 
@@ -197,7 +101,7 @@ def resume(folder: Path) -> Run:
         raise ValueError(f"resume must be a run folder, which holds config.json, but is {folder}")
     if (folder / CARD).exists():
         raise ValueError(f"resume must be a run that was stopped, but {folder} is finished; it holds its policy")
-    return _Training(_read_config(folder), folder).run()
+    return _Training(read_config(folder), folder).run()
 
 
 class _Training:
@@ -356,32 +260,3 @@ def _run_folder(config: TrainConfig) -> Path:
         number += 1
         folder = base.with_name(f"{base.name}-{number}")
     return folder
-
-
-def describe(config: TrainConfig) -> dict[str, Any]:
-    """What a run was made from: the resolved configuration, the command and the versions."""
-    resolved = asdict(config) | {"hyperparameters": as_written(config.hyperparameters)}
-    resolved = {name: str(value) if isinstance(value, Path) else value for name, value in resolved.items()}
-    return {
-        "config": resolved,
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions(*_PACKAGES, *_contrib(config)),
-    }
-
-
-def _contrib(config: TrainConfig) -> tuple[str, ...]:
-    """sb3-contrib, where the algorithm is of it."""
-    return ("sb3_contrib",) if config.algo in ("tqc", "recurrent_ppo") else ()
-
-
-def _read_config(folder: Path) -> TrainConfig:
-    """The configuration that a run folder was made from; what only a script had in it is left out."""
-    try:
-        place = whole_file(folder / "config.json", "resume must be a run folder, with a config.json", 2**20)
-        found = json.loads(place.read_text())["config"]
-        known = {f.name: found[f.name] for f in fields(TrainConfig)}
-        known |= {name: None if known[name] is None else Path(known[name]) for name in ("output", "settings", "begin")}
-        known["hyperparameters"] = settings_of(ALGORITHMS[known["algo"]], known["hyperparameters"])
-        return TrainConfig(**known)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"config.json must be that of a run, but that of {folder} is not: {error!r}") from error

@@ -15,9 +15,10 @@ import numpy as np
 
 from agents.results import show, table, write_json
 from agents.training.algorithms import as_written
+from agents.training.config import TrainConfig, describe
 from agents.training.heldout import SCORE
 from agents.training.hyperparameters import track_of, write_settings
-from agents.training.runs import TrainConfig, describe, train
+from agents.training.runs import train
 from estimator.extras import need
 
 if TYPE_CHECKING:

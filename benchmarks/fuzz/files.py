@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from agents.commands.rig_file import text_of
 from agents.policies.learned import CARD, WEIGHTS, load_policy
 from agents.training.checkpoints import STATE, Progress, load_progress
+from agents.training.config import TrainConfig, describe, read_config
 from agents.training.hyperparameters import FILES, read_settings
-from agents.training.runs import TrainConfig, _read_config, describe
 from benchmarks.fuzz.estimators import RIG, begun, sound, suppress_overflow
 from benchmarks.fuzz.judge import Call
 from benchmarks.fuzz.values import another_array, changed, damaged
@@ -139,7 +139,7 @@ def calls() -> st.SearchStrategy[Call]:
                 draw(damaged(config.encode())) if draw(st.booleans()) else json.dumps(described).encode()
             )
             names = (*names, "config", *TrainConfig.__dataclass_fields__, "hyperparameter")
-            function = lambda: _read_config(folder)  # noqa: E731
+            function = lambda: read_config(folder)  # noqa: E731
         elif kind == "checkpoint":
             described = draw(changed(json.loads(progress)))
             (folder / STATE).write_bytes(

@@ -18,8 +18,8 @@ from agents.cli import JsonOptions, run_script
 ROOT = Path(__file__).parents[2]
 #: Where the options of each script are declared: file and class.
 DECLARED = {
-    "train.py": [("agents/commands/train.py", "Config", ""), ("agents/training/runs.py", "Subject", ""),
-                 ("agents/training/runs.py", "TrainConfig", ""),
+    "train.py": [("agents/commands/train.py", "Config", ""), ("agents/training/config.py", "Subject", ""),
+                 ("agents/training/config.py", "TrainConfig", ""),
                  ("agents/training/algorithms.py", "AlgorithmSettings", "ppo."),
                  ("agents/training/algorithms.py", "OnPolicySettings", "ppo.")],
     "evaluate.py": [("agents/commands/evaluate.py", "Evaluate", "")],

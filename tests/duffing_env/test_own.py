@@ -51,7 +51,7 @@ OWN = [
 ]
 
 
-@pytest.mark.parametrize("options", OWN, ids=str)
+@pytest.mark.parametrize("options", OWN, ids=range(len(OWN)))
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_rows_are_single_environments(mode, options):
     steps = play_beside_singles(5, 80, mode=mode, **BOTH_ENDS, **options)
@@ -59,7 +59,7 @@ def test_rows_are_single_environments(mode, options):
     assert (ended > 3).all()
 
 
-@pytest.mark.parametrize("options", OWN[:4], ids=str)
+@pytest.mark.parametrize("options", OWN[:4], ids=range(4))
 def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(options):
     from stable_baselines3.common.env_checker import check_env as sb3_check
 
