@@ -28,8 +28,8 @@ class ContinuousExperiment(SimulatedExperiment):
     estimator: str = "ode"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         one_of("estimator", self.estimator, ("ode", "nlarx"))
+        super().__post_init__()
         if self.reward == "fisher" and self.estimator != "ode":
             raise ValueError(
                 "reward must not be 'fisher' for estimator='nlarx', whose equation the plant does not obey"

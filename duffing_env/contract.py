@@ -27,7 +27,9 @@ def action_space() -> spaces.Box:
 
 
 def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, Any]:
-    """The options of a reset; ValueError for one that is not known."""
+    """The options of a reset; ValueError for one that is not known, or what is no dict."""
+    if not isinstance(options, dict | None):
+        raise ValueError(f"options of reset must be a dict or None, but are {options!r:.200}")
     for name in options or {}:
         if name not in known:
             raise ValueError(f"options of reset must be among {list(known)}, but there is {name!r}; remove it")

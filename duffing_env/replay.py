@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
@@ -47,12 +48,15 @@ class ReplayExperiment(Experiment):
     data: str | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, choices in (("regime", REGIME_NAMES), ("prior", _PRIORS), ("input_delay", (0, 1))):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} must be one of {list(choices)}, but is {getattr(self, name)!r}")
         for name in ("nonlinear", "as_published"):
             self._check_flag(name)
+        for name, choices in (("regime", REGIME_NAMES), ("prior", _PRIORS), ("input_delay", (0, 1))):
+            value = getattr(self, name)
+            if not isinstance(value, str | int) or value not in choices:
+                raise ValueError(f"{name} must be one of {list(choices)}, but is {value!r}")
+        if self.data is not None and not isinstance(self.data, str | PathLike):
+            raise ValueError(f"data must be the name of a file or folder, or None to search, but is {self.data!r}")
+        super().__post_init__()
         if self.hold != 1:
             raise ValueError(f"hold must be 1 for a record, which answers sample by sample, but is {self.hold}")
         if self.reward == "fisher":

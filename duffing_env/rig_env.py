@@ -46,7 +46,7 @@ class RigExperiment(RigNumbers, SimulatedExperiment):
     noise_hypotheses: Hypotheses = (5, 5)
 
     def __post_init__(self) -> None:
-        if self.factorisation != "structured":
+        if not isinstance(self.factorisation, str) or self.factorisation != "structured":
             raise ValueError(f"factorisation must be 'structured' for a rig, but is {self.factorisation!r}")
         rig = checked_rig(self.rig)
         object.__setattr__(self, "rig", rig)

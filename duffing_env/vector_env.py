@@ -254,7 +254,10 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
             whole("seed", seed, MOST_SEED, 0)
             seeds = spawn_seeds(int(seed), self.num_envs)
         elif seed is not None:
-            seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes) else []
+            if isinstance(seed, np.ndarray):
+                seeds = list(seed) if seed.ndim else []
+            else:
+                seeds = list(seed) if isinstance(seed, Sequence) and not isinstance(seed, str | bytes) else []
             if len(seeds) != self.num_envs:
                 raise ValueError(
                     f"seed must be a whole number or {self.num_envs} of them, one for each row, but is {shown(seed)}"

@@ -131,7 +131,7 @@ class LearnedPolicy:
             foresight = CommonForesight(env, own=self._features > len(FEATURES))
             if foresight.features != self._features:
                 raise ValueError(
-                    f"env must show {self._features} features to this policy, but shows {foresight.features}: it is of "
+                    f"env must have {self._features} features for this policy, but has {foresight.features}: it is of "
                     "another model than the policy was trained on; play ppo/universal there"
                 )
             self._foresight = foresight
@@ -264,7 +264,7 @@ def load_policy(folder: str | Path, seed: int = 0) -> LearnedPolicy:
         raise ValueError(
             f"policy folder must hold {WEIGHTS} and {CARD}, but {folder} does not; pass a run folder. "
             "Archives and pickles may run any code when they are opened, so they are not; convert one that you trust "
-            f"with agents.save_policy({str(folder.with_suffix(''))!r}, PPO.load(...))"
+            f"with agents.save_policy({str(folder).removesuffix('.zip')!r}, PPO.load(...))"
         )
     for name in (WEIGHTS, CARD):
         whole_file(folder / name, f"policy folder must hold {name}", _LARGEST)

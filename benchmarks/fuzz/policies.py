@@ -35,7 +35,9 @@ def calls() -> st.SearchStrategy[Call]:
             name = draw(st.sampled_from([*POLICIES, *trained_policies()]))
             given = draw(options(dict(_USUAL)))
             given = {key: value for key, value in given.items() if value is not _USUAL.get(key, value) or key == "seed"}
-            return Call(f"make_policy {name}", lambda: make_policy(name, env, **given), (*given, "options", "seed"))
+            return Call(
+                f"make_policy {name}", lambda: make_policy(name, env, **given), (*given, "options", "seed", "env")
+            )
         name = draw(st.sampled_from(names))
         value = draw(st.one_of(anything, st.just(observation), st.floats().map(lambda x: np.full(22, x))))
         state = draw(st.one_of(st.none(), st.none(), anything))

@@ -196,3 +196,28 @@ def test_oscillators_are_drawn_about_a_mean_of_ones_own():
         assert 1.28 * middle < high <= 1.3 * middle
     assert isinstance(Beliefs(difference(), moved.records).mean, np.ndarray)
     assert moved.belief(0) != usual.belief(0)
+
+
+@pytest.mark.parametrize(
+    ("track", "name"),
+    [
+        ("Amplitude-v0", "observation"),
+        ("Amplitude-v0", "reward"),
+        ("Amplitude-v1", "estimator"),
+        ("Rig-v0", "factorisation"),
+        ("SilverboxReplay-v0", "nonlinear"),
+        ("SilverboxReplay-v0", "data"),
+    ],
+)
+def test_an_array_is_no_name(track, name):
+    value = 1.0 if name == "data" else np.ones(3)
+    with pytest.raises(ValueError, match=f"{name} must be "):
+        gym.make(f"duffing_env/{track}", **{name: value})
+
+
+def test_what_is_no_seed_and_no_options_is_refused():
+    envs = DuffingVectorEnv(3)
+    with pytest.raises(ValueError, match="seed must be a whole number or 3 of them"):
+        envs.reset(seed=np.array(3))
+    with pytest.raises(ValueError, match="options of reset must be a dict or None"):
+        envs.reset(options=np.array(3))
