@@ -1,4 +1,4 @@
-"""What a user installs: the wheel in a clean environment, without torch."""
+"""What a user installs: the wheel in a clean environment, without torch; it takes the dependencies from the index."""
 
 import os
 import subprocess
@@ -54,8 +54,6 @@ def test_a_clean_installation_is_light_and_works(tmp_path):
     (wheel,) = tmp_path.glob("*.whl")
     python = tmp_path / "venv" / "bin" / "python"
     done = run(python, "-m", "pip", "install", "--quiet", wheel, check=False)
-    if "No matching distribution" in done.stderr or "Temporary failure" in done.stderr:
-        pytest.skip("the package index is not at hand")
     assert done.returncode == 0, done.stderr
     tried = run(python, "-c", TRIED, ROOT / "README.md", check=False)
     assert tried.returncode == 0, tried.stdout + tried.stderr
