@@ -9,15 +9,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
-from agents.policies.learned import ACTIVATIONS, CARD, FORMAT, WEIGHTS, Network
+from agents.policies.learned import ACTIVATIONS, CARD, FORMAT, WEIGHTS, LearnedPolicy, Network
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
+    from torch.nn import Module
+
+#: Mean and standard deviation of observations, and how many standard deviations are seen at most.
+Normalizer = tuple[npt.ArrayLike, npt.ArrayLike, float]
 
 
-def save_policy(folder: str | Path, model: BaseAlgorithm, card: dict[str, Any] | None = None) -> None:
+def save_policy(
+    folder: str | Path,
+    model: BaseAlgorithm | Module,
+    card: dict[str, Any] | None = None,
+    normalizer: Normalizer | None = None,
+) -> None:
     """Write a trained policy into a folder, each file in one piece; `make_policy` plays it, without torch.
 
     The observations' normaliser goes with it, where the model's environment is a `VecNormalize`. An archive of
@@ -29,15 +39,24 @@ def save_policy(folder: str | Path, model: BaseAlgorithm, card: dict[str, Any] |
         folder: made where it is missing.
         model: PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, TQC or RecurrentPPO of sb3-contrib, with a network of
             linear layers. Of those that learn from a buffer only the actor is written; the others are written whole.
+            Or, of whatever was trained elsewhere, the ``torch.nn.Sequential`` that gives the mean of the action: linear
+            layers with tanh, ReLU or ELU between them, and perhaps a tanh at the end.
         card: what it was trained on: algorithm, track, options, seed, steps, versions; its algorithm and steps where
             it is None.
+        normalizer: mean and standard deviation (features,) of the observations, and how many standard deviations a
+            network of torch sees at most; None where it sees them as they are.
 
     Raises:
         ValueError: for a model that `LearnedPolicy` could not play as it is; nothing is written then.
     """
-    from safetensors.numpy import save
+    from torch.nn import Module
 
     folder = Path(folder)
+    if isinstance(model, Module):
+        _write(folder, *_network_alone(model, normalizer), card or {})
+        return
+    if normalizer is not None:
+        raise ValueError("normalizer must be None for an algorithm, whose VecNormalize is written; leave it out")
     card = {"algorithm": type(model).__name__.lower(), "steps": model.num_timesteps} if card is None else card
     tensors = {name: value.detach().cpu().numpy() for name, value in model.policy.state_dict().items()}
     if not hasattr(model.policy, "mlp_extractor"):
@@ -52,12 +71,45 @@ def save_policy(folder: str | Path, model: BaseAlgorithm, card: dict[str, Any] |
     if foresight is not None:
         network = replace(network, foresight=True)
         tensors |= foresight.to_tensors()
+        card = card | {"foresight": foresight.describe()}
+    _write(folder, network, tensors, card)
+
+
+def _write(folder: Path, network: Network, tensors: dict[str, Any], card: dict[str, Any]) -> None:
+    from safetensors.numpy import save
+
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / WEIGHTS, save(tensors))
     described = {"format": FORMAT, "network": asdict(network), **card}
-    if foresight is not None:
-        described["foresight"] = foresight.describe()
     write_atomically(folder / CARD, json.dumps(described, indent=2).encode())
+
+
+def _network_alone(model: Module, normalizer: Normalizer | None) -> tuple[Network, dict[str, Any]]:
+    """A network that is no algorithm's, and its tensors; ValueError where `LearnedPolicy` could not play it."""
+    from torch.nn import Sequential
+
+    model = model if isinstance(model, Sequential) else Sequential(model)
+    kinds = [type(part).__name__.lower() if getattr(part, "alpha", 1.0) == 1.0 else repr(part) for part in model]
+    squashed = kinds[-1:] == ["tanh"]
+    layers = kinds[: len(kinds) - squashed]
+    between = set(layers[1::2])
+    if len(layers) % 2 == 0 or set(layers[::2]) != {"linear"} or len(between) > 1 or not between <= set(ACTIVATIONS):
+        raise ValueError(
+            f"model must be linear layers with one of {', '.join(ACTIVATIONS)} between them, but is {kinds}; "
+            "pass it to make_policy as it is"
+        )
+    names = tuple(str(place) for place in range(0, len(layers), 2))
+    tensors = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
+    network = Network(names, next(iter(between), "tanh"), squashed=squashed, spread=None)
+    if normalizer is not None:
+        mean, std, most = normalizer
+        network = replace(network, normalised=float(most))
+        tensors |= {"normalizer.mean": np.asarray(mean, np.float32), "normalizer.std": np.asarray(std, np.float32)}
+    try:
+        LearnedPolicy(network, tensors, {})
+    except KeyError as error:
+        raise ValueError(f"model must have a bias in every layer, but {error} is missing") from error
+    return network, tensors
 
 
 def _normalizer_of(model: BaseAlgorithm) -> Any:

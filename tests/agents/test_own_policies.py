@@ -158,3 +158,48 @@ def test_an_algorithm_as_it_comes_is_trained_and_saved(tmp_path, monkeypatch):
     policy = make_policy("runs/sb3-ppo-short-v0-0")
     assert policy.card["steps"] == 2048  # a roll-out of PPO as it comes
     assert policy.predict(observations(), deterministic=True)[0].shape == (50, 1)
+
+
+def sequence(between=torch.nn.ReLU, *after):
+    torch.manual_seed(0)
+    return torch.nn.Sequential(torch.nn.Linear(FEATURES, 8), between(), torch.nn.Linear(8, 1), *after)
+
+
+@pytest.mark.parametrize("between", [torch.nn.Tanh, torch.nn.ReLU, torch.nn.ELU])
+@pytest.mark.parametrize("after", [(), (torch.nn.Tanh(),)])
+def test_a_network_alone_is_saved_with_what_it_sees(tmp_path, between, after):
+    model, seen = sequence(between, *after), observations()
+    mean, std = np.full(FEATURES, 0.1), np.linspace(0.2, 1.0, FEATURES)
+    save_policy(tmp_path, model, {"steps": 5}, normalizer=(mean, std, 2.0))
+    shown = ((seen - mean) / std).clip(-2, 2).astype(np.float32)
+    expected = model(torch.from_numpy(shown)).detach().numpy().clip(-1, 1)
+    policy = make_policy(str(tmp_path))
+    np.testing.assert_allclose(policy.predict(seen)[0], expected, atol=1e-6)
+    assert policy.card["steps"] == 5
+    save_policy(tmp_path, model)
+    plain = model(torch.from_numpy(seen)).detach().numpy().clip(-1, 1)
+    np.testing.assert_allclose(make_policy(str(tmp_path)).predict(seen)[0], plain, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (sequence(torch.nn.GELU), r"but is \['linear', 'gelu', 'linear'\]"),
+        (torch.nn.Sequential(torch.nn.ReLU()), "must be linear layers"),
+        (torch.nn.LSTM(FEATURES, 1), r"but is \['lstm'\]"),
+        (torch.nn.Linear(FEATURES, 2), "0.weight must be finite float32 of shape"),
+        (torch.nn.Linear(FEATURES, 1, bias=False), "must have a bias in every layer, but '0.bias' is missing"),
+        (torch.nn.ELU(2.0), "must be linear layers"),
+        (sequence(lambda: torch.nn.ELU(2.0)), r"ELU\(alpha=2.0\)"),
+    ],
+)
+def test_a_network_alone_that_could_not_be_played_is_refused(tmp_path, model, message):
+    with pytest.raises(ValueError, match=message):
+        save_policy(tmp_path / "new", model)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_normaliser_beside_an_algorithm_is_refused(tmp_path):
+    model = PPO("MlpPolicy", DuffingVecEnv("duffing_env/Short-v0", 2, seed=0), device="cpu")
+    with pytest.raises(ValueError, match="normalizer must be None for an algorithm"):
+        save_policy(tmp_path, model, normalizer=(0.0, 1.0, 10.0))
