@@ -66,9 +66,10 @@ def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
 
 
 def progress_bar() -> Progress:
-    """A bar on stderr that names what is being done."""
+    """A bar on stderr that names what is being done; none where that is a file, which has room for messages only."""
     columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    return Progress(*columns, console=Console(stderr=True))
+    console = Console(stderr=True)
+    return Progress(*columns, console=console, disable=not console.is_terminal)
 
 
 def check_track(env_id: str) -> None:

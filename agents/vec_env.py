@@ -79,7 +79,7 @@ class DuffingVecEnv(VecEnv):
         self._actions = np.zeros((num_envs, 1), dtype=np.float32)
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
-        self._started = time.time()
+        self._started = time.perf_counter()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the batch at its next reset."""
@@ -107,7 +107,7 @@ class DuffingVecEnv(VecEnv):
         dones = terminated | truncated
         rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if dones.any():
-            elapsed = round(time.time() - self._started, 6)
+            elapsed = round(time.perf_counter() - self._started, 6)
             for row in np.flatnonzero(dones).tolist():
                 rows[row] = told_of(infos["final_info"], row) | {
                     "terminal_observation": infos["final_obs"][row],

@@ -5,22 +5,63 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
-def write_atomically(path: Path, content: bytes | str) -> None:
-    """Write a file under a temporary name beside its place, then rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    data = content.encode() if isinstance(content, str) else content
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Let what the system says while a file is written name that file, and what to do."""
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+        yield
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, f"{error.strerror}; make room, or name another place", str(path)) from error
+
+
+def write_atomically(path: Path, content: bytes | str) -> None:
+    """Write a file under a temporary name beside its place, then rename it.
+
+    Raises:
+        OSError: where it cannot be written; what was there before still is.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+
+def append_atomically(path: Path, text: str) -> None:
+    """Add text to a file, all of it or nothing: what a full disk cut off is taken back.
+
+    Of two programs that add at once, each adds its text in one piece.
+
+    Raises:
+        OSError: where it cannot be written.
+    """
+    data, written = text.encode(), 0
+    with writing(path):
+        place = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            before = os.fstat(place).st_size
+            while written < len(data):
+                written += os.write(place, data[written:])
+        except OSError:
+            if written and os.fstat(place).st_size == before + written:  # nobody else has added to it
+                os.ftruncate(place, before)
+            raise
+        finally:
+            os.close(place)
 
 
 def whole_file(path: str | Path, must: str, largest: int, missing: str = "") -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from agents.evaluation.leaderboard import METRICS, Metric
 from agents.evaluation.protocol import SCORE, TRACKS, VERSION, digest
 from agents.evaluation.systems import FOLDER
 from agents.results import finite
-from estimator.files import whole_file, write_atomically
+from estimator.files import append_atomically, whole_file, write_atomically
 
 #: The board that ships with the package.
 SHIPPED = Path(__file__).parents[1] / "leaderboard.jsonl"
@@ -31,18 +30,13 @@ TITLES = (
 
 
 def append(path: Path, entry: dict[str, Any]) -> None:
-    """Add an entry, in one piece: of two programs that add at once, each adds a whole line.
+    """Add an entry, in one piece.
 
     Raises:
         OSError: where it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    line = json.dumps(finite(entry), ensure_ascii=False, allow_nan=False) + "\n"
-    place = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-    try:
-        os.write(place, line.encode())
-    finally:
-        os.close(place)
+    append_atomically(path, json.dumps(finite(entry), ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read(path: Path) -> list[dict[str, Any]]:

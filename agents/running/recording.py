@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.results import finite, versions
-from estimator.files import write_atomically
+from estimator.files import append_atomically, write_atomically
 
 #: Columns of samples.csv; `identify` takes ``time``, ``u`` and ``y``. ``time`` is that of the tick, ``clock`` the one
 #: when the row was complete; ``u`` the mean of the applied input until the next tick, ``asked`` what was asked for;
@@ -43,10 +43,7 @@ class Recording:
         packages = versions("duffing-env", "numpy", "scipy", "numba")
         self._manifest = {**manifest, "versions": packages, "commit": _commit(), "started": _time(), "ended": None}
         self._write_manifest()
-        self._samples = self.samples.open("a", encoding="utf-8", newline="")
-        self._events = (self.folder / "events.jsonl").open("a", encoding="utf-8")
-        self._samples.write(",".join(COLUMNS) + "\n")
-        self._samples.flush()
+        append_atomically(self.samples, ",".join(COLUMNS) + "\n")
 
     @property
     def samples(self) -> Path:
@@ -58,18 +55,16 @@ class Recording:
         lines = [
             ",".join("" if value is None or not math.isfinite(value) else repr(value) for value in row) for row in rows
         ]
-        self._samples.write("\n".join(lines) + "\n")
-        self._samples.flush()
+        append_atomically(self.samples, "\n".join(lines) + "\n")
 
     def note(self, event: str, **details: Any) -> None:
         """Write a line about an event."""
-        self._events.write(json.dumps(finite({"time": _time(), "event": event, **details})) + "\n")
-        self._events.flush()
+        line = json.dumps(finite({"time": _time(), "event": event, **details}))
+        append_atomically(self.folder / "events.jsonl", line + "\n")
 
     def close(self, **outcome: Any) -> None:
-        """Tell the manifest how it ended; the samples become read-only."""
-        self._samples.close()
-        self._events.close()
+        """Tell events and manifest how it ended; the samples become read-only."""
+        self.note("ended", **outcome)
         self._manifest |= {**outcome, "ended": _time()}
         self._write_manifest()
         self.samples.chmod(0o444)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -129,7 +130,7 @@ def run(
     _warm_up(follower, observed, design, policy, plan)
     described = {"command": sys.argv, "rig": rig.to_dict(), "plan": asdict(plan), "watchdog": silence}
     recording = Recording(out, {**described, "plant": repr(plant)[:200]})
-    ended, message, status, late = "error", "", 1, 0
+    message, status, late = "", 1, 0
     try:
         with Session(plant, rig, recording.note, silence, plan.stale) as session:
             rng = np.random.default_rng(plan.seed)
@@ -156,11 +157,10 @@ def run(
     except Stopped as stopped:
         ended, message, status = str(stopped), f"stopped by {stopped}", 128 + stopped.signum
     except BaseException as error:
-        message = f"{type(error).__name__}: {error}"
+        with suppress(OSError):  # a full disk may be what ended it
+            recording.close(how="error", message=f"{type(error).__name__}: {error}", late=late)
         raise
-    finally:
-        recording.note("ended", how=ended, message=message, late=late)
-        recording.close(how=ended, message=message, late=late)
+    recording.close(how=ended, message=message, late=late)
     result = Run(rig, Path(out), ended, message, follower.belief, late, status)
     _write(result, follower)
     return result

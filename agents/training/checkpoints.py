@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from agents.policies.learned import WEIGHTS
 from agents.policies.saving import save_policy
-from estimator.files import whole_file
+from estimator.files import whole_file, write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -63,16 +63,18 @@ def save_checkpoint(run: Path, model: BaseAlgorithm, card: dict[str, Any], progr
         progress: of a training that is to go on from here; older checkpoints then lose their state. None: the policy
             alone.
     """
-    run.mkdir(parents=True, exist_ok=True)
-    half_written = Path(tempfile.mkdtemp(dir=run, prefix=_HALF_WRITTEN))
-    half_written.chmod(0o755)
-    save_policy(half_written, model, card)
-    if progress is not None:
-        _save_state(half_written, model, progress)
     target = run / FOLDER / f"{model.num_timesteps:09d}"
-    target.parent.mkdir(exist_ok=True)
-    shutil.rmtree(target, ignore_errors=True)
-    os.replace(half_written, target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    half_written = Path(tempfile.mkdtemp(dir=run, prefix=_HALF_WRITTEN))
+    try:
+        half_written.chmod(0o755)
+        save_policy(half_written, model, card)
+        if progress is not None:
+            _save_state(half_written, model, progress)
+        shutil.rmtree(target, ignore_errors=True)
+        os.replace(half_written, target)
+    finally:
+        shutil.rmtree(half_written, ignore_errors=True)
     if progress is not None:
         drop_states(run, but=target)
 
@@ -150,6 +152,7 @@ def drop_states(run: Path, but: Path | None = None) -> None:
 
 def _save_state(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
     import torch
+    from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
     tensors: Tensors = {}
@@ -162,8 +165,11 @@ def _save_state(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
     if (buffer := _buffer(model)) is not None:
         tensors |= {f"buffer/{name}": getattr(buffer, name)[: buffer.size()] for name in _BUFFER}
         tensors["buffer/position"] = np.array(buffer.pos)
-    save_file({name: np.array(tensor, order="C") for name, tensor in tensors.items()}, folder / TENSORS)
-    (folder / STATE).write_text(json.dumps(asdict(progress)))
+    try:
+        save_file({name: np.array(tensor, order="C") for name, tensor in tensors.items()}, folder / TENSORS)
+    except SafetensorError as error:  # of a full disk
+        raise OSError(f"{folder / TENSORS} cannot be written: {error}; make room, then resume") from error
+    write_atomically(folder / STATE, json.dumps(asdict(progress)))
 
 
 def _entropy(model: BaseAlgorithm) -> Any:

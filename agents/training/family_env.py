@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
+from time import perf_counter
 from typing import Any
 
 import gymnasium as gym
@@ -69,7 +69,7 @@ class FamilyVecEnv(VecEnv):
         self.foresight = self._groups[0].foresight
         self._choices = np.zeros(num_envs)
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64)
-        self._started = time.time()
+        self._started = perf_counter()
 
     def reset(self) -> VecEnvObs:
         """Show what every row sees; the episodes have begun."""
@@ -106,7 +106,7 @@ class FamilyVecEnv(VecEnv):
                 rows[at] = {
                     "terminal_observation": seen,
                     "TimeLimit.truncated": bool(not ended[row]),
-                    "episode": {"r": self._returns[at], "l": self._lengths[at], "t": time.time() - self._started},
+                    "episode": {"r": self._returns[at], "l": self._lengths[at], "t": perf_counter() - self._started},
                 }
                 self._returns[at], self._lengths[at] = 0.0, 0
             if group.left == 0:

@@ -1,0 +1,221 @@
+"""Full disks, and limits of the size of files: one line that names the file, and everything of before still there."""
+
+import json
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager, suppress
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from agents import policies
+from agents.cli import run_script
+from agents.commands import main
+from agents.evaluation import protocol
+from agents.policies.saving import save_policy
+from agents.running.clock import JumpingClock
+from agents.running.run import Plan, run
+from agents.running.simulated import SimulatedPlant
+from agents.studies import ship
+from agents.training import TrainConfig, resume, train
+from agents.training.algorithms import ALGORITHMS
+from agents.training.checkpoints import latest_checkpoint
+from agents.vec_env import DuffingVecEnv
+from estimator import Rig
+from estimator.identification.tables import read_table
+
+resource = pytest.importorskip("resource", reason="this system has no limits of the size of files")
+
+RIG = """step = 1e-3
+[input]
+unit = "N"
+limit = 6.0
+[output]
+unit = "m"
+range = 0.03
+noise = 5e-6
+[guess]
+m = [0.3, 0.5]
+c = [0.4, 0.8]
+a = [2e3, 3e3]
+b = [2e7, 6e7]
+"""
+SHORT = "duffing_env/Short-v0"
+
+#: Every command that writes, and the files that it writes over what is there; none where it asks for a new folder.
+WRITERS = {
+    "rig init rig.toml --from beam --force": ["rig.toml"],
+    "export prbs --output signal.csv": ["signal.csv"],
+    "design bench.toml --policy prbs --samples 64 -o next.csv": ["next.csv"],
+    "identify bench.toml record.csv --save known.npz": ["known.npz"],
+    "identify bench.toml record.csv --report page.html": ["page.html"],
+    "report --output board.html": ["board.html"],
+    "evaluate --policies uniform --systems 4 --output out": ["out/evaluation.json", "out/excitations.png"],
+    "evaluate --policies uniform --systems 4 --report out": ["out/report.html"],
+    "evaluate --protocol Short-v0 --policies uniform --submit noise --board board.jsonl": ["board.jsonl"],
+    "run bench.toml --plant agents.running.simulated:plant --policy prbs --samples 16 --out new": [],
+    "ship --name ppo/mine --runs run --systems 4": ["ppo/mine/policy.json", "ppo/mine/policy.safetensors"],
+    "train --env duffing_env/Short-v0 --steps 16 --systems 0 --output new --ppo.num-envs 2 --ppo.n-steps 8 "
+    "--ppo.batch-size 16": [],
+}
+
+
+@contextmanager
+def limited(size):
+    """No file can grow beyond so many bytes, as by ``ulimit -f``."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@contextmanager
+def filled(folder):
+    """A disk without a free page."""
+    with open(folder / "filler", "wb", buffering=0) as filler, suppress(OSError):
+        while True:
+            filler.write(bytes(4096))
+    try:
+        yield
+    finally:
+        (folder / "filler").unlink()
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A rig, a record, and a policy that nobody trained."""
+    place = tmp_path_factory.mktemp("bench")
+    (place / "bench.toml").write_text(RIG)
+    rig = Rig.from_file(place / "bench.toml")
+    plant = SimulatedPlant(rig, clock=JumpingClock())
+    run(rig, plant, place / "measured", Plan("prbs", 64), clock=plant.clock)
+    shutil.copy(place / "measured" / "samples.csv", place / "record.csv")
+    model = PPO("MlpPolicy", DuffingVecEnv(SHORT, 2), n_steps=8, batch_size=16, device="cpu")
+    config = {"env": SHORT, "reward": "information_gain", "options": {}, "seed": 0, "output": "run"}
+    save_policy(place / "run", model, {"algorithm": "ppo", "config": config, "command": ["train.py"]})
+    return place
+
+
+@pytest.fixture(params=["limit", "disk"])
+def place(request, bench, tmp_path, monkeypatch):
+    """The folder, and what makes that nothing more can be written: a limit of 100 bytes, or a full disk of its own."""
+    monkeypatch.setattr(protocol, "SYSTEMS", 8)
+    folder = tmp_path / "place"
+    folder.mkdir()
+    if request.param == "limit":
+        shutil.copytree(bench, folder, dirs_exist_ok=True)
+        monkeypatch.chdir(folder)
+        yield folder, lambda: limited(100)
+        return
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder], capture_output=True).returncode:
+        pytest.skip("this user can mount no disk")
+    try:
+        shutil.copytree(bench, folder, dirs_exist_ok=True)
+        monkeypatch.chdir(folder)
+        yield folder, lambda: filled(folder)
+    finally:
+        monkeypatch.chdir(tmp_path)
+        subprocess.run(["umount", folder], check=True)
+
+
+def content(folder):
+    """Every file, by its name; not the one that fills the disk, nor the folder of a run that just began."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "filler")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files if "new/" not in str(path)}
+
+
+def command(words, monkeypatch, capsys, folder):
+    """Exit status and messages."""
+    name, *rest = words.split()
+    monkeypatch.setattr(sys, "argv", ["duffing-env", name, *rest])
+    monkeypatch.setattr(policies, "TRAINED", folder)
+    status = 0
+    try:
+        if name == "ship":
+            monkeypatch.setattr(sys, "argv", ["ship.py", *rest])
+            run_script(ship.main, ship.Config)
+        else:
+            main()
+    except SystemExit as stop:
+        status = stop.code
+    return status, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", WRITERS, ids=lambda words: " ".join(words.split()[:2]))
+def test_a_full_disk_is_one_line_and_leaves_everything_as_it_was(words, place, monkeypatch, capsys):
+    folder, full = place
+    status, messages = command(words, monkeypatch, capsys, folder)
+    assert status == 0, messages
+    before = content(folder)
+    assert before.keys() >= set(WRITERS[words])
+    shutil.rmtree(folder / "new", ignore_errors=True)
+    with full():
+        status, messages = command(words, monkeypatch, capsys, folder)
+    assert status == 2
+    assert len(messages.splitlines()) == 1, messages
+    assert "make room" in messages
+    assert "File too large" in messages or "No space left" in messages
+    assert content(folder) == before
+    assert not [path for path in folder.rglob(".*") if path.is_file() or path.name.startswith(".checkpoint")]
+    shutil.rmtree(folder / "new", ignore_errors=True)
+    assert command(words, monkeypatch, capsys, folder)[0] == 0
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+def test_a_training_goes_on_from_what_was_written_before_the_disk_was_full(tmp_path, algo):
+    small = {"num_envs": 8, "batch_size": 16, "hidden": (4,)}
+    own = {"n_steps": 16} if algo == "ppo" else {"buffer_size": 400, "learning_starts": 32}
+    config = TrainConfig(
+        algo=algo, env=SHORT, steps=1024, checkpoints=4, eval_every=128, output=tmp_path / "run",
+        hyperparameters=ALGORITHMS[algo](**small, **own),
+    )  # fmt: skip
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(steps, found):
+        if steps >= 384:
+            size = (tmp_path / "run/checkpoints/000000256/training.safetensors").stat().st_size
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, hard))
+
+    try:
+        with pytest.raises(OSError, match=r"training\.safetensors.*File too large.*make room"):
+            train(config, fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert latest_checkpoint(tmp_path / "run").name == "000000256"
+    assert not list((tmp_path / "run").glob(".*"))
+    assert resume(tmp_path / "run").curve[-1][0] == 1024
+
+
+def test_a_run_ends_with_its_input_at_zero_and_whole_rows(bench, tmp_path):
+    rig, told = Rig.from_file(bench / "bench.toml"), []
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    class Filling(SimulatedPlant):
+        """Leaves room for half a row after 30 samples."""
+
+        def read(self):
+            told.append("read")
+            if len(told) == 46:  # 16 of them while it listened
+                size = (tmp_path / "out/samples.csv").stat().st_size
+                resource.setrlimit(resource.RLIMIT_FSIZE, (size + 20, hard))
+            return super().read()
+
+        def disarm(self):
+            told.append(self._u)
+            super().disarm()
+
+    plant = Filling(rig, clock=JumpingClock())
+    try:
+        with pytest.raises(OSError, match=r"File too large; make room.*samples\.csv"):
+            run(rig, plant, tmp_path / "out", Plan("prbs", 64), clock=plant.clock)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert told[-1] == 0.0
+    table = read_table(tmp_path / "out/samples.csv")
+    np.testing.assert_array_equal(table.columns[0], np.arange(table.columns.shape[1]))
+    assert table.columns.shape[1] >= 45
+    assert json.loads((tmp_path / "out/manifest.json").read_text())["how"] == "error"
