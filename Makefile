@@ -32,8 +32,10 @@ bench: $(READY)  ## timed comparisons, with peers in .venv-peers; about 15 minut
 compat: $(READY)  ## what other RL libraries make of the environments, in .venv-compat; a quarter of an hour
 	$(BIN)/python -m venv .venv-compat
 	.venv-compat/bin/python -m pip install --quiet --requirement benchmarks/compat.lock
+	.venv-compat/bin/python -m pip install --quiet --no-deps --editable .
 	.venv-compat/bin/python -m pip install --quiet --no-deps --upgrade --target .venv-compat/newest gymnasium==1.4.0
 	.venv-compat/bin/python -m benchmarks.compat
+	.venv-compat/bin/python -m pytest tests/test_examples.py
 	PYTHONPATH=.venv-compat/newest .venv-compat/bin/python -m benchmarks.compat
 
 lint: $(READY)  ## style, format and types

@@ -1,0 +1,115 @@
+"""PPO of TorchRL's parts on our vector environment, with the hyperparameters that TorchRL's example for MuJoCo has.
+
+$ python examples/torchrl_ppo.py --seed 0
+$ duffing-env evaluate --protocol Short-v0 --policies "torchrl-ppo=runs/torchrl-ppo-short-v0-*" --submit torchrl-ppo
+
+Needs ``torchrl``; benchmarks/compat.lock has the versions that this runs with.
+"""
+
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import gymnasium as gym
+import torch
+import tyro
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import GymWrapper
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from agents import save_policy
+from agents.results import versions
+
+
+@dataclass(frozen=True)
+class Args:
+    """TorchRL's PPO on an environment of duffing_env."""
+
+    env_id: str = "duffing_env/Short-v0"
+    """Id of the environment."""
+    seed: int = 0
+    """Seed of everything."""
+    output: Path | None = None
+    """Policy folder; runs/torchrl-ppo-TRACK-SEED where it is not given."""
+    total_timesteps: int = 1_000_000
+    """Samples; a roll-out that would pass them is not begun."""
+    num_envs: int = 8
+    """Environments that are stepped together."""
+    batch: int = 2048
+    """Samples of a roll-out, over all environments."""
+    minibatch: int = 64
+    """Samples of a gradient step."""
+    epochs: int = 10
+    """Passes over a roll-out."""
+    learning_rate: float = 3e-4
+    """Step size at the start; it falls linearly to 0."""
+
+
+def main(args: Args) -> Path:
+    """Train, write the policy folder, and give its path."""
+    torch.manual_seed(args.seed)
+    torch.set_num_threads(1)
+    # TorchRL resets the rows that have ended itself.
+    envs = gym.make_vec(f"duffing_env:{args.env_id}", num_envs=args.num_envs, autoreset_mode="Disabled")
+    env = GymWrapper(envs)
+    env.set_seed(args.seed)
+    features = envs.single_observation_space.shape[0]
+    layers = {"num_cells": [64, 64], "activation_class": nn.Tanh}
+    mean = MLP(features, 1, **layers)
+    actor = ProbabilisticActor(
+        TensorDictModule(
+            nn.Sequential(mean, AddStateIndependentNormalScale(1)), in_keys=["observation"], out_keys=["loc", "scale"]
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+        spec=env.action_spec,
+    )
+    critic = ValueOperator(MLP(features, 1, **layers), in_keys=["observation"])
+    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
+    loss = ClipPPOLoss(
+        actor, critic, clip_epsilon=0.2, entropy_bonus=False, critic_coeff=0.25, loss_critic_type="l2",
+        normalize_advantage=True,
+    )  # fmt: skip
+    optimiser = torch.optim.Adam(loss.parameters(), lr=args.learning_rate, eps=1e-5)
+
+    total = args.total_timesteps // args.batch * args.batch
+    steps = 0
+    for rolled in Collector(
+        env, actor, frames_per_batch=args.batch, total_frames=total, auto_register_policy_transforms=True
+    ):
+        optimiser.param_groups[0]["lr"] = args.learning_rate * (1 - steps / total)
+        for _ in range(args.epochs):
+            with torch.no_grad():
+                advantage(rolled)
+            samples = rolled.reshape(-1)
+            for rows in torch.randperm(len(samples)).split(args.minibatch):
+                terms = loss(samples[rows])
+                optimiser.zero_grad()
+                (terms["loss_objective"] + terms["loss_critic"]).backward()
+                nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
+                optimiser.step()
+        steps += rolled.numel()
+        print(f"{steps:9,} samples, mean reward {rolled['next', 'reward'].mean():.3f}", flush=True)
+
+    track = args.env_id.split("/")[-1].lower()
+    folder = args.output or Path("runs") / f"torchrl-ppo-{track}-{args.seed}"
+    card = {
+        "algorithm": "ppo",
+        "steps": steps,
+        "config": asdict(args) | {"output": str(folder)},
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "versions": versions("duffing-env", "gymnasium", "numpy", "torch", "torchrl"),
+    }
+    # The most probable action of a TanhNormal, as TorchRL plays it without exploration, is the tanh of its mean.
+    save_policy(folder, nn.Sequential(*mean, nn.Tanh()), card)
+    print(folder)
+    return folder
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
