@@ -83,13 +83,16 @@ lock: $(LOCKED)  ## write the versions that are installed now into the lock, kee
 lock-check: $(READY)  ## every line of the lock has a binary file for every Python version
 	$(BIN)/python .ci/check_lock.py $(VERSIONS)
 
-.PHONY: fuzz soak release licences
+.PHONY: fuzz soak kills release licences
 INPUTS ?= 50000
 fuzz: $(READY)  ## bad inputs by the thousand; fails where one is not refused clearly
 	$(BIN)/python -m benchmarks.fuzz --inputs $(INPUTS)
 
 soak: $(READY)  ## long runs on every track
 	$(BIN)/python -m benchmarks.soak --steps 10000000
+
+kills: $(READY)  ## commands killed at random moments, and started again; a quarter of an hour
+	$(BIN)/python -m benchmarks.kills
 
 release: $(READY)  ## wheel and sdist into dist, built twice and compared
 	$(BIN)/python .ci/release.py

@@ -56,7 +56,7 @@ def append_atomically(path: Path, text: str) -> None:
             before = os.fstat(place).st_size
             while written < len(data):
                 written += os.write(place, data[written:])
-        except OSError:
+        except BaseException:
             if written and os.fstat(place).st_size == before + written:  # nobody else has added to it
                 os.ftruncate(place, before)
             raise

@@ -51,7 +51,7 @@ def tune(config: TrainConfig, trials: int) -> Path:
     optuna = _optuna()
     folder = config.output or Path("runs") / f"tune-{config.algo}-{track_of(config.env).lower()}-{config.seed}"
     _claim(folder, config)
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # it warns of a trial that a signal ended, with a traceback
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
     study = optuna.create_study(storage=storage, study_name=folder.name, load_if_exists=True, direction="maximize")
     begun = study.get_trials(deepcopy=False)

@@ -1,7 +1,12 @@
-"""Full disks, and limits of the size of files: one line that names the file, and everything of before still there."""
+"""Commands that are disturbed while they write, by full disks, limits of the size of files, and signals.
+
+One line says so, and everything of before is still there.
+"""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
@@ -13,7 +18,7 @@ from stable_baselines3 import PPO
 from agents import policies
 from agents.cli import run_script
 from agents.commands import main
-from agents.evaluation import protocol
+from agents.evaluation import board, protocol
 from agents.policies.saving import save_policy
 from agents.running.clock import JumpingClock
 from agents.running.run import Plan, run
@@ -163,6 +168,38 @@ def test_a_full_disk_is_one_line_and_leaves_everything_as_it_was(words, place, m
     assert not [path for path in folder.rglob(".*") if path.is_file() or path.name.startswith(".checkpoint")]
     shutil.rmtree(folder / "new", ignore_errors=True)
     assert command(words, monkeypatch, capsys, folder)[0] == 0
+
+
+@pytest.mark.parametrize("place", ["limit"], indirect=True)
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("words", WRITERS, ids=lambda words: " ".join(words.split()[:2]))
+def test_a_signal_while_it_writes_is_one_line_and_leaves_everything_as_it_was(
+    words, number, status, place, monkeypatch, capsys
+):
+    """The signal comes when the first file is there under its temporary name, or a line is about to be added."""
+    folder, _ = place
+    before = content(folder)
+    sent = []
+
+    def disturbed(call):
+        def first(*arguments, **options):
+            if not sent:
+                sent.append(number)
+                os.kill(os.getpid(), number)
+            return call(*arguments, **options)
+
+        return first
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", disturbed(os.replace))
+        patch.setattr(board, "append_atomically", disturbed(board.append_atomically))
+        found, messages = command(words, monkeypatch, capsys, folder)
+    assert sent
+    assert found == status
+    assert len(messages.splitlines()) == 1, messages
+    assert "stopped" in messages
+    assert content(folder) == before
+    assert not [path for path in folder.rglob(".*") if path.is_file()]
 
 
 @pytest.mark.parametrize("algo", ["ppo", "sac"])

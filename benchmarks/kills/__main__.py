@@ -1,0 +1,171 @@
+"""Kill commands at random moments with SIGKILL, start them again, and count what is lost.
+
+$ python -m benchmarks.kills --kills 50 --seed 0
+$ python -m benchmarks.kills --kills 6 --commands train run
+
+Each command runs to its end once, undisturbed. Half of the kills come at a moment between its first sign of life and
+its end, the other half within 50 ms of a moment when it wrote a file. After each kill every file is read, but those
+under temporary names; the command is started again as its user would, and has to end well; what it had measured before
+the kill has to be there. Where the same result is promised, it is compared bit for bit. The exit status is 1 where
+something of that failed.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.cli import run_script
+from benchmarks.kills.cases import CASES, Case
+from benchmarks.kills.processes import started
+from benchmarks.kills.whole import half_written
+
+_NEAR = 0.05  # s
+_PATIENCE = 300.0  # s
+_TRIES = 50
+
+
+@dataclass(frozen=True)
+class Config:
+    """Kill commands at random moments."""
+
+    kills: int = 50
+    """How many, shared among the commands."""
+    seed: int = 0
+    """Of the moments."""
+    commands: tuple[str, ...] = ()
+    """Names of commands; all if none."""
+    json: Path | None = None
+    """File for the counts."""
+
+
+def main(config: Config) -> None:
+    """Kill, and print the table."""
+    from agents.results import show, table, write_json
+
+    unknown = set(config.commands) - set(CASES)
+    if unknown:
+        raise ValueError(f"commands must be of {list(CASES)}, but are {sorted(unknown)}")
+    os.environ["OMP_NUM_THREADS"] = "1"  # so that a training repeats itself bit for bit
+    chosen = {name: CASES[name]() for name in config.commands or CASES}
+    tried = [name for name, case in chosen.items() if not case.missing]
+    shares = [len(part) for part in np.array_split(np.arange(config.kills), len(tried))]
+    found = {}
+    for place, (name, kills) in enumerate(zip(tried, shares, strict=True)):
+        with tempfile.TemporaryDirectory() as base:
+            found[name] = play(chosen[name], Path(base), kills, np.random.default_rng((config.seed, place)))
+        print(f"{name}: {found[name]}", file=sys.stderr)
+    rows = []
+    for name, case in chosen.items():
+        if case.missing:
+            rows.append([name, "0", f"left out: {case.missing}", "", "", ""])
+            continue
+        told = found[name]
+        equal = f"{told['equal']} of {told['kills']}" if case.promises else "not promised"
+        lost = f"{told['lost']:g} {case.unit}"
+        rows.append(
+            [name, str(told["kills"]), lost, str(told["half-written"]), f"{told['resumed']} of {told['kills']}", equal]
+        )
+    heads = ("command", "kills", "lost at most", "half-written files", "goes on", "equal")
+    show(table(heads, rows, markdown=True), width=150)
+    for told in found.values():
+        for fault in told["faults"]:
+            print(fault, file=sys.stderr)
+    if config.json is not None:
+        write_json(config.json, found)
+    sys.exit(any(told["faults"] for told in found.values()))
+
+
+def play(case: Case, base: Path, kills: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Kill a command so many times; what came of it."""
+    whole = base / "whole"
+    case.prepare(whole)
+    _finish(case, whole, ["rig", "list"], "before")  # the packages are imported
+    began = time.time()
+    _finish(case, whole, case.start(whole), "undisturbed")
+    times = _times(whole, began)
+    told: Counter[str] = Counter(kills=kills)
+    lost, faults = 0.0, []
+    for k in range(kills):
+        folder = base / str(k)
+        times = _kill(case, folder, times, bool(k % 2), rng)
+        bad = half_written(folder)
+        measured = case.measured(folder)
+        lost = max(lost, case.lost(folder))
+        told["half-written"] += len(bad)
+        faults += [f"{case.name}, kill {k}: {path} is half-written: {why}" for path, why in bad]
+        copy = base / "copy"
+        shutil.copytree(folder, copy)
+        try:
+            _finish(case, folder, case.again(folder), f"kill {k}")
+            told["resumed"] += 1
+            gone = [what for what in measured if what not in case.measured(folder)]
+            faults += [f"{case.name}, kill {k}: what was measured is gone: {gone}"] if gone else []
+            if case.promises and (fault := _unequal(case, folder, copy, whole)):
+                faults.append(f"{case.name}, kill {k}: {fault}")
+            else:
+                told["equal"] += 1
+        except RuntimeError as error:
+            faults.append(f"{case.name}: {error}")
+        shutil.rmtree(copy)
+        shutil.rmtree(folder)
+    if lost > case.most:
+        faults.append(f"{case.name}: {lost:g} {case.unit} were lost, more than {case.most:g}")
+    return {"kills": 0, "half-written": 0, "resumed": 0, "equal": 0, **told, "lost": lost, "faults": faults}
+
+
+def _unequal(case: Case, folder: Path, copy: Path, whole: Path) -> str:
+    """What is not as promised: as undisturbed, or, where a command goes on from a state, as when it does so again."""
+    if not case.goes_on_from_a_state(copy):
+        return "" if case.result(folder) == case.result(whole) else "the result is not that of the undisturbed command"
+    _finish(case, copy, case.again(copy), "a copy")
+    return "" if case.result(folder) == case.result(copy) else "a copy that went on, too, has another result"
+
+
+def _times(folder: Path, began: float) -> list[float]:
+    """When a command that has just ended wrote its files, and when it ended: seconds from its start."""
+    files = (path.stat().st_mtime for path in folder.rglob("*") if path.is_file())
+    return [*(at - began for at in files if at > began), time.time() - began]
+
+
+def _kill(case: Case, folder: Path, times: list[float], near: bool, rng: np.random.Generator) -> list[float]:
+    """Start a command and kill it; returns the times that the moment was drawn from.
+
+    It begins again if the command was quicker. The machine may be faster now than it was: its times count then.
+    """
+    for _ in range(_TRIES):
+        shutil.rmtree(folder, ignore_errors=True)
+        case.prepare(folder)
+        moment = rng.choice(times) + rng.uniform(-_NEAR, _NEAR) if near else rng.uniform(0.0, times[-1])
+        began = time.time()
+        process = started(folder, case.start(folder))
+        process.join(max(0.0, moment))
+        process.kill()
+        process.join()
+        if process.exitcode == -9:
+            return times
+        times = _times(folder, began)
+    raise RuntimeError(f"{case.name} ended before each of {_TRIES} kills")
+
+
+def _finish(case: Case, folder: Path, words: list[str], when: str) -> None:
+    """Run a command to its end; RuntimeError where it does not end well."""
+    process = started(folder, words)
+    process.join(_PATIENCE)
+    if process.exitcode != 0:
+        process.kill()
+        said = (folder.parent / f"{folder.name}.log").read_text().strip().splitlines()
+        raise RuntimeError(f"{case.name}, {when}: exit status {process.exitcode}: {' '.join(said[-1:])}")
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__)

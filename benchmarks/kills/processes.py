@@ -1,0 +1,46 @@
+"""Processes that run a command line, and that can be killed; the packages are imported once for all of them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+from agents.cli import run_script
+
+#: The processes are forked from one that imported these.
+PRELOADED = (
+    "torch", "stable_baselines3", "optuna", "matplotlib.figure", "duffing_env", "agents.commands.train",
+    "agents.evaluation.comparison", "agents.studies.ship", "agents.running.run", "estimator.identification",
+)  # fmt: skip
+
+
+def started(folder: Path, words: list[str]) -> Any:
+    """Run a command line in a folder, in a process of its own; its output goes into a file beside the folder."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(PRELOADED))
+    process = context.Process(target=_command, args=(folder, words))
+    process.start()
+    return process
+
+
+def _command(folder: Path, words: list[str]) -> None:
+    os.chdir(folder)
+    with open(folder.parent / f"{folder.name}.log", "w") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background ignores it
+    sys.argv = ["duffing-env", *words]
+    if words[0] == "ship":
+        from agents import policies
+        from agents.studies import ship
+
+        policies.TRAINED = folder  # not into the package
+        sys.argv = words
+        return run_script(ship.main, ship.Config)
+    from agents.commands import main as command
+
+    command()

@@ -1,0 +1,95 @@
+"""SIGINT and SIGTERM at random moments of every command, each in a process of its own."""
+
+import os
+import shutil
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from agents.running.clock import JumpingClock
+from agents.running.run import Plan, run
+from agents.running.simulated import SimulatedPlant
+from benchmarks.kills.cases import RIG, SMALL, Ship
+from benchmarks.kills.processes import started
+from benchmarks.kills.whole import half_written
+from estimator import Rig
+
+SHORT = "duffing_env/Short-v0"
+COMMANDS = {
+    "train": ["train", "--env", SHORT, "--steps", "8192", "--systems", "0", "--output", "new/run", *SMALL],
+    "tune": ["train", "--env", SHORT, "--steps", "1024", "--tune", "2", "--output", "new/search", *SMALL],
+    "evaluate": ["evaluate", "--env", SHORT, "--policies", "uniform", "prbs", "--systems", "16", "--output", "new"],
+    "submit": [
+        "evaluate",
+        "--protocol",
+        "Short-v0",
+        "--policies",
+        "prbs",
+        "--submit",
+        "prbs",
+        "--board",
+        "new/board.jsonl",
+    ],
+    "export": ["export", "prbs", "--samples", "2000000", "--output", "new/signal.csv"],
+    "design": ["design", "rig.toml", "--policy", "efe", "--samples", "64", "-o", "new/next.csv"],
+    "identify": ["identify", "rig.toml", "record.csv", "--report", "new/page.html", "--save", "new/known.npz"],
+    "run": [
+        "run",
+        "rig.toml",
+        "--plant",
+        "agents.running.simulated:plant",
+        "--policy",
+        "prbs",
+        "--samples",
+        "500",
+        "--out",
+        "new/run",
+    ],
+    "report": ["report", "--output", "new/board.html"],
+    "ship": ["ship", "--name", "new/mine", "--runs", "run-0", "run-1", "--systems", "16"],
+}
+_TRIES = 12
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A rig, a record and two runs."""
+    place = tmp_path_factory.mktemp("base") / "bench"
+    Ship().prepare(place)
+    (place / "rig.toml").write_text(RIG)
+    rig = Rig.from_file(place / "rig.toml")
+    plant = SimulatedPlant(rig, clock=JumpingClock())
+    run(rig, plant, place / "measured", Plan("prbs", 512), clock=plant.clock)
+    shutil.copy(place / "measured" / "samples.csv", place / "record.csv")
+    process = started(place, ["rig", "list"])  # the packages are imported
+    process.join()
+    assert process.exitcode == 0
+    return place
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_signal_at_work_is_one_line_and_its_exit_status(name, bench, tmp_path):
+    words, rng, lasted = COMMANDS[name], np.random.default_rng(list(name.encode())), 0.0
+    for number in (signal.SIGINT, signal.SIGTERM):
+        for k in range(_TRIES):  # until it is not too late; the first one tells how long it takes
+            folder = tmp_path / f"{number.name}-{k}"
+            shutil.copytree(bench, folder)
+            began = time.perf_counter()
+            process = started(folder, words)
+            process.join(float(rng.uniform(min(0.3, lasted / 2), lasted)) if lasted else None)
+            if process.is_alive():
+                os.kill(process.pid, number)
+            process.join(90)
+            if process.exitcode != 0:
+                break
+            lasted = time.perf_counter() - began
+        said = (tmp_path / f"{number.name}-{k}.log").read_text()
+        assert process.exitcode == 128 + number, said
+        assert "Traceback" not in said
+        assert "Exception ignored" not in said
+        assert sum("stopped" in line or "ended early" in line for line in said.splitlines()) == 1, said
+        assert half_written(folder) == []
+        assert not list(folder.rglob(".*"))
