@@ -95,6 +95,18 @@ class DuffingVecEnv(VecEnv):
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return observations
 
+    @property
+    def memory(self) -> dict[str, npt.NDArray[Any]]:
+        """As `DuffingVectorEnv.memory`."""
+        return self.envs.unwrapped.memory | {"returns": self._returns, "lengths": self._lengths}
+
+    def recall(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
+        """Go on with the episodes that a copy of `memory` is of, and see what was seen then."""
+        observations = self.reset()
+        for name, array in self.memory.items():
+            array[...] = memory[name]
+        return observations
+
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Take the actions of the next `step_wait`."""
         self._actions = actions if self._levels is None else self._levels[actions][:, None]

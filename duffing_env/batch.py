@@ -172,6 +172,11 @@ class Batch:
         else:
             self._kernel.step(0, len(self._blocks), self._flat_blocks, self._members, self._saved[0], *told)
 
+    @property
+    def memory(self) -> dict[str, npt.NDArray[Any]]:
+        """All that the next step goes on from, and what the last one showed: the arrays themselves."""
+        return {"blocks": self._blocks, "members": self._members, "observations": self._observations}
+
     def measure(self, u: float, y: float) -> None:
         """Let the next step play this input and output [V], of an experiment that replays a record of one sample."""
         self._recorded[:, 0] = u, y

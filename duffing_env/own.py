@@ -172,6 +172,11 @@ class Own:
         self._samples[mask] = 0.0
         self.observations = self._seen(self._batch.observations, None)
 
+    @property
+    def memory(self) -> dict[str, npt.NDArray[Any]]:
+        """As `Batch.memory`."""
+        return {"samples": self._samples, "shown": self.observations}
+
     def before(self) -> None:
         """Remember what is believed before a step."""
         self._waiting = self._batch.quantity("WAITING") != 0.0

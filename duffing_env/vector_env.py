@@ -233,6 +233,15 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         return self._seen.observations, outcomes[0], terminated, truncated, infos
 
     @property
+    def memory(self) -> dict[str, npt.NDArray[Any]]:
+        """All that the next step goes on from, by name: the arrays themselves, until the next step or reset.
+
+        Episodes that went on in the one of two environments with the same options go on in the other when it is reset,
+        and its arrays are filled with copies of these.
+        """
+        return self._batch.memory | ({} if self._own is None else self._own.memory)
+
+    @property
     def _seen(self) -> Batch | Own:
         """What has the observations."""
         return self._batch if self._own is None else self._own

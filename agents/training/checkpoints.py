@@ -1,7 +1,7 @@
 """Checkpoints: the policy on the way, and in the latest one the state of the training, from which it goes on.
 
-The state is ``training.safetensors`` (weights, moments of the optimisers, and the replay buffer where there is one) and
-``training.json`` (the counts). The environments' state is not in it: after a resume all of them begin new episodes.
+The state is ``training.safetensors`` (weights, moments of the optimisers, the replay buffer where there is one, and
+`agents.training.moments`) and ``training.json`` (the counts).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from agents.policies.learned import WEIGHTS
 from agents.policies.saving import save_policy
+from agents.training.moments import Tensors, go_on, moment_of
 from estimator.files import whole_file, write_atomically
 
 if TYPE_CHECKING:
@@ -30,8 +30,6 @@ STATE = "training.json"
 TENSORS = "training.safetensors"
 _HALF_WRITTEN = ".checkpoint-"
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-
-Tensors = dict[str, npt.NDArray[Any]]
 
 
 @dataclass
@@ -116,7 +114,7 @@ def begin_with(folder: Path, model: BaseAlgorithm) -> None:
 
 
 def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
-    """Give a new model the weights, moments, buffer and counts that the checkpoint holds.
+    """Give a new model the weights, moments, buffer, counts and episodes that the checkpoint holds.
 
     Raises:
         ValueError: where the tensors are damaged or those of another model.
@@ -138,6 +136,7 @@ def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
             entropy.data.copy_(torch.from_numpy(tensors["log_ent_coef"]))
         if (buffer := _buffer(model)) is not None:
             _refill(buffer, tensors)
+        go_on(model, {key.removeprefix("moment/"): t for key, t in tensors.items() if _of("moment", key)})
     except (KeyError, RuntimeError, ValueError, OSError, SafetensorError) as error:
         raise ValueError(f"checkpoint must hold this algorithm's state, but {checkpoint} does not: {error}") from error
 
@@ -165,6 +164,7 @@ def _save_state(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
     if (buffer := _buffer(model)) is not None:
         tensors |= {f"buffer/{name}": getattr(buffer, name)[: buffer.size()] for name in _BUFFER}
         tensors["buffer/position"] = np.array(buffer.pos)
+    tensors |= {f"moment/{name}": array for name, array in moment_of(model).items()}
     try:
         save_file({name: np.array(tensor, order="C") for name, tensor in tensors.items()}, folder / TENSORS)
     except SafetensorError as error:  # of a full disk

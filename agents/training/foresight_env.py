@@ -65,6 +65,10 @@ class ForesightVecEnv(VecEnvWrapper):
         """Start an episode in every row."""
         return self._see(self.venv.reset())
 
+    def recall(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
+        """As `DuffingVecEnv.recall`."""
+        return self._see(self.venv.recall(memory))  # type: ignore[attr-defined]
+
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Take what the network chose, as the foresight's actions."""
         choices = actions[:, 0] if self._levels is None else self._levels[actions]

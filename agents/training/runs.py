@@ -86,10 +86,9 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
 def resume(folder: Path) -> Run:
     """Go on with a run that was stopped, from its latest checkpoint, up to the samples that it was to have.
 
-    The count of samples, the moments of the optimisers, the schedule of the learning rate and the replay buffer go on;
-    the log loses what came after the checkpoint. All environments begin new episodes, with systems and noise that
-    follow from the run's seed and the samples so far: so a resumed run repeats itself, but is not the run that was
-    never stopped.
+    It is then the run that was never stopped, bit for bit: weights, moments of the optimisers, replay buffer, episodes,
+    streams of random numbers and schedules go on, and the log loses what came after the checkpoint. Of the family the
+    environments begin new episodes, which follow from the run's seed and the samples so far.
 
     Args:
         folder: the run folder.

@@ -4,7 +4,6 @@ import csv
 import json
 import os
 import runpy
-import shutil
 import signal
 import subprocess
 import sys
@@ -48,9 +47,8 @@ def tiny(algo):
 
 
 def config(algo, output, **settings):
-    return TrainConfig(
-        algo=algo, env=ENV, steps=STEPS, checkpoints=CHECKPOINTS, output=output, hyperparameters=tiny(algo), **settings
-    )
+    settings = {"hyperparameters": tiny(algo)} | settings
+    return TrainConfig(algo=algo, env=ENV, steps=STEPS, checkpoints=CHECKPOINTS, output=output, **settings)
 
 
 def log(folder):
@@ -150,13 +148,23 @@ def test_every_algorithm_is_resumed(tmp_path, algo):
     assert [int(row.split(",")[0]) for row in rows[1:]] == list(range(128, STEPS + 1, 128))
 
 
-def test_a_resumed_run_repeats_itself(tmp_path):
-    folder = stopped("sac", tmp_path / "run", at=400)
-    shutil.copytree(folder, tmp_path / "copy")
-    for name in ("run", "copy"):
-        resume(tmp_path / name)
-    first, again = ((tmp_path / name / "policy.safetensors").read_bytes() for name in ("run", "copy"))
-    assert first == again
+@pytest.mark.parametrize(
+    ("algo", "settings"),
+    [
+        *((algo, {}) for algo in ALGORITHMS),
+        ("ppo", {"hyperparameters": ALGORITHMS["ppo"](**ON_POLICY, foresight=True, levels=4, entropy_bonus=0.1)}),
+        ("sac", {"hyperparameters": ALGORITHMS["sac"](**OFF_POLICY | {"learning_starts": 600})}),
+    ],
+)
+def test_a_resumed_run_is_the_one_that_was_never_stopped(tmp_path, algo, settings):
+    folder = stopped(algo, tmp_path / "run", at=640, **settings)
+    assert load_progress(latest_checkpoint(folder)).steps == 512
+    resume(folder)
+    whole = train(config(algo, tmp_path / "whole", eval_every=128, **settings)).folder
+    for name in ("policy.safetensors", "evaluations.csv"):
+        assert (folder / name).read_bytes() == (whole / name).read_bytes(), name
+    returns, others = ([row["rollout/ep_rew_mean"] for row in log(path)] for path in (folder, whole))
+    assert returns == others
 
 
 def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_again(tmp_path):

@@ -284,3 +284,30 @@ def test_evaluate_policy_evaluates_a_model():
         observations = [step[0] for step in steps]
         earned.append([step[1] for step in steps])
     np.testing.assert_allclose(returns, np.sum(earned, axis=0), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("track", "options"),
+    [
+        ("Short-v0", {}),
+        ("Short-v1", {"horizon": 12}),
+        ("Drift-v0", {"horizon": 12}),
+        ("Pendulum-v0", {"horizon": 12}),
+        ("Short-v0", {"observation": "history", "history": 3, "hold": 2, "input_cost": 0.1}),
+        ("Short-v0", {"observation": "privileged", "reward": lambda before, after, u, y, truth: u * y / truth["m"]}),
+    ],
+)
+def test_episodes_go_on_in_other_environments_from_a_copy_of_the_memory(track, options):
+    rng = np.random.default_rng(0)
+    one, other = (DuffingVecEnv(f"duffing_env/{track}", 11, seed=seed, **options) for seed in (0, 1))
+    one.reset()
+    for _ in range(7):
+        seen, *_ = one.step(rng.uniform(-1, 1, (11, 1)).astype(np.float32))
+    copied = {name: array.copy() for name, array in one.memory.items()}
+    np.testing.assert_array_equal(other.recall(copied), seen)
+    for _ in range(70):
+        actions = rng.uniform(-1, 1, (11, 1)).astype(np.float32)
+        (seen, rewards, dones, told), (*others, other_told) = one.step(actions), other.step(actions)
+        for mine, its in zip((seen, rewards, dones), others, strict=True):
+            np.testing.assert_array_equal(mine, its)
+        assert [t.get("episode", {}).get("r") for t in told] == [t.get("episode", {}).get("r") for t in other_told]
