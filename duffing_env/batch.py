@@ -14,6 +14,7 @@ from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, noise_rows, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
 from duffing_env.recycling import Recycled
+from duffing_env.threads import use_threads
 from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, Parameters
@@ -164,11 +165,9 @@ class Batch:
         )  # fmt: skip
         if blocks is not None:
             self._kernel.step(*blocks, self._flat_blocks, self._members, self._saved[0], *told)
-        elif self._threads > 1:
-            import numba
-
-            numba.set_num_threads(self._threads)
-            self._kernel.step_parallel(self._flat_blocks, self._members, self._saved, *told)
+        elif self._threads > 1 and (turn := use_threads(self._threads)) is not None:
+            with turn:
+                self._kernel.step_parallel(self._flat_blocks, self._members, self._saved, *told)
         else:
             self._kernel.step(0, len(self._blocks), self._flat_blocks, self._members, self._saved[0], *told)
 

@@ -78,7 +78,7 @@ class Case:
 class Train(Case):
     """A training; eight checkpoints."""
 
-    name, unit = "train", "samples (of 8,192; a checkpoint is 1,024)"
+    name, unit = "train", "of 8,192 samples (a checkpoint is 1,024)"
     most = 1024 + 256  # an update that is on its way has no row in the log
 
     def start(self, folder: Path) -> list[str]:
@@ -121,7 +121,7 @@ class Train(Case):
 class Tune(Case):
     """A search of three trials."""
 
-    name, unit, most = "train --tune", "trial (of 3)", 1.0
+    name, unit, most = "train --tune", "of 3 trials", 1.0
 
     def start(self, folder: Path) -> list[str]:
         """The same whenever."""
@@ -153,7 +153,7 @@ class Tune(Case):
 class Evaluate(Case):
     """A comparison, over an earlier one."""
 
-    name, unit = "evaluate", "of what was written"
+    name, unit = "evaluate", "files of before"
 
     def prepare(self, folder: Path) -> None:
         """With a comparison of before."""
@@ -173,7 +173,7 @@ class Evaluate(Case):
 class Submit(Case):
     """The protocol, onto a board with an entry."""
 
-    name, unit, most = "evaluate --submit", "of what was written", 0.0
+    name, unit, most = "evaluate --submit", "entries of before", 0.0
     _board = "board.jsonl"
 
     def prepare(self, folder: Path) -> None:
@@ -198,7 +198,7 @@ class Submit(Case):
 class Ship(Case):
     """Two seeds, over a policy that ships already."""
 
-    name, unit = "agents.studies.ship", "of what was written"
+    name, unit = "agents.studies.ship", "files of before"
 
     def prepare(self, folder: Path) -> None:
         """Two run folders of policies that nobody trained."""
@@ -247,7 +247,7 @@ def plant(rig: Rig) -> Counted:
 class Run(Case):
     """An experiment, sample by sample against the clock."""
 
-    name, unit, most, promises = "run", "sample (of 1,016)", 1.0, False
+    name, unit, most, promises = "run", "of 1,016 samples", 1.0, False
 
     def prepare(self, folder: Path) -> None:
         """With a rig file."""

@@ -110,6 +110,18 @@ def test_code_of_other_sources_is_replaced_in_silence(place):
     assert path.read_bytes()[:64] == content[:64]
 
 
+def test_code_of_another_processor_is_left_to_it(place, monkeypatch):
+    """A folder that two machines share: each finds its own."""
+    own = type(fresh().run.targetctx.codegen()).magic_tuple
+    called()
+    with monkeypatch.context() as other:
+        another = "numba.core.codegen.CPUCodegen.magic_tuple"
+        other.setattr(another, lambda self: (own(self)[0], "another", "+avx512,+amx"))
+        assert [called(), called()] == [(42, 0), (42, 1)]
+    assert called() == (42, 1)
+    assert len(list(place.iterdir())) == 2
+
+
 def test_functions_with_other_surroundings_have_other_code(place):
     module = fresh()
     assert [module.adder(shift)(1) for shift in (1, 10, 1)] == [2, 11, 2]

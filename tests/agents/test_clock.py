@@ -1,0 +1,55 @@
+"""A clock that is set back: durations are of the clock that cannot be."""
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+
+from agents.running.run import Plan, run
+from agents.running.simulated import SimulatedPlant
+from agents.training import ALGORITHMS, TrainConfig, train
+from agents.vec_env import DuffingVecEnv
+from estimator import Channel, Rig
+
+RIG = Rig(
+    5e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03, noise=5e-6),
+    guess={"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)},
+)  # fmt: skip
+
+
+@pytest.fixture
+def set_back(monkeypatch):
+    """Every look at the clock finds it an hour earlier than the last one."""
+    hours = itertools.count(0, -3600)
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + next(hours))
+    monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * (now + next(hours))))
+    assert time.time() > time.time()
+
+
+def test_a_training_lasts_forward(set_back, tmp_path):
+    small = ALGORITHMS["ppo"](num_envs=8, batch_size=64, hidden=(4,), n_steps=16)
+    found = train(
+        TrainConfig(env="duffing_env/Short-v0", steps=512, output=tmp_path, eval_every=256, hyperparameters=small)
+    )
+    seconds = np.array(found.curve)[:, 1]
+    assert (np.diff(seconds) > 0).all()
+    assert 0 < seconds[0] < found.seconds < 600
+
+
+def test_episodes_last_forward(set_back):
+    envs = DuffingVecEnv("duffing_env/Short-v0", 2, horizon=4)
+    envs.reset()
+    times = [info["episode"]["t"] for _ in range(12) for info in envs.step(np.zeros((2, 1)))[3] if "episode" in info]
+    assert len(times) == 6
+    assert min(times) > 0
+    assert (np.diff(times) >= 0).all()
+
+
+def test_a_run_meets_its_ticks(set_back, tmp_path):
+    found = run(RIG, SimulatedPlant(RIG), tmp_path / "run", Plan("prbs", 40))
+    assert (found.ended, found.exit_status) == ("complete", 0)
+    tick, clock = np.loadtxt(tmp_path / "run/samples.csv", delimiter=",", skiprows=1, usecols=(1, 7), unpack=True)
+    assert (np.diff(tick) > 0).all()
+    assert (np.diff(clock) >= 0).all()

@@ -1,0 +1,129 @@
+"""Threads and processes: environments of their own give what they give one after the other, however they are shared."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+PLAY = """
+import hashlib, os, sys, threading, warnings
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+import duffing_env
+from duffing_env.vector_env import DuffingVectorEnv
+
+def play(rows, seed, threads=1, steps=40):
+    "The digest of all that an environment gave."
+    envs, told = DuffingVectorEnv(rows, threads=threads, horizon=16), hashlib.sha256()
+    rng = np.random.default_rng(seed)
+    envs.reset(seed=seed)
+    for _ in range(steps):
+        for given in envs.step(rng.uniform(-1, 1, (rows, 1)).astype(np.float32))[:4]:
+            told.update(np.ascontiguousarray(given))
+    return told.hexdigest()
+
+def make():
+    return gym.make("duffing_env/Short-v0")
+
+def gather(kind, workers):
+    "All that single environments in a vector of Gymnasium's gave."
+    envs = kind([make] * workers)
+    told = [envs.reset(seed=5)[0]]
+    actions = np.random.default_rng(0).uniform(-1, 1, (40, workers, 1)).astype(np.float32)
+    for action in actions:
+        told += envs.step(action)[:4]
+    envs.close()
+    return [np.array(given) for given in told]
+"""
+
+
+def run(program, **variables):
+    """What a program says on stdout, in a process of its own."""
+    finished = subprocess.run(
+        [sys.executable, "-c", PLAY + program], capture_output=True, text=True, cwd=ROOT, env=os.environ | variables
+    )
+    assert finished.returncode == 0, finished.stderr
+    return finished.stdout.split()
+
+
+@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_sixteen_workers_are_one_process(context, tmp_path):
+    if context == "fork" and not hasattr(os, "fork"):
+        pytest.skip("this system cannot fork")
+    path = tmp_path / "workers.py"  # spawn imports it
+    path.write_text(
+        PLAY + "from functools import partial\nif __name__ == '__main__':\n"
+        "    warnings.simplefilter('ignore', DeprecationWarning)  # of a fork beside threads, since Python 3.12\n"
+        f"    ours = gather(partial(AsyncVectorEnv, context={context!r}), 16)\n"
+        "    assert all(map(np.array_equal, ours, gather(SyncVectorEnv, 16)))\n    print(len(ours))\n"
+    )
+    finished = subprocess.run(
+        [sys.executable, path], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stdout.split() == ["161"]
+
+
+LAYERS = ["default", "workqueue"]
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_eight_threads_with_environments_of_their_own(layer, threads):
+    """Numba's simplest threads end a process that enters them from two of Python's at once."""
+    program = f"""
+found = {{}}
+def work(seed):
+    found[seed] = play(70, seed, {threads})
+workers = [threading.Thread(target=work, args=(seed,)) for seed in range(8)]
+for worker in workers: worker.start()
+for worker in workers: worker.join()
+print(*(found[seed] for seed in range(8)), *(play(70, seed) for seed in range(8)))
+"""
+    told = run(program, NUMBA_THREADING_LAYER=layer, NUMBA_NUM_THREADS="2")
+    assert told[:8] == told[8:]
+    assert len(set(told)) == 8
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+@pytest.mark.parametrize("layer", LAYERS)
+def test_a_fork_after_threads_have_stepped(layer):
+    """GNU's threads end a child that uses them: it is stepped by one thread."""
+    program = """
+expected = play(70, 3, 2)
+warnings.simplefilter('ignore', DeprecationWarning)
+child = os.fork()
+if child == 0:
+    os._exit(0 if play(70, 3, 2) == expected else 1)
+print(os.waitpid(child, 0)[1], play(70, 3, 2) == expected)
+"""
+    assert run(program, NUMBA_THREADING_LAYER=layer, NUMBA_NUM_THREADS="2") == ["0", "True"]
+
+
+@pytest.mark.slow
+def test_three_processes_that_compile_at_once_agree(tmp_path):
+    """With an empty cache, which a fourth then reads."""
+    variables = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", PLAY + "print(play(70, 3))"]
+    running = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=variables)
+        for _ in range(3)
+    ]
+    said = [each.communicate(timeout=300) for each in running]
+    assert [each.returncode for each in running] == [0, 0, 0], said
+    assert {told.strip() for told, _ in said} == set(run("print(play(70, 3))"))
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+    finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=variables)
+    assert finished.stdout == said[0][0]
+    assert finished.stderr == ""
+
+
+def test_threads_are_used_where_they_may_be():
+    """Else the tests above would hold of one thread alone."""
+    told = run("import numba; play(70, 3, 2); print(numba.threading_layer())", NUMBA_NUM_THREADS="2")
+    assert told[0] in ("omp", "tbb", "workqueue")
