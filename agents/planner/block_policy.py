@@ -66,21 +66,19 @@ class BlockPlanner:
         deterministic: bool = False,
     ) -> tuple[npt.NDArray[np.float32], BlockState]:
         """The next inputs of the blocks, which are planned where one is at its end; as `Planner.predict`."""
-        observed, records = np.asarray(observation, dtype=np.float64), self._env.records
-        n, view = len(records), self._planner.view
+        rows, begun = self._planner.asked(observation, state, BlockState, episode_start)
+        records, n, at = self._env.records, len(rows), places(self._planner.view.model)
         if state is None:
             state = BlockState(np.zeros((n, self.block)), np.full(n, self.block))
         plans, played = state.plans.copy(), state.played.copy()
-        if episode_start is not None:
-            played[np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)] = self.block
-        at, rows = places(view.model), observed.reshape(n, -1)
+        played[begun] = self.block
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
         for i in np.flatnonzero(played >= self.block):
             last = self._planner.terms.amplitude * rows[i, at.last_input]
             plans[i] = self._plan(records[i], int(max(1, left[i])), float(last), int(i))
             played[i] = 0
         actions = (plans[np.arange(n), played] / self._planner.terms.amplitude).astype(np.float32)
-        return actions.reshape(*observed.shape[:-1], 1), BlockState(plans, played + 1)
+        return actions.reshape(*np.shape(observation)[:-1], 1), BlockState(plans, played + 1)
 
     def _plan(self, record: FloatArray, left: int, last: float, i: int) -> FloatArray:
         """A block (block,), zeros beyond the end of the episode."""

@@ -40,11 +40,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri, stdtrit
 
+from agents.asked import check_rows, starts
 from agents.planner.imagination import TAILS, Terms
 from agents.planner.motion import View, places, seen, swing_of
 from agents.planner.pursuit import Rule, pursuit
 from agents.planner.search import search
-from estimator.checks import LARGEST, SMALLEST, number, shown
+from estimator.checks import LARGEST, SMALLEST, number, numbers, shown
 from estimator.parameters import FloatArray
 
 
@@ -190,15 +191,10 @@ class Planner:
             The actions in [-1, 1], float32 (n, 1), or (1,) for a single observation; and the next state.
 
         Raises:
-            ValueError: if ``observation`` is not for as many environments as ``env`` has.
+            ValueError: as `asked`.
         """
-        observed = np.asarray(observation, dtype=np.float64)
-        records = self._env.records
-        if observed.ndim not in (1, 2) or observed.size != len(records) * observed.shape[-1]:
-            raise ValueError(
-                f"observation must be of the planner's own {len(records)} environments, but has shape {observed.shape}"
-            )
-        n = len(records)
+        rows, begun = self.asked(observation, state, PlannerState, episode_start)
+        records, n = self._env.records, len(rows)
         k, terms = self.view.model.n_coefficients, self.terms
         if state is None:
             words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
@@ -206,10 +202,8 @@ class Planner:
             state = PlannerState(plans, rates, words, np.zeros(n), np.zeros(n), held)
         plans, rates, words = state.plans.copy(), state.rates.copy(), state.words.copy()
         before, chosen, held = state.last.copy(), state.chosen.copy(), state.held.copy()
-        if episode_start is not None:
-            begun = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), n)
-            plans[begun], rates[begun], before[begun], held[begun] = 0.0, 0.0, 0.0, 0
-        at, rows = places(self.view.model), observed.reshape(n, -1)
+        plans[begun], rates[begun], before[begun], held[begun] = 0.0, 0.0, 0.0, 0
+        at = places(self.view.model)
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
         last = terms.amplitude * rows[:, at.last_input]
         due = np.flatnonzero(held == 0)
@@ -231,7 +225,31 @@ class Planner:
         plans[due], rates[due], words[due] = searched
         chosen[due] = inputs
         actions = (chosen / terms.amplitude).astype(np.float32)
-        return actions.reshape(*observed.shape[:-1], 1), PlannerState(plans, rates, words, last, chosen, held)
+        return actions.reshape(*np.shape(observation)[:-1], 1), PlannerState(plans, rates, words, last, chosen, held)
+
+    def asked(
+        self, observation: npt.ArrayLike, state: Any, kind: type[tuple[Any, ...]], episode_start: npt.ArrayLike | None
+    ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """The observations (n, features) of all environments, and which of them begin an episode (n,).
+
+        Raises:
+            ValueError: for an observation that is not finite, or not one of as many environments as ``env`` has; or a
+                state or ``episode_start`` that does not go with it.
+        """
+        observed, n = numbers("observation", observation), len(self._env.records)
+        least = places(self.view.model).size
+        if observed.ndim not in (1, 2) or observed.shape[-1] < least or observed.size != n * observed.shape[-1]:
+            raise ValueError(
+                f"observation must be of the planner's own {n} environments, with {least} entries each, but has shape "
+                f"{observed.shape}"
+            )
+        if not np.isfinite(observed).all():
+            raise ValueError("observation must be finite, but is not; pass what the environment showed last")
+        if state is not None:
+            if not isinstance(state, kind):
+                raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
+            check_rows("state", len(state[0]), n)
+        return observed.reshape(n, -1), starts(episode_start, n)
 
 
 def _stream(seed: np.random.SeedSequence) -> npt.NDArray[np.uint64]:

@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.asked import check_rows, check_state, starts
 from agents.planner.motion import places, resonances, survey
 from agents.policies.excitations import BAND
-from agents.policies.signals import Limits, check_rows, check_state, limits_of
+from agents.policies.signals import Limits, limits_of
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from estimator.checks import numbers
 from estimator.parameters import SAMPLING_STEP
@@ -112,10 +113,8 @@ class FeedbackPolicy:
         if state is not None:
             check_state(state, 1)
         phase = np.zeros(len(rows)) if state is None else state
-        starts = np.zeros(len(rows), dtype=bool) if episode_start is None else np.atleast_1d(episode_start)
         check_rows("state", len(phase), len(rows))
-        check_rows("episode_start", len(starts), len(rows))
-        phase = np.where(starts, 0.0, phase)
+        phase = np.where(starts(episode_start, len(rows)), 0.0, phase)
         seen = self._look(rows)
         signs = np.where(self._amplitude(*seen) > TURN, -np.sign(seen[1]), self._signs(seen[1], phase))
         # An input of one magnitude has that magnitude as its RMS.

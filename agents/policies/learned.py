@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from agents.asked import check_state, starts
 from agents.policies.foresight import CommonForesight, Foresight
 from agents.policies.imagined import FEATURES
-from agents.policies.signals import check_state
 from estimator.checks import numbers
 from estimator.files import whole_file
 
@@ -237,7 +237,7 @@ class _Memory:
         if hidden.shape != zeros.shape or cell.shape != zeros.shape:
             raise ValueError(f"state must be two arrays of shape {zeros.shape}, but has {hidden.shape}, {cell.shape}")
         if episode_start is not None:
-            kept = ~np.atleast_1d(np.asarray(episode_start, dtype=np.bool_))[:, None]
+            kept = ~starts(episode_start, len(inputs))[:, None]
             hidden, cell = hidden * kept, cell * kept
         gates = inputs @ self.from_input.T + hidden[0] @ self._from_hidden.T + self._bias
         admit, keep, candidate, show = np.split(gates, 4, axis=-1)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from estimator.checks import numbers
+
 
 def own_policy(made: Any, env: Any, seed: int, options: dict[str, Any]) -> Any:
     """The policy that a user's own thing is, or makes; see `agents.policies.make_policy`.
@@ -41,7 +43,7 @@ class _Normalised:
 
     def predict(self, observation: npt.ArrayLike, *how: Any, **named: Any) -> Any:
         """As the model's, of the observation itself."""
-        return self._model.predict(self._normalizer.normalize_obs(np.asarray(observation)), *how, **named)
+        return self._model.predict(self._normalizer.normalize_obs(numbers("observation", observation)), *how, **named)
 
 
 class _Function:
@@ -56,7 +58,7 @@ class _Function:
         self, observation: npt.ArrayLike, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """As `agents.policies.Policy`; actions beyond the limits are cut."""
-        seen = np.asarray(observation, dtype=np.float32)
+        seen = numbers("observation", observation).astype(np.float32)
         rows = np.atleast_2d(seen)
         if self._torch is None:
             chosen = self._function(rows)

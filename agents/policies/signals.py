@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.asked import check_rows, check_state, starts
 from agents.planner.motion import frequency
 from agents.policies.excitations import EXCITATIONS, Draw, draw_recorded
 from estimator.belief import Belief
-from estimator.checks import shown
+from estimator.checks import numbers
 from estimator.parameters import SAMPLING_STEP
 
 # Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
@@ -168,7 +169,7 @@ class SignalPolicy:
             ValueError: `observation` has neither one nor two dimensions, or `state` or `episode_start` is for another
                 number of environments.
         """
-        observed = np.shape(observation)
+        observed = np.shape(observation if isinstance(observation, np.ndarray) else numbers("observation", observation))
         if len(observed) not in (1, 2):
             raise ValueError(
                 "observation must have the shape (features,) or (environments, features), but its "
@@ -182,11 +183,7 @@ class SignalPolicy:
             check_state(state, 2)
             position, signals = state
             check_rows("state", len(position), rows)
-        due = position == self.actions
-        if episode_start is not None:
-            starts = np.atleast_1d(np.asarray(episode_start, dtype=bool))
-            check_rows("episode_start", len(starts), rows)
-            due = due | starts
+        due = (position == self.actions) | starts(episode_start, rows)
         if due.any():
             position = np.where(due, 0, position)
             signals = signals.copy()
@@ -201,21 +198,6 @@ class SignalPolicy:
         if missing > 0:
             self._generators += map(np.random.default_rng, self._seeds.spawn(missing))
         return self.limits.fit(self._draw(self._generators[row], self.samples))
-
-
-def check_state(state: Any, arrays: int) -> None:
-    """Refuse what no policy of so many arrays returned."""
-    parts = state if isinstance(state, tuple) else (state,)
-    if len(parts) != arrays or not all(isinstance(part, np.ndarray) and part.ndim for part in parts):
-        raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
-
-
-def check_rows(name: str, given: int, expected: int) -> None:
-    """Refuse what is for another number of environments than the observation."""
-    if given != expected:
-        raise ValueError(
-            f"{name} is for {given} environments, but observation is for {expected}; pass None when the batch changes"
-        )
 
 
 def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:

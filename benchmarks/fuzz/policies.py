@@ -22,8 +22,9 @@ def calls() -> st.SearchStrategy[Call]:
     env = gym.make("duffing_env/Amplitude-v0")
     observation, _ = env.reset(seed=0)
     signals = [name for name in POLICIES if not name.startswith("efe")]
-    names = [*signals, "ppo/amplitude"]
+    names = [*signals, "efe-myopic", "efe-block-16", "ppo/amplitude"]
     made: dict[str, Any] = {name: make_policy(name, env) for name in names}
+    made["a function"] = make_policy(lambda seen: 0.1 * seen[:, :1])
 
     @st.composite
     def call(draw: st.DrawFn) -> Call:
@@ -38,15 +39,15 @@ def calls() -> st.SearchStrategy[Call]:
             return Call(
                 f"make_policy {name}", lambda: make_policy(name, env, **given), (*given, "options", "seed", "env")
             )
-        name = draw(st.sampled_from(names))
+        name = draw(st.sampled_from(list(made)))
         value = draw(st.one_of(anything, st.just(observation), st.floats().map(lambda x: np.full(22, x))))
-        state = draw(st.one_of(st.none(), st.none(), anything))
+        state, begun = (draw(st.one_of(st.none(), st.none(), anything)) for _ in range(2))
 
         def function() -> str:
-            action, _ = made[name].predict(value, state, deterministic=True)
+            action, _ = made[name].predict(value, state, begun, deterministic=True)
             fine = np.isfinite(action).all() and (np.abs(action) <= 1).all() and action.shape[-1:] == (1,)
             return "" if fine else f"action {action!r}"
 
-        return Call(f"{name}: predict", function, ("observation", "state", "entries"), sound=str)
+        return Call(f"{name}: predict", function, ("observation", "state", "episode_start", "entries"), sound=str)
 
     return call()

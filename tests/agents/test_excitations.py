@@ -286,7 +286,7 @@ def test_feedback_refuses_what_is_no_observation(name):
 
 def test_square_believed_refuses_another_batch():
     policy = make_policy("square-believed")
-    with pytest.raises(ValueError, match="state is for 3 environments, but observation is for 4"):
+    with pytest.raises(ValueError, match="state must be for as many environments as observation, 4, but is for 3"):
         policy.predict(np.zeros((4, 22)), np.zeros(3))
 
 

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -142,12 +143,29 @@ def test_reset_starts_over_and_takes_a_seed():
     np.testing.assert_array_equal(other, play(counting_policy(seed=2), rows=2, steps=8))
 
 
+@pytest.mark.parametrize("name", ["square", "velocity-sign", "efe-myopic", "efe-block-16", lambda seen: seen[:, 0]])
+def test_what_is_no_array_is_refused_by_name(name):
+    env = gym.make("duffing_env/Amplitude-v0")
+    observation, _ = env.reset(seed=0)
+    policy = make_policy(name, env)
+    with pytest.raises(ValueError, match=r"observation must be numbers, but is \[\[1.0\], \[2.0, 3.0\]\]"):
+        policy.predict([[1.0], [2.0, 3.0]])
+    if isinstance(name, str):
+        with pytest.raises(ValueError, match="episode_start must be numbers"):
+            policy.predict(observation, None, [[True], []])
+    if isinstance(name, str) and name.startswith("efe"):
+        with pytest.raises(ValueError, match="state must be what the last call returned, or None, but is 3"):
+            policy.predict(observation, 3)
+        with pytest.raises(ValueError, match="observation must be finite"):
+            policy.predict(np.full_like(observation, np.nan))
+
+
 def test_mismatched_batches_are_refused():
     policy = counting_policy()
     _, state = policy.predict(np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="state is for 2 environments, but observation is for 3"):
+    with pytest.raises(ValueError, match="state must be for as many environments as observation, 3, but is for 2"):
         policy.predict(np.zeros((3, 3)), state)
-    with pytest.raises(ValueError, match="episode_start is for 1 environments"):
+    with pytest.raises(ValueError, match="episode_start must be for as many environments as observation"):
         policy.predict(np.zeros((2, 3)), state, episode_start=[True])
     with pytest.raises(ValueError, match=r"its shape is \(2, 3, 4\)"):
         policy.predict(np.zeros((2, 3, 4)))
