@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 LEFT_TO_TORCH = ("cuda-", "nvidia-", "triton")
 
 # Extras that `make` does not install: one command needs them, and its test is skipped without.
-NOT_LOCKED = ("datasets",)
+NOT_LOCKED = ("datasets", "ray")
 
 
 def environment(version: str) -> Environment:

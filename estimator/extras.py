@@ -12,6 +12,7 @@ EXTRAS = {
     "optuna": "tune",
     "pygame": "human",
     "pyvisa": "instrument",
+    "ray": "ray",
     "sb3_contrib": "train",
     "stable_baselines3": "train",
     "tensorboard": "train",

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from agents.cli import told_in_one_line
-from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, tune
+from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, train_seeds, tune
 from agents.training.family import FAMILY
 
 DESCRIPTION = """Train a policy that chooses the input, and compare it with the reference policies.
@@ -19,6 +19,7 @@ $ duffing-env train --rig rig.toml                     on a rig of your own
 $ duffing-env train --env family                       to play any oscillator
 $ duffing-env train --algo sac --help                  another algorithm
 $ duffing-env train --algo td3 --tune 50               search hyperparameters
+$ duffing-env train --seeds 5 --ray                    five seeds, on a cluster
 $ duffing-env train --resume runs/ppo-amplitude-v0-0   go on after a stop
 """
 
@@ -31,6 +32,10 @@ class Config(TrainConfig):
     """Run folder to go on with after it was stopped; it has its settings in it, so none are taken here."""
     tune: int = 0
     """Trials of a search for hyperparameters, instead of a training; the same command goes on with a search."""
+    seeds: int = 1
+    """Trainings, of the seed and those after it, into OUTPUT/SEED each; the same command goes on with them."""
+    ray: bool = False
+    """Whether seeds, or trials of --tune, are spread over a Ray cluster: that of RAY_ADDRESS, or of this machine."""
     systems: int = 256
     """Systems to compare on afterwards; 0 to skip the comparison."""
 
@@ -38,19 +43,26 @@ class Config(TrainConfig):
         super().__post_init__()
         if self.tune < 0:
             raise ValueError(f"tune must be at least 0, but is {self.tune}")
+        if self.seeds < 1 or (self.seeds > 1 and self.tune):
+            raise ValueError(f"seeds must be at least 1, and 1 in a search, but is {self.seeds}")
+        if self.ray and self.seeds == 1 and not self.tune:
+            raise ValueError("ray spreads several trainings, but there is one; add --seeds or --tune, or leave it out")
         if self.systems != 0 and self.systems < 2:
             raise ValueError(f"systems must be 0 or at least 2, but is {self.systems}; intervals need more than one")
 
     def run(self) -> None:
         """Train, compare, and say where everything is."""
-        from agents.evaluation.comparison import compare, usual_policies
-
         if self.resume is None and self.samples > self.steps:
             each = self.hyperparameters.samples_per_update
             print(f"An update takes {each:,} samples, so {self.samples:,} will be learned from, not {self.steps:,}.")
         if self.tune:
-            best = tune(self, self.tune)
+            best = tune(self, self.tune, on_ray=self.ray)
             print(f"The best hyperparameters are in {best}: duffing-env train --algo {self.algo} --settings {best}")
+            return
+        if self.seeds > 1:
+            for folder in train_seeds(self, self.seeds, on_ray=self.ray):
+                print(f"The run is in {folder}", flush=True)
+            self._compare(f"{self.algo}={folder.parent}/[0-9]*", self, folder.parent)
             return
         if self.resume is None:
             run = train(self)
@@ -59,12 +71,19 @@ class Config(TrainConfig):
                 raise ValueError("resume takes all settings but systems from the run; leave out the others")
             run = resume(self.resume)
         print(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
-        if self.env == FAMILY:
-            print(f"python -m agents.studies.universal --policies {run.folder}")
-        elif self.systems:
-            policies = (str(run.folder), *usual_policies(run.config.env, run.config.options))
-            compare(policies, run.config.env, self.systems, run.config.options, run.folder)
+        self._compare(str(run.folder), run.config, run.folder)
         print(run.folder / "learning_curve.png")
+
+    def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
+        """Compare what was trained with the usual policies."""
+        from agents.evaluation.comparison import compare, usual_policies
+
+        if config.env == FAMILY:
+            print(f"python -m agents.studies.universal --policies {policy}")
+        elif self.systems:
+            compare(
+                (policy, *usual_policies(config.env, config.options)), config.env, self.systems, config.options, folder
+            )
 
 
 def default_config(words: list[str] | None) -> Config:

@@ -11,6 +11,7 @@ from agents.training.algorithms import (
 )
 from agents.training.config import Subject, TrainConfig
 from agents.training.runs import Run, resume, train
+from agents.training.seeds import train_seeds
 from agents.training.tuning import tune
 
 __all__ = [
@@ -26,5 +27,6 @@ __all__ = [
     "TrainConfig",
     "resume",
     "train",
+    "train_seeds",
     "tune",
 ]

@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.cli import RIG_TRACK, JsonOptions, check_track, with_rig
-from agents.results import versions
+from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
 from agents.training.hyperparameters import read_settings, settings_of
 from estimator.extras import need
 from estimator.files import whole_file
+
+#: File of a run folder that says what the run was made from.
+CONFIG = "config.json"
 
 _PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy", "stable-baselines3", "torch")
 
@@ -118,6 +121,20 @@ def describe(config: TrainConfig) -> dict[str, Any]:
     }
 
 
+def claim(file: Path, config: TrainConfig) -> None:
+    """Write what something in the folder of a file is made from; a folder that holds another is refused.
+
+    Raises:
+        ValueError: for a file that says something else.
+    """
+    described = json.loads(json.dumps(describe(config)))
+    before = json.loads(file.read_text()) if file.exists() else described
+    if any(before["config"].get(f.name) != described["config"][f.name] for f in fields(TrainConfig)):
+        raise ValueError(f"output must be a new folder or that of the same command, but {file} is another's")
+    if not file.exists():
+        write_json(file, described)
+
+
 def contrib(config: TrainConfig) -> tuple[str, ...]:
     """sb3-contrib, where the algorithm is of it."""
     return ("sb3_contrib",) if config.algo in ("tqc", "recurrent_ppo") else ()
@@ -126,11 +143,11 @@ def contrib(config: TrainConfig) -> tuple[str, ...]:
 def read_config(folder: Path) -> TrainConfig:
     """The configuration that a run folder was made from; what only a script had in it is left out."""
     try:
-        place = whole_file(folder / "config.json", "resume must be a run folder, with a config.json", 2**20)
+        place = whole_file(folder / CONFIG, "resume must be a run folder, with a config.json", 2**20)
         found = json.loads(place.read_text())["config"]
         known = {f.name: found[f.name] for f in fields(TrainConfig)}
         known |= {name: None if known[name] is None else Path(known[name]) for name in ("output", "settings", "begin")}
         known["hyperparameters"] = settings_of(ALGORITHMS[known["algo"]], known["hyperparameters"])
         return TrainConfig(**known)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"config.json must be that of a run, but that of {folder} is not: {error!r}") from error
+        raise ValueError(f"{CONFIG} must be that of a run, but that of {folder} is not: {error!r}") from error

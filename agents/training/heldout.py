@@ -30,6 +30,12 @@ _SYSTEMS = 128
 _SEED = 0
 
 
+def score_of(folder: Path) -> float:
+    """The score of a finished run, which was evaluated at its end."""
+    *_, last = csv.DictReader((folder / FILE).read_text().splitlines())
+    return float(last[SCORE])
+
+
 class HeldOut:
     """Evaluations on the same systems throughout, in ``evaluations.csv``; the best policy so far is in ``best/``.
 

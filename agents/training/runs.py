@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable
@@ -25,7 +26,7 @@ from agents.training.checkpoints import (
     restore,
     save_checkpoint,
 )
-from agents.training.config import TrainConfig, contrib, describe, read_config
+from agents.training.config import CONFIG, TrainConfig, contrib, describe, read_config
 from agents.training.family import FAMILY
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import track_of
@@ -83,7 +84,7 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     return _Training(config, _run_folder(config), on_evaluation).run()
 
 
-def resume(folder: Path) -> Run:
+def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None) -> Run:
     """Go on with a run that was stopped, from its latest checkpoint, up to the samples that it was to have.
 
     It is then the run that was never stopped, bit for bit: weights, moments of the optimisers, replay buffer, episodes,
@@ -92,23 +93,31 @@ def resume(folder: Path) -> Run:
 
     Args:
         folder: the run folder.
+        on_evaluation: as of `train`.
 
     Raises:
         ValueError: where it is no run folder, or the run is finished.
     """
-    if not (folder / "config.json").is_file():
+    if not (folder / CONFIG).is_file():
         raise ValueError(f"resume must be a run folder, which holds config.json, but is {folder}")
     if (folder / CARD).exists():
         raise ValueError(f"resume must be a run that was stopped, but {folder} is finished; it holds its policy")
-    return _Training(read_config(folder), folder).run()
+    return _Training(read_config(folder), folder, on_evaluation).run()
+
+
+def carry_on(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found: None) -> None:
+    """Train into ``config.output``, or go on with what is there; of a finished run there is nothing to do."""
+    assert config.output is not None
+    if not (config.output / CONFIG).exists():
+        train(config, on_evaluation)
+    elif not (config.output / CARD).exists():
+        resume(config.output, on_evaluation)
 
 
 class _Training:
     """A model, its environments, and what is written on the way."""
 
-    def __init__(
-        self, config: TrainConfig, folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
-    ) -> None:
+    def __init__(self, config: TrainConfig, folder: Path, on_evaluation: OnEvaluation) -> None:
         import torch
 
         self._clock = time.perf_counter()
@@ -133,7 +142,8 @@ class _Training:
         self._held_out = HeldOut(folder, config, begun)
         self._evaluated = on_evaluation
         self._board: Any = None
-        self._description = describe(config)
+        begun_as = folder / CONFIG
+        self._description = json.loads(begun_as.read_text()) if begun_as.exists() else describe(config)
 
     def run(self) -> Run:
         from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
@@ -141,8 +151,8 @@ class _Training:
         from agents.evaluation.figures import figure_of_learning, save
         from agents.training.callbacks import ContinuedCSV
 
-        if not (self._folder / "config.json").exists():
-            write_json(self._folder / "config.json", self._description)
+        if not (self._folder / CONFIG).exists():
+            write_json(self._folder / CONFIG, self._description)
         logs: list[KVWriter] = [ContinuedCSV(self._folder / "progress.csv", self._progress.steps)]
         if self._config.tensorboard:
             self._board = TensorBoardOutputFormat(str(self._folder))
@@ -250,7 +260,7 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
 def _run_folder(config: TrainConfig) -> Path:
     """The folder to write to; one that is named must not hold a run already."""
     if config.output is not None:
-        if (config.output / "config.json").exists():
+        if (config.output / CONFIG).exists():
             raise ValueError(f"output must be a new folder, but {config.output} holds a run; remove it or name another")
         return config.output
     base = Path("runs") / f"{config.algo}-{track_of(config.env).lower()}-{config.seed}"

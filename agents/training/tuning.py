@@ -6,19 +6,19 @@ The search folder holds ``study.log`` (Optuna's journal, of JSON lines), ``trial
 
 from __future__ import annotations
 
-import json
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.results import show, table, write_json
+from agents.results import show, table
 from agents.training.algorithms import as_written
-from agents.training.config import TrainConfig, describe
-from agents.training.heldout import SCORE
+from agents.training.cluster import spread
+from agents.training.config import TrainConfig, claim
+from agents.training.heldout import SCORE, score_of
 from agents.training.hyperparameters import track_of, write_settings
-from agents.training.runs import train
+from agents.training.runs import carry_on
 from estimator.extras import need
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ _EVALUATIONS = 10  # of each trial; after each it may be given up
 _SHOWN = 10
 
 
-def tune(config: TrainConfig, trials: int) -> Path:
+def tune(config: TrainConfig, trials: int, *, on_ray: bool = False) -> Path:
     """Train with many hyperparameters, and write the best.
 
     The first trial has those of the configuration, the others are chosen by a tree-structured Parzen estimator within
@@ -40,17 +40,23 @@ def tune(config: TrainConfig, trials: int) -> Path:
     Args:
         config: of every trial, but for what is searched for.
         trials: how many the search is to have in the end; one that was stopped goes on in the same folder.
+        on_ray: whether trials are tasks on a cluster, as many at once as it has processors, see
+            `agents.training.cluster`; all its nodes must see the folder. What is chosen then depends on which of them
+            are finished first.
 
     Returns:
         The file of the best hyperparameters.
 
     Raises:
-        ModuleNotFoundError: without Optuna.
+        ModuleNotFoundError: without Optuna, or Ray where that is asked for.
         ValueError: where the folder holds another search.
     """
     optuna = _optuna()
+    if on_ray:
+        need("ray")
     folder = config.output or Path("runs") / f"tune-{config.algo}-{track_of(config.env).lower()}-{config.seed}"
-    _claim(folder, config)
+    folder = folder.resolve()
+    claim(folder / "search.json", config)
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # it warns of a trial that a signal ended, with a traceback
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
     study = optuna.create_study(storage=storage, study_name=folder.name, load_if_exists=True, direction="maximize")
@@ -69,42 +75,42 @@ def tune(config: TrainConfig, trials: int) -> Path:
             study.enqueue_trial(trial.params)
     finished = sum(trial.state in (state.COMPLETE, state.PRUNED) for trial in begun)
 
-    def objective(trial: Trial) -> float:
+    def objective(trial: Trial) -> float | None:
+        """The score; None for a trial that was given up."""
+        output = folder / "trials" / f"{trial.number:03d}"
         run = replace(
             config,
             hyperparameters=replace(config.hyperparameters, **config.hyperparameters.suggest(trial)),
-            output=folder / "trials" / f"{trial.number:03d}",
-            checkpoints=1,
+            output=output,
+            checkpoints=_EVALUATIONS,
             eval_every=every,
         )
-        scores: list[float] = []
 
         def report(steps: int, found: dict[str, float]) -> None:
-            scores.append(found[SCORE])
             trial.report(found[SCORE], steps)
             if steps < config.steps and trial.should_prune():
                 raise optuna.TrialPruned
 
-        train(run, report)
-        return scores[-1]
+        try:
+            carry_on(run, report)
+        except optuna.TrialPruned:
+            return None
+        return score_of(output)
 
-    study.optimize(objective, n_trials=max(0, trials - finished))
+    def asked() -> Trial:
+        """The next trial, whose hyperparameters are chosen here, where all that is known is at hand."""
+        trial = study.ask()
+        config.hyperparameters.suggest(trial)
+        return trial
+
+    left = (asked() for _ in range(trials - finished))
+    for trial, score in spread(objective, left) if on_ray else ((trial, objective(trial)) for trial in left):
+        study.tell(trial, score, state=state.PRUNED if score is None else state.COMPLETE)
     best = replace(config.hyperparameters, **study.best_params)
     comment = f"{config.algo}, trial {study.best_trial.number} of {folder}: {SCORE} {study.best_value:.3f} nat"
     write_settings(folder / BEST, config.env, best, comment)
     _print_table(study)
     return folder / BEST
-
-
-def _claim(folder: Path, config: TrainConfig) -> None:
-    """Write what the search is made from; a folder that holds a search of something else is refused."""
-    described = json.loads(json.dumps(describe(config)))
-    file = folder / "search.json"
-    before = json.loads(file.read_text()) if file.exists() else described
-    if any(before["config"][f.name] != described["config"][f.name] for f in fields(TrainConfig)):
-        raise ValueError(f"output must be a new folder or that of the same search, but {folder} holds another search")
-    if not file.exists():
-        write_json(file, described)
 
 
 def _print_table(study: Study) -> None:

@@ -36,6 +36,7 @@ REFERENCE = {
         "agents.training.TrainConfig",
         "agents.training.train",
         "agents.training.resume",
+        "agents.training.train_seeds",
         "agents.training.tune",
         "agents.training.PPOSettings",
         "agents.training.SACSettings",

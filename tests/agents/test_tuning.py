@@ -59,7 +59,7 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
     assert "3 trials to the end, 0 given up" in printed
     rows = [line.split()[0] for line in printed.splitlines() if re.match(r"\d+ +\d", line)][-3:]
     assert [int(row) for row in rows] == sorted(found, key=lambda number: -found[number])
-    with pytest.raises(ValueError, match="output must be a new folder or that of the same search"):
+    with pytest.raises(ValueError, match="output must be a new folder or that of the same command"):
         tune(tiny(folder, seed=1), 4)
 
 
@@ -68,7 +68,8 @@ def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch):
         report(run.steps, {"log_posterior_gain": 1.0})
 
     folder = tmp_path / "search"
-    monkeypatch.setattr("agents.training.tuning.train", stand_in)
+    monkeypatch.setattr("agents.training.tuning.carry_on", stand_in)
+    monkeypatch.setattr("agents.training.tuning.score_of", lambda output: 1.0)
     tune(tiny(folder), 1)
     journal = folder / "study.log"
     lines = journal.read_text().splitlines()
@@ -91,7 +92,8 @@ def test_trials_below_the_median_are_given_up(tmp_path, optuna, monkeypatch):
             report(steps, {"log_posterior_gain": score})
         ended.append(run.output.name)
 
-    monkeypatch.setattr("agents.training.tuning.train", fake)
+    monkeypatch.setattr("agents.training.tuning.carry_on", fake)
+    monkeypatch.setattr("agents.training.tuning.score_of", lambda output: -float(output.name))
     tune(tiny(tmp_path / "search", steps=1000), 8)
     assert ended == ["000", "001", "002", "003", "004"]
 

@@ -1,0 +1,89 @@
+"""Several seeds of one recipe: each is the training of that seed alone, wherever it is trained."""
+
+import importlib.util
+import json
+from dataclasses import replace
+
+import pytest
+
+from agents.commands.train import main
+from agents.training import PPOSettings, TrainConfig, train, train_seeds, tune
+from agents.training.seeds import carry_on
+
+ENV = "duffing_env/Short-v0"
+TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
+
+needs_ray = pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None, reason="ray is not installed here; make compat runs this one"
+)
+
+
+def config(output, **settings):
+    return TrainConfig(env=ENV, steps=512, checkpoints=2, output=output, hyperparameters=TINY, **settings)
+
+
+def weights(folder):
+    return (folder / "policy.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("on_ray", [False, pytest.param(True, marks=[needs_ray, pytest.mark.filterwarnings("ignore")])])
+def test_each_seed_is_the_training_of_that_seed_alone(tmp_path, on_ray):
+    folders = sorted(train_seeds(config(tmp_path / "all", seed=3), 2, on_ray=on_ray))
+    assert folders == [tmp_path / "all" / "3", tmp_path / "all" / "4"]
+    for folder in folders:
+        alone = train(config(tmp_path / f"alone-{folder.name}", seed=int(folder.name))).folder
+        assert weights(folder) == weights(alone)
+        card = json.loads((folder / "policy.json").read_text())
+        assert (card["config"]["seed"], card["command"]) == (int(folder.name), json.loads(
+            (alone / "policy.json").read_text())["command"])  # fmt: skip
+
+
+def test_the_same_call_goes_on_and_another_is_refused(tmp_path, monkeypatch):
+    carried = []
+    monkeypatch.setattr("agents.training.seeds.carry_on", lambda run: carried.append(run) or carry_on(run))
+    assert len(list(train_seeds(config(tmp_path), 1))) == 1
+    before = (tmp_path / "0" / "policy.json").stat().st_mtime_ns
+    assert len(list(train_seeds(config(tmp_path), 2))) == 2
+    assert (tmp_path / "0" / "policy.json").stat().st_mtime_ns == before
+    assert [run.seed for run in carried] == [0, 0, 1]
+    with pytest.raises(ValueError, match=r"output must be a new folder or that of the same command, but .*0/config"):
+        list(train_seeds(replace(config(tmp_path), reward="fisher"), 2))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--ray"], "ray spreads several trainings, but there is one"),
+        (["--seeds", "0"], "seeds must be at least 1, and 1 in a search, but is 0"),
+        (["--seeds", "2", "--tune", "2"], "seeds must be at least 1, and 1 in a search, but is 2"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(words, message, capsys):
+    with pytest.raises(SystemExit):
+        main("train", words)
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None if name == "ray" else name)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'duffing-env\[ray\]'"):
+        list(train_seeds(config(tmp_path), 2, on_ray=True))
+
+
+@needs_ray
+@pytest.mark.filterwarnings("ignore")
+def test_a_search_on_ray_has_all_its_trials(tmp_path):
+    pytest.importorskip("optuna", reason="Optuna is not installed; it is the extra tune")
+    best = tune(config(tmp_path / "search"), 5, on_ray=True)
+    assert best.read_text().startswith("# ppo, trial ")
+    assert len(list((tmp_path / "search" / "trials").iterdir())) == 5
+
+
+@needs_ray
+@pytest.mark.filterwarnings("ignore")
+def test_what_a_task_raises_is_told_as_it_is(tmp_path):
+    checkpoint = tmp_path / "0" / "checkpoints" / "000000256"
+    checkpoint.mkdir(parents=True)
+    (checkpoint / "training.json").write_text("{")
+    with pytest.raises(ValueError, match=r"checkpoint must hold a sound training.json"):
+        list(train_seeds(config(tmp_path), 2, on_ray=True))
