@@ -255,6 +255,10 @@ class Filter:
         for name, records in (("records", given["records"][alive]), ("first", given["first"][None])):
             for record in records:
                 check_record(name, self.model, record, _ROUNDING)
+        if self.members > 1:  # their moments together may overflow, or vanish, where none of them does
+            side = side_by_side(given["records"], self._loop.lanes)
+            _, record = mixture(side, weights, len(self.model.names))
+            check_record("records", self.model, record, _ROUNDING)
         for name in ("weights", "first", "walk", "begun"):
             setattr(self, f"_{name}", given[name])
         self._inputs[:-1], self._outputs[:-1] = given["inputs"], given["outputs"]

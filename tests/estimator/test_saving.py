@@ -133,6 +133,15 @@ def test_restore_is_all_or_nothing(kind):
     np.testing.assert_array_equal(estimator.belief.record, other.belief.record)
 
 
+def test_members_that_are_no_belief_together_are_refused():
+    estimator = KINDS["ensemble"]()
+    estimator.run(*record(12))
+    arrays = estimator.arrays()
+    arrays["records"] *= 1e300
+    with pytest.raises(ValueError, match="records must be finite"):
+        estimator.restore(arrays)
+
+
 def test_an_ensemble_without_some_members_comes_back(tmp_path):
     estimator = KINDS["ensemble"]()
     estimator.run(*record())
