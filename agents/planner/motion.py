@@ -194,8 +194,8 @@ class Swing(NamedTuple):
             limit is out of reach, too.
         pace: samples that a planned input is held for, so that a plan of some moves looks some periods ahead also
             where there are many samples in a period.
-        shaken: variance by which process noise moves the oscillator in a quarter of a period, in parts of what it does
-            to the first sensor in a sample, less that sample's own. Nothing done within this time takes it back.
+        shaken: variance by which process noise moves the first sensor in a quarter of a period, in parts of what it
+            does to the displacement in a sample, less that sample's own. Nothing done within this time takes it back.
         taught: (K, K) the mean of φ φᵀ over the samples, with φ the derivatives by the coefficients of what the first
             sensor shows a sample later.
     """
@@ -217,6 +217,9 @@ def _swinger(view: View) -> Any:
     n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
     u, shown, velocity = at["INPUT"], at["SHOWN"], at["VELOCITY"]
     phi = at[f"PHI_{next(iter(view.model.coefficients))}"]
+    # What pumps is a push along the motion itself: along what an accelerometer sees rise, it would brake.
+    rate, states = (view.model.rates or ("",))[0], list(view.model.states)
+    velocity = at[rate] if rate in states else velocity
 
     @kernel(kind=f"{view.model.name}_{view.model.digest}_{view.degree}_{view.lag}")
     def swing(means, max_input, limit, peaks, taught):
@@ -271,6 +274,6 @@ def swing_of(view: View, prior_means: npt.ArrayLike, max_input: float, limit: fl
     keeps = np.array([x == sensor or (not model.is_continuous and move == sensor) for x, move in moves])
     keeps |= (sizes <= 0) | (peak <= 0)
     scales = limit * np.divide(sizes, peak, out=np.ones(model.n_states), where=~keeps)
-    # Kicks of the velocity, of variance 3 a sample, after a quarter period 2π/4ω: 3 (t/2ω²).
-    shaken = max(0.0, 3.0 * period**3 / (32.0 * np.pi**2) - 1.0)
+    # Kicks of the velocity, of variance 3 a sample, after a quarter period 2π/4ω: 3 (t/2ω²), of the displacement.
+    shaken = max(0.0, 3.0 * period**3 / (32.0 * np.pi**2) - 1.0) * float(limit / scales[0]) ** 2
     return Swing(scales, max(1, round(period / _MOVES)), float(shaken), taught)

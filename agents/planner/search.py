@@ -176,7 +176,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                     W[U + j] = choose(b % _CHOICES, W[U + j], terms)
                 for _ in range(task.pace):
                     advance(W, task.record, terms)
-                appraise(W, task.M, np.sqrt(task.left - (h + 1) * task.pace))
+                appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
                 for j in range(min(LANES, count - b // _CHOICES * LANES)):
                     cell = place(W[j], terms.scales[0], cells, right)
                     if is_plane:
@@ -222,7 +222,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the plan's score [nats]."""
         candidates, last = memory.candidates, lasts[0]
         cells, pace = _CELLS, min(terms.pace, left)
-        steps = min(len(best), left // pace)
+        steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
             cells, steps, rounds = _LATE_CELLS, min(steps, _LATE_HORIZON), _LATE_ROUNDS * rounds
         M = np.zeros((k, k))
@@ -249,7 +249,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                 change(candidates[j], steps, terms.amplitude, words)
                 bound(candidates[j], steps, last, terms)
             follow(W, task, candidates)
-            appraise(W, M, np.sqrt(left - steps * pace))
+            appraise(W, M, np.sqrt(max(0, left - steps * pace)))
             for j in range(LANES):
                 if W[SCORE + j] > score:
                     score = W[SCORE + j]

@@ -201,6 +201,19 @@ def test_the_map_measures_every_state_by_its_size_at_the_limit():
     assert swing_of(View(decay), [0.3], 1.0, 2.0).scales == [2.0]
 
 
+def test_other_sensors_see_the_same_swing():
+    omega = 2 * np.pi / 40
+    means = [omega**2, 0.0, 0.02, 0.002]
+    swings = [
+        swing_of(View(duffing(sensor=sensor)), means, 1.0, 0.6 * omega**order)
+        for order, sensor in enumerate(("displacement", "velocity", "acceleration"))
+    ]
+    assert {swing.pace for swing in swings} == {round(40 / 9)}
+    for order, swing in enumerate(swings):
+        np.testing.assert_allclose(swing.scales, [0.6, 0.6 * omega], rtol=0.15)
+        np.testing.assert_allclose(swing.shaken, swings[0].shaken * omega ** (2 * order), rtol=0.4)
+
+
 @pytest.mark.slow  # seconds of compilation
 def test_under_a_budget_plans_follow_the_differential_equation_too():
     options = {"horizon": 128}
