@@ -25,6 +25,7 @@ from scipy.special import ndtr, stdtrit
 
 from agents.planner.imagination import TAILS, Terms
 from agents.planner.motion import View, places, survey, swing_of
+from agents.planner.motion import seen as seen_part
 from agents.policies.imagined import BOUND, FEATURES, Ahead, imaginer
 from agents.policies.prospects import EXPECTED, MARGIN, Outlook, feature_names, look_at
 from duffing_env.experiment import Experiment
@@ -37,13 +38,12 @@ from estimator.parameters import FloatArray
 _DRIVE, _DRIVE_SPAN = 0.06, 0.1
 
 #: An oscillator that is within this part of the limit is at rest; it is pushed as if it moved by so much.
-_REST, _NUDGE = 0.007, 0.05
+REST, NUDGE = 0.007, 0.05
 
 #: A push alone changes the displacement by no more than half of this part of its limit in a move.
-_LEAP = 0.5
+_LEAP = 1.0
 
-#: Features of the free motion.
-_FREE = [FEATURES.index(f"free_{t}") for t in (1, 2, 3)]
+THRIFT = FEATURES.index("thrift")
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Sight:
         features: (n, features) float32 what the network sees.
         safe: (n, 3) whether a push up, none, a push down need not lead beyond the limit.
         signs: (n,) -1.0 where the observation was turned over.
-        motions: (n,) the input that is all of the motion, upright.
+        motions: (n,) the input that is all of the motion, upright; zeros where no action is a drive.
     """
 
     features: npt.NDArray[np.float32]
@@ -173,7 +173,7 @@ class Foresight:
             states = view.features[:, first : first + self._view.model.n_states] / sizes
             at_rest_gain = survey(self._view.model, outlook.center, np.zeros(self._view.model.n_states)).gains[0]
             nudge = np.where(
-                np.abs(states).max(axis=1) < _REST, _NUDGE * outlook.max_output / abs(at_rest_gain), view.motions
+                np.abs(states).max(axis=1) < REST, NUDGE * outlook.max_output / abs(at_rest_gain), view.motions
             )
         return acted(choices, view, nudge, self._outlook.max_input)
 
@@ -181,10 +181,12 @@ class Foresight:
 class CommonForesight:
     """What a policy for all oscillators looks with in an environment, single or vector, of whatever model.
 
-    What it sees is `agents.policies.imagined`; nothing of it is of the systems that a policy was trained on. So with
-    that alone a policy plays any environment. Beside the observation itself it tells more of one model, and a policy
-    plays environments of that. Outputs keep `agents.policies.prospects.MARGIN` standard deviations from the limit;
-    where noises are weighed, as many as make the same chance under Student's t.
+    What it sees is `agents.policies.imagined`, of the environment's beliefs as the planner reads them; nothing of it is
+    of the systems that a policy was trained on. So with that alone a policy plays any environment. Beside the
+    observation itself it tells more of one model, and a policy plays environments of that. Outputs keep
+    `agents.policies.prospects.MARGIN` standard deviations from the limit; where noises are weighed, as many as make the
+    same chance under Student's t. On a rig the limit is lower by what a swing at it can hide between two samples. An
+    action is a push, where the energy is limited in proportion to what is left of it.
 
     Args:
         env: the unwrapped environment.
@@ -205,16 +207,16 @@ class CommonForesight:
         setup, prior, self._view = experiment.setup, experiment.believed, View.of(experiment)
         center = prior.coefficients_mean
         swing = swing_of(self._view, center, setup.max_input, setup.max_output)
-        process, sensor = (float(rate / shape) for shape, rate in (prior.noises[:2], prior.noises[2:4]))
-        rate = swing.taught / (process + sensor)
+        rate = swing.taught / sum(float(rate / shape) for shape, rate in (prior.noises[:2], prior.noises[2:4]))
         gain = abs(survey(self._view.model, center, np.zeros(self._view.model.n_states)).gains[0]) * swing.pace**2
         push = min(setup.max_input, _LEAP * setup.max_output / gain)
-        weighs = experiment.noise_hypotheses != 1 and getattr(experiment, "rig", None) is None
-        self._ahead = Ahead(center, 1.0 / setup.inverse_std, push, process, sensor, setup.horizon, setup.budget, rate)
+        of_rig = getattr(experiment, "rig", None) is not None
+        weighs = experiment.noise_hypotheses != 1 and not of_rig
+        self._ahead = Ahead(push, setup.horizon, setup.budget, rate)
         self._terms = Terms(
             setup.max_input,
             np.inf,
-            setup.max_output,
+            setup.max_output * (seen_part(prior, float(swing.scales[0])) if of_rig else 1.0),
             float(-stdtrit(TAILS, ndtr(-MARGIN)) if weighs else MARGIN),
             np.zeros(len(center)),
             swing.scales,
@@ -224,8 +226,7 @@ class CommonForesight:
         at, model = places(self._view.model), self._view.model
         odd = (*range(at.state, at.state + model.n_states), at.last_input)
         self._odd = (*odd, *range(at.last_output, at.last_output + model.n_outputs))
-        self._own = own
-        self._nudge, self._push = _NUDGE * setup.max_output / gain, push / setup.max_input
+        self._own, self._env, self._push = own, env, push / setup.max_input
 
     def to_tensors(self) -> dict[str, FloatArray]:
         """Nothing: all of it is taken from the environment at hand."""
@@ -233,7 +234,7 @@ class CommonForesight:
 
     def describe(self) -> dict[str, Any]:
         """As `Foresight.describe`."""
-        return {"is_common": True}
+        return {"is_common": True, "reads_belief": True}
 
     @property
     def observation_size(self) -> int:
@@ -250,35 +251,39 @@ class CommonForesight:
         """As `Foresight.to_come`."""
         return FEATURES.index("to_come")
 
-    @property
-    def is_drive(self) -> bool:
-        """Whether an action is how hard to push along the motion."""
-        return bool(np.isfinite(self._ahead.energy))
-
     def look(self, observations: npt.ArrayLike) -> Sight:
-        """What observations (n, entries) look like."""
-        seen = np.ascontiguousarray(observations, dtype=np.float32)
+        """What the environment's beliefs look like, which it has just shown in observations (n, entries).
+
+        Raises:
+            ValueError: for observations that are not of as many environments.
+        """
+        seen, records = np.ascontiguousarray(observations, dtype=np.float32), self._env.records
+        if len(seen) != len(records):
+            raise ValueError(
+                f"observation must be of the policy's own {len(records)} environments, but is of {len(seen)}"
+            )
+        return self._seen(seen, records)
+
+    def _seen(self, seen: npt.NDArray[np.float32], records: FloatArray) -> Sight:
+        """What beliefs look like."""
         n = len(seen)
         features, safe = np.empty((n, len(FEATURES)), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
-        signs, motions = np.empty(n), np.empty(n)
-        imaginer(self._view)(seen, self._ahead, self._terms, features, safe, signs, motions)
+        signs = np.empty(n)
+        imaginer(self._view)(records, seen, self._ahead, self._terms, features, safe, signs)
         if self._own:
             upright = np.clip(seen, -BOUND, BOUND)
             upright[:, self._odd] *= signs[:, None].astype(np.float32)
             features = np.concatenate([features, upright], axis=1)
-        return Sight(features, safe, signs, motions)
+        return Sight(features, safe, signs, np.zeros(n))
 
     def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
         """As `Foresight.act`."""
-        if self.is_drive:
-            at_rest = np.abs(view.features[:, _FREE]).max(axis=1) < _REST
-            motions = np.where(at_rest, self._nudge, view.motions)
-            return acted(choices, view, motions, self._terms.amplitude, self._push)
-        return acted(self._push * np.asarray(choices, dtype=np.float64), view, None, self._terms.amplitude, self._push)
+        pushes = self._push * np.minimum(1.0, self._ahead.haste * view.features[:, THRIFT])
+        return acted(pushes * np.asarray(choices), view, None, self._terms.amplitude, pushes)
 
 
 def acted(
-    choices: npt.ArrayLike, view: Sight, motions: FloatArray | None, max_input: float, push: float = 1.0
+    choices: npt.ArrayLike, view: Sight, motions: FloatArray | None, max_input: float, push: npt.ArrayLike = 1.0
 ) -> npt.NDArray[np.float32]:
     """The actions (n, 1) of choices (n,); where there are ``motions`` (n,), a choice drives along them.
 
@@ -287,10 +292,10 @@ def acted(
     chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
     if motions is not None:
         chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / max_input, -1.0, 1.0)
-    up, none, down = view.safe.T
-    chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -push), chosen)
-    chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, push), chosen)
-    chosen = np.where((chosen == 0) & ~none, np.where(up, push, -push), chosen)
+    (up, none, down), most = view.safe.T, np.asarray(push)
+    chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -most), chosen)
+    chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, most), chosen)
+    chosen = np.where((chosen == 0) & ~none, np.where(up, most, -most), chosen)
     actions: npt.NDArray[np.float32] = (chosen * view.signs).astype(np.float32)[:, None]
     return actions
 

@@ -1,6 +1,6 @@
 """What the beliefs of all oscillators have in common: what they expect of simple ways to go on, imagined exactly.
 
-From an observation the believed oscillator is imagined for `HORIZONS`[-1] moves, each held for as many samples as
+From the belief the oscillator is imagined for `HORIZONS`[-1] moves, each held for as many samples as
 `agents.planner.motion.Swing` says. The first move is a push up, none, or a push down; then follows one of
 
 - the eight signs of the next three pushes, and from there on pushes along the motion, but against it where they would
@@ -11,15 +11,11 @@ From an observation the believed oscillator is imagined for `HORIZONS`[-1] moves
 All of these thirty ways lie side by side in the lanes of one block, and are imagined as the planner imagines its own:
 by belief propagation (`agents.planner.imagination`), so that what one sample teaches is not counted again by the next,
 and with what the rest of the episode will bring anyway. What a way is worth is in nats known at the end.
-
-An observation does not hold the covariance of the state, nor that of state and coefficients. They are taken to be those
-of a state that was just seen, and nothing.
 """
 
 from __future__ import annotations
 
 from functools import cache
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,7 +36,7 @@ FIRST_INPUTS = ("up", "none", "down")
 
 #: What all observations become.
 FEATURES = (
-    "log_std_mean", "log_std_max", "last_input", "last_output", "log_gamma", "log_xi", "time_left", "budget_left",
+    "log_std_mean", "log_std_max", "last_input", "last_output", "log_gamma", "log_xi", "time_left", "thrift",
     *(f"{c}_{way}_{h}" for c in CONTINUATIONS for h in HORIZONS for way in ("up", "none")),
     *(f"{c}_peak_{first}" for c in CONTINUATIONS for first in FIRST_INPUTS),
     "free_1", "free_2", "free_3", "pushed_1", "pushed_2", "brings", "to_come",
@@ -57,87 +53,52 @@ _CODES = (1 << _TRIED) + 2
 #: parts of the limit.
 _IN_REACH, _TURN = 8, 0.95
 
-#: Covariances of float32 correlations are made positive definite by this much.
-_RIDGE = 1e-6
-
-#: A push lasts at most so many times longer than the energy that is left allows for the samples that are left.
-_THRIFT = 3.0
+#: Where the energy is limited a push has at most so many times the size that what is left would last for to the end.
+_HASTE = 2.0
 
 
 class Ahead(NamedTuple):
-    """What an observation is relative to, and what is ahead.
+    """What is ahead.
 
     Attributes:
-        center: (K,) prior means of the coefficients.
-        std: (K,) their standard deviations.
-        push: size of a push; no more than what moves the first sensor by a part of its limit in a move.
-        process: variance of the process noise that the prior is centred at.
-        sensor: the same of the first sensor's noise.
+        push: largest push; no more than what moves the first sensor by a part of its limit in a move.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
         rate: (K, K) information about the coefficients that a sample brings.
+        haste: `_HASTE`.
     """
 
-    center: FloatArray
-    std: FloatArray
     push: float
-    process: float
-    sensor: float
     samples: float
     energy: float
     rate: FloatArray
+    haste: float = _HASTE
 
 
 @cache
 def imaginer(view: View) -> Any:
-    """``look(observations, ahead, terms, features, safe, signs, motions)``: what n observations of a model become.
+    """``look(records, observations, ahead, terms, features, safe, signs)``: what n beliefs of a model become.
 
-    - ``observations`` (n, entries) float32;
+    - ``records`` (n, size): the beliefs, as `estimator.Belief` keeps them;
+    - ``observations`` (n, entries) float32, as they were shown with them;
     - ``ahead``: `Ahead`; ``terms``: `agents.planner.imagination.Terms`;
     - ``features`` (n, len(FEATURES)) float32, receives the features, upright, all finite and at most `BOUND` in size;
     - ``safe`` (n, 3) bool, receives which first moves need not lead beyond the limit; one of them is the safest;
-    - ``signs`` (n,) receives -1.0 where up and down changed places, so that the motion is upwards without input;
-    - ``motions`` (n,) receives what an input that is all of the motion in two samples would be, upright, by the pace.
+    - ``signs`` (n,) receives -1.0 where up and down changed places, so that the motion is upwards without input.
     """
     model = view.model
     size, _, U, SCORE, begin, _, advance, appraise, _ = mind(*view)
     found, at, place = motion(*view), places(model), imagination(*view).layout
-    row, sense, glance, step = found.layout, found.sense, found.glance, found.step
+    row, sense, glance = found.layout, found.sense, found.glance
     shown, spread = place["SHOWN"] * LANES, place["SPREAD"] * LANES
-    n, k, width, n_record = model.n_states, model.n_coefficients, len(row), len(belief_names(model))
-    d, n_outputs, noise = n + k, model.n_outputs, belief_names(model).index("GAMMA_SHAPE")
-    u, now, velocity, gain, later = (row[name] for name in ("INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN"))
-    last, older = row["LAST_INPUT"], row["OLDER_INPUT"]
+    n, k, width, noise = model.n_states, model.n_coefficients, len(row), belief_names(model).index("GAMMA_SHAPE")
+    d = n + k
+    u, now, velocity, later = (row[name] for name in ("INPUT", "NOW", "VELOCITY", "SHOWN"))
+    last = row["LAST_INPUT"]
     # An array, because an empty tuple has no type.
     olders = np.array([place[x] * LANES for x in ("LAST_INPUT", "OLDER_INPUT") if x in place], dtype=np.int64)
-    pairs = tuple(combinations(range(k), 2))
     kind = f"{model.name}_{model.digest}_{view.degree}_{view.lag}"
     inner, entry = part(kind), kernel(kind=kind)
-
-    @inner
-    def believe(seen, ahead, terms, record, P):
-        """Put what an observation tells of the belief into a record; the coefficients' covariance also into ``P``."""
-        for a in range(k):
-            record[n + a] = ahead.center[a] + ahead.std[a] * seen[at.mean + a]
-            std = ahead.std[a] * np.exp(seen[at.log_std + a])
-            P[n + a, n + a] = (1.0 + _RIDGE) * std * std
-        for p in range(len(pairs)):
-            a, b = pairs[p]
-            std = np.sqrt(P[n + a, n + a] * P[n + b, n + b]) / (1.0 + _RIDGE)
-            P[n + a, n + b] = seen[at.correlation + p] * std
-        process = ahead.process * np.exp(-seen[at.noise])
-        sensor = ahead.sensor * np.exp(-seen[at.noise + 1])
-        for a in range(n):
-            record[a] = terms.limit * seen[at.state + a]
-            P[a, a] = 0.5 * (process + sensor) * (terms.scales[a] / terms.limit) ** 2
-        to = d
-        for a in range(d):
-            for b in range(a, d):
-                record[to] = P[a, b]
-                to += 1
-        for i in range(1 + n_outputs):
-            record[to + 2 * i] = 1.0
-            record[to + 2 * i + 1] = sensor if i else process
 
     @inner
     def along(W, j, still, push, terms):
@@ -179,32 +140,23 @@ def imaginer(view: View) -> Any:
         return found
 
     @entry
-    def look(observations, ahead, terms, features, safe, signs, motions):
-        W, still, record, P = np.zeros(size), np.zeros(width), np.zeros(n_record), np.zeros((d, d))
+    def look(records, observations, ahead, terms, features, safe, signs):
+        W, still = np.zeros(size), np.zeros(width)
         M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(LANES)
         brought = np.empty((len(HORIZONS), LANES))
         free = np.empty((3, 3))
         factorise(ahead.rate, M)
         for i in range(len(observations)):
-            seen, told = observations[i], features[i]
-            believe(seen, ahead, terms, record, P)
+            record, seen, told = records[i], observations[i], features[i]
             lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
             copy(still, 0, record, d)
-            still[last] = still[older] = lasts[0]
-            sense(still)
-            velocity_now, place_now, gain_now = still[velocity], still[now], still[gain]
-            still[u] = 0.0
-            step(still)
-            motions[i] = (velocity_now + still[later] - place_now) / terms.pace
-            motions[i] *= gain_now / max(gain_now * gain_now, 1e-300)
-            copy(still, 0, record, d)
-            still[last] = still[older] = lasts[0]
-            left, push = max(1.0, seen[at.time_left] * ahead.samples), ahead.push
-            share = seen[at.time_left]
+            share, thrift = seen[at.time_left], 1.0
             if ahead.energy < np.inf:
                 # What is still to come takes time and energy.
+                left = max(1.0, share * ahead.samples)
                 share = 0.5 * (share + seen[at.budget_left])
-                push = min(push, _THRIFT * np.sqrt(max(0.0, seen[at.budget_left]) * ahead.energy / left))
+                thrift = min(1.0, np.sqrt(max(0.0, seen[at.budget_left]) * ahead.energy / left) / ahead.push)
+            push = ahead.push * min(1.0, ahead.haste * thrift)
             begin(W, record, lasts)
             appraise(W, none, 0.0)
             known = W[SCORE]
@@ -231,7 +183,6 @@ def imaginer(view: View) -> Any:
                     h += 1
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
             signs[i] = sign
-            motions[i] *= sign
             up, down = (0, 2) if sign > 0.0 else (2, 0)
             mean = widest = seen[at.log_std]
             for a in range(1, k):
@@ -240,7 +191,7 @@ def imaginer(view: View) -> Any:
             told[0], told[1] = mean / k, widest
             told[2], told[3] = sign * seen[at.last_input], sign * seen[at.last_output]
             told[4], told[5] = seen[at.noise], seen[at.noise + 1]
-            told[6], told[7] = seen[at.time_left], seen[at.budget_left]
+            told[6], told[7] = seen[at.time_left], thrift
             to = 8
             for group in range(3):
                 for h in range(len(HORIZONS)):

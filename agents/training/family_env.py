@@ -89,7 +89,7 @@ class FamilyVecEnv(VecEnv):
             mine = slice(g * LANES, (g + 1) * LANES)
             before = group.view.features[:, _TO_COME]
             actions = group.foresight.act(self._choices[mine], group.view)
-            observations, gained, terminated, truncated, infos = group.envs.step(actions)
+            observations, gained, terminated, truncated, _ = group.envs.step(actions)
             ended = terminated | truncated
             group.view = group.foresight.look(observations)
             group.left -= 1
@@ -99,12 +99,9 @@ class FamilyVecEnv(VecEnv):
             self._lengths[mine] += 1
             dones[mine] = ended | (group.left == 0)
             for row in np.flatnonzero(dones[mine]):
-                seen = group.view.features[row].copy()
-                if ended[row]:
-                    seen = group.foresight.look(infos["final_obs"][row][None]).features[0]
                 at = g * LANES + row
                 rows[at] = {
-                    "terminal_observation": seen,
+                    "terminal_observation": group.view.features[row].copy(),
                     "TimeLimit.truncated": bool(not ended[row]),
                     "episode": {"r": self._returns[at], "l": self._lengths[at], "t": perf_counter() - self._started},
                 }

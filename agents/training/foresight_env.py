@@ -76,11 +76,14 @@ class ForesightVecEnv(VecEnvWrapper):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows."""
-        before = self._view.features[:, self.foresight.to_come]
+        seen = self._view.features
+        before = seen[:, self.foresight.to_come]
         observations, rewards, dones, infos = self.venv.step_wait()
         ended = np.flatnonzero(dones)
         if len(ended):
-            last = self.foresight.look([infos[row]["terminal_observation"] for row in ended]).features
+            last = seen[ended]  # all the same, because nothing comes after it; its belief is gone
+            if isinstance(self.foresight, Foresight):
+                last = self.foresight.look([infos[row]["terminal_observation"] for row in ended]).features
             for row, features in zip(ended, last, strict=True):
                 infos[row] |= {"terminal_observation": features, "TimeLimit.truncated": False}
         features = self._see(observations)

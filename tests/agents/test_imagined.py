@@ -17,6 +17,7 @@ from agents.studies.universal import play, unseen
 from agents.training import PPOSettings, TrainConfig, train
 from agents.training.family import draw_member
 from agents.training.rule import rule
+from estimator.belief import covariance_places
 from estimator.models.difference import difference
 
 
@@ -30,20 +31,20 @@ def observations_of(envs, samples, seed=0):
     return observations
 
 
-def reference(seen, ahead, terms):
-    """The features of one observation of Eq. (2), from its matrices, way by way."""
-    k, A, L = 4, terms.amplitude, terms.limit
-    std = ahead.std * np.exp(seen[4:8])
-    R = np.eye(k)
-    R[np.triu_indices(k, 1)] = seen[8:14]
-    R = R + np.triu(R, 1).T
-    theta = ahead.center + ahead.std * seen[:4]
-    q, r = ahead.process * np.exp(-seen[14]), ahead.sensor * np.exp(-seen[15])
-    P = np.zeros((6, 6))
-    P[:2, :2] = 0.5 * (q + r) * np.eye(2)
-    P[2:, 2:] = np.outer(std, std) * (R + 1e-6 * np.eye(k))
-    z = L * seen[16:18].astype(np.float64)
+def beside(envs, records):
+    """The same environments with other beliefs."""
+    return SimpleNamespace(experiment=envs.experiment, records=records)
+
+
+def reference(belief, seen, ahead, terms):
+    """The features of one belief about Eq. (2), from its matrices, way by way."""
+    L = terms.limit
+    P, theta, z = belief.record[covariance_places(belief.model)], belief.coefficients_mean, belief.state_mean
+    q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
     last_u, time_left = seen[18], seen[20]
+    thrift = min(1.0, np.sqrt(seen[21] * ahead.energy / max(1.0, time_left * ahead.samples)) / ahead.push)
+    A = ahead.push * min(1.0, 2.0 * thrift)
+    share = 0.5 * (time_left + seen[21]) if ahead.energy < np.inf else time_left
 
     def sample(z, P, u):
         moved = np.array([theta[0] * z[0] + theta[1] * z[0] ** 3 + theta[2] * z[1] + theta[3] * u, z[0]])
@@ -80,7 +81,7 @@ def reference(seen, ahead, terms):
                 peak = max(peak, reach) if t < 8 else peak
             seen_at.append(x[0])
             if t + 1 in (4, 8, 16):
-                told.append(worth(C, max(0.0, time_left * ahead.samples - (t + 1) * terms.pace)) - cost)
+                told.append(worth(C, max(0.0, share * ahead.samples - (t + 1) * terms.pace)) - cost)
         return told, peak, seen_at
 
     ways = {(first, code): way(first, code) for first in range(3) for code in range(10)}
@@ -90,58 +91,63 @@ def reference(seen, ahead, terms):
     groups = [range(8), [8], [9]]
     brought = lambda group, first, h: max(ways[first, code][0][h] for code in groups[group])  # noqa: E731
     peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(3)] for codes in groups])
-    told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, seen[21]]
+    told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, thrift]
     for group in range(3):
         for h in range(3):
             rise, calm, fall = (brought(group, first, h) for first in (up, 1, down))
             told += [np.arcsinh(20 * (rise - fall)), np.arcsinh(20 * (calm - max(rise, fall)))]
     told += [peaks[group, first] / L for group in range(3) for first in (up, 1, down)]
     told += [*(sign * free[:, 1] / L), *((free[:2, 0] - free[:2, 2]) / L)]
-    now = worth(P, time_left * ahead.samples)
+    now = worth(P, share * ahead.samples)
     told += [np.arcsinh(20 * (max(brought(0, first, 2) for first in range(3)) - now)), now - worth(P, 0.0)]
     allowed = peaks.min(axis=0) <= max(L, peaks[0].min())
     return np.clip(told, -BOUND, BOUND), allowed if sign > 0 else allowed[::-1], sign
 
 
-@pytest.mark.parametrize("pace", [1, 2])
-def test_features_are_those_of_the_matrices(pace):
-    envs = make("duffing_env/Amplitude-v0", 12)
+@pytest.mark.parametrize(("track", "pace"), [("Amplitude", 1), ("Amplitude", 2), ("Power", 1)])
+def test_features_are_those_of_the_matrices(track, pace):
+    envs = make(f"duffing_env/{track}-v0", 12)
     seen = observations_of(envs, 40)
     foresight = CommonForesight(envs)
     terms = foresight._terms._replace(pace=pace, shaken=3.0)
     features, safe = np.empty((12, len(FEATURES)), np.float32), np.empty((12, 3), np.bool_)
-    signs, motions = np.empty((2, 12))
-    imaginer(View(difference()))(seen, foresight._ahead, terms, features, safe, signs, motions)
+    signs = np.empty(12)
+    imaginer(View(difference()))(envs.records, seen, foresight._ahead, terms, features, safe, signs)
     assert {*signs} == {-1.0, 1.0}
     for i in range(12):
-        told, allowed, sign = reference(seen[i], foresight._ahead, terms)
+        told, allowed, sign = reference(envs.belief(i), seen[i], foresight._ahead, terms)
         np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
         np.testing.assert_array_equal(safe[i], allowed)
         assert signs[i] == sign
 
 
-def test_an_observation_looks_the_same_alone_and_any_is_finite():
+def test_a_belief_looks_the_same_alone_and_any_is_finite():
     envs = make("duffing_env/Amplitude-v0", 12)
     foresight, rng = CommonForesight(envs), np.random.default_rng(1)
-    space = envs.single_observation_space
-    seen = rng.uniform(space.low, space.high, (200, len(space.low))).astype(np.float32)
-    view = foresight.look(seen)
+    seen = observations_of(envs, 40)
+    records = envs.records * rng.choice([-1e3, 0.0, 1e-3, 1.0, 1e6], envs.records.shape)
+    view = CommonForesight(beside(envs, records)).look(seen)
     assert np.isfinite(view.features).all()
     assert (np.abs(view.features) <= BOUND).all()
     assert view.safe.any(axis=1).all()
-    np.testing.assert_array_equal(foresight.look(seen[7][None]).features[0], view.features[7])
+    alone = CommonForesight(beside(envs, envs.records[7:8])).look(seen[7][None])
+    np.testing.assert_array_equal(alone.features[0], foresight.look(seen).features[7])
 
 
 def test_turning_the_task_over_turns_the_action_over():
     envs = make("duffing_env/Amplitude-v0", 12)
-    seen = observations_of(envs, 40)
+    seen, records = observations_of(envs, 40), envs.records
     turned = seen.copy()
     turned[:, 16:20] *= -1
-    foresight = CommonForesight(envs)
-    one, other = foresight.look(seen), foresight.look(turned)
+    states = np.arange(6) < 2
+    records[:, :2] *= -1
+    crossed = covariance_places(envs.experiment.model)[states[:, None] & ~states]
+    records[:, crossed] *= -1
+    foresight, reverse = CommonForesight(envs), CommonForesight(beside(envs, records))
+    one, other = foresight.look(seen), reverse.look(turned)
     np.testing.assert_allclose(one.features, other.features, atol=1e-5)
     choices = np.linspace(-1, 1, 12)
-    np.testing.assert_allclose(foresight.act(choices, one), -foresight.act(choices, other), atol=1e-6)
+    np.testing.assert_allclose(foresight.act(choices, one), -reverse.act(choices, other), atol=1e-6)
 
 
 def test_it_refuses_what_it_cannot_look_at():
@@ -149,6 +155,9 @@ def test_it_refuses_what_it_cannot_look_at():
         CommonForesight(SimpleNamespace())
     with pytest.raises(ValueError, match="hold must be 1"):
         CommonForesight(make("duffing_env/Amplitude-v0", 1, {"hold": 2}))
+    envs = make("duffing_env/Amplitude-v0", 2)
+    with pytest.raises(ValueError, match="policy's own 2 environments, but is of 1"):
+        CommonForesight(envs).look(observations_of(envs, 1)[:1])
 
 
 def test_members_are_drawn_within_their_ranges_and_make_environments():
