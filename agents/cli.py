@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from tyro.constructors import PrimitiveConstructorSpec
 
 from agents.running.stopping import Stopped, stopped_by_sigterm
+from estimator.checks import printable
 
 
 def _parse_options(words: list[str]) -> dict[str, Any]:
@@ -67,7 +68,7 @@ def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
 
 def progress_bar() -> Progress:
     """A bar on stderr that names what is being done; none where that is a file, which has room for messages only."""
-    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
     console = Console(stderr=True)
     return Progress(*columns, console=console, disable=not console.is_terminal)
 
@@ -113,7 +114,7 @@ def told_in_one_line(name: str) -> Iterator[None]:
             yield
     except (KeyboardInterrupt, Stopped) as stopped:
         left = f"; {stopped.left}" if isinstance(stopped, Stopped) and stopped.left else ""
-        print(f"{name}: stopped{left}", file=sys.stderr)
+        print(f"{name}: stopped{printable(left)}", file=sys.stderr)
         sys.exit(128 + (stopped.signum if isinstance(stopped, Stopped) else SIGINT))
     except Exception as error:
         from gymnasium.error import Error as GymnasiumError
@@ -123,7 +124,7 @@ def told_in_one_line(name: str) -> Iterator[None]:
         if isinstance(error, ModuleNotFoundError) and (package := str(error.name).split(".")[0]) in EXTRAS:
             print(f"{name}: {how_to_get(package)}", file=sys.stderr)
         elif isinstance(error, ValueError | OSError | GymnasiumError):
-            print(f"{name}: {error}", file=sys.stderr)
+            print(f"{name}: {printable(' '.join(str(error).splitlines()))}", file=sys.stderr)
         else:
             raise
         sys.exit(2)

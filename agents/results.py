@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from estimator.checks import printable
 from estimator.files import write_atomically
 
 
@@ -18,10 +20,20 @@ def show(*parts: Any, width: int = 100) -> None:
     """Print texts and tables, as wide as the terminal but at least so many characters."""
     from rich.console import Console
 
-    console = Console(highlight=False, markup=False)
+    console = Console(highlight=False, markup=False, emoji=False)
     console.width = max(console.width, width)
     for part in parts:
-        console.print(part)
+        console.print(printable(part, "\n") if isinstance(part, str) else part)
+
+
+@contextmanager
+def spinner(what: str) -> Iterator[Callable[[str], None]]:
+    """A spinner on stderr, and what tells it a new text."""
+    from rich.console import Console
+    from rich.text import Text
+
+    with Console(stderr=True).status(what) as status:
+        yield lambda text: status.update(Text(printable(text)))
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: bool = False, title: str = "") -> Any:
@@ -43,7 +55,7 @@ def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: boo
     for place, text in enumerate(titles):
         made.add_column(text, justify="left" if markdown or place == 0 else "right", no_wrap=markdown)
     for row in rows:
-        made.add_row(*row)
+        made.add_row(*(printable(cell, "\n") for cell in row))
     return made
 
 

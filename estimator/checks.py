@@ -101,3 +101,13 @@ def numbers(name: str, values: npt.ArrayLike) -> FloatArray:
         return np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be numbers, but is {shown(values)}; {error}") from error
+
+
+def printable(text: str, kept: str = "") -> str:
+    """Text for people: control codes, which a terminal would obey and which break lines, become question marks.
+
+    Args:
+        text: whatever a user or a file calls something.
+        kept: control codes that stay.
+    """
+    return "".join(letter if letter.isprintable() or letter in kept else "?" for letter in text)

@@ -14,6 +14,9 @@ from estimator.extras import need
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+#: Letters of a name in a figure.
+_LONGEST = 48
+
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1c1c; --paper: #ffffff; --line: #d0d0d0; --soft: #f4f4f4; }
 @media (prefers-color-scheme: dark) {
@@ -59,8 +62,12 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def plain(text: str) -> str:
-    """Text that matplotlib takes as it is: a name or a unit may hold dollar signs, which are no formula."""
-    return text.replace("$", r"\$")
+    """Text that matplotlib takes as it is, and has room for.
+
+    A name may hold dollar signs, which are no formula, begin with an underscore, which legends leave out, or be long.
+    """
+    short = text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]}…{text[-_LONGEST // 2 :]}"
+    return (" " if short.startswith("_") else "") + short.replace("$", r"\$")
 
 
 def svg(figure: Figure) -> str:

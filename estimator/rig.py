@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from estimator.checks import number, one_of, shown, whole
+from estimator.checks import number, one_of, printable, shown, whole
 from estimator.files import whole_file
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
@@ -60,6 +60,8 @@ class Channel:
     def __post_init__(self) -> None:
         if not isinstance(self.unit, str) or not self.unit.strip() or len(self.unit) > 40:
             raise ValueError(f"unit must be a short text such as 'N', but is {self.unit!r:.60}; '1' is a pure number")
+        if printable(self.unit) != self.unit or set(self.unit) & set(',;"[]'):  # it stands in heads of CSV files
+            raise ValueError(f"unit must hold no control codes, commas, quotes or brackets, but is {self.unit!r:.60}")
         for name in ("limit", "range", "noise"):
             value = getattr(self, name)
             if value is not None:

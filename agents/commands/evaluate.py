@@ -71,17 +71,15 @@ class Evaluate:
         )  # fmt: skip
 
     def _measure(self, protocol: str) -> None:
-        from rich.console import Console
-
         from agents.evaluation.board import CAPTION, TITLES, append, cells
         from agents.evaluation.protocol import measure
-        from agents.results import show, table
+        from agents.results import show, spinner, table
 
         (policy,) = self.policies
         track = protocol if "/" in protocol else f"duffing_env/{protocol}"
-        with Console(stderr=True).status("Measuring") as status:
+        with spinner("Measuring") as say:
             name = policy.partition("=")[0] if self.submit is None else self.submit
-            entry = measure(policy, track, name, self.samples, status.update)
+            entry = measure(policy, track, name, self.samples, say)
         show(track, table(TITLES, [cells(entry)]), CAPTION, width=130)
         if self.submit is not None:
             append(self.board, entry)

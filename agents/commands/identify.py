@@ -88,6 +88,8 @@ def show(result: Result) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from estimator.checks import printable
+
     console = Console()
     units, intervals = result.units, result.interval(0.9)
     table = Table("", "mean", "90 % interval", "unit", box=box.SIMPLE_HEAD)
@@ -97,6 +99,6 @@ def show(result: Result) -> None:
     console.print("m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0", highlight=False)
     console.print(table)
     for warning in result.warnings:
-        console.print(f"[bold red]{warning.name}[/]: {escape(warning.message)}", highlight=False)
+        console.print(f"[bold red]{warning.name}[/]: {escape(printable(warning.message))}", highlight=False)
     if not result.warnings:
         console.print("[green]No check speaks against this result.[/]")

@@ -31,6 +31,7 @@ class Init:
     def run(self) -> None:
         """Write it."""
         from agents.commands.rig_file import ask, from_record, text_of
+        from estimator.checks import printable
         from estimator.files import write_atomically
         from estimator.rig import SHIPPED
 
@@ -47,7 +48,7 @@ class Init:
         write_atomically(self.path, text)
         print(f"Wrote {self.path}: read it, and correct what is not so.")
         data = "data.csv" if self.source is None or self.source in SHIPPED else self.source
-        print(f"Next: duffing-env identify {self.path} {data}")
+        print(printable(f"Next: duffing-env identify {self.path} {data}"))
 
 
 @dataclass(frozen=True)

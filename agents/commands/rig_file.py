@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from estimator.checks import printable
 from estimator.identification.tables import Table, read_table
 from estimator.models.duffing import KINDS
 from estimator.rig import INTERPOLATIONS, Channel, Rig
@@ -89,7 +90,7 @@ def from_record(path: Path, step: float | None = None) -> str:
         # Times are written with some digits, and their mean difference is off by the last of them.
         step = float(f"{own:.6g}")
     rig = Rig(step, input=Channel(table.unit(table.u) or "1"), output=_output(table))
-    return text_of(rig, f", from {path.name}")
+    return text_of(rig, f", from {printable(path.name)}")
 
 
 def _output(table: Table) -> Channel:

@@ -40,12 +40,13 @@ class Run:
         from agents.running.plant import load_plant
         from agents.running.run import run
         from estimator import Rig
+        from estimator.checks import printable
 
         rig = Rig.of(self.rig)
         plant = load_plant(self.plant, rig, instrument_of(self.rig))
         try:
             with progress_bar() as bar:
-                task = bar.add_task(self.plan.policy, total=self.plan.samples)
+                task = bar.add_task(printable(self.plan.policy), total=self.plan.samples)
                 result = run(rig, plant, self.out, self.plan, told=lambda done: bar.update(task, completed=done))
         finally:
             if hasattr(plant, "close"):

@@ -12,6 +12,7 @@ from agents.evaluation.leaderboard import METRICS, Metric
 from agents.evaluation.protocol import SCORE, TRACKS, VERSION, digest
 from agents.evaluation.systems import FOLDER
 from agents.results import finite
+from estimator.checks import printable
 from estimator.files import append_atomically, whole_file, write_atomically
 
 #: The board that ships with the package.
@@ -82,7 +83,7 @@ def cells(entry: dict[str, Any]) -> list[str]:
     told = entry["metrics"]
     shifted = [entry["shifted"].get(shift, {}).get("fisher_gain") for shift in _SHIFTS]
     return [
-        str(entry["name"]),
+        printable(str(entry["name"])),
         _with_interval(SCORE, entry["score"]),
         str(entry["seeds"]),
         str(entry["budget"]),

@@ -13,6 +13,7 @@ from agents.evaluation.leaderboard import print_estimators, print_table, write_e
 from agents.evaluation.rollout import Evaluation, evaluate
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import load_policy
+from agents.results import spinner
 from duffing_env.silverbox import record_available
 from estimator.extras import how_to_get, is_missing, need
 
@@ -48,15 +49,10 @@ def compare(
     Raises:
         ModuleNotFoundError: for a report without matplotlib. Figures are left out without it.
     """
-    from rich.console import Console
-
     if report:
         need("matplotlib")
-    console = Console()
-    with console.status("Evaluating") as status:
-        evaluations = evaluate(
-            policies, env_id, systems, seed, options, lambda name: status.update(f"Evaluating {name}")
-        )
+    with spinner("Evaluating") as say:
+        evaluations = evaluate(policies, env_id, systems, seed, options, lambda name: say(f"Evaluating {name}"))
     title = f"{env_id}, {systems} systems"
     print_table(evaluations, title)
     print_estimators(evaluations)

@@ -20,6 +20,7 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
 from estimator.belief import Belief
+from estimator.checks import printable
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
@@ -66,7 +67,7 @@ class Evaluation:
     @property
     def title(self) -> str:
         """The name, without control codes, which a terminal would obey; and of several the number of seeds."""
-        name = "".join(letter if letter.isprintable() else "?" for letter in self.policy)
+        name = printable(self.policy)
         return name if self.seeds == 1 else f"{name} ({self.seeds} seeds)"
 
 

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
+from estimator.checks import printable
 from estimator.files import whole_file, write_atomically
 
 #: Folder of the files that come with the package, ``ALGORITHM.toml``.
@@ -89,7 +90,7 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
 
 def write_settings(path: Path, env_id: str, settings: AlgorithmSettings, comment: str) -> None:
     """Write a file that `read_settings` reads, with these hyperparameters for this track."""
-    lines = [f"# {comment}", f"[{table_of(env_id)}]"]
+    lines = [f"# {printable(comment)}", f"[{table_of(env_id)}]"]
     for name, value in as_written(settings).items():
         entries = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
         lines += [f"{key} = {json.dumps(each)}" for key, each in entries.items()]

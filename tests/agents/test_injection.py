@@ -1,0 +1,188 @@
+"""Names are names: of policies, rigs, channels and files, in pages, tables, figures, CSV, TOML and messages."""
+
+import csv
+import json
+import tomllib
+import warnings
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from agents.cli import progress_bar, told_in_one_line
+from agents.commands import main
+from agents.commands.identify import show as show_identified
+from agents.commands.rig_file import from_record, text_of
+from agents.evaluation import board
+from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, save
+from agents.evaluation.leaderboard import print_table
+from agents.evaluation.report import write_report
+from agents.evaluation.rollout import evaluate
+from agents.results import show, spinner, table
+from agents.running.experiment import design
+from agents.training.algorithms import ALGORITHMS
+from agents.training.hyperparameters import write_settings
+from estimator import Rig, identify
+
+NAMES = [
+    "<script>alert(1)</script>", "\"><img src=x onerror='alert(1)'>", "&lt;b&gt;", "=cmd|' /C calc'!A0", "+1+1", "-2",
+    "@SUM(1)", "\t=1", '"quoted"', "two\nlines", "two\r\nlines", "# no comment", "$\\frac{$", "$x$", "\\textbf{b}",
+    "\x1b]0;title\x07", "\x1b[2J", "\x9b31m", "\u202ereversed", "\x7f", "[bold]", "[/]", "[link=file:///x]y[/link]",
+    ":warning:", "_hidden", "n" * 300, "$" * 300,
+]  # fmt: skip
+RIG = {
+    "step": 1e-3, "input": {"unit": "N", "limit": 6.0}, "output": {"unit": "m", "range": 0.03, "noise": 5e-6},
+    "guess": {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)},
+}  # fmt: skip
+#: For what takes long: all of it at once, and what there is no room for.
+SHARP = ["<img src=x onerror=1>\x1b[2J\n[/]$\\frac{$\u202e'", "=cmd|' '!A0", "_hidden", "n" * 300, "$" * 300]
+names = pytest.mark.parametrize("name", NAMES, ids=lambda name: ascii(name[:24]))
+
+
+def is_tame(text):
+    """Whether a terminal would only show it."""
+    return all(letter.isprintable() or letter == "\n" for letter in text)
+
+
+class Elements(HTMLParser):
+    """What a browser would make: names of elements and attributes, and the text."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found, self.text = set(), ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.found |= {tag, *(name for name, _ in attributes if name.startswith("on"))}
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def evaluation():
+    return evaluate(["uniform"], systems=4, options={"horizon": 8})[0]
+
+
+sharp = pytest.mark.parametrize("name", SHARP, ids=lambda name: ascii(name[:24]))
+
+
+@sharp
+def test_a_policy_in_pages_and_figures(name, evaluation, tmp_path):
+    named, other = replace(evaluation, policy=name), replace(evaluation, policy="other")
+    settings = {"env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 0, "options": {"own": name}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of layouts that have no room
+        write_report(tmp_path / "report.html", [named, other], settings, ["evaluate.py", name])
+        for figure in (figure_of_contraction([named, other]), figure_of_inputs([named, other])):
+            save(figure, tmp_path / "figure.png")
+        legend = figure_of_contraction([named, other]).axes[0].get_legend()
+    assert len(legend.get_texts()) == 2
+    page = Elements((tmp_path / "report.html").read_text())
+    assert not page.found & {"script", "img", "b", "onerror"}
+    assert named.title in page.text
+
+
+@names
+def test_a_policy_in_tables(name, evaluation, capsys):
+    named, other = replace(evaluation, policy=name), replace(evaluation, policy="other")
+    print_table([named, other], "title")
+    show(table(["name"], [[name]]), name)
+    told = capsys.readouterr().out
+    assert is_tame(told)
+    if len(name) < 20:
+        assert told.count(named.title) >= (1 if "\n" in name else 2)  # cells keep their lines
+
+
+@names
+def test_a_name_on_a_board(name, tmp_path, monkeypatch, capsys):
+    (first, *_) = [json.loads(line) for line in board.SHIPPED.read_text().splitlines()][-1:]
+    board.append(tmp_path / "board.jsonl", first | {"name": name, "track": f"duffing_env/{name}"})
+    assert len((tmp_path / "board.jsonl").read_text().splitlines()) == 1
+    main(["report", "--board", str(tmp_path / "board.jsonl"), "--output", str(tmp_path / "board.html")])
+    assert is_tame(capsys.readouterr().out)
+    assert not Elements((tmp_path / "board.html").read_text()).found & {"script", "img", "b", "onerror"}
+
+
+@names
+def test_an_error_is_one_line(name, capsys):
+    with pytest.raises(SystemExit) as ended, told_in_one_line("duffing-env"):
+        raise ValueError(f"rig must be a file, but is {name}")
+    assert ended.value.code == 2
+    told = capsys.readouterr().err
+    assert len(told.splitlines()) == 1
+    assert is_tame(told)
+    # Words that no option takes are repeated as they were typed: by tyro, not here.
+    for words in (["identify", name, "none.csv"], ["evaluate", "--policies", name], ["export", name, "--output", "x"],
+                  ["report", "--board", name]):  # fmt: skip
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        assert ended.value.code == 2
+        assert is_tame(capsys.readouterr().err)
+
+
+@names
+def test_what_is_being_done(name, capsys):
+    with spinner("Evaluating") as say:
+        say(f"Evaluating {name}")
+    with progress_bar() as bar:
+        bar.disable = False
+        bar.add_task(name, total=1)
+        bar.refresh()
+
+
+@sharp
+def test_a_channel(name, tmp_path):
+    """A unit stands in the heads of CSV files, in comments of rig files, in pages and figures."""
+    described = RIG | {"input": {"unit": name[:40].replace("\n", "").replace("[", "("), "limit": 6.0}}
+    if not is_tame(name):
+        with pytest.raises(ValueError, match="unit must hold no control codes"):
+            Rig.from_dict(described)
+        described["input"]["unit"] = "<b onerror=1>$\\frac{$"
+    rig = Rig.from_dict(described)
+    assert Rig.from_dict(tomllib.loads(text_of(rig))) == rig
+    design(rig, policy="prbs", samples=16).write(tmp_path / "next.csv")
+    head, *rows = csv.reader((tmp_path / "next.csv").read_text().splitlines())
+    assert head == ["time [s]", f"u [{rig.input.unit}]"]
+    assert {len(row) for row in rows} == {2}
+    result = identify(rig, record(tmp_path / "record.csv"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result.report(tmp_path / "page.html", [name])
+    assert not Elements((tmp_path / "page.html").read_text()).found & {"script", "img", "onerror"}
+
+
+def record(path):
+    """A short record of an oscillator."""
+    rng, y, v = np.random.default_rng(0), np.zeros(256), 0.0
+    u = 6.0 * np.repeat(rng.choice([-1.0, 1.0], 32), 8)
+    for k in range(255):
+        x = y[k]
+        for _ in range(50):
+            v += 2e-5 / 0.4 * (u[k] - 0.6 * v - 2500.0 * x - 4e7 * x**3)
+            x += 2e-5 * v
+        y[k + 1] = x
+    y += 5e-6 * rng.standard_normal(256)
+    rows = np.column_stack([1e-3 * np.arange(256), u, y])
+    np.savetxt(path, rows, delimiter=",", header="time [s],u [N],y [m]", comments="")
+    return path
+
+
+@sharp
+def test_a_file(name, tmp_path, capsys):
+    """Of a record: in the rig file made from it, in the page, and in what is printed."""
+    if "/" in name or len(name) > 200:
+        name = name.replace("/", ":")[:200]
+    path = record(tmp_path / f"{name}.csv")
+    text = from_record(path)
+    assert tomllib.loads(text).keys() == {"step", "interpolation", "delay", "input", "output"}
+    assert is_tame(text)
+    result = identify(Rig.from_dict(RIG), [path])
+    result.report(tmp_path / "page.html", [f"duffing-env identify {path}"])
+    assert not Elements((tmp_path / "page.html").read_text()).found & {"script", "img", "onerror"}
+    show_identified(result)
+    assert is_tame(capsys.readouterr().out)
+    write_settings(tmp_path / "best.toml", "duffing_env/Short-v0", ALGORITHMS["ppo"](), f"trial 3 of {path}")
+    (found,) = tomllib.loads((tmp_path / "best.toml").read_text()).values()
+    assert "learning_rate" in found
