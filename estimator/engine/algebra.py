@@ -11,11 +11,16 @@ that step's posterior, which depend on scalars only:
     E[w²] = (q e/S)² + q (1 - q/S),   E[v²] = (r e/S)² + r (1 - r/S),   S = s + q + r.
 
 γ is learned from the first sensor that shows the process noise of the same sample; where none does, γ stays.
+
+Differences of rounded numbers may leave a covariance that is none, where a sample says 10⁸ times more than was known.
+So every variance takes along what rounding may have changed it by, `ROUNDING` of what it is the difference of: the
+rounded matrix is the exact one and an error E, |E_ij| ≤ a_i a_j ROUNDING/d, to which ROUNDING diag(a²) is added.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import sympy as sp
@@ -26,8 +31,14 @@ from estimator.models.model import Model
 
 ZERO, ONE, HALF = sp.S.Zero, sp.S.One, sp.S.Half
 
+#: What rounding may change a variance by, in parts of its terms: 64 times 2⁻⁵³, for sums of d² = 36 or so products.
+ROUNDING = 2.0**-47
+
 #: 1 where a number is there and 0 where it is NaN; and the second of three where the first is positive, else the third.
 present, select = sp.Function("present"), sp.Function("select")
+
+#: A number, or 0 where it is negative; and the first of three, or whichever of the others it lies beyond. NaN stays.
+rectified, clip = sp.Function("rectified"), sp.Function("clip")
 
 
 class Gaussian:
@@ -42,6 +53,8 @@ class Gaussian:
         self.model, self.moved = model, moved
         self.names, self.states = list(model.names), list(model.states)
         self.lines: Assignments = []
+        if model.is_continuous and not model.held:
+            self.moved = replace(moved, noise=self._sound(moved.noise))
         self.mean: dict[str, sp.Expr] = {
             **dict(zip(self.states, moved.state, strict=True)),
             **{c: symbol(c) for c in model.coefficients},
@@ -59,6 +72,28 @@ class Gaussian:
             return expression
         self.lines.append((name, expression))
         return symbol(name)
+
+    def _sound(self, noise: Sequence[Sequence[sp.Expr]]) -> tuple[tuple[sp.Expr, ...], ...]:
+        """N, where it is a covariance; its variances, with covariances that they can have, where it is none.
+
+        N is integrated by steps that are too long for slopes of more than about 3 a step, and may then be anything.
+        """
+        n = len(noise)
+        at = {(a, b): noise[a][b] for a in range(n) for b in range(a, n)}
+        for a in range(n):
+            at[a, a] = self.put(f"SOUND_{a}_{a}", rectified(at[a, a]))
+        rest = dict(at)  # what those before leave of it
+        for a in range(n - 1):
+            for b in range(a + 1, n):
+                largest = self.put(f"LARGEST_{a}_{b}", sp.sqrt(rectified(rest[a, a])) * sp.sqrt(rectified(rest[b, b])))
+                kept = self.put(f"KEPT_{a}_{b}", clip(rest[a, b], -largest, largest))
+                at[a, b] = self.put(f"SOUND_{a}_{b}", at[a, b] + (kept - rest[a, b])) if a else kept
+                rest[a, b] = kept
+            inverse = self.put(f"INVERSE_{a}", 1 / select(rest[a, a], rest[a, a], ONE)) if a < n - 2 else ZERO
+            for b in range(a + 1, n if a < n - 2 else 0):
+                for c in range(b, n):
+                    rest[b, c] = self.put(f"REST_{a}_{b}_{c}", rest[b, c] - rest[a, b] * rest[a, c] * inverse)
+        return tuple(tuple(at[min(a, b), max(a, b)] for b in range(n)) for a in range(n))
 
     def _predict(self) -> None:
         """Q = S P Sᵀ, or Q as it is where no S is given: the states' rows change, the coefficients' block stays."""
@@ -79,6 +114,9 @@ class Gaussian:
         for a, i in enumerate(self.states):
             for b in range(a, n):
                 total = sum((s * rows[a][k] for k, s in zip(names, by[b], strict=True)), ZERO)
+                if a == b and not total.is_Symbol:
+                    terms = (s**2 * pair("P", k, k, names) for k, s in zip(names, by[b], strict=True))
+                    total += ROUNDING * sum(terms, ZERO)
                 self.cov[i, self.states[b]] = self.put(f"Q_{i}_{self.states[b]}", total)
             for j in names[n:]:
                 self.cov[i, j] = rows[a][j]
@@ -115,9 +153,10 @@ class Gaussian:
                     self.cov[i, k] = self.put(f"R_{i}_{k}", self.cov[i, k] + strength * spread)
 
     def condition(
-        self, readout: Sequence[sp.Expr], c: dict[str, sp.Expr], weight: sp.Expr, step: sp.Expr, keep: sp.Expr, tag: str
-    ) -> None:
-        """Condition on a sensor: mean + c step, Q - c cᵀ weight; ``keep`` is r weight.
+        self, readout: Sequence[sp.Expr], c: dict[str, sp.Expr], weight: sp.Expr, step: sp.Expr, keep: sp.Expr,
+        tag: str, there: sp.Expr = ONE,
+    ) -> None:  # fmt: skip
+        """Condition on a sensor: mean + c step, Q - c cᵀ weight; ``keep`` is r weight; ``there`` is 0 for no output.
 
         A quantity that the sensor shows as it is keeps its row times r/S, which cannot become negative by rounding.
         """
@@ -127,12 +166,14 @@ class Gaussian:
         for i in self.names:
             if c[i] != 0 and step != 0:
                 self.mean[i] = self.put(f"M{tag}_{i}", self.mean[i] + c[i] * step)
+        more = self.put(f"GROWN{tag}", 1 + sp.Float(ROUNDING) * there)
         for (i, j), value in list(self.cov.items()):
+            grown = more if i == j else ONE
             if exact in (i, j):
                 other = j if i == exact else i
-                self.cov[i, j] = self.put(f"P{tag}_{i}_{j}", keep * c[other])
+                self.cov[i, j] = self.put(f"P{tag}_{i}_{j}", keep * c[other] * grown)
             elif c[i] != 0 and c[j] != 0:
-                self.cov[i, j] = self.put(f"P{tag}_{i}_{j}", value - gain[i] * c[j])
+                self.cov[i, j] = self.put(f"P{tag}_{i}_{j}", value * grown - gain[i] * c[j])
 
     def results(self) -> dict[str, str]:
         """Row of the belief to the name that holds its new value, where it has one."""
@@ -172,14 +213,15 @@ def update(
         last = learned[-1]
         if shown != 0:
             along = {i: sum((readout[b] * n for b, n in enumerate(row)), ZERO)
-                     for i, row in zip(g.states, moved.noise, strict=True)}  # fmt: skip
+                     for i, row in zip(g.states, g.moved.noise, strict=True)}  # fmt: skip
             c |= {i: g.put(f"D{tag}_{i}", c[i] + last.strength * part) for i, part in along.items() if part != 0}
             g.add_noise(last.strength)
             results |= {"GAMMA_SHAPE": text_of(last.gamma_shape), "GAMMA_RATE": text_of(last.gamma_rate)}
         results |= {f"XI_SHAPE_{sensor}": text_of(last.xi_shape), f"XI_RATE_{sensor}": text_of(last.xi_rate)}
         keep = last.r * last.weight
         weight = g.put(f"W{tag}", seen * last.weight)
-        g.condition(readout, c, weight, last.step, g.put(f"H{tag}", select(seen, keep, ONE) if missing else keep), tag)
+        keep = g.put(f"H{tag}", select(seen, keep, ONE) if missing else keep)
+        g.condition(readout, c, weight, last.step, keep, tag, seen)
         if trace:
             left = {"mean": expected, "innovation": e, "variance": s, "shown": shown}
             for i, one in enumerate(learned):

@@ -20,6 +20,7 @@ _INLINE = {
     "finite": "(1.0 if {0} - {0} == 0.0 else 0.0)",
     "below": "(0.0 if {0} >= 0.0 else 1.0)",
     "positive": "(1.0 if {0} > 0.0 else 0.0)",
+    "rectified": "(0.0 if {0} < 0.0 else {0})",
     "reaches": "(1.0 if {0} >= {1} else 0.0)",
     "select": "({1} if {0} > 0.0 else {2})",
     "clip": "({1} if not {0} > {1} else ({0} if {0} < {2} else {2}))",

@@ -81,7 +81,26 @@ def spread(plant: Plant, z: np.ndarray, c: np.ndarray, inputs: Sequence[float]) 
         return np.concatenate([f(z), (slope @ N + N @ slope.T + np.outer(g, g)).ravel()])
 
     end = runge_kutta(rates, np.concatenate([z, np.zeros(n if plant.held else n * n)]), plant.substeps)[n:]
-    return np.outer(end, end) if plant.held else end.reshape(n, n)
+    return np.outer(end, end) if plant.held else sound(end.reshape(n, n))
+
+
+def sound(N: np.ndarray) -> np.ndarray:
+    """N, where it is a covariance; else its variances, row by row with the nearest covariances that they can have.
+
+    Truncation makes it none where slopes are steep, and where states go along with one another to a high order.
+    """
+    N, n = N.copy(), len(N)
+    N[np.diag_indices(n)] = np.maximum(np.diag(N), 0.0)
+    rest = N.copy()
+    for a in range(n - 1):
+        largest = np.sqrt(np.maximum(rest[a, a], 0.0) * np.maximum(np.diag(rest), 0.0))
+        kept = np.where(np.arange(n) > a, np.clip(rest[a], -largest, largest), rest[a])
+        N[a] += kept - rest[a]
+        N[:, a] = N[a]
+        rest[a] = rest[:, a] = kept
+        if rest[a, a] > 0:
+            rest = rest - np.outer(kept, kept) / rest[a, a]
+    return N
 
 
 def input_seen(plant: Plant, inputs: Sequence[float]) -> float:

@@ -140,7 +140,8 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
             assert np.linalg.eigvalsh(cov / np.outer(std, std))[0] >= -len(std) * np.sqrt(ROUNDING)
             sound += 1
     assert sound > 20
-    assert flagged > 0
+    assert sound + flagged == 17 * LANES
+    assert name != "paper" or not flagged  # which has no steps to be too long
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,31 @@ def test_what_is_generated_names_nothing_twice():
     assert_equals_reference(case, task, some_samples(case, 9), 2)
 
 
+@pytest.mark.parametrize(("name", "scale"), [("paper", 1e9), ("duffing", 1e3), ("wiener-hammerstein", 1e3)])
+def test_a_covariance_stays_one_whatever_the_samples(name, scale):
+    """Samples that tell 1e18 times more than was known, and slopes that are too steep for the steps."""
+    case = CASES[name]
+    task = tasks.structured(case.model, case.degree, lanes=LANES)
+    rng = np.random.default_rng(11)
+    whole = 0
+    for size in scale ** rng.uniform(0.0, 1.0, 40):
+        W = block(task.layout, LANES)
+        for lane in range(LANES):
+            put_belief(W, task.layout, LANES, lane, case, random_belief(case, rng))
+        table = W.reshape(-1, LANES)
+        for _ in range(6):
+            for row in (*input_rows(case.model, case.degree), *(f"Y_{y}" for y in case.model.outputs)):
+                table[task.layout[row]] = size * rng.uniform(-1, 1, LANES)
+            task.update(W)
+            for lane in np.flatnonzero(np.isfinite(table[: max(task.layout.values())]).all(axis=0)):
+                cov = get_belief(W, task.layout, LANES, lane, case).cov
+                std = np.sqrt(np.diag(cov))
+                assert (std > 0).all()
+                assert np.linalg.eigvalsh(cov / np.outer(std, std))[0] > -EPS * case.operations
+                whole += 1
+    assert whole > 500
+
+
 def test_lanes_do_not_know_one_another():
     case = CASES["pendulum"]
     task = tasks.structured(case.model, case.degree, iterations=2, lanes=LANES, missing=True)
