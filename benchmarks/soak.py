@@ -1,11 +1,12 @@
-"""Long runs on every track: is every number finite and in bounds, every covariance one, and memory flat?
+"""Long runs on every track and of filters: is every number finite and in bounds, every covariance one, memory flat?
 
 $ python -m benchmarks.soak --steps 10000000
-$ python -m benchmarks.soak --steps 1000000 --tracks Short-v0 Rig-v0
+$ python -m benchmarks.soak --steps 1000000 --runs Short-v0 Rig-v0 filter-duffing
 
 A track's samples are shared among four kinds of actions (random, constant, alternating, at the believed resonance) and
-as many with extreme options. The exit status is 1 where a number was not finite or out of bounds, a covariance none, or
-memory grew by more than 2 MB.
+as many with extreme options. A filter goes over one record, played again and again. Every covariance of a track is
+looked at after every 64th sample, and that of a filter after every 16,384th. The exit status is 1 where a number was
+not finite or out of bounds, a covariance none, or memory grew by more than 2 MB in the second half of a run.
 """
 
 from __future__ import annotations
@@ -22,13 +23,15 @@ import gymnasium as gym
 import numpy as np
 
 import duffing_env  # noqa: F401  registers the tracks
-from agents.cli import run_script
+from agents.cli import progress_bar, run_script
 from duffing_env.silverbox import record_available
 from duffing_env.tracks import TRACKS
-from estimator import Channel, Rig
+from estimator import Channel, OnlineEstimator, Rig
 from estimator.belief import check_record
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
 
-_ROWS = 256
+_ROWS = 1024
 
 #: Extreme, but no kernel of their own.
 _EXTREME = {"max_input": 300.0, "max_output": 4000.0, "process_noise": 0.3, "noise_shape": 0.1}
@@ -36,6 +39,12 @@ _RIG = Rig(
     1e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03, noise=5e-6),
     guess={"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)},
 )  # fmt: skip
+
+COUNTED = ("samples", "episodes", "not finite", "out of bounds", "no covariance", "growth")
+
+#: Models of the filters, with their default priors; and samples of the record.
+FILTERS = {"filter-paper": difference, "filter-duffing": duffing}
+_PIECE = 16_384
 
 #: Samples of half a period of the tracks' middle oscillator.
 _HALF = 4
@@ -54,8 +63,8 @@ class Config:
 
     steps: int = 1_000_000
     """Samples of each track."""
-    tracks: tuple[str, ...] = ()
-    """Names of tracks; all if none."""
+    runs: tuple[str, ...] = ()
+    """Names of tracks, filter-paper, filter-duffing; all if none."""
     json: Path | None = None
     """File for the counts."""
 
@@ -64,13 +73,16 @@ def main(config: Config) -> None:
     """Run, and print the table."""
     from agents.results import show, table
 
-    names = [name.split("/")[1] for name in TRACKS if record_available() or "Replay" not in name]
-    unknown = set(config.tracks) - set(names)
+    names = [name.split("/")[1] for name in TRACKS if record_available() or "Replay" not in name] + list(FILTERS)
+    unknown = set(config.runs) - set(names)
     if unknown:
-        raise ValueError(f"tracks must be of {names}, but are {sorted(unknown)}")
-    found = {name: soak(name, config.steps) for name in config.tracks or names}
+        raise ValueError(f"runs must be of {names}, but are {sorted(unknown)}")
+    found = {}
+    with progress_bar() as bar:
+        for name in bar.track(config.runs or names, description="runs"):
+            found[name] = filtered(name, config.steps) if name in FILTERS else soak(name, config.steps)
     rows = [[name, *(f"{value:,}" for value in counts.values())] for name, counts in found.items()]
-    heads = ("track", "samples", "episodes", "not finite", "out of bounds", "no covariance", "growth / kB")
+    heads = ("run", "samples", "episodes", "not finite", "out of bounds", "no covariance", "growth / kB")
     show(table(heads, rows, markdown=True), width=120)
     if config.json is not None:
         config.json.write_text(json.dumps(found, indent=2))
@@ -81,7 +93,7 @@ def main(config: Config) -> None:
 
 def soak(name: str, steps: int) -> dict[str, int]:
     """What a track's samples came to."""
-    counts = dict.fromkeys(("samples", "episodes", "not finite", "out of bounds", "no covariance", "growth"), 0)
+    counts = dict.fromkeys(COUNTED, 0)
     given: dict[str, Any] = {"rig": _RIG} if "Rig" in name else {}
     extreme = {} if given or "Replay" in name else _EXTREME
     rng = np.random.default_rng(0)
@@ -104,15 +116,39 @@ def _play(envs: Any, play: Callable[..., Any], rounds: int, rng: np.random.Gener
         counts["episodes"] += int((terminated | truncated).sum())
         counts["not finite"] += int((~np.isfinite(rewards)).sum() + (~np.isfinite(observations)).sum())
         counts["out of bounds"] += int(((observations < low) | (observations > high)).sum())
-        if t % 64 == 0:
-            for record in envs.records[:: _ROWS // 8]:
-                try:
-                    check_record("belief", model, record, 1e-5)
-                except ValueError:
-                    counts["no covariance"] += 1
-        if t == min(64, rounds - 1):
+        if t % 64 == 63:
+            counts["no covariance"] += sum(not _is_sound(model, record) for record in envs.records)
+        if t == rounds // 2:
             before = _memory()
     counts["growth"] = max(counts["growth"], _memory() - before)
+
+
+def filtered(name: str, steps: int) -> dict[str, int]:
+    """What a filter's samples came to, over a record that is played again and again."""
+    estimator, counts, before = OnlineEstimator(FILTERS[name]()), dict.fromkeys(COUNTED, 0), 0
+    rng = np.random.default_rng(0)
+    u = 0.02 * rng.standard_normal(_PIECE)
+    y = estimator.simulate(u, np.zeros(2)) + 5e-4 * rng.standard_normal(_PIECE)
+    pieces = max(2, steps // len(u))
+    for piece in range(pieces):
+        energies = estimator.run(u, y)
+        belief = estimator.belief
+        counts["samples"] += len(u)
+        counts["not finite"] += int((~np.isfinite(energies)).sum())
+        counts["no covariance"] += not _is_sound(belief.model, belief.record)
+        if piece == pieces // 2:
+            before = _memory()
+    counts["growth"] = _memory() - before
+    return counts
+
+
+def _is_sound(model: Any, record: Any) -> bool:
+    """Whether a record is a belief."""
+    try:
+        check_record("belief", model, record, 1e-5)
+    except ValueError:
+        return False
+    return True
 
 
 def _memory() -> int:
