@@ -43,7 +43,7 @@ _RIG = Rig(
 COUNTED = ("samples", "episodes", "not finite", "out of bounds", "no covariance", "growth")
 
 #: Models of the filters, with their default priors; and samples of the record.
-FILTERS = {"filter-paper": difference, "filter-duffing": duffing}
+FILTERS: dict[str, Callable[[], Any]] = {"filter-paper": difference, "filter-duffing": duffing}
 _PIECE = 16_384
 
 #: Samples of half a period of the tracks' middle oscillator.
