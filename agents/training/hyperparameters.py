@@ -28,8 +28,8 @@ def track_of(env_id: str) -> str:
 
 
 def table_of(env_id: str) -> str:
-    """The name of a track's table, which all its versions share: "Amplitude"."""
-    return track_of(env_id).rpartition("-v")[0]
+    """The name of a track's table, which all its versions share: "Amplitude"; of what has no versions its own."""
+    return track_of(env_id).rpartition("-v")[0] or env_id
 
 
 def read_settings(algo: str, env_id: str, path: Path | None = None) -> AlgorithmSettings:

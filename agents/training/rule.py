@@ -18,9 +18,8 @@ if TYPE_CHECKING:
 _AHEAD = 8
 _UP, _NONE = (FEATURES.index(f"best_{way}_{_AHEAD}") for way in ("up", "none"))
 
-#: Samples of every environment that are imitated, the share of them that is played at random, passes over them, and the
-#: probability that is left to other choices, so that there is something to try.
-_SAMPLES, _RANDOM, _PASSES, _LEFT = 128, 0.1, 4, 0.1
+#: How sharply a layer tells the sign of what it is given, and the logit of what brings most.
+_SHARP, _LOGIT = 3.0, 3.0
 
 
 def rule(features: npt.NDArray[np.float32], levels: int) -> npt.NDArray[np.int64]:
@@ -37,15 +36,14 @@ def rule(features: npt.NDArray[np.float32], levels: int) -> npt.NDArray[np.int64
     return np.where(features[:, _NONE] > 0.0, levels // 2, push) if levels % 2 else push
 
 
-def begin_with_rule(model: BaseAlgorithm, envs: Any, seed: int) -> None:
-    """Train a new model's actor to choose as `rule` does, from what it sees while that is played.
+def begin_with_rule(model: BaseAlgorithm, envs: Any) -> None:
+    """Let a new model's actor choose as `rule` does: two units of every layer carry what it depends on.
 
     A model that does not choose from levels, or does not see the features of all oscillators, is left as it is.
 
     Args:
         model: of Stable-Baselines3.
         envs: as it sees them.
-        seed: of the choices at random, and of the order.
     """
     import torch
 
@@ -53,23 +51,17 @@ def begin_with_rule(model: BaseAlgorithm, envs: Any, seed: int) -> None:
         return
     if not isinstance(envs.action_space, gym.spaces.Discrete):
         return
-    levels = int(envs.action_space.n)
-    rng = np.random.default_rng(seed)
-    seen, chosen = [], []
-    features = envs.reset()
-    for _ in range(_SAMPLES):
-        best = rule(features, levels)
-        seen.append(features)
-        chosen.append(best)
-        tried = rng.integers(levels, size=len(best))
-        features, *_ = envs.step(np.where(rng.random(len(best)) < _RANDOM, tried, best))
-    inputs, targets = torch.from_numpy(np.concatenate(seen)), torch.from_numpy(np.concatenate(chosen))
     policy: Any = model.policy
-    optimizer = torch.optim.Adam(policy.parameters(), lr=1e-3)
-    for _ in range(_PASSES):
-        for batch in torch.from_numpy(rng.permutation(len(inputs))).split(2048):
-            logits = policy.get_distribution(inputs[batch]).distribution.logits
-            loss = torch.nn.functional.cross_entropy(logits, targets[batch], label_smoothing=_LEFT)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
+    layers = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, torch.nn.Linear)]
+    with torch.no_grad():
+        inputs = _UP, _NONE
+        for layer in layers:
+            layer.weight[:2], layer.bias[:2] = 0.0, 0.0
+            for unit in range(2):
+                layer.weight[unit, inputs[unit]] = _SHARP
+            inputs = 0, 1
+        last = policy.action_net.weight
+        last[:, :2] = 0.0
+        last[-1, 0], last[0, 0] = _LOGIT, -_LOGIT
+        if len(last) % 2:
+            last[len(last) // 2, 1] = 2.0 * _LOGIT

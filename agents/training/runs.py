@@ -137,7 +137,7 @@ class _Training:
         else:
             from agents.training.rule import begin_with_rule
 
-            begin_with_rule(self._model, self._envs, seed)
+            begin_with_rule(self._model, self._envs)
         self._checkpoints = self._due_checkpoints()
         self._held_out = HeldOut(folder, config, begun)
         self._evaluated = on_evaluation
