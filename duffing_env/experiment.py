@@ -20,7 +20,7 @@ from duffing_env.own import Beliefs, check_observation
 from duffing_env.rewards import check_reward, rewarding
 from estimator.belief import Belief
 from estimator.checks import LARGEST, flag, number, one_of, whole
-from estimator.ensemble import Hypotheses, priors, start
+from estimator.ensemble import Hypotheses, first_weights, priors, start
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -161,6 +161,11 @@ class Experiment:
         return {}
 
     @property
+    def balance(self) -> float | None:
+        """Where hypotheses about the noises are likeliest at first (`estimator.ensemble.first_weights`)."""
+        return None
+
+    @property
     def _iterations(self) -> int:
         return int(self.iterations or DEFAULT_ITERATIONS[self.factorisation])
 
@@ -181,7 +186,9 @@ class Experiment:
         first, noises = prior.record.copy(), np.empty(0)
         if self.noise_hypotheses != 1:
             members = priors(prior, self.noise_hypotheses)
-            first, noises = start(members, len(model.names)), members[:, -4:].ravel()
+            weights = first_weights(members, self.balance)
+            first = start(members, len(model.names), weights)
+            noises = np.column_stack([members[:, -4:], weights]).ravel()
         precisions = first[-2 - 2 * model.n_outputs :]
         names = parameter_names(self.truth_model)
         values: dict[str, Any] = {

@@ -99,7 +99,8 @@ class Setup(NamedTuple):
         prior: (size,) record that episodes start from.
         inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
         log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
-        hypotheses: (4 members,) shape and rate of γ and of ξ that each of several beliefs starts from; () for one.
+        hypotheses: (5 members,) shape and rate of γ and of ξ that each of several beliefs starts from, and its weight;
+            () for one.
     """
 
     max_input: float

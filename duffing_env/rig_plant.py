@@ -21,7 +21,7 @@ from estimator.ensemble import Hypotheses
 from estimator.models.model import Model
 from estimator.parameters import Parameters
 from estimator.rig import Rig
-from estimator.rig_prior import rig_prior
+from estimator.rig_prior import balance, rig_prior
 from estimator.units import Scales
 
 AnyRig = Rig | Mapping[str, Any] | str | Path
@@ -145,6 +145,11 @@ class RigPlantExperiment(RigNumbers, Experiment):
     def samples(self) -> int:
         """The horizon."""
         return self.horizon
+
+    @property
+    def balance(self) -> float | None:
+        """That of the prior, where each noise is unknown by itself."""
+        return balance(self.believed) if isinstance(self.noise_hypotheses, tuple) else None
 
     @property
     def knows_truth(self) -> bool:

@@ -13,6 +13,8 @@ and each is weighed by its free energies, F_m of a sample standing for -log p(y_
 
 The belief has the mixture's mean and covariance of states and coefficients, and its mean and variance of the noises'
 variances: those are what acts in a prediction, and a hypothesis of no noise at all must not make a precision infinite.
+
+Where the outputs do not tell σ_w from 0, or σ_v, the first weights decide (`first_weights`).
 """
 
 from __future__ import annotations
@@ -83,9 +85,31 @@ def priors(prior: Belief, hypotheses: Hypotheses) -> FloatArray:
     return records
 
 
-def start(records: FloatArray, names: int) -> FloatArray:
-    """(size,) the record of the mixture of equally weighed members (M, size), of so many states and coefficients."""
-    weights = np.full(len(records), 1 / len(records))
+def first_weights(records: FloatArray, balance: float | None = None) -> FloatArray:
+    """(M,) weights of members (M, size) before the first sample.
+
+    Args:
+        records: that they begin with.
+        balance: log(σ_w/σ_v) of noises that move the output and hide it alike: the weights are then half a Cauchy
+            density about that (`half_cauchy`). They are even where it is None: that holds that either noise may as well
+            be next to 0, and where the samples cannot contradict, intervals become too narrow.
+    """
+    if balance is None:
+        return np.full(len(records), 1 / len(records))
+    weights = np.exp(-half_cauchy(np.array([log_ratio(record[-4:]) for record in records]) - balance))
+    return np.asarray(weights / weights.sum())
+
+
+def half_cauchy(away: FloatArray) -> FloatArray:
+    """Minus the logarithm of a density of log(σ_w/σ_v), ``away`` from its middle: half a Cauchy density of the ratio.
+
+    (Gelman 2006, doi:10.1214/06-BA117A.) Up to a constant.
+    """
+    return np.asarray(np.logaddexp(away, -away))
+
+
+def start(records: FloatArray, names: int, weights: FloatArray) -> FloatArray:
+    """(size,) the record of the mixture of members (M, size) with weights (M,), of so many states and coefficients."""
     record: FloatArray = mixture(side_by_side(records, LANES), weights, names)[1]
     return record
 
@@ -112,12 +136,20 @@ def log_ratio(noises: FloatArray) -> float:
     return float(0.5 * np.log(noises[1] / noises[0] / (noises[3] / noises[2])))
 
 
-def ratio_of(weights: FloatArray, ratios: FloatArray, first: FloatArray) -> NoiseRatio:
-    """What weights (M,) of members with these log ratios (M,) say, which were (members,) at first."""
+def ratio_of(weights: FloatArray, ratios: FloatArray, first: FloatArray, at_first: FloatArray) -> NoiseRatio:
+    """What weights (M,) of members with these log ratios (M,) say.
+
+    Args:
+        weights: of members.
+        ratios: of these.
+        first: (members,) the log ratios that all members began with.
+        at_first: (members,) their weights then.
+    """
     mean = weights @ ratios
     within = np.diff(np.unique(first.round(9)))[0] ** 2 / 12
     std = np.sqrt(weights @ (ratios - mean) ** 2 + within)
-    return NoiseRatio(float(mean), float(std), float(np.sqrt(first.var() + within)))
+    before = np.sqrt(at_first @ (first - at_first @ first) ** 2 + within)
+    return NoiseRatio(float(mean), float(std), float(before))
 
 
 def matched_gamma(weights: FloatArray, shapes: FloatArray, rates: FloatArray) -> tuple[float, float]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief, check_record, covariance_places
-from estimator.ensemble import NoiseRatio, log_ratio, priors, ratio_of, side_by_side
+from estimator.ensemble import NoiseRatio, first_weights, log_ratio, priors, ratio_of, side_by_side
 from estimator.inference import samples
 from estimator.inference.mixture import mixture
 from estimator.inputs import Feed, degree, feed
@@ -17,6 +17,7 @@ from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
+from estimator.rig_prior import balance
 from estimator.settings import Settings
 
 #: Shape of a Gamma belief that further samples do not move.
@@ -46,7 +47,7 @@ class Filter:
         blocks = -(-members // lanes)
         self._block = np.zeros((blocks, len(self._loop.layout) * lanes))
         self._backup = np.empty((blocks, size * lanes))
-        self._weights = np.full(members, 1 / members)
+        self._weights = self._begun_with(records)
         self._begun = np.zeros(1)
         self._inputs = np.zeros(self.feed.past + 1)
         self._outputs = np.zeros((self.feed.waits + 1, self.model.n_outputs))
@@ -55,6 +56,11 @@ class Filter:
         shape = [self.feed.stride, self.feed.past, self.feed.waits, self.feed.fills]
         self._steps = np.array(shape, dtype=np.int64)
         self._put(records)
+
+    def _begun_with(self, records: FloatArray) -> FloatArray:
+        """(members,) the first weights. Of a rig whose guess is a prior, each noise is unknown by itself."""
+        unknown = self.rig.guess is not None and isinstance(self.settings.noise_hypotheses, tuple)
+        return first_weights(records, balance(self.prior) if unknown else None)
 
     def _compiled(self, members: int) -> samples.Loop:
         settings = self.settings
@@ -154,8 +160,9 @@ class Filter:
         """What the weights say, at the precisions that each member has learned."""
         weights, _ = mixture(self._block, self._weights, len(self.model.names))
         ratios = np.array([log_ratio(record[-4:]) for record in self.records[weights > 0]])
-        first = [log_ratio(record[-4:]) for record in priors(self.prior, self.settings.noise_hypotheses)]
-        return ratio_of(weights[weights > 0], ratios, np.array(first))
+        records = priors(self.prior, self.settings.noise_hypotheses)
+        first = np.array([log_ratio(record[-4:]) for record in records])
+        return ratio_of(weights[weights > 0], ratios, first, self._begun_with(records))
 
     def _mixture(self) -> FloatArray:
         """(size,) a record with the mixture's moments."""

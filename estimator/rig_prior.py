@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from estimator.belief import Belief
@@ -60,7 +62,7 @@ def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
 def about(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief:
     """A belief in given moments of the coefficients of the rig's model, before a record that may begin in motion."""
     model, known = rig.model, dict(zip(rig.model.coefficients, mean, strict=True))
-    frequency = float(np.clip(np.sqrt(abs(known["stiffness"]) + abs(known["cubic"]) * _START**2), 1e-3, 1.0))
+    frequency = _frequency(known)
     displacement = _START / frequency ** KINDS[rig.output.kind]
     n, d = model.n_states, len(model.names)
     joint_mean, joint = np.concatenate([np.zeros(n), mean]), np.zeros((d, d))
@@ -75,6 +77,22 @@ def about(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief
     noises = known["gain"] * force / np.sqrt(3), (rig.output.noise or NOISE * scales.output) / scales.output
     gamma, xi = ((2.0, 2.0 * float(noise) ** 2) for noise in noises)
     return Belief.of(model, joint_mean, joint, gamma, xi, scales=scales)
+
+
+def balance(belief: Belief) -> float | None:
+    """log(σ_w/σ_v) at which the process noise moves the output as much as the sensor's hides it, about.
+
+    None for a model without stiffness, of which that is not known.
+    """
+    known = dict(zip(belief.model.coefficients, belief.coefficients_mean, strict=True))
+    if not {"stiffness", "cubic"} <= set(known):
+        return None
+    return float((2 - belief.scales.order) * np.log(_frequency(known)))
+
+
+def _frequency(known: Mapping[str, float]) -> float:
+    """Angular frequency of large motions [rad per sample], about."""
+    return float(np.clip(np.sqrt(abs(known["stiffness"]) + abs(known["cubic"]) * _START**2), 1e-3, 1.0))
 
 
 def _axis(name: str, low: float, high: float) -> tuple[FloatArray, FloatArray]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimator.ensemble import half_cauchy
 from estimator.identification.fit import Fits, Fitter, Hypothesis, Prior, with_ratios
 from estimator.identification.problem import Problem
 from estimator.identification.start import starts
@@ -188,7 +189,7 @@ def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: flo
         if not np.isfinite(fits.free_energy).any():
             raise ValueError("records must keep the fit finite, but it ran away; check units and the sampling step")
         away = logs - np.log(unit)
-        energies = fits.free_energy + np.logaddexp(away, -away)
+        energies = fits.free_energy + half_cauchy(away)
         best = int(np.argmin(energies))
         start, level = fits.mean[best], float(fits.level[best])
         worse = energies - energies[best]

@@ -306,7 +306,7 @@ def test_one_hypothesis_is_the_prior_itself():
     assert not one.kind.weighs
     assert one.setup.hypotheses.size == 0
     np.testing.assert_array_equal(one.setup.prior, one.believed.record)
-    assert many.setup.hypotheses.shape == (27 * 4,)
+    assert many.setup.hypotheses.shape == (27 * 5,)
     assert many.kind == SimulatedExperiment(noise_hypotheses=4).kind  # a kernel does not know how many there are
     assert many.believed == one.believed
     np.testing.assert_allclose(many.setup.prior[:-4], one.setup.prior[:-4], rtol=1e-13)

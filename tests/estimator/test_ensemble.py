@@ -1,15 +1,18 @@
 """Hypotheses about the noise ratio: the mixture against its definition, and whether it finds the ratio."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from estimators import OWN_TAPS, record
 from scipy.special import logsumexp
 
-from estimator import OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
+from estimator import Channel, OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
 from estimator.belief import Belief
-from estimator.ensemble import FARTHEST, LEVELS, displaced, matched_gamma, side_by_side
+from estimator.ensemble import FARTHEST, LEVELS, displaced, first_weights, matched_gamma, priors, side_by_side
 from estimator.inference.mixture import SWITCHING, mixture, weigh
 from estimator.lanes import LANES
+from estimator.rig_prior import rig_prior
 
 RATIOS = 5
 MODELS = {
@@ -106,6 +109,28 @@ def test_displacement_keeps_the_shapes_and_says_ratio_and_sum():
     assert np.sqrt(q / r) == pytest.approx(7 * 3)
     assert q + r == pytest.approx(9 * (3e-3**2 + 1e-3**2))
     np.testing.assert_allclose(displaced(noises, 1.0, 1.0), noises, rtol=1e-14)
+
+
+def test_first_weights_are_half_a_cauchy_density_of_the_ratio():
+    records = priors(silverbox_prior(), (3, 1))
+    middle = np.log(2e-3)
+    ratios = np.sqrt(records[:, -3] / records[:, -4] / (records[:, -1] / records[:, -2]))
+    # A density of the logarithm is that of the ratio, 1/(1 + (ratio/scale)²), times the ratio.
+    density = ratios / (1 + (ratios / np.exp(middle)) ** 2)
+    np.testing.assert_allclose(first_weights(records, middle), density / density.sum(), rtol=1e-12)
+    np.testing.assert_array_equal(first_weights(records), [1 / 3] * 3)
+
+
+def test_only_a_rig_with_a_guess_says_where_noises_are_likely():
+    guess = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
+    rig = Rig(1e-3, input=Channel("N", limit=6), output=Channel("m", range=0.03), guess=guess)
+    own = OnlineEstimator(rig=rig)
+    # 2500 N/m and 0.4 kg, and as much again of the cubic term at a third of the range: some 0.1 rad per sample.
+    likely = own.noise_ratio.mean
+    assert np.log(0.05**2) < likely < np.log(0.2**2)
+    even = OnlineEstimator(rig.model, rig_prior(rig), replace(rig, guess=None), noise_hypotheses=(7, 7))
+    assert np.ptp(even.arrays()["weights"]) == 0.0
+    assert own.noise_ratio.prior_std < even.noise_ratio.prior_std
 
 
 def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
