@@ -1,4 +1,4 @@
-"""What a policy's `predict` is asked, checked: an observation, the state of the last call, and which episodes begin."""
+"""What a policy is asked, checked: the state of the last call, which episodes begin, and how long a signal may be."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.checks import numbers, shown
+
+#: Samples of a signal, or of a run, at most: two hours of the Silverbox's.
+MOST_SAMPLES = 2**22
 
 
 def check_state(state: Any, arrays: int) -> None:

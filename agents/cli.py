@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from tyro.constructors import PrimitiveConstructorSpec
 
 from agents.running.stopping import Stopped, stopped_by_sigterm
-from estimator.checks import printable
+from estimator.checks import printable, shown
 
 
 def _parse_options(words: list[str]) -> dict[str, Any]:
@@ -85,6 +85,8 @@ def check_track(env_id: str) -> None:
 
     from duffing_env.vector_env import DuffingVectorEnv
 
+    if not isinstance(env_id, str):
+        raise ValueError(f"env must be the id of a track such as duffing_env/Short-v0, but is {shown(env_id)}")
     try:
         entry: Any = gym.spec(env_id).vector_entry_point
         entry = load_env_creator(entry) if isinstance(entry, str) else entry
@@ -92,6 +94,8 @@ def check_track(env_id: str) -> None:
         raise ValueError(
             f"env must be the id of a track such as duffing_env/Short-v0, but is {env_id}: {error}"
         ) from error
+    except gym.error.Error as error:
+        raise type(error)(f"env must be the id of a track such as duffing_env/Short-v0: {error}") from error
     if entry is None or (isinstance(entry, type) and not issubclass(entry, DuffingVectorEnv)):
         raise ValueError(
             f"env must be a track, which has a vector environment of duffing_env, but is {env_id}; "

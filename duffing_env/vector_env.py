@@ -41,6 +41,9 @@ _FIRST_FLAG = _PLACES["terminated"]
 #: Rows at most, some gigabytes of them; and the largest seed.
 MOST_ENVS, MOST_SEED = 2**20, 2**128
 
+#: Numbers that all observations have together: 1 GiB.
+_MOST_SHOWN = 2**28
+
 Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 
@@ -109,6 +112,12 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         self.render_mode = None
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
         self.single_observation_space = observation_space(self.experiment)
+        each, shown = len(self.experiment.setup.hypotheses) // 4, int(np.prod(self.single_observation_space.shape))
+        if num_envs * each > MOST_ENVS or num_envs * shown > _MOST_SHOWN:
+            raise ValueError(
+                f"num_envs must leave room for {each or 1} beliefs and {shown} observed numbers in each of {num_envs} "
+                f"environments, at most {MOST_ENVS} and {_MOST_SHOWN} in all; take fewer"
+            )
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)

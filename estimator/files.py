@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from estimator.checks import shown
+
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
@@ -64,6 +66,22 @@ def append_atomically(path: Path, text: str) -> None:
             os.close(place)
 
 
+def file_name(name: str, value: object) -> Path:
+    """The path that an argument is, of a file or folder to be written.
+
+    Raises:
+        ValueError: for what is no path, or a name that no file can have.
+    """
+    try:
+        place = Path(value)  # type: ignore[arg-type]
+        place.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return place
+    except (TypeError, ValueError, OSError) as error:
+        raise ValueError(f"{name} must be the name of a file, but is {shown(value)}: {error!s:.80}") from error
+    return place
+
+
 def whole_file(path: str | Path, must: str, largest: int, missing: str = "") -> Path:
     """A file that can be read: no folder, nor a pipe or device, which might never end, and none that is too large.
 
@@ -77,7 +95,10 @@ def whole_file(path: str | Path, must: str, largest: int, missing: str = "") -> 
         ValueError: for anything else, or a name that no file can have.
         FileNotFoundError: if there is no such file.
     """
-    place = Path(path)
+    try:
+        place = Path(path)
+    except TypeError as error:
+        raise ValueError(f"{must}, but {shown(path)} is none; name one") from error
     try:
         found = place.stat()
     except (FileNotFoundError, NotADirectoryError):

@@ -177,7 +177,7 @@ def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = Non
 
 
 def relative_covariance(
-    model: Model, coefficients: npt.ArrayLike, covariance: FloatArray, scales: Scales = VOLTS
+    model: Model, coefficients: npt.ArrayLike, covariance: npt.ArrayLike, scales: Scales = VOLTS
 ) -> FloatArray:
     """Covariance of the relative errors of the physical parameters, to first order, from one of the coefficients.
 
@@ -189,10 +189,19 @@ def relative_covariance(
 
     Returns:
         (..., p, p): the roots of its diagonal are coefficients of variation.
+
+    Raises:
+        ValueError: for a model that is none, or shapes that do not fit it.
     """
-    points = np.asarray(coefficients, dtype=np.float64)
+    points, spread = numbers("coefficients", coefficients), numbers("covariance", covariance)
+    k = Model.checked(model).n_coefficients
+    if points.shape[-1:] != (k,) or spread.shape[-2:] != (k, k):
+        raise ValueError(
+            f"coefficients and covariance must have shapes (..., {k}) and (..., {k}, {k}) for {model.name}, but have "
+            f"{points.shape} and {spread.shape}"
+        )
     slopes = physical_slopes(model, points, scales) / to_physical(model, points, scales)[..., :, None]
-    relative: FloatArray = slopes @ covariance @ np.swapaxes(slopes, -1, -2)
+    relative: FloatArray = slopes @ spread @ np.swapaxes(slopes, -1, -2)
     return relative
 
 

@@ -30,7 +30,10 @@ class Parameters(Mapping[str, Any]):
     """
 
     def __init__(self, values: Mapping[str, Any] | Iterable[tuple[str, Any]] = (), /, **named: Any) -> None:
-        self._values: dict[str, Any] = dict(values, **named)
+        try:
+            self._values: dict[str, Any] = dict(values, **named)
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"values must be a mapping from names to numbers, or pairs of both: {error}") from error
 
     def __getitem__(self, name: str) -> Any:
         return self._values[name]

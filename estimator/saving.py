@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from estimator.belief import Belief, record_size
-from estimator.files import whole_file, write_atomically
+from estimator.checks import shown
+from estimator.files import file_name, whole_file, write_atomically
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
 from estimator.rig import Rig
@@ -29,7 +30,15 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
     """Write an estimator to one file, a NumPy archive, from which it continues bit by bit.
 
     The free energies and forecasts of its last run are not kept.
+
+    Raises:
+        ValueError: for what is no estimator, or no name of a file.
     """
+    if not isinstance(estimator, OnlineEstimator):
+        raise ValueError(f"estimator must be an OnlineEstimator, but is {shown(estimator)}")
+    place = file_name("path", path)
+    if place.is_dir():
+        raise ValueError(f"path must be the name of a file, but {place} is a folder; name a file in it")
     description = {
         "format": FORMAT,
         "model": estimator.model.to_dict(),
@@ -40,7 +49,7 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
     text = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
     np.savez(buffer, **estimator.arrays(), description=text)  # type: ignore[arg-type]
-    write_atomically(Path(path), buffer.getvalue())
+    write_atomically(place, buffer.getvalue())
 
 
 def load_estimator(path: str | Path) -> OnlineEstimator:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,8 +18,8 @@ EXPECTATIONS = ("first_order", "sigma_points")
 #: More iterations per sample change nothing that shows.
 MOST_ITERATIONS = 100
 
-#: More ratios of the noises than data could tell apart.
-_MOST_HYPOTHESES = 1000
+#: More ratios of the noises than data could tell apart; and of two numbers, more values of each than there are noises.
+_MOST_HYPOTHESES, _MOST_VALUES = 1000, 99
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,9 @@ def checked_hypotheses(given: object, factorisation: str, model: Model, most: in
     """
     counts: list[Any] = list(given) if isinstance(given, tuple | list) and len(given) == 2 else [given]
     for count in counts:
-        whole("noise_hypotheses", count, most)
+        whole("noise_hypotheses", count, min(most, _MOST_VALUES) if len(counts) == 2 else most)
+    if math.prod(counts) > most:
+        raise ValueError(f"noise_hypotheses must be at most {most} in all, but are {given}; (9, 9) are plenty")
     published = factorisation == "mean_field"
     if list(counts) != [1] and (published or model.n_outputs > 1):
         what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"

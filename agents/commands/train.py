@@ -9,6 +9,7 @@ import tyro
 from agents.cli import told_in_one_line
 from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, train_seeds, tune
 from agents.training.family import FAMILY
+from estimator.checks import whole
 
 DESCRIPTION = """Train a policy that chooses the input, and compare it with the reference policies.
 
@@ -41,10 +42,10 @@ class Config(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.tune < 0:
-            raise ValueError(f"tune must be at least 0, but is {self.tune}")
-        if self.seeds < 1 or (self.seeds > 1 and self.tune):
-            raise ValueError(f"seeds must be at least 1, and 1 in a search, but is {self.seeds}")
+        whole("tune", self.tune, 10**6, 0)
+        whole("seeds", self.seeds, 1000)
+        if self.seeds > 1 and self.tune:
+            raise ValueError(f"seeds must be 1 in a search, but is {self.seeds}; leave it out, or tune")
         if self.ray and self.seeds == 1 and not self.tune:
             raise ValueError("ray spreads several trainings, but there is one; add --seeds or --tune, or leave it out")
         if self.systems != 0 and self.systems < 2:

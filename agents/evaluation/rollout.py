@@ -20,7 +20,7 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
 from estimator.belief import Belief
-from estimator.checks import printable
+from estimator.checks import printable, whole
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
@@ -34,6 +34,9 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Who else identifies the systems from what a policy left behind, beside the environment's own estimator.
 AUDITOR = "auditor"
+#: Systems that one evaluation keeps in memory, with all that they did.
+_MOST_SYSTEMS = 100_000
+
 FACTORISATIONS = ("structured", "mean_field")
 
 
@@ -99,7 +102,7 @@ def evaluate(
         policies: at least one: what `agents.policies.make_policy` takes, or patterns as above. A thing of one's own
             is titled by its ``name``, or that of its class.
         env_id: a registered track.
-        systems: number of systems, at least 2.
+        systems: number of systems, 2 to 100,000.
         seed: of systems and noise; and of the policies' own randomness.
         options: of the environment.
         on_policy: called with each policy's name before its turn.
@@ -110,8 +113,8 @@ def evaluate(
     """
     if not policies:
         raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
-    if systems < 2:
-        raise ValueError(f"systems must be at least 2, but is {systems}; intervals need more than one")
+    whole("systems", systems, _MOST_SYSTEMS, 2)  # intervals need more than one
+    whole("seed", seed, 2**128, 0)
     own = [title_of(policy) for policy in policies if not isinstance(policy, str)]
     if len(set(own)) < len(own):
         raise ValueError(f"policies must differ by their names, but are called {own}; give each a name of its own")

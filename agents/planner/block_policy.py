@@ -11,10 +11,14 @@ from agents.planner.blocks import best_block, drafts, systems_of
 from agents.planner.futures import Futures, drawn_from_records, draws_for
 from agents.planner.motion import places
 from agents.planner.policy import Planner
+from estimator.checks import whole
 from estimator.parameters import FloatArray
 
 #: Moves after a block that are planned with it, so that it ends where the next can go on.
 _AFTER = 9
+
+#: Samples of a block, at most.
+_MOST = 4096
 
 #: No block is asked to be safer: systems that tell it must be drawn.
 _FINEST = 5e-4
@@ -50,8 +54,7 @@ class BlockPlanner:
 
     def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 0.004) -> None:
         self._planner = Planner(env, seed, risk=risk)
-        if not isinstance(block, int | np.integer) or block < 1:
-            raise ValueError(f"block must be a whole number of at least 1, but is {block!r}")
+        whole("block", block, _MOST)
         setup = env.experiment.setup
         if np.isfinite(setup.budget):
             raise ValueError(f"env must have no limit of energy for blocks, but has max_rms={env.experiment.max_rms!r}")

@@ -45,7 +45,7 @@ from agents.planner.imagination import TAILS, Terms
 from agents.planner.motion import View, places, seen, swing_of
 from agents.planner.pursuit import Rule, pursuit
 from agents.planner.search import search
-from estimator.checks import LARGEST, SMALLEST, number, numbers, shown
+from estimator.checks import LARGEST, SMALLEST, number, numbers, shown, whole
 from estimator.parameters import FloatArray
 
 
@@ -71,6 +71,9 @@ class PlannerState(NamedTuple):
 
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
 _HORIZON = 24
+
+#: Moves of a plan, at most.
+_MOST_MOVES = 100_000
 
 #: Part of the limit that is left to the imagination of a differential equation: its two Runge-Kutta steps a sample err
 #: by up to 2.1 mV at 0.6 V and 0.5 V a sample.
@@ -124,9 +127,8 @@ class Planner:
                 f"env must be an environment of duffing_env that simulates a plant, but is {type(env).__name__}; "
                 "the planner needs its beliefs: pass it to make_policy"
             )
-        for name, count in (("horizon", 1 if horizon is None else horizon), ("rounds", rounds)):
-            if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= 10**6:
-                raise ValueError(f"{name} must be a whole number from 1 to 1000000, but is {shown(count)}")
+        whole("horizon", _HORIZON if horizon is None else horizon, _MOST_MOVES)
+        whole("rounds", rounds, 1000)
         number("risk", risk, SMALLEST, 1 - SMALLEST)
         number("input_cost", input_cost, 0)
         number("goal", goal, -LARGEST)
@@ -139,15 +141,20 @@ class Planner:
                 "make it with hold=1, or choose a learned policy or a signal"
             )
         setup, self.view = experiment.setup, View.of(experiment)
-        whole = bool(np.isfinite(setup.budget)) and horizon is None
-        if whole and (goal_std is not None or input_cost):
+        all_of_it = bool(np.isfinite(setup.budget)) and horizon is None
+        if all_of_it and env.horizon > _MOST_MOVES:
+            raise ValueError(
+                f"horizon must be given in an episode of {env.horizon} samples whose energy is limited, but is None; a "
+                f"plan of all of it has at most {_MOST_MOVES}"
+            )
+        if all_of_it and (goal_std is not None or input_cost):
             raise ValueError(
                 "goal_std and input_cost must be left out where the energy is limited, but are "
                 f"{goal_std!r} and {input_cost!r}; pass a horizon to plan with them"
             )
-        horizon = env.horizon if whole else min(horizon or _HORIZON, env.horizon)
-        self._energy = setup.budget if whole else None
-        if whole:
+        horizon = env.horizon if all_of_it else min(horizon or _HORIZON, env.horizon)
+        self._energy = setup.budget if all_of_it else None
+        if all_of_it:
             self._pursue = pursuit(self.view.model, self.view.degree).pursue
         self._env = env
         self.seed = seed

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duffing_env.silverbox import regime_input
+from estimator.checks import whole
 from estimator.models.difference import difference
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.physical import coefficients_of
@@ -75,7 +76,7 @@ def draw_prbs(max_input: float, hold: int = 1) -> Draw:
         hold: For how many samples each value is kept, at least 1.
 
     Raises:
-        ValueError: `hold` is below 1.
+        ValueError: `hold` is no whole number of at least 1.
     """
     return draw_levels(max_input, hold, levels=(-1.0, 1.0))
 
@@ -89,10 +90,9 @@ def draw_levels(max_input: float, hold: int, levels: tuple[float, ...] = LEVELS)
         levels: The values, in parts of `max_input`.
 
     Raises:
-        ValueError: `hold` is below 1.
+        ValueError: `hold` is no whole number of at least 1.
     """
-    if hold < 1:
-        raise ValueError(f"hold must be 1 sample or more, but it is {hold}")
+    whole("hold", hold, 10**9)
 
     def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
         values = rng.choice(levels, size=-(-samples // hold))

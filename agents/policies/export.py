@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.asked import MOST_SAMPLES
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_MAX_INPUT, DEFAULT_SAMPLES, Limits
+from estimator.checks import shown, whole
 from estimator.files import write_atomically
 from estimator.parameters import SAMPLING_STEP
 
@@ -31,7 +33,7 @@ def draw_signal(
 
     Args:
         name: A name in `agents.policies.excitations.EXCITATIONS`.
-        samples: Its length, at least 1; multisines need 5.
+        samples: Its length, 1 to `MOST_SAMPLES`; multisines need 5.
         max_input: The amplitude limit, in volts, positive.
         max_rms: The largest root mean square, in volts, positive; None: no limit. See `Limits.fit`.
         seed: The seed of the draw, 0 or more.
@@ -42,16 +44,14 @@ def draw_signal(
     Raises:
         ValueError: An argument is out of its range, or there is no excitation of this name.
     """
-    if name not in EXCITATIONS:
-        nearest = difflib.get_close_matches(name, EXCITATIONS, n=1)
+    if not isinstance(name, str) or name not in EXCITATIONS:
+        nearest = difflib.get_close_matches(str(name), EXCITATIONS, n=1)
         hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        if name in FEEDBACK:
+        if str(name) in FEEDBACK:
             hint = "; it answers to what an oscillator does, so it must be played: use agents.make_policy"
-        raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {name!r}{hint}")
-    if samples < 1:
-        raise ValueError(f"samples must be 1 or more, but it is {samples}; {DEFAULT_SAMPLES} last 1.7 s")
-    if seed < 0:
-        raise ValueError(f"seed must be 0 or more, but it is {seed}; any whole number from 0 on gives a signal")
+        raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {shown(name)}{hint}")
+    whole("samples", samples, MOST_SAMPLES)
+    whole("seed", seed, 2**128, 0)
     limits = Limits(max_input, max_rms)
     generator = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
     return max_input * limits.fit(EXCITATIONS[name](max_input)(generator, samples))

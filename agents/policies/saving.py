@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.policies.learned import ACTIVATIONS, CARD, FORMAT, WEIGHTS, LearnedPolicy, Network
-from estimator.files import write_atomically
+from estimator.checks import shown
+from estimator.files import file_name, write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -51,12 +52,14 @@ def save_policy(
     """
     from torch.nn import Module
 
-    folder = Path(folder)
+    folder = file_name("folder", folder)
     if isinstance(model, Module):
         _write(folder, *_network_alone(model, normalizer), card or {})
         return
     if normalizer is not None:
         raise ValueError("normalizer must be None for an algorithm, whose VecNormalize is written; leave it out")
+    if not hasattr(model, "policy"):
+        raise ValueError(f"model must be an algorithm or a module of torch, but is {shown(model)}; pass one")
     card = {"algorithm": type(model).__name__.lower(), "steps": model.num_timesteps} if card is None else card
     tensors = {name: value.detach().cpu().numpy() for name, value in model.policy.state_dict().items()}
     if not hasattr(model.policy, "mlp_extractor"):

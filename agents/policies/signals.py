@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.asked import check_rows, check_state, starts
+from agents.asked import MOST_SAMPLES, check_rows, check_state, starts
 from agents.planner.motion import frequency
 from agents.policies.excitations import EXCITATIONS, Draw, draw_recorded
 from estimator.belief import Belief
-from estimator.checks import numbers
+from estimator.checks import SMALLEST, is_finite, numbers, shown, whole
 from estimator.parameters import SAMPLING_STEP
 
 # Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
@@ -23,6 +23,7 @@ SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 DEFAULT_MAX_INPUT = 0.15  # V; the largest input of the Silverbox record is 0.149 V
 _RESONANCE = 68.1 * SAMPLING_STEP  # cycles per sample; the Silverbox's, for which bands and holds are made
+_MOST_DRAWN = 2**16  # of an environment's; longer episodes are continued by the next draw
 DEFAULT_SAMPLES = 1024  # for environments whose episodes have no fixed length
 
 # Float32 rounding of the actions must not bring a signal of exactly the budget above it.
@@ -48,8 +49,11 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name, value in (("max_input", self.max_input), ("max_rms", self.max_rms)):
-            if value is not None and not (np.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} must be positive and finite, in volts, but it is {value}")
+            if value is not None and not (is_finite(value) and SMALLEST <= value <= 1e300):
+                raise ValueError(
+                    f"{name} must be positive and finite, in volts, from {SMALLEST} to 1e300, but it is {shown(value)}"
+                )
+        whole("hold", self.hold, 10**9)
 
     def fit(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
         """Turns an input into actions within the limits. This is the one place where signals are scaled.
@@ -112,15 +116,15 @@ class SignalPolicy:
                 of samples.
             max_input: The input at action 1, in volts, positive; the signal is clipped there.
             max_rms: The largest root mean square of a draw, in volts; see `Limits.fit`. None: no limit.
-            samples: The length of one draw, at least 1.
+            samples: The length of one draw, 1 to `MOST_SAMPLES`.
             hold: Samples that an action is applied for; see `Limits.fit`.
             seed: The seed of all the signals.
 
         Raises:
-            ValueError: `max_input` or `max_rms` is not positive and finite, or `samples` is below 1.
+            ValueError: `max_input` or `max_rms` is not positive and finite, or a number of samples or seed is none.
         """
-        if samples < 1:
-            raise ValueError(f"samples must be 1 or more, but it is {samples}")
+        whole("samples", samples, MOST_SAMPLES)
+        whole("seed", seed, 2**128, 0)
         self.name = name
         self.limits = Limits(max_input, max_rms, hold)
         self.samples = samples
@@ -262,4 +266,4 @@ def limits_of(env: Any) -> tuple[Limits, int]:
         )
     experiment = getattr(env, "experiment", None)
     limits = Limits(env.max_input, getattr(experiment, "max_rms", None), getattr(experiment, "hold", 1))
-    return limits, getattr(env, "horizon", None) or DEFAULT_SAMPLES
+    return limits, min(getattr(env, "horizon", None) or DEFAULT_SAMPLES, _MOST_DRAWN)

@@ -19,12 +19,16 @@ from agents.policies.signals import SignalPolicy
 from agents.running.designs import Block, SignalDesign
 from agents.running.observed import Observed
 from estimator.belief import Belief, covariance_places
+from estimator.checks import SMALLEST, number, whole
 from estimator.files import write_atomically
 from estimator.free_run import free_run
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
 from estimator.rig import Rig
 from estimator.rig_prior import rig_prior
+
+#: Samples of an experiment, which is planned as a whole.
+_MOST = 2**16
 
 #: Systems on which a policy that answers to outputs is played.
 _PLAYED = 4
@@ -96,7 +100,7 @@ def design(
 
     Raises:
         ValueError: for a rig without limit or range, or without guess where there is no prior; a prior in other
-            scales; samples below 8; a bound that is no probability; or where even no input is safe.
+            scales; samples below 8 or above 65,536; a bound that is no probability; or where even no input is safe.
 
     Example:
         >>> from agents.running.experiment import design
@@ -108,10 +112,9 @@ def design(
         >>> bool(half < (high - low) / 2), unit, found.probability < 0.05, len(found.u)
         (True, 'kg', True, 256)
     """
-    if not isinstance(samples, int | np.integer) or samples < 8:
-        raise ValueError(f"samples must be a whole number of at least 8, but is {samples!r}")
-    if not 0 < bound < 1:
-        raise ValueError(f"bound must be a probability between 0 and 1, but is {bound!r}; 0.05 is usual")
+    whole("samples", samples, _MOST, 8)
+    number("bound", bound, SMALLEST, 1 - SMALLEST, "0.05 is usual")
+    whole("seed", seed, 2**128, 0)
     rig = Rig.of(rig)
     belief = rig_prior(rig) if prior is None else prior
     observed = Observed(rig, belief, int(samples))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+
+from agents.asked import MOST_SAMPLES
+from estimator.checks import SMALLEST, flag, number, shown, whole
 
 #: Shortest time of silence that the watchdog is told [s].
 _SHORTEST = 2.0
@@ -40,15 +42,19 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        least = {"samples": 1, "block": 8, "listen": 1, "stale": 0, "seed": 0}
-        for name, low in least.items():
-            value = getattr(self, name)
-            if (name != "block" or value is not None) and (not isinstance(value, int) or value < low):
-                raise ValueError(f"{name} must be a whole number of at least {low}, but is {value!r}")
-        if not 0 < self.bound < 1:
-            raise ValueError(f"bound must be a probability between 0 and 1, but is {self.bound!r}; 0.05 is usual")
-        if self.watchdog is not None and not 0 < self.watchdog < math.inf:
-            raise ValueError(f"watchdog must be positive, in seconds, but is {self.watchdog!r}")
+        ranges = {
+            "samples": (1, MOST_SAMPLES), "listen": (1, MOST_SAMPLES), "stale": (0, MOST_SAMPLES), "seed": (0, 2**128),
+            "block": (8, MOST_SAMPLES),
+        }  # fmt: skip
+        for name, (least, most) in ranges.items():
+            if name != "block" or self.block is not None:
+                whole(name, getattr(self, name), most, least)
+        if not isinstance(self.policy, str):
+            raise ValueError(f"policy must be a name, but is {shown(self.policy)}; see agents.POLICIES")
+        number("bound", self.bound, SMALLEST, 1 - SMALLEST, "0.05 is usual")
+        if self.watchdog is not None:
+            number("watchdog", self.watchdog, remedy="it is in seconds")
+        flag("no_watchdog", self.no_watchdog)
 
     def silence(self, step: float) -> float | None:
         """Seconds that the watchdog is told; None for none."""

@@ -20,12 +20,16 @@ from agents.cli import check_track, run_script
 from agents.evaluation.batch import make
 from agents.evaluation.comparison import usual_policies
 from agents.policies import make_policy, trained_policies
+from estimator.checks import one_of, whole
 from estimator.extras import need
 
 #: Grade to the policy that plays it; the expert is the one that ships for the track.
 POLICIES = {"random": "uniform", "medium": "velocity-sign", "planner": "efe"}
 
 _ROWS = 256
+
+#: Episodes, which are in memory together.
+_MOST = 100_000
 
 
 @dataclass(frozen=True)
@@ -43,8 +47,9 @@ class Config:
 
     def __post_init__(self) -> None:
         check_track(self.env)
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1, but is {self.episodes}")
+        one_of("grade", self.grade, (*POLICIES, "expert"))
+        whole("episodes", self.episodes, _MOST)
+        whole("seed", self.seed, 2**32 - 1, 0)
 
     @property
     def policy(self) -> str:

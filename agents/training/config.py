@@ -13,6 +13,7 @@ from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
 from agents.training.hyperparameters import read_settings, settings_of
+from estimator.checks import mapping, whole
 from estimator.extras import need
 from estimator.files import whole_file
 
@@ -69,14 +70,13 @@ class TrainConfig(Subject):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        mapping("options", self.options)
         # A run has its rig in itself, and not the name of a file that may change.
         object.__setattr__(self, "options", with_rig(self.options, self.rig))
         object.__setattr__(self, "rig", None)
-        for name in ("steps", "checkpoints", "torch_threads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}")
-        if self.eval_every < 0:
-            raise ValueError(f"eval_every must be at least 0, but is {self.eval_every}")
+        most = {"steps": 10**12, "checkpoints": 10**4, "torch_threads": 1024, "eval_every": 10**12, "seed": 2**32 - 1}
+        for name, highest in most.items():
+            whole(name, getattr(self, name), highest, 0 if name in ("eval_every", "seed") else 1)
         if self.tensorboard:
             need("tensorboard")
         if "reward" in self.options:

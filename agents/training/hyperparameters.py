@@ -45,7 +45,7 @@ def read_settings(algo: str, env_id: str, path: Path | None = None) -> Algorithm
         OSError: where the file cannot be read.
     """
     if algo not in ALGORITHMS:
-        raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, but is {algo}{_hint(algo, ALGORITHMS)}")
+        raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, but is {algo}{_hint(str(algo), ALGORITHMS)}")
     path = FILES / f"{algo}.toml" if path is None else path
     try:
         tables = tomllib.loads(whole_file(path, "settings must be a TOML file", 2**20).read_text())

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from agents.commands import main
 from agents.commands.rig_file import text_of
+from agents.evaluation.board import SHIPPED
 from benchmarks.fuzz.estimators import RIG
 from benchmarks.fuzz.judge import Call
 
@@ -21,10 +22,14 @@ _WORDS = [
     *("--options", '{"num_envs": 3}', '{"autoreset_mode": "x"}', '{"max_episode_steps": "x"}', "[" * 5000, "{", "[1]"),
     *("--policies", "prbs", "unifrom", "../x", "--systems", "--env", "duffing_env/Short-v0", "CartPole-v1"),
     *("--samples", "--output", "--step", "--seed", "--plant", "os:system", "x:y", "--out", "--max-rms", "=1+1"),
-    *("\x1b[31m", ""),
+    *("\x1b[31m", "", "--bound", "--board", "board.jsonl"),
 ]  # fmt: skip
 
-_FIRST = [["rig", "list"], ["rig", "init"], ["identify"], ["evaluate", "--systems", "1"], ["export"], ["run"], []]
+_FIRST = [
+    *(["rig", "list"], ["rig", "init"], ["identify"], ["run"], ["report"], ["report", "--board", "board.jsonl"], []),
+    *(["evaluate", "--systems", "1"], ["evaluate", "--protocol"], ["export"], ["export", "prbs", "--output", "x.csv"]),
+    *(["design", "--samples", "8", "--policy", "prbs"], ["train", "--steps", "0"]),
+]  # fmt: skip
 
 
 def calls() -> st.SearchStrategy[Call]:
@@ -33,6 +38,7 @@ def calls() -> st.SearchStrategy[Call]:
     os.chdir(place)
     Path("rig.toml").write_text(text_of(RIG, ""))
     Path("record.csv").write_text("u,y\n" + "1,2\n" * 60)
+    Path("board.jsonl").write_text(SHIPPED.read_text().splitlines()[0] + "\n{}\n")
     Path("short.csv").write_text("u,y\n1,2\n")
 
     @st.composite

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
+import os
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
 
+from agents.policies.export import draw_signal
+from agents.policies.saving import save_policy
+from agents.running.plan import Plan
+from agents.studies.datasets import Config as Dataset
+from agents.training.config import TrainConfig
 from benchmarks.fuzz.estimators import RIG
 from benchmarks.fuzz.judge import Call
 from benchmarks.fuzz.values import anything, changed, options
@@ -17,14 +26,19 @@ from estimator import (
     Belief,
     Channel,
     OnlineEstimator,
+    Parameters,
     Rig,
     coefficients_of,
     cramer_rao,
     difference,
     duffing,
     fisher_information,
+    identify,
+    paper_text_prior,
     published_run_prior,
     recorded_prior,
+    relative_covariance,
+    save_estimator,
     silverbox_prior,
     to_physical,
     weak_prior,
@@ -79,6 +93,20 @@ MADE: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "coefficients_of": (coefficients_of, {"model": difference(), "parameters": _TWIN}),
     "to_physical": (to_physical, {"model": difference(), "coefficients": _POINT}),
     "PEMNARX": (PEMNARX, {"units": 2, "input_delay": 0, "seed": 0, "restarts": 1}),
+    "paper_text_prior": (paper_text_prior, {"nonlinear": True, "model": None}),
+    "relative_covariance": (relative_covariance, {"model": difference(), "coefficients": _POINT, "covariance": _EYE}),
+    "Parameters": (lambda values: Parameters(values), {"values": _TWIN}),
+    "identify": (identify, {"rig": RIG, "records": (np.ones(5), np.ones(5))}),  # too short
+    "save_estimator": (save_estimator, {"estimator": OnlineEstimator(), "path": "estimator.npz"}),
+    "save_policy": (save_policy, {"folder": "policy", "model": 3, "card": None, "normalizer": None}),
+    "draw_signal": (draw_signal, {"name": "prbs", "samples": 64, "max_input": 0.15, "max_rms": None, "seed": 0}),
+    "Plan": (Plan, {name: one.default for name, one in Plan.__dataclass_fields__.items()}),
+    "Dataset": (Dataset, {"grade": "random", "env": "duffing_env/Short-v0", "episodes": 3, "seed": 0}),
+    "TrainConfig": (
+        TrainConfig,
+        {"algo": "ppo", "env": "duffing_env/Short-v0", "reward": "fisher", "steps": 9, "seed": 0, "options": {},
+         "checkpoints": 5, "eval_every": 0, "torch_threads": 1},
+    ),
 }  # fmt: skip
 
 #: Numbers of these would each compile a kernel of their own, or be tried where nothing is wrong with them.
@@ -87,6 +115,10 @@ _COSTLY = {"OnlineEstimator": ("iterations", "noise_hypotheses", "model", "prior
 
 def calls() -> st.SearchStrategy[Call]:
     """Calls of constructors and functions."""
+    place = Path(tempfile.mkdtemp(prefix="fuzz-")) / "here"  # some write, and "../x" is a name, too
+    place.mkdir()
+    os.chdir(place)
+    importlib.import_module("torch")  # takes seconds, which are no hang
 
     @st.composite
     def call(draw: st.DrawFn) -> Call:

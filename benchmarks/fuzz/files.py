@@ -13,6 +13,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from agents.commands.rig_file import text_of
+from agents.evaluation import board
 from agents.policies.learned import CARD, WEIGHTS, load_policy
 from agents.training.checkpoints import STATE, Progress, load_progress
 from agents.training.config import TrainConfig, describe, read_config
@@ -73,15 +74,15 @@ def calls() -> st.SearchStrategy[Call]:
             estimators[name] = ((place / "estimator.npz").read_bytes(), {key: archive[key] for key in archive.files})
     matlab = io.BytesIO()
     __import__("scipy.io").io.savemat(matlab, {"u": np.arange(60.0), "y": np.sin(np.arange(60.0))})
+    entries = board.SHIPPED.read_text().splitlines()[:2]
     config = json.dumps(describe(TrainConfig()), default=str)
     progress = json.dumps(vars(Progress(steps=5, curve=[(1, 0.5, None)])))
     counter = iter(range(10**9))
 
     @st.composite
     def call(draw: st.DrawFn) -> Call:
-        kind = draw(st.sampled_from(
-            ["estimator", "estimator", "estimator", "policy", "rig", "csv", "mat", "run", "checkpoint", "settings"]
-        ))  # fmt: skip
+        others = ("policy", "rig", "csv", "mat", "run", "checkpoint", "settings", "board")
+        kind = draw(st.sampled_from(["estimator"] * 3 + [*others]))
         number = next(counter) % 4
         if kind == "mat" and draw(st.integers(0, 9)):  # a process each
             kind = "csv"
@@ -146,6 +147,11 @@ def calls() -> st.SearchStrategy[Call]:
                 draw(damaged(progress.encode())) if draw(st.booleans()) else json.dumps(described).encode()
             )
             names, function = (*names, "checkpoint"), lambda: load_progress(folder)
+        elif kind == "board":
+            described = draw(changed(json.loads(entries[0])))
+            whole = "\n".join(entries).encode()
+            path.write_bytes(draw(damaged(whole)) if draw(st.booleans()) else json.dumps(described).encode())
+            names, function = (*names, "board"), lambda: board.tables(board.read(path))
         else:
             text = (FILES / "ppo.toml").read_bytes()
             path.write_bytes(draw(damaged(text)))

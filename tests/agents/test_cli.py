@@ -87,7 +87,7 @@ def test_help_explains_every_option(name):
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
-        ("train.py", ["--steps", "0"], "steps must be at least 1, but is 0"),
+        ("train.py", ["--steps", "0"], "steps must be a whole number from 1 to 1000000000000, but is 0"),
         ("train.py", ["--steps", "many"], "many"),
         ("train.py", ["--stepps", "5"], "--stepps"),
         ("train.py", ["--reward", "free_energie"], "did you mean 'free_energy'"),
@@ -102,11 +102,11 @@ def test_help_explains_every_option(name):
         ("train.py", ["--algo", "sac", "--ppo.gamma", "0.9"], "--ppo.gamma"),
         ("train.py", ["--algo", "sac", "--steps", "5000"], "learning_starts must be below steps, but is 5000 of 5000"),
         ("train.py", ["--settings", "none.toml"], "none.toml"),
-        ("train.py", ["--eval-every", "-1"], "eval_every must be at least 0, but is -1"),
-        ("train.py", ["--tune", "-1"], "tune must be at least 0, but is -1"),
+        ("train.py", ["--eval-every", "-1"], "eval_every must be a whole number from 0 to 1000000000000, but is -1"),
+        ("train.py", ["--tune", "-1"], "tune must be a whole number from 0 to 1000000, but is -1"),
         ("train.py", ["--resume", "none"], "resume takes all settings but systems from the run"),
         ("evaluate.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
-        ("evaluate.py", ["--systems", "1"], "systems must be at least 2, but is 1"),
+        ("evaluate.py", ["--systems", "1"], "systems must be a whole number from 2 to 100000, but is 1"),
         ("evaluate.py", ["--systems", "a few"], "a few"),
         ("evaluate.py", ["--policies", "unifrom"], "did you mean 'uniform'"),
         ("evaluate.py", ["--options", "[1]"], "options must be a JSON object, but are [1]"),

@@ -499,7 +499,7 @@ def test_policies_of_several_seeds_are_one_entry(tmp_path, without_record):
 
 @pytest.mark.parametrize("systems", [1, 0, -3])
 def test_one_system_is_too_few(systems):
-    with pytest.raises(ValueError, match=f"systems must be at least 2, but is {systems}"):
+    with pytest.raises(ValueError, match=f"systems must be a whole number from 2 to 100000, but is {systems}"):
         evaluate(["uniform"], systems=systems)
 
 

@@ -149,7 +149,7 @@ def test_limits_leave_what_fits_and_silence_alone():
     np.testing.assert_allclose(
         limits.fit(np.array([0.3, 0.0, 0.0, 0.0])), [1.0, 0.0, 0.0, 0.0], rtol=2e-6
     )  # clipped first
-    with pytest.raises(ValueError, match=r"max_rms must be positive and finite, in volts, but it is 0"):
+    with pytest.raises(ValueError, match=r"max_rms must be positive and finite, in volts, .* but it is 0"):
         Limits(0.1, 0.0)
     with pytest.raises(ValueError, match=r"max_input must be positive .* it is nan"):
         SignalPolicy("prbs", EXCITATIONS["prbs"](1.0), max_input=np.nan)
@@ -319,11 +319,13 @@ def test_export_round_trip(tmp_path):
     [
         ("multisin", {}, r"name must be one of .*did you mean 'multisine'"),
         ("velocity-sign", {}, r"must be played: use agents.make_policy"),
-        ("prbs", {"samples": 0}, r"samples must be 1 or more, but it is 0"),
+        ("prbs", {"samples": 0}, "samples must be a whole number from 1 to 4194304, but is 0"),
+        ("prbs", {"samples": 10**12}, "samples must be a whole number from 1 to 4194304, but is 1000000000000"),
+        ("prbs", {"max_input": "x"}, "max_input must be positive and finite, in volts, .* but it is 'x'"),
         ("multisine", {"samples": 4}, r"samples must be 5 or more .* but it is 4"),
-        ("prbs", {"max_input": -1.0}, r"max_input must be positive and finite, in volts, but it is -1"),
-        ("prbs", {"max_rms": np.inf}, r"max_rms must be positive and finite, in volts, but it is inf"),
-        ("prbs", {"seed": -1}, r"seed must be 0 or more, but it is -1"),
+        ("prbs", {"max_input": -1.0}, r"max_input must be positive and finite, in volts, .* but it is -1"),
+        ("prbs", {"max_rms": np.inf}, r"max_rms must be positive and finite, in volts, .* but it is inf"),
+        ("prbs", {"seed": -1}, "seed must be a whole number from 0 to .*, but is -1"),
     ],
 )
 def test_export_refuses_and_writes_nothing(tmp_path, name, options, message):

@@ -136,6 +136,9 @@ def test_a_broken_board_is_told(tmp_path, entry, line):
     path.write_text(json.dumps(entry) + "\n" + line + "\n")
     with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:2 is none"):
         board.read(path)
+    path.write_bytes(json.dumps({**entry, "reference": {}}).encode() + b"\n\xff\n")
+    with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:1 is none"):
+        board.read(path)
 
 
 def _append(path, entry, name):

@@ -54,8 +54,8 @@ def test_the_same_call_goes_on_and_another_is_refused(tmp_path, monkeypatch):
     ("words", "message"),
     [
         (["--ray"], "ray spreads several trainings, but there is one"),
-        (["--seeds", "0"], "seeds must be at least 1, and 1 in a search, but is 0"),
-        (["--seeds", "2", "--tune", "2"], "seeds must be at least 1, and 1 in a search, but is 2"),
+        (["--seeds", "0"], "seeds must be a whole number from 1 to 1000, but is 0"),
+        (["--seeds", "2", "--tune", "2"], "seeds must be 1 in a search, but is 2"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(words, message, capsys):

@@ -178,9 +178,9 @@ def test_senseless_limits_are_refused(max_input):
 
 
 def test_senseless_lengths_are_refused():
-    with pytest.raises(ValueError, match="samples must be 1 or more, but it is 0"):
+    with pytest.raises(ValueError, match="samples must be a whole number from 1 to 4194304, but is 0"):
         SignalPolicy("uniform", draw_uniform(0.1), max_input=0.1, samples=0)
-    with pytest.raises(ValueError, match="hold must be 1 sample or more, but it is 0"):
+    with pytest.raises(ValueError, match="hold must be a whole number from 1 to 1000000000, but is 0"):
         draw_prbs(0.1, hold=0)
 
 

@@ -219,9 +219,9 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"steps": 0}, "steps must be at least 1, but is 0"),
-        ({"checkpoints": 0}, "checkpoints must be at least 1, but is 0"),
-        ({"torch_threads": -1}, "torch_threads must be at least 1, but is -1"),
+        ({"steps": 0}, "steps must be a whole number from 1 to 1000000000000, but is 0"),
+        ({"checkpoints": 0}, "checkpoints must be a whole number from 1 to 10000, but is 0"),
+        ({"torch_threads": -1}, "torch_threads must be a whole number from 1 to 1024, but is -1"),
         ({"options": {"reward": "log_posterior"}}, "options must not hold reward"),
         ({"options": {"horizons": 3}}, "did you mean 'horizon'"),
         ({"reward": "information_gian"}, "did you mean 'information_gain'"),

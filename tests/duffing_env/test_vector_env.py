@@ -304,6 +304,8 @@ def test_bad_actions_are_refused_and_change_nothing(actions, message):
         ({"num_envs": 0}, "num_envs must be a whole number from 1 to 1048576, but is 0"),
         ({"num_envs": 2.0}, "num_envs must be a whole number from 1 to 1048576, but is 2.0"),
         ({"num_envs": 2**31}, "num_envs must be a whole number from 1 to 1048576, but is 2147483648"),
+        ({"num_envs": 2**18, "noise_hypotheses": 7}, "num_envs must leave room for 21 beliefs"),
+        ({"num_envs": 2**18, "observation": "history", "history": 1000}, "and 2002 observed numbers in each"),
         ({"threads": 0}, "threads must be a whole number from 1 to"),
         ({"threads": 10_000}, "threads must be a whole number from 1 to"),
         ({"autoreset_mode": "later"}, r"autoreset_mode must be one of \['NextStep', 'SameStep', 'Disabled'\]"),

@@ -133,6 +133,16 @@ def test_restore_is_all_or_nothing(kind):
     np.testing.assert_array_equal(estimator.belief.record, other.belief.record)
 
 
+@pytest.mark.parametrize("place", [3, ".", "a" * 300, "\0"])
+def test_what_cannot_be_written_is_refused(place, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="path must be the name of a file"):
+        save_estimator(KINDS["paper"](), place)
+    with pytest.raises(ValueError, match="estimator must be an OnlineEstimator, but is 3"):
+        save_estimator(3, "estimator.npz")
+    assert not list(tmp_path.iterdir())
+
+
 def test_members_that_are_no_belief_together_are_refused():
     estimator = KINDS["ensemble"]()
     estimator.run(*record(12))
