@@ -16,7 +16,6 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from tyro.constructors import PrimitiveConstructorSpec
 
 from agents.running.stopping import Stopped, stopped_by_sigterm
-from estimator.checks import printable, shown
 
 
 def _parse_options(words: list[str]) -> dict[str, Any]:
@@ -84,6 +83,7 @@ def check_track(env_id: str) -> None:
     from gymnasium.envs.registration import load_env_creator
 
     from duffing_env.vector_env import DuffingVectorEnv
+    from estimator.checks import shown
 
     if not isinstance(env_id, str):
         raise ValueError(f"env must be the id of a track such as duffing_env/Short-v0, but is {shown(env_id)}")
@@ -117,12 +117,17 @@ def told_in_one_line(name: str) -> Iterator[None]:
         with stopped_by_sigterm():
             yield
     except (KeyboardInterrupt, Stopped) as stopped:
-        left = f"; {stopped.left}" if isinstance(stopped, Stopped) and stopped.left else ""
-        print(f"{name}: stopped{printable(left)}", file=sys.stderr)
+        left = ""
+        if isinstance(stopped, Stopped) and stopped.left:
+            from estimator.checks import printable
+
+            left = f"; {printable(stopped.left)}"
+        print(f"{name}: stopped{left}", file=sys.stderr)
         sys.exit(128 + (stopped.signum if isinstance(stopped, Stopped) else SIGINT))
     except Exception as error:
         from gymnasium.error import Error as GymnasiumError
 
+        from estimator.checks import printable
         from estimator.extras import EXTRAS, how_to_get
 
         if isinstance(error, ModuleNotFoundError) and (package := str(error.name).split(".")[0]) in EXTRAS:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.asked import MOST_SAMPLES
-from estimator.checks import SMALLEST, flag, number, shown, whole
-
 #: Shortest time of silence that the watchdog is told [s].
 _SHORTEST = 2.0
 
@@ -42,6 +39,13 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if self != _USUAL:  # which is made for --help too, where nothing is imported that computes
+            self._check()
+
+    def _check(self) -> None:
+        from agents.asked import MOST_SAMPLES
+        from estimator.checks import SMALLEST, flag, number, shown, whole
+
         ranges = {
             "samples": (1, MOST_SAMPLES), "listen": (1, MOST_SAMPLES), "stale": (0, MOST_SAMPLES), "seed": (0, 2**128),
             "block": (8, MOST_SAMPLES),
@@ -61,3 +65,6 @@ class Plan:
         if self.no_watchdog:
             return None
         return self.watchdog or max(_SHORTEST, 20 * step) + 2 * (self.block or 0) * step
+
+
+_USUAL = object.__new__(Plan)  # its fields are the defaults
