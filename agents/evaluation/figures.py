@@ -89,15 +89,19 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
     """Input and output of one system in time, and the spectrum of the inputs: root of the mean power over systems."""
     figure = new_figure(12, 1.6 * len(evaluations) + 0.8)
     grid = figure.subplots(len(evaluations), 3, sharex="col", sharey="col", squeeze=False)
+    scales = evaluations[0].scales
+    unit, small, factor = scales.input_unit, scales.input_unit, scales.input
+    if unit == "V":
+        small, factor = "mV", 1e3 * factor
     for row, evaluation, colour in zip(grid, evaluations, cycle(_COLOURS), strict=False):
-        time = 1e3 * evaluation.step * np.arange(len(evaluation.inputs))
+        time = 1e3 * scales.step * np.arange(len(evaluation.inputs))
         inputs = np.nan_to_num(evaluation.inputs)  # an episode that ended is silent
-        spectrum = 1e3 * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
-        frequencies = np.fft.rfftfreq(len(inputs), evaluation.step)
+        spectrum = factor * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
+        frequencies = np.fft.rfftfreq(len(inputs), scales.step)
         lines = (
-            ("u / V", time, evaluation.inputs[:, system]),
-            ("y / V", time, evaluation.outputs[:, system]),
-            ("|U| / mV", frequencies, spectrum),
+            (f"u / {unit}", time, scales.input * evaluation.inputs[:, system]),
+            (f"y / {scales.output_unit}", time, scales.output * evaluation.outputs[:, system]),
+            (f"|U| / {small}", frequencies, spectrum),
         )
         for axes, (label, x, y) in zip(row, lines, strict=True):
             axes.plot(x, y, color=colour, linewidth=0.8)

@@ -33,7 +33,7 @@ class Metric:
 
     Attributes:
         title: with its unit.
-        digits: decimals that are printed.
+        digits: decimals that are printed; of what may have any size, less than 0 the significant ones.
         scale: from the stored to the printed unit.
         center: the statistic over systems, and its name.
         center_of_seeds: the same over systems and training seeds, by default the interquartile mean. Of shares it is
@@ -45,6 +45,11 @@ class Metric:
     scale: float = 1.0
     center: Statistic = MEAN
     center_of_seeds: Statistic = IQM
+
+    def text(self, value: float) -> str:
+        """A value as it is printed."""
+        form = f".{self.digits}f" if self.digits >= 0 else f".{-self.digits}g"
+        return format(self.scale * value, form)
 
 
 _share = partial(Metric, center_of_seeds=MEAN)
@@ -76,11 +81,23 @@ METRICS = {
 }
 
 
-def metrics_of(found: Iterable[str]) -> dict[str, Metric]:
-    """The columns of the metrics that were found, in their order; errors of other parameters than m, c, a, b first."""
+def metrics_of(found: Iterable[str], unit: str = "V") -> dict[str, Metric]:
+    """The columns of the metrics that were found, in their order; errors of other parameters than m, c, a, b first.
+
+    Args:
+        found: names.
+        unit: of the input; of a rig its own.
+    """
     others = {name for name in found if name not in METRICS}
     errors = {name: Metric(f"error of {name.removeprefix('error_')} / %", 2, 100, MEDIAN) for name in sorted(others)}
-    return errors | {name: metric for name, metric in METRICS.items() if name in found}
+    known = METRICS
+    if unit != "V":
+        powers = {
+            "input_power": f"input power / {unit}²" if unit.isalpha() else f"input power / ({unit})²",
+            "input_peak": f"input peak / {unit}",
+        }
+        known = METRICS | {name: Metric(title, -4) for name, title in powers.items()}
+    return errors | {name: metric for name, metric in known.items() if name in found}
 
 
 def summarise(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, Any]]:
@@ -150,7 +167,9 @@ def leaderboard(evaluations: list[Evaluation]) -> Table:
     summaries = [summarise(evaluation) for evaluation in ordered]
     rows = [
         [metric.title, *(cell_of(metric, summary.get(name)) for summary in summaries)]
-        for name, metric in metrics_of([name for summary in summaries for name in summary]).items()
+        for name, metric in metrics_of(
+            [name for summary in summaries for name in summary], ordered[0].scales.input_unit
+        ).items()
     ]
     return ["", *(evaluation.title for evaluation in ordered)], rows
 
@@ -163,7 +182,7 @@ def two_way_table(evaluations: list[Evaluation]) -> Table:
     for evaluation in in_order(evaluations):
         for estimator, values in evaluation.estimators.items():
             centers = {name: float(metric.center[1](values[name])) for name, metric in columns.items()}
-            cells = [f"{m.scale * centers[name]:.{m.digits}f}" for name, m in columns.items()]
+            cells = [metric.text(centers[name]) for name, metric in columns.items()]
             rows.append([evaluation.title, estimator.replace("_", " "), *cells])
     return ["policy", "estimator", *(metric.title for metric in columns.values())], rows
 
@@ -209,9 +228,7 @@ def cell_of(metric: Metric, entry: dict[str, Any] | None) -> str:
     if entry is None:
         return "-"
 
-    def text(value: float) -> str:
-        return f"{metric.scale * value:.{metric.digits}f}"
-
+    text = metric.text
     center = next(value for key, value in entry.items() if key in ("mean", "median", "iqm"))
     cell = f"{text(center)}\n[{text(entry['low'])}, {text(entry['high'])}]"
     return f"{cell}\nmedian seed {text(entry['median_of_seeds'])}" if "seeds" in entry else cell

@@ -64,7 +64,7 @@ def estimate_metrics(
 
 
 def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
-    """Mean square [V²], largest value [V] and crest factor (that over the RMS) of inputs (T, n), NaN where ended."""
+    """Mean square, largest value, and crest factor (that over the RMS) of inputs (T, n), NaN where ended."""
     power, peak = np.nanmean(inputs**2, axis=0), np.nanmax(np.abs(inputs), axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         crest = np.where(power > 0, peak / np.sqrt(power), np.nan)

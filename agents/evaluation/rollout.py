@@ -29,6 +29,7 @@ from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
 from estimator.posteriors import posteriors
 from estimator.rig import Rig
+from estimator.units import Scales
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -51,9 +52,10 @@ class Evaluation:
         metrics: name of a metric to its value for each system (systems,); see `agents.evaluation.leaderboard.METRICS`.
         curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats]; what a jump of the
             truth takes away is in it.
-        inputs: (horizon, systems) inputs that the plant was given [V], NaN after the end of an episode.
-        outputs: (horizon, systems) outputs [V], likewise; (horizon, systems, sensors) of several sensors.
-        step: sampling step [s].
+        inputs: (horizon, systems) inputs that the plant was given, in parts of their scale, NaN after the end of an
+            episode.
+        outputs: (horizon, systems) outputs, likewise; (horizon, systems, sensors) of several sensors.
+        scales: what one of them is worth, and the sampling step: 1 V, or what the rig says.
         estimators: what others make of the same inputs and outputs: name of an estimator to its `metrics`.
         seeds: number of policies.
     """
@@ -63,7 +65,7 @@ class Evaluation:
     curve: FloatArray
     inputs: FloatArray
     outputs: FloatArray
-    step: float
+    scales: Scales
     estimators: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
     seeds: int = 1
 
@@ -168,7 +170,7 @@ def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
         np.concatenate([e.curve for e in evaluations], axis=1),
         np.concatenate([e.inputs for e in evaluations], axis=1),
         np.concatenate([e.outputs for e in evaluations], axis=1),
-        evaluations[0].step,
+        evaluations[0].scales,
         {name: join([e.estimators[name] for e in evaluations]) for name in evaluations[0].estimators},
         sum(e.seeds for e in evaluations),
     )
@@ -263,12 +265,12 @@ def roll_out(
         "log_posterior_gain": curve[-1],
         **metrics.estimate_metrics(means, covs, truth, prior.model, prior.scales),
         "ended_early": ended_early,
-        **metrics.input_metrics(inputs),
+        **metrics.input_metrics(prior.scales.input * inputs),
         # Processor time. The first call may compile, and counts where there is no other.
         "decision_time": np.full(systems, np.mean(deciding[1:] or deciding) / systems),
     }
     seen = outputs[..., 0] if sensors == 1 else outputs
-    return Evaluation(title_of(name), values, curve, inputs, seen, prior.step), beliefs, truth, envs.experiment
+    return Evaluation(title_of(name), values, curve, inputs, seen, prior.scales), beliefs, truth, envs.experiment
 
 
 def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:

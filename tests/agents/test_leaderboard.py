@@ -14,6 +14,7 @@ from agents.evaluation.comparison import compare
 from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, figure_of_learning, save
 from agents.evaluation.leaderboard import (
     METRICS,
+    leaderboard,
     print_estimators,
     print_table,
     summarise,
@@ -22,6 +23,7 @@ from agents.evaluation.leaderboard import (
 )
 from agents.evaluation.rollout import Evaluation
 from estimator import SAMPLING_STEP
+from estimator.units import VOLTS, Scales
 
 # What the table must print for these values, by hand: centre, then both ends of an interval of width zero.
 CONSTANTS = {
@@ -58,7 +60,7 @@ def make_evaluation(policy="policy", *, samples=20, systems=30, seed=0, shift=0.
         metrics["log_posterior_gain"] = metrics["log_posterior_gain"] + shift
     curve = np.cumsum(rng.normal(1.0, 0.3, (samples + 1, systems)), axis=0) + shift
     inputs, outputs = rng.uniform(-0.1, 0.1, (2, samples, systems))
-    return Evaluation(policy, metrics, curve, inputs, outputs, SAMPLING_STEP)
+    return Evaluation(policy, metrics, curve, inputs, outputs, VOLTS)
 
 
 def test_every_metric_of_an_evaluation_has_a_column(monkeypatch):
@@ -210,6 +212,24 @@ def test_the_two_way_table_has_a_row_for_each_policy_and_estimator(capsys):
     assert {tuple(row[2:]) for row in rows} == {("2.000", "2.00", "2.000", "2.00", "3.0", "0.03")}
     print_estimators([make_evaluation("without")])
     assert capsys.readouterr().out == ""
+
+
+def test_a_rigs_table_and_figure_are_in_its_units():
+    newtons = Scales(1e-3, input=20.0, output=0.03, input_unit="N", output_unit="m")
+    values = {"input_power": [90.25, 110.25], "input_peak": [19.0, 20.0], "log_posterior_gain": [1.0, 2.0]}
+    told = {name: np.array(value) for name, value in values.items()}
+    evaluation = replace(make_evaluation(systems=2, **told), scales=newtons)
+    _, rows = leaderboard([evaluation])
+    cells = {title: cell.split("\n")[0] for title, cell in rows}
+    assert cells["input power / N²"] == "100.2"
+    assert cells["input peak / N"] == "19.5"
+    u, y, spectrum = figure_of_inputs([evaluation]).axes
+    assert [axes.get_ylabel() for axes in (u, y, spectrum)] == ["u / N", "y / m", "|U| / N"]
+    np.testing.assert_allclose(u.lines[0].get_ydata(), 20.0 * evaluation.inputs[:, 0])
+    np.testing.assert_allclose(y.lines[0].get_ydata(), 0.03 * evaluation.outputs[:, 0])
+    np.testing.assert_allclose(u.lines[0].get_xdata(), np.arange(20))  # ms
+    in_volts = figure_of_inputs([replace(evaluation, scales=VOLTS)]).axes[2].lines[0].get_ydata()
+    np.testing.assert_allclose(spectrum.lines[0].get_ydata(), 20.0 * 1e-3 * in_volts)
 
 
 def test_the_best_policy_comes_first(capsys):
