@@ -71,8 +71,9 @@ def tune(config: TrainConfig, trials: int, *, on_ray: bool = False) -> Path:
     state = optuna.trial.TrialState
     for trial in begun:
         if trial.state == state.RUNNING:  # the one that the search was stopped in; it is made again
+            # It may have been told a part of its hyperparameters by then.
+            study.enqueue_trial(trial.system_attrs.get("fixed_params", {}) | trial.params)
             study.tell(trial.number, state=state.FAIL)
-            study.enqueue_trial(trial.params)
     finished = sum(trial.state in (state.COMPLETE, state.PRUNED) for trial in begun)
 
     def objective(trial: Trial) -> float | None:

@@ -63,7 +63,10 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
         tune(tiny(folder, seed=1), 4)
 
 
-def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch):
+@pytest.mark.parametrize("at_once", [False, True], ids=["trained", "began"])
+def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch, at_once):
+    """Also where it was killed between two of its hyperparameters."""
+
     def stand_in(run, report):
         report(run.steps, {"log_posterior_gain": 1.0})
 
@@ -73,13 +76,17 @@ def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch):
     tune(tiny(folder), 1)
     journal = folder / "study.log"
     lines = journal.read_text().splitlines()
-    journal.write_text("\n".join(lines[:-1]) + "\n")  # without its last line, the trial is still running
+    told = [k for k, line in enumerate(lines) if json.loads(line)["op_code"] == 5]  # a hyperparameter of a trial
+    kept = lines[: told[0] + 1] if at_once else lines[:-1]  # without its last line, the trial is still running
+    journal.write_text("\n".join(kept) + "\n")
     tune(tiny(folder), 1)
     tune(tiny(folder), 2)
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
     first, again, other = optuna.load_study(study_name=None, storage=storage).trials
     assert [trial.state.name for trial in (first, again, other)] == ["FAIL", "COMPLETE", "COMPLETE"]
-    assert first.params == again.params != other.params
+    assert first.params.items() <= again.params.items()
+    assert (len(first.params) == 1) == at_once
+    assert again.params == {name: getattr(TINY, name) for name in again.params} != other.params
 
 
 def test_trials_below_the_median_are_given_up(tmp_path, optuna, monkeypatch):
