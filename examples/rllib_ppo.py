@@ -6,6 +6,7 @@ $ duffing-env evaluate --protocol Short-v0 --policies "rllib-ppo=runs/rllib-ppo-
 Needs ``ray[rllib]``; benchmarks/compat.lock has the versions that this runs with.
 """
 
+import os
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -44,7 +45,7 @@ def mean_network(module: torch.nn.Module) -> torch.nn.Sequential:
 def main(args: Args) -> Path:
     """Train, write the policy folder, and give its path."""
     torch.set_num_threads(1)  # more than one are slower, and many times so on a busy machine
-    ray.init(include_dashboard=False)
+    ray.init(os.environ.get("RAY_ADDRESS", "local"))  # and not whatever cluster runs on this machine
     config = PPOConfig().environment(f"duffing_env:{args.env_id}").debugging(seed=args.seed)
     algorithm, steps = config.build_algo(), 0
     while steps + config.train_batch_size <= args.total_timesteps:

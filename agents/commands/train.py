@@ -77,11 +77,11 @@ class Config(TrainConfig):
 
     def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
         """Compare what was trained with the usual policies."""
-        from agents.evaluation.comparison import compare, usual_policies
-
         if config.env == FAMILY:
             print(f"python -m agents.studies.universal --policies {policy}")
         elif self.systems:
+            from agents.evaluation.comparison import compare, usual_policies
+
             compare(
                 (policy, *usual_policies(config.env, config.options)), config.env, self.systems, config.options, folder
             )
