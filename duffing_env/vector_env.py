@@ -258,10 +258,14 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
     def _reset_mask(self, options: dict[str, Any]) -> Flags:
         if "reset_mask" not in options:
             return self._everywhere
-        mask = np.asarray(options["reset_mask"])
+        try:
+            mask = np.asarray(options["reset_mask"])
+        except ValueError:  # ragged
+            mask = np.empty(0)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(
-                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is {mask!r}"
+                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is "
+                f"{shown(options['reset_mask'])}"
             )
         return mask
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief, check_record, covariance_places
+from estimator.checks import numbers
 from estimator.ensemble import NoiseRatio, first_weights, log_ratio, priors, ratio_of, side_by_side
 from estimator.inference import samples
 from estimator.inference.mixture import mixture
@@ -274,15 +275,15 @@ class Filter:
 
 def _checked(name: str, value: npt.ArrayLike, own: FloatArray) -> FloatArray:
     """A copy of an array of the right kind."""
-    array = np.asarray(value)
-    if array.dtype != np.float64 or array.shape != own.shape:
+    array = numbers(name, value)
+    if np.asarray(value).dtype != np.float64 or array.shape != own.shape:
         raise ValueError(
-            f"{name} must be float64 of shape {own.shape}, but is {array.dtype} of {array.shape}; use arrays() of an "
-            f"estimator with the same settings"
+            f"{name} must be float64 of shape {own.shape}, but is {np.asarray(value).dtype} of {array.shape}; use "
+            f"arrays() of an estimator with the same settings"
         )
     # A member without weight may have overflowed, and an output that waits may be missing.
     if name not in ("records", "outputs") and not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite, but is {array.tolist()}; use arrays() of an estimator")
     if name == "outputs" and np.isinf(array).any():
         raise ValueError(f"outputs must be finite or missing, but are {array.tolist()}; use arrays() of an estimator")
-    return np.array(array, order="C")
+    return array

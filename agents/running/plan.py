@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 #: Shortest time of silence that the watchdog is told [s].
 _SHORTEST = 2.0
@@ -39,7 +39,8 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self != _USUAL:  # which is made for --help too, where nothing is imported that computes
+        # The usual plan is made for --help too, where nothing is imported that computes.
+        if any(getattr(self, field.name) is not field.default for field in fields(self)):
             self._check()
 
     def _check(self) -> None:
@@ -65,6 +66,3 @@ class Plan:
         if self.no_watchdog:
             return None
         return self.watchdog or max(_SHORTEST, 20 * step) + 2 * (self.block or 0) * step
-
-
-_USUAL = object.__new__(Plan)  # its fields are the defaults

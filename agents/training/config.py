@@ -13,7 +13,7 @@ from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
 from agents.training.hyperparameters import read_settings, settings_of
-from estimator.checks import mapping, whole
+from estimator.checks import mapping, one_of, whole
 from estimator.extras import need
 from estimator.files import whole_file
 
@@ -70,6 +70,9 @@ class TrainConfig(Subject):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        one_of("algo", self.algo, ALGORITHMS)
+        if not isinstance(self.env, str):
+            check_track(self.env)
         mapping("options", self.options)
         # A run has its rig in itself, and not the name of a file that may change.
         object.__setattr__(self, "options", with_rig(self.options, self.rig))

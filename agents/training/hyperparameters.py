@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
-from estimator.checks import printable
+from estimator.checks import one_of, printable
 from estimator.files import whole_file, write_atomically
 
 #: Folder of the files that come with the package, ``ALGORITHM.toml``.
@@ -44,8 +44,7 @@ def read_settings(algo: str, env_id: str, path: Path | None = None) -> Algorithm
         ValueError: for an unknown algorithm, or a file that is no TOML or has an entry that is no hyperparameter.
         OSError: where the file cannot be read.
     """
-    if algo not in ALGORITHMS:
-        raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, but is {algo}{_hint(str(algo), ALGORITHMS)}")
+    one_of("algo", algo, ALGORITHMS)
     path = FILES / f"{algo}.toml" if path is None else path
     try:
         tables = tomllib.loads(whole_file(path, "settings must be a TOML file", 2**20).read_text())

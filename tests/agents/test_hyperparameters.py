@@ -80,7 +80,7 @@ def test_a_mistake_is_refused_by_name(tmp_path, text, message):
 
 
 def test_an_unknown_algorithm_is_refused():
-    with pytest.raises(ValueError, match=r"algo must be one of ppo, .* but is saac; did you mean 'sac'\?"):
+    with pytest.raises(ValueError, match=r"algo must be one of \['ppo', .* but is 'saac'; did you mean 'sac'\?"):
         read_settings("saac", SHORT)
 
 

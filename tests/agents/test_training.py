@@ -219,6 +219,8 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"algo": np.ones(2)}, r"algo must be one of \['ppo', .*\], but is array"),
+        ({"env": np.ones(2)}, "env must be the id of a track such as duffing_env/Short-v0, but is array"),
         ({"steps": 0}, "steps must be a whole number from 1 to 1000000000000, but is 0"),
         ({"checkpoints": 0}, "checkpoints must be a whole number from 1 to 10000, but is 0"),
         ({"torch_threads": -1}, "torch_threads must be a whole number from 1 to 1024, but is -1"),

@@ -267,7 +267,16 @@ def test_finished_rows_are_reset_by_hand():
 
 
 @pytest.mark.parametrize(
-    "mask", [np.ones(2, dtype=bool), np.zeros(3, dtype=bool), np.ones(3), [1, 0, 1], np.ones((3, 1), dtype=bool), None]
+    "mask",
+    [
+        np.ones(2, dtype=bool),
+        np.zeros(3, dtype=bool),
+        np.ones(3),
+        [1, 0, 1],
+        np.ones((3, 1), dtype=bool),
+        None,
+        [[True], [True, False]],
+    ],
 )
 def test_bad_reset_masks_are_refused(mask):
     with pytest.raises(ValueError, match=r"reset_mask must be a bool array of shape \(3,\)"):

@@ -127,6 +127,9 @@ def test_restore_is_all_or_nothing(kind):
             with pytest.raises(ValueError, match=r"use arrays\(\) of an estimator"):
                 estimator.restore(wrong)
             assert_same(estimator, untouched)
+    with pytest.raises(ValueError, match="records must be numbers, but is"):
+        estimator.restore({**arrays, "records": [[1.0, 2.0], [3.0]]})
+    assert_same(estimator, untouched)
     estimator.restore(arrays)
     for array in arrays.values():
         array[...] = 0.0

@@ -421,6 +421,7 @@ def test_the_folder_of_another_run_is_left_alone(tmp_path):
     [
         ({"samples": 0}, "samples must be"),
         ({"block": 4}, "block must be"),
+        ({"bound": np.ones(2)}, "bound must be a number"),
         ({"bound": 0.0}, "bound must be"),
         ({"watchdog": -1.0}, "watchdog must be"),
         ({"policy": "prsb"}, "did you mean 'prbs'"),
