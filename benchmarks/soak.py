@@ -35,10 +35,6 @@ _ROWS = 1024
 
 #: Extreme, but no kernel of their own.
 _EXTREME = {"max_input": 300.0, "max_output": 4000.0, "process_noise": 0.3, "noise_shape": 0.1}
-_RIG = Rig(
-    1e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03, noise=5e-6),
-    guess={"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)},
-)  # fmt: skip
 
 COUNTED = ("samples", "episodes", "not finite", "out of bounds", "no covariance", "growth")
 
@@ -91,13 +87,19 @@ def main(config: Config) -> None:
     sys.exit(bool(bad))
 
 
+def _rig(limit: float, span: float) -> Rig:
+    """A rig with an input limit [N] and an output range [m]."""
+    guess = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
+    return Rig(1e-3, input=Channel("N", limit=limit), output=Channel("m", range=span, noise=5e-6), guess=guess)
+
+
 def soak(name: str, steps: int) -> dict[str, int]:
     """What a track's samples came to."""
     counts = dict.fromkeys(COUNTED, 0)
-    given: dict[str, Any] = {"rig": _RIG} if "Rig" in name else {}
-    extreme = {} if given or "Replay" in name else _EXTREME
+    usual: dict[str, Any] = {"rig": _rig(6.0, 0.03)} if "Rig" in name else {}
+    extreme = {"rig": _rig(600.0, 30.0)} if "Rig" in name else {} if "Replay" in name else _EXTREME
     rng = np.random.default_rng(0)
-    for options in (given, {**given, **extreme}):
+    for options in (usual, extreme):
         envs: Any = gym.make_vec(f"duffing_env/{name}", _ROWS, vectorization_mode="vector_entry_point", **options)
         for play in ACTIONS.values():
             _play(envs, play, max(1, steps // (_ROWS * 2 * len(ACTIONS))), rng, counts)
