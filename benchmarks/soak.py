@@ -27,7 +27,7 @@ from agents.cli import progress_bar, run_script
 from duffing_env.silverbox import record_available
 from duffing_env.tracks import TRACKS
 from estimator import Channel, OnlineEstimator, Rig
-from estimator.belief import check_record
+from estimator.belief import check_record, covariance_places
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 
@@ -119,7 +119,7 @@ def _play(envs: Any, play: Callable[..., Any], rounds: int, rng: np.random.Gener
         counts["not finite"] += int((~np.isfinite(rewards)).sum() + (~np.isfinite(observations)).sum())
         counts["out of bounds"] += int(((observations < low) | (observations > high)).sum())
         if t % 64 == 63:
-            counts["no covariance"] += sum(not _is_sound(model, record) for record in envs.records)
+            counts["no covariance"] += _unsound(model, envs.records)
         if t == rounds // 2:
             before = _memory()
     counts["growth"] = max(counts["growth"], _memory() - before)
@@ -137,11 +137,23 @@ def filtered(name: str, steps: int) -> dict[str, int]:
         belief = estimator.belief
         counts["samples"] += len(u)
         counts["not finite"] += int((~np.isfinite(energies)).sum())
-        counts["no covariance"] += not _is_sound(belief.model, belief.record)
+        counts["no covariance"] += _unsound(belief.model, belief.record[None])
         if piece == pieces // 2:
             before = _memory()
     counts["growth"] = _memory() - before
     return counts
+
+
+def _unsound(model: Any, records: Any) -> int:
+    """How many records (n, size) are no belief: all are looked at together, and one by one what is not plainly one."""
+    covs = records[:, covariance_places(model)]
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
+        correlations = covs / stds[:, :, None] / stds[:, None]
+    plain = np.isfinite(correlations).all((1, 2)) & np.isfinite(records).all(1)
+    plain &= (records[:, -2 - 2 * model.n_outputs :] > 0).all(1)
+    plain[plain] = np.linalg.eigvalsh(correlations[plain])[:, 0] > 0
+    return sum(not _is_sound(model, record) for record in records[~plain])
 
 
 def _is_sound(model: Any, record: Any) -> bool:
