@@ -22,6 +22,7 @@ from estimator.checks import LARGEST, number, numbers
 from estimator.engine.feeding import input_degree
 from estimator.engine.rows import path_results
 from estimator.engine.tasks import path
+from estimator.inputs import lengths_of
 from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
@@ -246,8 +247,7 @@ def follow(
         cov: (n_states, n_states) of the states at the start.
     """
     k = model.n_coefficients
-    ends = np.isnan(inputs[:, :, 0])
-    lengths = np.where(ends.any(axis=1), ends.argmax(axis=1), inputs.shape[1])
+    lengths = lengths_of(inputs[:, :, 0])
     totals = np.zeros((len(inputs), len(path_results(model))))
     start = cov[np.triu_indices(model.n_states)]
     outputs = np.zeros((0, 0, 0)) if y is None else y

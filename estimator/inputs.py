@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import numpy.typing as npt
 
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
@@ -76,6 +77,11 @@ def feed(model: Model, rig: Rig) -> Feed:
     if rig.interpolation == "look_ahead":
         return _feed(_look_ahead(), rig.delay - 1, fills=True)
     return Feed(np.eye(_DEGREE + 1), 0, fills=True, at_once=True, delay=rig.delay)
+
+
+def lengths_of(series: FloatArray) -> npt.NDArray[np.int64]:
+    """Samples (n,) of each of some series (n, T), which may have none, before its first NaN."""
+    return (np.cumsum(np.isnan(series), axis=1) == 0).sum(axis=1)
 
 
 def degree(model: Model, rig: Rig) -> int:

@@ -16,7 +16,7 @@ from estimator.belief import Belief
 from estimator.engine import tasks
 from estimator.engine.rows import belief_names
 from estimator.inference import DEFAULT_ITERATIONS, mean_field
-from estimator.inputs import degree, feed
+from estimator.inputs import degree, feed, lengths_of
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
 from estimator.rig import Rig
@@ -51,8 +51,7 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
     way = feed(prior.model, rig)
     if way.fills:
         raise ValueError(f"interpolation must be 'zero_order' or 'linear', but is {rig.interpolation!r}; or use run()")
-    ended = np.isnan(inputs)
-    lengths = np.where(ended.any(axis=1), ended.argmax(axis=1), inputs.shape[1])
+    lengths = lengths_of(inputs)
     for row, length in enumerate(lengths):
         if not (np.isfinite(inputs[row, :length]).all() and np.isfinite(outputs[row, :length]).all()):
             raise ValueError(f"u and y must be finite up to the end of a record, but those of record {row} are not")

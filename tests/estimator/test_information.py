@@ -139,6 +139,7 @@ def test_a_series_ends_before_its_first_nan():
     information = fisher_information(PAPER, TWIN, short, Q, R)
     np.testing.assert_array_equal(information[0], fisher_information(PAPER, TWIN, u[0, :30], Q, R))
     np.testing.assert_array_equal(information[1], fisher_information(PAPER, TWIN, u[1], Q, R))
+    assert not fisher_information(PAPER, TWIN, u[:, :0], Q, R).any()
 
 
 def test_bounds():
