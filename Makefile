@@ -95,8 +95,9 @@ soak: $(READY)  ## long runs on every track
 kills: $(READY)  ## commands killed at random moments, and started again; a quarter of an hour
 	$(BIN)/python -m benchmarks.kills
 
-release: $(READY)  ## wheel and sdist into dist, built twice and compared
+release: $(READY)  ## wheel and sdist into dist, built twice and compared; the wheel tried in a clean environment
 	$(BIN)/python .ci/release.py
+	$(BIN)/python -m pytest -m slow -s tests/test_wheel.py
 
 licences: $(READY)  ## of every installed package
 	$(BIN)/python .ci/licences.py

@@ -1,7 +1,9 @@
 """Build wheel and sdist from the commit that is checked out, twice, in two clones: `make release`.
 
 They must be the same, byte for byte, and go into ``dist``. All times in them are that of the commit. The wheel must
-hold the packages, the trained policies, the rigs and the licence, and have the version of ``pyproject.toml``.
+hold the packages, the trained policies, the rigs and the licence, and have the version of ``pyproject.toml``; an index
+must be able to show what both say of themselves (twine). ``make release`` then tries the wheel in a clean environment
+(`tests/test_wheel.py`).
 """
 
 import hashlib
@@ -15,6 +17,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+TWINE = "twine==7.0.0"  # and not in the lock: nothing else needs what it brings
 WANTED = ("estimator/py.typed", "estimator/rigs/beam.toml", "agents/policies/trained/ppo/short/policy.json")
 
 
@@ -42,6 +45,15 @@ def check(wheel: Path) -> None:
         sys.exit(f"{wheel.name} must hold {missing}, but does not")
 
 
+def check_metadata(files: list[Path]) -> None:
+    """Refuse files that an index would not show."""
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+        python = Path(folder) / "bin" / "python"
+        subprocess.run([python, "-m", "pip", "install", "--quiet", TWINE], check=True)
+        subprocess.run([python, "-m", "twine", "check", "--strict", *files], check=True)
+
+
 def main() -> None:
     """Build twice, compare, check, and put the files into ``dist``."""
     if git("status", "--porcelain"):
@@ -58,6 +70,7 @@ def main() -> None:
         (ROOT / "dist" / name).write_bytes(content)
         print(f"{hashlib.sha256(content).hexdigest()}  dist/{name}")
     check(next((ROOT / "dist").glob("*.whl")))
+    check_metadata(sorted((ROOT / "dist").iterdir()))
     print("two builds in two clones gave the same files")
 
 
