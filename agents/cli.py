@@ -19,7 +19,7 @@ from agents.running.stopping import Stopped, stopped_by_sigterm
 
 
 def _parse_options(words: list[str]) -> dict[str, Any]:
-    """The object that the first of the words holds as JSON; ValueError where it is none."""
+    """The JSON object that the first of the words holds; ValueError where it is not one."""
     try:
         options = json.loads(words[0])
     except RecursionError:
@@ -55,7 +55,7 @@ def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
     """Options of an environment, with the rig of a file written out.
 
     Raises:
-        ValueError: for a file that is no rig's.
+        ValueError: for a file that is not a rig's.
         FileNotFoundError: if there is no such file.
     """
     if rig is None:

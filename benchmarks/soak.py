@@ -1,4 +1,4 @@
-"""Long runs on every track and of filters: is every number finite and in bounds, every covariance one, memory flat?
+"""Long runs on every track and of filters: are numbers finite and in bounds, covariances sound, and memory flat?
 
 $ python -m benchmarks.soak --steps 10000000
 $ python -m benchmarks.soak --steps 1000000 --runs Short-v0 Rig-v0 filter-duffing
@@ -6,7 +6,8 @@ $ python -m benchmarks.soak --steps 1000000 --runs Short-v0 Rig-v0 filter-duffin
 A track's samples are shared among four kinds of actions (random, constant, alternating, at the believed resonance) and
 as many with extreme options. A filter goes over one record, played again and again. Every covariance of a track is
 looked at after every 64th sample, and that of a filter after every 16,384th. The exit status is 1 where a number was
-not finite or out of bounds, a covariance none, or memory grew by more than 2 MB in the second half of a run.
+not finite or out of bounds, a covariance not positive semi-definite, or where memory grew by more than 2 MB in the
+second half of a run.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _ROWS = 1024
 #: Extreme, but no kernel of their own.
 _EXTREME = {"max_input": 300.0, "max_output": 4000.0, "process_noise": 0.3, "noise_shape": 0.1}
 
-COUNTED = ("samples", "episodes", "not finite", "out of bounds", "no covariance", "growth")
+COUNTED = ("samples", "episodes", "not finite", "out of bounds", "not a covariance", "growth")
 
 #: Models of the filters, with their default priors; and samples of the record.
 FILTERS: dict[str, Callable[[], Any]] = {"filter-paper": difference, "filter-duffing": duffing}
@@ -78,11 +79,11 @@ def main(config: Config) -> None:
         for name in bar.track(config.runs or names, description="runs"):
             found[name] = filtered(name, config.steps) if name in FILTERS else soak(name, config.steps)
     rows = [[name, *(f"{value:,}" for value in counts.values())] for name, counts in found.items()]
-    heads = ("run", "samples", "episodes", "not finite", "out of bounds", "no covariance", "growth / kB")
+    heads = ("run", "samples", "episodes", "not finite", "out of bounds", "not a covariance", "growth / kB")
     show(table(heads, rows, markdown=True), width=120)
     if config.json is not None:
         config.json.write_text(json.dumps(found, indent=2))
-    bad = [name for name, c in found.items() if c["not finite"] + c["out of bounds"] + c["no covariance"]]
+    bad = [name for name, c in found.items() if c["not finite"] + c["out of bounds"] + c["not a covariance"]]
     bad += [name for name, c in found.items() if c["growth"] > 2000]
     sys.exit(bool(bad))
 
@@ -119,7 +120,7 @@ def _play(envs: Any, play: Callable[..., Any], rounds: int, rng: np.random.Gener
         counts["not finite"] += int((~np.isfinite(rewards)).sum() + (~np.isfinite(observations)).sum())
         counts["out of bounds"] += int(((observations < low) | (observations > high)).sum())
         if t % 64 == 63:
-            counts["no covariance"] += _unsound(model, envs.records)
+            counts["not a covariance"] += _unsound(model, envs.records)
         if t == rounds // 2:
             before = _memory()
     counts["growth"] = max(counts["growth"], _memory() - before)
@@ -137,7 +138,7 @@ def filtered(name: str, steps: int) -> dict[str, int]:
         belief = estimator.belief
         counts["samples"] += len(u)
         counts["not finite"] += int((~np.isfinite(energies)).sum())
-        counts["no covariance"] += _unsound(belief.model, belief.record[None])
+        counts["not a covariance"] += _unsound(belief.model, belief.record[None])
         if piece == pieces // 2:
             before = _memory()
     counts["growth"] = _memory() - before

@@ -21,7 +21,7 @@ def check_mean(given: Mapping[str, float] | None, names: Sequence[str]) -> None:
 
 
 def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None) -> None:
-    """Refuse what is no belief, or one in other scales, or of another model where that is given."""
+    """Refuse what is not a belief, or one in other scales, or of another model where that is given."""
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be an estimator.Belief or None, but is {shown(prior)}")
     if prior.scales != scales:

@@ -27,7 +27,7 @@ def action_space() -> spaces.Box:
 
 
 def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, Any]:
-    """The options of a reset; ValueError for one that is not known, or what is no dict."""
+    """The options of a reset; ValueError for one that is not known, or what is not a dict."""
     if not isinstance(options, dict | None):
         raise ValueError(f"options of reset must be a dict or None, but are {options!r:.200}")
     for name in options or {}:

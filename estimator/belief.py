@@ -41,7 +41,7 @@ def record_size(model: Model) -> int:
 
 
 def check_record(what: str, model: Model, record: FloatArray, rounding: float) -> None:
-    """Refuse numbers (size,) that are no belief of a model.
+    """Refuse numbers (size,) that are not a belief of a model.
 
     Args:
         what: names them in the message.

@@ -34,14 +34,14 @@ def is_finite(value: object) -> bool:
 
 
 def number(name: str, value: object, low: float = SMALLEST, high: float = LARGEST, remedy: str = "") -> None:
-    """Refuse what is no number from ``low`` to ``high``; the remedy ends the message."""
+    """Refuse what is not a number from ``low`` to ``high``; the remedy ends the message."""
     if not (is_finite(value) and low <= value <= high):  # type: ignore[operator]
         end = f"; {remedy}" if remedy else ""
         raise ValueError(f"{name} must be a number from {low:.10g} to {high:.10g}, but is {shown(value)}{end}")
 
 
 def whole(name: str, value: object, most: int, least: int = 1) -> None:
-    """Refuse what is no whole number from ``least`` to ``most``."""
+    """Refuse what is not a whole number from ``least`` to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
         raise ValueError(f"{name} must be a whole number from {least} to {most}, but is {shown(value)}")
 
@@ -53,7 +53,7 @@ def flag(name: str, value: object) -> None:
 
 
 def one_of(name: str, value: object, known: Collection[str]) -> None:
-    """Refuse what is no name among those that are known."""
+    """Refuse what is not a name among those that are known."""
     if not isinstance(value, str) or value not in known:
         near = difflib.get_close_matches(value, known, 1) if isinstance(value, str) else []
         hint = f"; did you mean {near[0]!r}?" if near else ""
@@ -61,7 +61,7 @@ def one_of(name: str, value: object, known: Collection[str]) -> None:
 
 
 def mapping(name: str, value: object, kind: type = object) -> None:
-    """Refuse what is no dictionary from names to values of a kind."""
+    """Refuse what is not a dictionary from names to values of a kind."""
     if not isinstance(value, Mapping) or not all(isinstance(k, str) and isinstance(v, kind) for k, v in value.items()):
         raise ValueError(f"{name} must be a dictionary from names to values, but is {shown(value)}")
 

@@ -70,7 +70,7 @@ def file_name(name: str, value: object) -> Path:
     """The path that an argument is, of a file or folder to be written.
 
     Raises:
-        ValueError: for what is no path, or a name that no file can have.
+        ValueError: for what is not a path, or a name that no file can have.
     """
     try:
         place = Path(value)  # type: ignore[arg-type]
@@ -98,7 +98,7 @@ def whole_file(path: str | Path, must: str, largest: int, missing: str = "") -> 
     try:
         place = Path(path)
     except TypeError as error:
-        raise ValueError(f"{must}, but {shown(path)} is none; name one") from error
+        raise ValueError(f"{must}, but {shown(path)} is not a path; name one") from error
     try:
         found = place.stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -106,7 +106,7 @@ def whole_file(path: str | Path, must: str, largest: int, missing: str = "") -> 
     except (OSError, ValueError) as error:
         raise ValueError(f"{must}, but {str(place)!r:.80} cannot be opened: {error!r:.80}; name another") from error
     if not stat.S_ISREG(found.st_mode):
-        raise ValueError(f"{must}, but {place} is none; name the file itself")
+        raise ValueError(f"{must}, but {place} is not one; name the file itself")
     if found.st_size > largest:
         raise ValueError(f"{must}, but {place} has {found.st_size} bytes, more than {largest}; name another")
     return place

@@ -192,7 +192,7 @@ def relative_covariance(
         (..., p, p): the roots of its diagonal are coefficients of variation.
 
     Raises:
-        ValueError: for a model that is none, or shapes that do not fit it.
+        ValueError: for something that is not a model, or shapes that do not fit it.
     """
     points, spread = numbers("coefficients", coefficients), numbers("covariance", covariance)
     k = Model.checked(model).n_coefficients

@@ -53,7 +53,7 @@ def lanewise(
     Args:
         layout: name of a quantity to its row.
         outputs: the rows that the function returns, in its order, separated by spaces.
-        uniform: parameters that are no rows, in the order in which the loop takes them.
+        uniform: parameters that are not rows, in the order in which the loop takes them.
         lanes: systems in the block.
         one: for one lane: ``f(W, j, *uniform)``.
 
@@ -81,7 +81,7 @@ def of_lane(layout: Mapping[str, int], function: Callable[..., Any], lanes: int 
         lanes: systems in the block.
 
     Raises:
-        ValueError: for a parameter that is no row.
+        ValueError: for a parameter that is not a row.
     """
     source = f"def {function.__name__}(W, j):\n    return scalar({_places(function, layout, '', lanes)})\n"
     return jit(_define(source, function, scalar=jit(function)))

@@ -64,7 +64,8 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def plain(text: str) -> str:
     """Text that matplotlib takes as it is, and has room for.
 
-    A name may hold dollar signs, which are no formula, begin with an underscore, which legends leave out, or be long.
+    A name may hold dollar signs, which are not a formula, begin with an underscore, which legends
+    leave out, or be long.
     """
     short = text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]}…{text[-_LONGEST // 2 :]}"
     return (" " if short.startswith("_") else "") + short.replace("$", r"\$")

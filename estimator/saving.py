@@ -32,7 +32,7 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
     The free energies and forecasts of its last run are not kept.
 
     Raises:
-        ValueError: for what is no estimator, or no name of a file.
+        ValueError: for what is not an estimator, or no name of a file.
     """
     if not isinstance(estimator, OnlineEstimator):
         raise ValueError(f"estimator must be an OnlineEstimator, but is {shown(estimator)}")
@@ -62,7 +62,7 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
     place = whole_file(path, "path must be a file of save_estimator", _LARGEST)
     try:
         return _built(_read(place))
-    except Exception as error:  # whatever a file that is none of ours makes of the readers
+    except Exception as error:  # whatever the readers make of a foreign file
         raise ValueError(
             f"path must be a whole file of save_estimator, but {place} is not ({type(error).__name__}: {error}); save "
             f"the estimator again"

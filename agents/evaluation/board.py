@@ -44,7 +44,7 @@ def read(path: Path) -> list[dict[str, Any]]:
     """The entries of this version of the protocol; of one name on one track the latest.
 
     Raises:
-        ValueError: for a line that is no entry, saying which.
+        ValueError: for a line that is not an entry, saying which.
         FileNotFoundError: if there is no such file.
     """
     text = whole_file(path, "board must be a file of entries", _LARGEST).read_text(encoding="utf-8", errors="replace")
@@ -55,7 +55,7 @@ def read(path: Path) -> list[dict[str, Any]]:
             key = str(entry["track"]), str(entry["name"])
             tables([entry])
         except Exception as error:  # whatever a file of somebody else's makes of what is shown
-            raise ValueError(f"board must hold an entry a line, but {path}:{number} is none: {error!r}") from error
+            raise ValueError(f"board must hold an entry a line, but {path}:{number} is not one: {error!r}") from error
         if entry.get("protocol") == VERSION:
             found[key] = entry
     return list(found.values())

@@ -95,7 +95,7 @@ def measure(
         on_step: told what is measured next.
 
     Raises:
-        ValueError: for another track, no name, or a policy that is none.
+        ValueError: for another track, a missing name, or something that is not a policy.
     """
     if track not in TRACKS:
         raise ValueError(f"protocol must be one of {', '.join(TRACKS)}, but is {track}; others have no oracle")

@@ -94,7 +94,7 @@ def evaluate(
     of the inputs and outputs need a simulated plant whose truth stays as it is. With the Silverbox record there are
     also the samples of its regime that tell as much, for the oscillators of the tracks; and for the difference equation
     the errors of free runs over the arrow's input and, identified on the track's twin (``plant_spread=0``), over the
-    arrow's record. The latter is none for the differential equation: the simulated plant has no offsets, and those of
+    arrow's record. The differential equation has no such place: the simulated plant has no offsets, and those of
     the circuit, 8 mV at the input, would be nearly all of its error (5.3 mV for the twin itself).
 
     Policies that training made of one recipe with different seeds are one entry: ``TITLE=PATTERN`` is the title of the

@@ -45,7 +45,7 @@ class Systems:
         """The first systems of a track, as they are evaluated with seed 0: of the branch ``test``, if not told another.
 
         Raises:
-            ValueError: where its plant is none that is simulated and stays as it is.
+            ValueError: where its plant is not simulated, or changes.
         """
         envs = make(env_id, count, TESTED | (options or {}))
         envs.reset(seed=0)

@@ -95,7 +95,7 @@ def _charge(INPUT, SHOWN, SPREAD, COST, noise, unforeseen, limit, margin, price,
 
 
 def _weigh(KNOWN, COST):
-    """What is known, less the cost; also of a plan whose numbers are none any more."""
+    """What is known, less the cost; also of a plan whose numbers are no longer finite."""
     score = KNOWN - COST
     return score if score > LOST else LOST
 

@@ -307,7 +307,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
 @jit
 def place(x, scale, cells, offset):
-    """The cell of a state along one axis; the first for one that is no number."""
+    """The cell of a state along one axis; the first for one that is not a number."""
     where = (x / scale + 1.0) * 0.5 * (cells - 1) + offset
     if not where > 0.0:
         return 0

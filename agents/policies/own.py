@@ -16,7 +16,7 @@ def own_policy(made: Any, env: Any, seed: int, options: dict[str, Any]) -> Any:
     """The policy that a user's own thing is, or makes; see `agents.policies.make_policy`.
 
     Raises:
-        ValueError: for options that it does not take, or a thing that is no policy.
+        ValueError: for options that it does not take, or a thing that is not a policy.
     """
     if isinstance(made, type):
         taken = inspect.signature(made).parameters

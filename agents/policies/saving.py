@@ -88,7 +88,7 @@ def _write(folder: Path, network: Network, tensors: dict[str, Any], card: dict[s
 
 
 def _network_alone(model: Module, normalizer: Normalizer | None) -> tuple[Network, dict[str, Any]]:
-    """A network that is no algorithm's, and its tensors; ValueError where `LearnedPolicy` could not play it."""
+    """A network that is not an algorithm's, and its tensors; ValueError where `LearnedPolicy` could not play it."""
     from torch.nn import Sequential
 
     model = model if isinstance(model, Sequential) else Sequential(model)

@@ -121,7 +121,8 @@ class SignalPolicy:
             seed: The seed of all the signals.
 
         Raises:
-            ValueError: `max_input` or `max_rms` is not positive and finite, or a number of samples or seed is none.
+            ValueError: `max_input` or `max_rms` is not positive and finite, or `samples` or `seed` is not a whole
+                number.
         """
         whole("samples", samples, MOST_SAMPLES)
         whole("seed", seed, 2**128, 0)

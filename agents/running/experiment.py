@@ -100,7 +100,7 @@ def design(
 
     Raises:
         ValueError: for a rig without limit or range, or without guess where there is no prior; a prior in other
-            scales; samples below 8 or above 65,536; a bound that is no probability; or where even no input is safe.
+            scales; samples below 8 or above 65,536; a bound that is not a probability; or where even no input is safe.
 
     Example:
         >>> from agents.running.experiment import design

@@ -43,14 +43,14 @@ class Config:
         if not re.fullmatch(r"[a-z0-9-]+/[a-z0-9-]+", self.name):
             raise ValueError(f"name must be ALGORITHM/TRACK in small letters, but is {self.name!r}; e.g. ppo/amplitude")
         if not self.runs:
-            raise ValueError("runs must be run folders, but are none; name those of all seeds")
+            raise ValueError("runs must be run folders, but there are none; name those of all seeds")
 
 
 def ship(config: Config) -> Path:
     """Evaluate, choose and write; the folder that the policy ships in.
 
     Raises:
-        ValueError: for runs that are no policy folders, are of several recipes, or have a seed in common.
+        ValueError: for runs that are not policy folders, are of several recipes, or have a seed in common.
     """
     cards = [_card(run) for run in config.runs]
     env, options, seeds = _recipe(config.runs, cards)
@@ -72,7 +72,7 @@ def ship(config: Config) -> Path:
         },
     }
     folder = policies.TRAINED / config.name
-    # The weights first: a card without them is none, and a card that is older than they are is mended by a second try.
+    # The weights first: a card without them counts for nothing, and a second try mends a card that is older.
     write_atomically(folder / WEIGHTS, (config.runs[chosen] / WEIGHTS).read_bytes())
     write_json(folder / CARD, card)
     print_table([together], f"{env}, {config.systems} systems")

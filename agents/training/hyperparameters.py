@@ -41,7 +41,7 @@ def read_settings(algo: str, env_id: str, path: Path | None = None) -> Algorithm
         path: of the file; the package's where it is not given.
 
     Raises:
-        ValueError: for an unknown algorithm, or a file that is no TOML or has an entry that is no hyperparameter.
+        ValueError: for an unknown algorithm, or a file that is not TOML, or has an entry that is no hyperparameter.
         OSError: where the file cannot be read.
     """
     one_of("algo", algo, ALGORITHMS)
@@ -59,7 +59,7 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
     """Hyperparameters of this kind from entries as JSON and TOML hold them.
 
     Raises:
-        ValueError: for an entry that is no field, or whose value has another type.
+        ValueError: for an entry that is not a field, or whose value has another type.
     """
     defaults: dict[str, Any] = {f.name: getattr(kind(), f.name) for f in fields(kind)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}

@@ -118,7 +118,7 @@ def calls() -> st.SearchStrategy[Call]:
     place = Path(tempfile.mkdtemp(prefix="fuzz-")) / "here"  # some write, and "../x" is a name, too
     place.mkdir()
     os.chdir(place)
-    importlib.import_module("torch")  # takes seconds, which are no hang
+    importlib.import_module("torch")  # takes seconds, which are not a hang
 
     @st.composite
     def call(draw: st.DrawFn) -> Call:

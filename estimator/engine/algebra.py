@@ -12,7 +12,7 @@ that step's posterior, which depend on scalars only:
 
 γ is learned from the first sensor that shows the process noise of the same sample; where none does, γ stays.
 
-Differences of rounded numbers may leave a covariance that is none, where a sample says 10⁸ times more than was known.
+Where a sample says 10⁸ times more than was known, rounding may leave a matrix that is not positive semi-definite.
 So every variance takes along what rounding may have changed it by, `ROUNDING` of what it is the difference of: the
 rounded matrix is the exact one and an error E, |E_ij| ≤ a_i a_j ROUNDING/d, to which ROUNDING diag(a²) is added.
 """
@@ -74,7 +74,7 @@ class Gaussian:
         return symbol(name)
 
     def _sound(self, noise: Sequence[Sequence[sp.Expr]]) -> tuple[tuple[sp.Expr, ...], ...]:
-        """N, where it is a covariance; its variances, with covariances that they can have, where it is none.
+        """N where it is positive semi-definite; else its variances, with covariances cut to what they allow.
 
         N is integrated by steps that are too long for slopes of more than about 3 a step, and may then be anything.
         """

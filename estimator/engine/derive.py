@@ -70,7 +70,7 @@ def calculus(model: Model) -> Calculus:
     """Parse and differentiate a model.
 
     Raises:
-        ValueError: for an expression that is none, or uses a name that the model does not have.
+        ValueError: for text that is not an expression, or uses a name that the model does not have.
     """
     known = {name: symbol(name) for name in (*model.names, "u", *(["u1", "u2"] if not model.is_continuous else []))}
     moves = tuple(parse(text, known, model.name) for text in model.moves)
@@ -86,14 +86,14 @@ def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
     """An expression in known names.
 
     Raises:
-        ValueError: naming the text, for what is no expression, or a name that is not known.
+        ValueError: naming the text, for what is not an expression, or a name that is not known.
     """
     if not isinstance(text, str) or "__" in text or len(text) > 10_000:
         raise ValueError(f"expressions of {where} must be short strings without '__', but one is {text!r:.80}")
     try:
         code = compile(text, f"<{where}>", "eval")
     except (SyntaxError, ValueError) as error:
-        raise ValueError(f"expressions of {where} must be formulas, but {text!r} is none: {error}") from error
+        raise ValueError(f"expressions of {where} must be formulas, but {text!r} is not one: {error}") from error
     unknown = sorted(set(code.co_names) - set(known) - set(_FUNCTIONS))
     if unknown:
         raise ValueError(
@@ -102,7 +102,7 @@ def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
     try:
         parsed = sp.sympify(eval(code, {"__builtins__": {}}, {**_FUNCTIONS, **known}))
     except (ArithmeticError, NameError, TypeError, AttributeError, sp.SympifyError) as error:
-        raise ValueError(f"expressions of {where} must be formulas, but {text!r} is none: {error}") from error
+        raise ValueError(f"expressions of {where} must be formulas, but {text!r} is not one: {error}") from error
     if not isinstance(parsed, sp.Expr):
         raise ValueError(f"expressions of {where} must be numbers, but {text!r} is {parsed!r}")
     if parsed.has(sp.I, sp.nan, sp.zoo, sp.oo, -sp.oo):

@@ -25,7 +25,7 @@ from estimator.models.model import Model
 #: more or less from plan to plan.
 SUBSTEPS = 2
 
-#: What a belief knows that is none any more: less than any that is one, and still a number to compare with.
+#: What a belief that is no longer finite knows: less than any other, and still a number to compare with.
 LOST = -1e300
 
 

@@ -11,7 +11,7 @@ column of zeros without weight: all lanes run through all columns, each with the
 ``WEIGHT_c``  of each of the two points along column c
 ``X_i``       coefficient i at the point that moves; its state is in ``M_i``
 ``I_p_i``     state i after the motion, at point p: 2 c in the direction of column c, 2 c + 1 against it
-``UNSOUND``   how often a covariance was found that is none, since it was last set to 0
+``UNSOUND``   how often a covariance was not positive semi-definite, since it was last set to 0
 ============  ======================================================================================
 """
 
@@ -48,8 +48,8 @@ def order(model: Model) -> list[str]:
 def spread(model: Model) -> tuple[Assignments, dict[str, str]]:
     """The columns of √pairs L and their weights, and whether P is a covariance: assignments and results by row.
 
-    A column is dead where its pivot is within `ROUNDING` of the variance. P is none where a pivot is below that, or a
-    dead column still goes along with another quantity.
+    A column is dead where its pivot is within `ROUNDING` of the variance. P is not a covariance where a pivot is
+    below that, or a dead column still goes along with another quantity.
     """
     names, m = order(model), len(model.movers)
     covariance = lambda i, j: pair("P", i, j, model.names)  # noqa: E731

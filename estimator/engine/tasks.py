@@ -43,8 +43,8 @@ class Update:
         layout: rows of the block.
         lanes: systems in it.
         traced: rows that hold, per iteration and sensor, what `estimator.engine.free_energy` needs.
-        check: with sigma points, ``check(W)``: counts in the row ``UNSOUND`` whether a lane's covariance is none. The
-            update does so with the belief that it is given.
+        check: with sigma points, ``check(W)``: counts in the row ``UNSOUND`` whether a lane's covariance is not
+            positive semi-definite. The update does so with the belief that it is given.
     """
 
     update: Any
@@ -76,7 +76,7 @@ def structured(
         trace: leave what the free energy of every iteration needs, in further rows.
         missing: outputs that are NaN move the state and teach nothing.
         expectations: how the belief is moved: ``first_order`` or ``sigma_points`` (`estimator.engine.points`). The
-            latter counts in the row ``UNSOUND`` where it meets a covariance that is none.
+            latter counts in the row ``UNSOUND`` where it meets a covariance that is not positive semi-definite.
 
     Raises:
         ValueError: for iterations out of range, or other expectations.

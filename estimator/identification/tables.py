@@ -13,7 +13,7 @@ import numpy as np
 
 from estimator.parameters import FloatArray
 
-#: Names of columns, in lower case, up to the first character that is no letter.
+#: Names of columns, in lower case, up to the first character that is not a letter.
 _INPUTS = ("u", "input", "force", "f", "in", "drive", "excitation")
 _OUTPUTS = (
     *("y", "output", "out", "response", "x", "displacement", "disp", "position", "pos"),

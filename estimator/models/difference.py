@@ -79,7 +79,7 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
             other terms are k0, k1, ...
 
     Raises:
-        ValueError: for an unknown preset, or terms that repeat or are none.
+        ValueError: for an unknown preset, or terms that repeat or are not terms.
     """
     is_terms = isinstance(preset, tuple) and all(isinstance(term, Term) for term in preset)
     if not is_terms and not (isinstance(preset, str) and preset in PRESETS):

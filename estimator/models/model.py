@@ -52,7 +52,7 @@ class Model:
         inverse: coefficient to its expression in the parameters and ``step``; all of them, where ``physical`` is given.
 
     Raises:
-        ValueError: naming the argument, for a name that is no lower-case identifier or stands twice, or expressions
+        ValueError: naming the argument, for a name that is not a lower-case identifier or stands twice, or expressions
             that do not fit the names.
 
     Example:
@@ -187,7 +187,7 @@ class Model:
         """The value, which must be a model.
 
         Raises:
-            ValueError: where it is none.
+            ValueError: where it is not one.
         """
         if not isinstance(value, cls):
             raise ValueError(f"model must be a Model, but is {shown(value)}; use difference() or duffing()")

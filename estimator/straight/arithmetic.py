@@ -72,7 +72,9 @@ class Arithmetic:
         if isinstance(operator, ast.Not):
             return self.op("i1", f"xor i1 {self.truth(value)}, true")
         if not isinstance(operator, ast.USub) or (isinstance(value, Scalar) and value.kind in ("i1", "ptr")):
-            raise TypeError(f"{self.name} changes a sign that is none; negate numbers with a minus")
+            raise TypeError(
+                f"{self.name} changes the sign of something that is not a number; negate numbers with a minus"
+            )
         if is_number(value):
             return -value
         if value.kind == "double":

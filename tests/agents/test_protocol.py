@@ -134,10 +134,10 @@ def test_the_latest_entry_of_a_name_counts(tmp_path, entry):
 def test_a_broken_board_is_told(tmp_path, entry, line):
     path = tmp_path / "board.jsonl"
     path.write_text(json.dumps(entry) + "\n" + line + "\n")
-    with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:2 is none"):
+    with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:2 is not one"):
         board.read(path)
     path.write_bytes(json.dumps({**entry, "reference": {}}).encode() + b"\n\xff\n")
-    with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:1 is none"):
+    with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:1 is not one"):
         board.read(path)
 
 

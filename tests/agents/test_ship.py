@@ -82,7 +82,7 @@ def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
         ship(Config("ppo/short", (runs[0], twice)))
     with pytest.raises(ValueError, match="finished run folders"):
         ship(Config("ppo/short", (runs[0], tmp_path)))
-    with pytest.raises(ValueError, match="runs must be run folders, but are none"):
+    with pytest.raises(ValueError, match="runs must be run folders, but there are none"):
         Config("ppo/short", ())
     with pytest.raises(ValueError, match="ALGORITHM/TRACK"):
         Config("../short", runs)

@@ -204,7 +204,7 @@ def test_files(tmp_path):
     savemat(tmp_path / "r.mat", {"u": u, "y": y})
     np.testing.assert_array_equal(records_of(tmp_path / "r.mat", 0.01)[0].y, y)
     whole = bytearray((tmp_path / "r.mat").read_bytes())
-    whole[176] ^= 1  # a kind of number that is none, of which SciPy's reader dies
+    whole[176] ^= 1  # an unknown kind of number, of which SciPy's reader dies
     (tmp_path / "r.mat").write_bytes(whole)
     with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file .*, but is not: the reader died"):
         records_of(tmp_path / "r.mat", 0.01)

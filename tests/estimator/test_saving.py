@@ -29,7 +29,7 @@ def test_a_saved_estimator_continues_bit_by_bit(kind, tmp_path):
     np.testing.assert_array_equal(resumed.run(u, y), original.run(u, y))
 
 
-# --- Files that are none -------------------------------------------------------------------------------------------
+# --- Foreign files ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -52,12 +52,12 @@ def described(arrays, **changes):
 REFUSED = {
     "no description": lambda a: {name: array for name, array in a.items() if name != "description"},
     "another version": lambda a: described(a, format=1),
-    "a model that is none": lambda a: described(a, model={"name": "x"}),
+    "an unknown model": lambda a: described(a, model={"name": "x"}),
     "a model that runs code": lambda a: described(
         a, model={**json.loads(a["description"].tobytes())["model"], "rates": ["v", "().__class__"]}
     ),
-    "a rig that is none": lambda a: described(a, rig={"step": -1.0, "interpolation": "linear", "delay": 0}),
-    "settings that are none": lambda a: described(a, settings={"iterations": 2**31}),
+    "an impossible rig": lambda a: described(a, rig={"step": -1.0, "interpolation": "linear", "delay": 0}),
+    "impossible settings": lambda a: described(a, settings={"iterations": 2**31}),
     "an array too many": lambda a: {**a, "more": np.zeros(3)},
     "an array too few": lambda a: {name: array for name, array in a.items() if name != "walk"},
     "too many waiting": lambda a: {**a, "outputs": np.ones((50, 1))},
@@ -69,7 +69,7 @@ REFUSED = {
     "a negative covariance": lambda a: {**a, "records": a["records"] * np.where(np.arange(len(a["first"])) > 8, -1, 1)},
     "a prior with a negative covariance": lambda a: {**a, "first": a["first"] * np.where(a["first"] > 0, -1, 1)},
     "a negative walk": lambda a: {**a, "walk": a["walk"] - 1.0},
-    "weights that are none": lambda a: {**a, "weights": a["weights"] * 2},
+    "weights that do not sum to 1": lambda a: {**a, "weights": a["weights"] * 2},
     "half begun": lambda a: {**a, "begun": a["begun"] * 0.5},
 }
 
@@ -102,7 +102,7 @@ def test_a_damaged_file_is_refused(written):
 def test_what_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "fifo")  # reading it would wait for a writer
     for place in (tmp_path, tmp_path / "fifo"):
-        with pytest.raises(ValueError, match="is none; name the file itself"):
+        with pytest.raises(ValueError, match="is not one; name the file itself"):
             load_estimator(place)
     with pytest.raises(FileNotFoundError, match="there is no"):
         load_estimator(tmp_path / "missing.npz")

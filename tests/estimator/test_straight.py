@@ -265,7 +265,7 @@ def gives_too_much(a):
         (remembers, (np.zeros(4),), "name 'b' is not defined in remembers; assign it before, and not in a loop"),
         (loses, (np.zeros(4),), "loses calls total, which returns something; let it write into a block"),
         (counts_back, (np.zeros(4),), "'W[-1]' in counts_back counts from the end"),
-        (inverts, (1,), "inverts changes a sign that is none"),
+        (inverts, (1,), "inverts changes the sign of something that is not a number"),
         (is_none, (1.0,), "is_none compares by Is; use < <= > >= == or !="),
         (asks, (np.zeros(4),), "'W.size' in asks asks a number or a block for an attribute"),
         (gives_too_much, (1.0,), "swapped takes ['pair', 'more'], but is given 3 arguments; give all"),
