@@ -43,6 +43,10 @@ REST, NUDGE = 0.007, 0.05
 #: A push alone changes the displacement by no more than half of this part of its limit in a move.
 _LEAP = 1.0
 
+#: What a sample of the rest of an episode brings, in parts of one of a swing at the limit. All of it praises ways that
+#: teach what such a swing does not, such as to rest with a push on.
+_USUAL = 0.1
+
 THRIFT = FEATURES.index("thrift")
 
 
@@ -207,7 +211,7 @@ class CommonForesight:
         setup, prior, self._view = experiment.setup, experiment.believed, View.of(experiment)
         center = prior.coefficients_mean
         swing = swing_of(self._view, center, setup.max_input, setup.max_output)
-        rate = swing.taught / sum(float(rate / shape) for shape, rate in (prior.noises[:2], prior.noises[2:4]))
+        rate = _USUAL * swing.taught / sum(float(rate / shape) for shape, rate in (prior.noises[:2], prior.noises[2:4]))
         gain = abs(survey(self._view.model, center, np.zeros(self._view.model.n_states)).gains[0]) * swing.pace**2
         push = min(setup.max_input, _LEAP * setup.max_output / gain)
         of_rig = getattr(experiment, "rig", None) is not None

@@ -3,14 +3,16 @@
 From the belief the oscillator is imagined for `HORIZONS`[-1] moves, each held for as many samples as
 `agents.planner.motion.Swing` says. The first move is a push up, none, or a push down; then follows one of
 
-- the eight signs of the next three pushes, and from there on pushes along the motion, but against it where they would
-  lead beyond the limit (the *best* of them counts),
+- the signs of the next five pushes, but all of them alike, and from there on pushes along the motion, but against it
+  where they would lead beyond the limit (the *best* of these thirty ways counts),
 - *brake*: pushes against the motion,
 - *rest*: none.
 
-All of these thirty ways lie side by side in the lanes of one block, and are imagined as the planner imagines its own:
+The ways of a first move lie side by side in the lanes of one block, and are imagined as the planner imagines its own:
 by belief propagation (`agents.planner.imagination`), so that what one sample teaches is not counted again by the next,
-and with what the rest of the episode will bring anyway. What a way is worth is in nats known at the end.
+and with what the rest of the episode will bring anyway. What a way is worth is in nats: the mean of what is known after
+it has been followed for each of the horizons up to the one that a feature is named by. By the last alone the best way
+may be to wait for a move, and so at every decision anew.
 """
 
 from __future__ import annotations
@@ -45,9 +47,9 @@ FEATURES = (
 #: Largest size of a feature; what a difference of one nat counts for before arcsinh.
 BOUND, _NAT = 10.0, 20.0
 
-#: Continuations of each first move: the signs of three pushes, then brake and rest.
-_TRIED = 3
-_CODES = (1 << _TRIED) + 2
+#: Pushes after the first move whose signs are tried, by the lane's number plus one; the lanes of brake and rest.
+_TRIED = 5
+_BRAKE, _REST = LANES - 2, LANES - 1
 
 #: Moves in which an output can still be kept within the limit: nearly a period. Where pushes along the motion turn, in
 #: parts of the limit.
@@ -101,7 +103,12 @@ def imaginer(view: View) -> Any:
     inner, entry = part(kind), kernel(kind=kind)
 
     @inner
-    def along(W, j, still, push, terms):
+    def room(W, j, unforeseen, terms):
+        """How far from the limit lane j has to stay."""
+        return min(terms.margin * np.sqrt(W[spread + j] + unforeseen), MOST_MARGIN * terms.limit)
+
+    @inner
+    def along(W, j, still, push, unforeseen, terms):
         """The push of lane j along its motion, or against it where that would lead beyond the limit."""
         for a in range(n):
             still[a] = W[a * LANES + j]
@@ -112,38 +119,36 @@ def imaginer(view: View) -> Any:
         still[u] = way
         glance(still)
         ahead = still[later] + (terms.pace - 1) * (still[later] - still[now])
-        return way, -way if abs(ahead) > _TURN * terms.limit else way
+        return way, -way if abs(ahead) > _TURN * (terms.limit - room(W, j, unforeseen, terms)) else way
 
     @inner
-    def choose(W, t, still, push, terms):
-        """Put the inputs of move t into all lanes."""
-        for j in range(3 * _CODES):
-            code = j % _CODES
+    def choose(W, first, t, still, push, unforeseen, terms):
+        """Put the inputs of move t into all lanes, whose first move is ``first``."""
+        for j in range(LANES):
             if t == 0:
-                W[U + j] = (1.0 - j // _CODES) * push
-            elif code == _CODES - 1:
+                W[U + j] = (1.0 - first) * push
+            elif j == _REST:
                 W[U + j] = 0.0
-            elif code < _CODES - 2 and t <= _TRIED:
-                W[U + j] = push if (code >> (t - 1)) & 1 else -push
+            elif j < _BRAKE and t <= _TRIED:
+                W[U + j] = push if ((j + 1) >> (t - 1)) & 1 else -push
             else:
-                way, pump = along(W, j, still, push, terms)
-                W[U + j] = pump if code < _CODES - 2 else -way
+                way, pump = along(W, j, still, push, unforeseen, terms)
+                W[U + j] = pump if j < _BRAKE else -way
 
     @inner
     def best(values, first, group):
         """The best of a first move's ways in a group of continuations, which are 0 best, 1 brake, 2 rest."""
-        begin_at = first * _CODES + (0 if group == 0 else _CODES - 3 + group)
-        count = _CODES - 2 if group == 0 else 1
+        begin_at = first * LANES + (0 if group == 0 else _BRAKE - 1 + group)
         found = values[begin_at]
-        for j in range(begin_at + 1, begin_at + count):
+        for j in range(begin_at + 1, begin_at + (_BRAKE if group == 0 else 1)):
             found = max(found, values[j])
         return found
 
     @entry
     def look(records, observations, ahead, terms, features, safe, signs):
         W, still = np.zeros(size), np.zeros(width)
-        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(LANES)
-        brought = np.empty((len(HORIZONS), LANES))
+        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(3 * LANES)
+        brought = np.empty((len(HORIZONS), 3 * LANES))
         free = np.empty((3, 3))
         factorise(ahead.rate, M)
         for i in range(len(observations)):
@@ -163,24 +168,26 @@ def imaginer(view: View) -> Any:
             appraise(W, M, np.sqrt(share * ahead.samples))
             to_come = W[SCORE]
             fill(peaks, 0.0)
-            unforeseen, h = terms.shaken * record[noise + 1] / record[noise], 0
-            for t in range(HORIZONS[-1]):
-                choose(W, t, still, push, terms)
-                for _ in range(terms.pace):
-                    advance(W, record, terms)
-                    if t < _IN_REACH:
+            unforeseen = terms.shaken * record[noise + 1] / record[noise]
+            for first in range(3):
+                begin(W, record, lasts)
+                lane, h = first * LANES, 0
+                for t in range(HORIZONS[-1]):
+                    choose(W, first, t, still, push, unforeseen, terms)
+                    for _ in range(terms.pace):
+                        advance(W, record, terms)
+                        if t < _IN_REACH:
+                            for j in range(LANES):
+                                peak = abs(W[shown + j]) + room(W, j, unforeseen, terms)
+                                peaks[lane + j] = max(peaks[lane + j], peak)
+                    if t < 3:
+                        free[t, first] = W[shown + _REST]
+                    if t + 1 == HORIZONS[h]:
+                        appraise(W, M, np.sqrt(max(0.0, share * ahead.samples - (t + 1) * terms.pace)))
                         for j in range(LANES):
-                            margin = min(terms.margin * np.sqrt(W[spread + j] + unforeseen), MOST_MARGIN * terms.limit)
-                            peaks[j] = max(peaks[j], abs(W[shown + j]) + margin)
-                if t < 3:
-                    for first in range(3):
-                        free[t, first] = W[shown + first * _CODES + _CODES - 1]
-                if t + 1 == HORIZONS[h]:
-                    rest = max(0.0, share * ahead.samples - (t + 1) * terms.pace)
-                    appraise(W, M, np.sqrt(rest))
-                    for j in range(LANES):
-                        brought[h, j] = W[SCORE + j]
-                    h += 1
+                            before = brought[h - 1, lane + j] if h > 0 else 0.0
+                            brought[h, lane + j] = before + (W[SCORE + j] - before) / (h + 1)
+                        h += 1
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
             signs[i] = sign
             up, down = (0, 2) if sign > 0.0 else (2, 0)
@@ -200,7 +207,7 @@ def imaginer(view: View) -> Any:
                     told[to] = np.arcsinh(_NAT * (rise - fall))
                     told[to + 1] = np.arcsinh(_NAT * (calm - max(rise, fall)))
                     to += 2
-            for j in range(LANES):
+            for j in range(3 * LANES):
                 peaks[j] = -peaks[j]
             for group in range(3):
                 for first in (up, 1, down):
