@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -37,7 +38,7 @@ def spinner(what: str) -> Iterator[Callable[[str], None]]:
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: bool = False, title: str = "") -> Any:
-    """A table of texts for `show`: the first column to the left, the others to the right.
+    """A table of texts for `show`: the first column to the left, the others to the right, titles broken before cells.
 
     Args:
         titles: of the columns.
@@ -52,10 +53,15 @@ def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: boo
         box=MARKDOWN if markdown else SIMPLE_HEAD, show_edge=markdown, padding=(0, 1) if markdown else (0, 1, 0, 0),
         title=title or None,
     )  # fmt: skip
+    cells = [[printable(cell, "\n") for cell in row] for row in rows]
     for place, text in enumerate(titles):
-        made.add_column(text, justify="left" if markdown or place == 0 else "right", no_wrap=markdown)
-    for row in rows:
-        made.add_row(*(printable(cell, "\n") for cell in row))
+        below = "\n".join(cell for row in cells for cell in row[place : place + 1]).splitlines()
+        width = max([8, *map(len, below)])
+        broken = (textwrap.fill(line, width, break_long_words=False) for line in text.splitlines())
+        title = text if markdown else "\n".join(broken)
+        made.add_column(title, justify="left" if markdown or place == 0 else "right", no_wrap=markdown)
+    for row in cells:
+        made.add_row(*row)
     return made
 
 
