@@ -107,8 +107,8 @@ def trial(task: Task) -> Run:
         output=Channel(bench.units[1], kind=bench.kind, range=bench.output_range), guess=guess(bench, seed),
     )  # fmt: skip
     plant = BenchPlant(bench, seed)
-    # A signal sample by sample is scaled so that it stays in the range; blocks, and the planner, find out themselves.
-    largest = bench.amplitude / bench.limit if policy != "efe" else 1.0
+    # A signal sample by sample is scaled to stay in the range; blocks, planner and networks find out themselves.
+    largest = 1.0 if policy.startswith(("efe", "ppo/")) else bench.amplitude / bench.limit
     play = _samples if way == "samples" else _blocks
     belief, left = play(rig, plant, policy, seed, largest)
     prior = rig_prior(rig)
