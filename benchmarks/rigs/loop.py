@@ -89,6 +89,7 @@ class Run:
         error: (4,) of the estimates, relative.
         narrower: (4,) standard deviations before over those after.
         left: whether the output left its range, or the numbers ran away.
+        refused: whether a block was refused, because even silence might have left the range; the run ends there.
     """
 
     gain: float
@@ -96,6 +97,7 @@ class Run:
     error: list[float]
     narrower: list[float]
     left: bool
+    refused: bool
 
 
 def trial(task: Task) -> Run:
@@ -110,7 +112,7 @@ def trial(task: Task) -> Run:
     # A signal sample by sample is scaled to stay in the range; blocks, planner and networks find out themselves.
     largest = 1.0 if policy.startswith(("efe", "ppo/")) else bench.amplitude / bench.limit
     play = _samples if way == "samples" else _blocks
-    belief, left = play(rig, plant, policy, seed, largest)
+    belief, ended = play(rig, plant, policy, seed, largest)
     prior = rig_prior(rig)
     mean, std = np.array([belief.parameters()[p][:2] for p in PARAMETERS]).T
     before = np.array([prior.parameters()[p][1] for p in PARAMETERS])
@@ -118,12 +120,12 @@ def trial(task: Task) -> Run:
     truth = np.array(bench.truth)
     return Run(
         prior.entropy() - belief.entropy(), ((low <= truth) & (truth <= high)).tolist(),
-        (mean / truth - 1).tolist(), (before / std).tolist(), left,
+        (mean / truth - 1).tolist(), (before / std).tolist(), ended == "range", ended == "design",
     )  # fmt: skip
 
 
-def _samples(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float) -> tuple[Belief, bool]:
-    """Sample by sample through ``Rig-v0``: the belief at the end, and whether the output left its range."""
+def _samples(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float) -> tuple[Belief, str]:
+    """Sample by sample through ``Rig-v0``: the belief at the end, and what ended the run, as of one in blocks."""
     import gymnasium as gym
 
     import duffing_env  # noqa: F401  registers the tracks
@@ -138,10 +140,10 @@ def _samples(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float
         begins = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, _ = env.step(action)
         done = terminated or truncated
-    return env.unwrapped.belief, bool(terminated)
+    return env.unwrapped.belief, "range" if terminated else "complete"
 
 
-def _blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float) -> tuple[Belief, bool]:
+def _blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float) -> tuple[Belief, str]:
     """In blocks, as ``duffing-env run`` scales them: each has its share of what a run is allowed."""
     from agents.running.clock import JumpingClock
     from agents.running.run import Plan, run
@@ -149,9 +151,9 @@ def _blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float)
     plan = Plan(policy, SAMPLES, BLOCK, bound=ASKED * BLOCK / SAMPLES, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         ran = run(rig, plant, folder, plan, clock=JumpingClock())
-    if ran.ended not in ("complete", "range"):
+    if ran.ended not in ("complete", "range", "design"):
         raise RuntimeError(f"a run in blocks ended: {ran.message}")
-    return ran.belief, ran.ended == "range"
+    return ran.belief, ran.ended
 
 
 def run(
@@ -169,9 +171,9 @@ def show(runs: dict[tuple[str, str, str], list[Run]]) -> dict[str, Any]:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(width=160)
+    console = Console(width=175)
     table = Table("rig", "played by", "policy", "gained, nats", "median error of m, c, a, b, %", "coverage of 90 %",
-                  "times narrower", "left its range", box=box.MARKDOWN)  # fmt: skip
+                  "times narrower", "left its range", "refused", box=box.MARKDOWN)  # fmt: skip
     for (name, policy, way), found in runs.items():
         gains, number = np.array([one.gain for one in found]), len(found)
         table.add_row(
@@ -179,7 +181,7 @@ def show(runs: dict[tuple[str, str, str], list[Run]]) -> dict[str, Any]:
             percents(np.median(np.abs([one.error for one in found]), axis=0)),
             ", ".join(f"{share:.2f}" for share in np.mean([one.inside for one in found], axis=0)),
             ", ".join(f"{times:.3g}" for times in np.median([one.narrower for one in found], axis=0)),
-            f"{sum(one.left for one in found)} of {number}",
+            f"{sum(one.left for one in found)} of {number}", f"{sum(one.refused for one in found)} of {number}",
         )  # fmt: skip
     console.print(table)
     verdicts = {way: verdict(runs, way) for way in dict.fromkeys(way for *_, way in runs)}
