@@ -56,7 +56,7 @@ def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: boo
     cells = [[printable(cell, "\n") for cell in row] for row in rows]
     for place, text in enumerate(titles):
         below = "\n".join(cell for row in cells for cell in row[place : place + 1]).splitlines()
-        width = max([8, *map(len, below)])
+        width = max([10, *map(len, below)])
         broken = (textwrap.fill(line, width, break_long_words=False) for line in text.splitlines())
         title = text if markdown else "\n".join(broken)
         made.add_column(title, justify="left" if markdown or place == 0 else "right", no_wrap=markdown)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 _AHEAD = 8
 _UP, _NONE = (FEATURES.index(f"best_{way}_{_AHEAD}") for way in ("up", "none"))
 
-#: How sharply a layer tells the sign of what it is given, and the logit of what brings most.
-_SHARP, _LOGIT = 3.0, 3.0
+#: How sharply a layer tells the sign of what it is given, and the logit of what brings most: small enough to explore.
+_SHARP, _LOGIT = 3.0, 1.0
 
 
 def rule(features: npt.NDArray[np.float32], levels: int) -> npt.NDArray[np.int64]:
