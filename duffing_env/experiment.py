@@ -86,14 +86,11 @@ class Experiment:
         for name in ("max_input", "max_output"):  # what is far beyond lets an oscillator run away, and its episode end
             number(name, getattr(self, name), high=1e300)
         whole("hold", self.hold, MOST_SAMPLES)
-        self._check_flag("terminal")
+        flag("terminal", self.terminal)
         if self.terminated_return is not None:
             number("terminated_return", self.terminated_return, -LARGEST, LARGEST, "None keeps what was gained")
         hypotheses = checked_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MOST_HYPOTHESES)
         object.__setattr__(self, "noise_hypotheses", hypotheses)
-
-    def _check_flag(self, name: str) -> None:
-        flag(name, getattr(self, name))
 
     @property
     def samples(self) -> int:

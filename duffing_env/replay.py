@@ -14,6 +14,7 @@ from duffing_env.env import DuffingEnv
 from duffing_env.experiment import Experiment
 from duffing_env.silverbox import REGIME_NAMES, Regime, load_record
 from estimator.belief import Belief
+from estimator.checks import flag
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
@@ -49,7 +50,7 @@ class ReplayExperiment(Experiment):
 
     def __post_init__(self) -> None:
         for name in ("nonlinear", "as_published"):
-            self._check_flag(name)
+            flag(name, getattr(self, name))
         for name, choices in (("regime", REGIME_NAMES), ("prior", _PRIORS), ("input_delay", (0, 1))):
             value = getattr(self, name)
             if not isinstance(value, str | int) or value not in choices:

@@ -95,8 +95,7 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         **options: Any,
     ) -> None:
         whole("num_envs", num_envs, MOST_ENVS)
-        available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-        whole("threads", threads, available)
+        whole("threads", threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
         limit = None if max_episode_steps == -1 else max_episode_steps
         if limit is not None:
             whole("max_episode_steps", limit, MOST_SAMPLES)
@@ -112,10 +111,10 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         self.render_mode = None
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
         self.single_observation_space = observation_space(self.experiment)
-        each, shown = len(self.experiment.setup.hypotheses) // 5, int(np.prod(self.single_observation_space.shape))
-        if num_envs * each > MOST_ENVS or num_envs * shown > _MOST_SHOWN:
+        each, seen = len(self.experiment.setup.hypotheses) // 5, int(np.prod(self.single_observation_space.shape))
+        if num_envs * each > MOST_ENVS or num_envs * seen > _MOST_SHOWN:
             raise ValueError(
-                f"num_envs must leave room for {each or 1} beliefs and {shown} observed numbers in each of {num_envs} "
+                f"num_envs must leave room for {each or 1} beliefs and {seen} observed numbers in each of {num_envs} "
                 f"environments, at most {MOST_ENVS} and {_MOST_SHOWN} in all; take fewer"
             )
         self.single_action_space = action_space()
@@ -258,14 +257,11 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
     def _reset_mask(self, options: dict[str, Any]) -> Flags:
         if "reset_mask" not in options:
             return self._everywhere
-        try:
-            mask = np.asarray(options["reset_mask"])
-        except ValueError:  # ragged
-            mask = np.empty(0)
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+        mask = options["reset_mask"]
+        fits = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
+        if not (fits and mask.any()):
             raise ValueError(
-                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is "
-                f"{shown(options['reset_mask'])}"
+                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is {shown(mask)}"
             )
         return mask
 
