@@ -5,6 +5,7 @@ The record is never in the repository. The tests look for it where `load_record`
 """
 
 import os
+import signal
 from pathlib import Path
 
 # One thread for matrices and networks, before any of them is loaded: results then do not depend on the machine's
@@ -13,6 +14,9 @@ for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 # The manual's tools bring colorama, with which Numba colours the messages of every signature that does not fit.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
+# A shell lets its background jobs ignore Ctrl-C, and they what they start; some tests send it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest  # noqa: E402
 

@@ -62,7 +62,7 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
     capsys.readouterr()
     main(["design", "rig.toml", "posterior.npz", "--policy", "prbs", "--samples", "64", "-o", "next.csv"])
     told = capsys.readouterr().out
-    assert "expected after" in told
+    assert "narrower" in told
     assert "kg" in told
     found = design(RIG, load_estimator("posterior.npz").belief, "prbs", 64)
     written = np.loadtxt("next.csv", delimiter=",", skiprows=1)
