@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.rigs import accuracy, experiment, faults, loop, peers, sweep
+from benchmarks.rigs import accuracy, experiment, faults, loop, peer_rows, peers, sweep
 from benchmarks.rigs.catalogue import BENCHES
 from estimator.files import write_atomically
 
@@ -64,12 +64,14 @@ class Against:
     """Records of each rig."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
+    against: tuple[str, ...] = tuple(peer_rows.PEERS)
+    """The others: dynamax, scipy, pysindy."""
     json: Path | None = None
     """File for all errors and times."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        results = peers.run(self.rigs, self.seeds)
+        results = peers.run(self.rigs, self.seeds, self.against)
         return {"verdict": peers.show(results), "results": results}
 
 

@@ -53,19 +53,23 @@ def acting(problem: Problem) -> Any:
 
 def move(x: Any, v: Any, p: Any, forces: Any, step: float) -> tuple[Any, Any]:
     """Displacement and velocity a sample later; p are 1/m, c/m, a/m and b/m."""
-    substeps = len(forces) // 2
-    h = step / substeps
-    for s in range(substeps):
-        first, middle, last = (p[0] * forces[2 * s + i] for i in range(3))
-        k1 = first - p[1] * v - p[2] * x - p[3] * x**3
-        x2, v2 = x + h / 2 * v, v + h / 2 * k1
-        k2 = middle - p[1] * v2 - p[2] * x2 - p[3] * x2**3
-        x3, v3 = x + h / 2 * v2, v + h / 2 * k2
-        k3 = middle - p[1] * v3 - p[2] * x3 - p[3] * x3**3
-        x4, v4 = x + h * v3, v + h * k3
-        k4 = last - p[1] * v4 - p[2] * x4 - p[3] * x4**3
-        x, v = x + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    h = 2 * step / (len(forces) - 1)
+    for s in range(0, len(forces) - 1, 2):
+        x, v = substep(x, v, p, forces[s : s + 3], h)
     return x, v
+
+
+def substep(x: Any, v: Any, p: Any, forces: Any, h: float) -> tuple[Any, Any]:
+    """One of Runge and Kutta's steps, h seconds long, under the inputs at its begin, middle and end."""
+    first, middle, last = (p[0] * force for force in forces)
+    k1 = first - p[1] * v - p[2] * x - p[3] * x**3
+    x2, v2 = x + h / 2 * v, v + h / 2 * k1
+    k2 = middle - p[1] * v2 - p[2] * x2 - p[3] * x2**3
+    x3, v3 = x + h / 2 * v2, v + h / 2 * k2
+    k3 = middle - p[1] * v3 - p[2] * x3 - p[3] * x3**3
+    x4, v4 = x + h * v3, v + h * k3
+    k4 = last - p[1] * v4 - p[2] * x4 - p[3] * x4**3
+    return x + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def physical(p: Any) -> Any:
@@ -92,7 +96,10 @@ def compiled_filter(kind: str, step: float) -> Callable[..., Any]:
     def run(mean: Any, cov: Any, process_cov: Any, sensor_cov: Any, scale: Any, y: Any, inputs: Any) -> Any:
         def transition(state: Any, forces: Any) -> Any:
             s = state * scale
-            x, v = move(s[0], s[1], s[2:6], forces, step)
+            h = 2 * step / (len(forces) - 1)
+            triples = jax.numpy.stack([forces[:-1:2], forces[1::2], forces[2::2]], axis=1)
+            # A loop of its own: JAX compiles the steps for minutes where they stand one after the other.
+            (x, v), _ = jax.lax.scan(lambda xv, three: (substep(*xv, s[2:6], three, h), None), (s[0], s[1]), triples)
             return jax.numpy.concatenate([jax.numpy.stack([x, v]) / scale[:2], state[2:]])
 
         def emission(state: Any, forces: Any) -> Any:
@@ -219,8 +226,8 @@ PEERS = {"dynamax": dynamax, "scipy": shooting, "pysindy": pysindy}
 
 #: What a user writes for each, beside its own function.
 HELPERS: dict[str, tuple[Callable[..., Any], ...]] = {
-    "dynamax": (acting, move, physical, start, compiled_filter),
-    "scipy": (acting, move, physical, start, shot),
+    "dynamax": (acting, substep, physical, start, compiled_filter),
+    "scipy": (acting, move, substep, physical, start, shot),
     "pysindy": (start,),
 }
 

@@ -70,7 +70,7 @@ def write_problems(path: Path, names: Sequence[str], seeds: int) -> None:
     np.savez(path, **arrays)
 
 
-def run(names: Sequence[str], seeds: int) -> dict[str, dict[str, Any]]:
+def run(names: Sequence[str], seeds: int, against: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Rig and method to errors (seeds, 4) and seconds (seeds,), or the reason why there are none. In turns."""
     from rich.console import Console
     from rich.progress import track
@@ -83,7 +83,7 @@ def run(names: Sequence[str], seeds: int) -> dict[str, dict[str, Any]]:
             pairs = [(name, seed) for name in names for seed in range(seeds)]
             for name, seed in track(pairs, "Identifying in turns", console=Console(stderr=True)):
                 truth = np.array(BENCHES[name].truth)
-                for method in (OURS, *peer_rows.PEERS):
+                for method in (OURS, *against):
                     here = results[name].setdefault(method, {"errors": [], "seconds": [], "reasons": []})
                     try:
                         found, taken = _turn(method, name, seed, Path(folder), peers)
@@ -154,9 +154,10 @@ def show(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
     counts |= {peer: statements(function, *peer_rows.HELPERS[peer]) for peer, function in peer_rows.PEERS.items()}
     console.print("Statements of user code: " + ", ".join(f"{name} {count}" for name, count in counts.items()))
     console.print(f"{'PASS' if counts[OURS] <= MOST_STATEMENTS else 'MISS'}: at most {MOST_STATEMENTS} of ours")
-    times = np.array([[seconds(methods["dynamax"]), seconds(methods[OURS])] for methods in results.values()])
-    slower = np.nanmedian(times[:, 0] / times[:, 1], axis=0)
-    for when, value in zip(("a rig's first record, dynamax's compilation included", "others"), slower, strict=True):
+    times = [[seconds(here["dynamax"]), seconds(here[OURS])] for here in results.values() if "dynamax" in here]
+    slower = np.nanmedian(np.divide(*np.moveaxis(np.array(times), 1, 0)), axis=0) if times else np.array([])
+    whens = ("a rig's first record, dynamax's compilation included", "others")
+    for when, value in zip(whens, slower, strict=False):
         word = "PASS" if value >= TIME_BAR else "MISS"
         console.print(f"{word}: dynamax takes {value:.3g} times as long as ours (at least {TIME_BAR:g}), {when}")
     return {"statements": counts, "slower": slower.tolist(), "rows": verdict}
