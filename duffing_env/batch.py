@@ -61,7 +61,7 @@ class Batch:
         padded = n_blocks * LANES
         self._blocks = np.zeros((n_blocks, n_rows, LANES))
         self._flat_blocks = self._blocks.reshape(n_blocks, -1)
-        count = len(experiment.setup.hypotheses) // 5 * size
+        count = len(experiment.setup.hypotheses) * size
         n_member_rows = max(member_layout(self._kind).values()) + 1 if count else 0
         self._members = np.zeros((-(-count // LANES), n_member_rows * LANES))
         self._ended = np.zeros_like(self._blocks)
@@ -211,7 +211,7 @@ class Batch:
 
     def mixture(self, index: int) -> tuple[FloatArray, FloatArray]:
         """Records (m, size) and weights (m,) of the beliefs that environment ``index`` weighs: one, or its members."""
-        size, count = record_size(self.experiment.model), len(self.experiment.setup.hypotheses) // 5
+        size, count = record_size(self.experiment.model), len(self.experiment.setup.hypotheses)
         if not count:
             return self.records()[index : index + 1], np.ones(1)
         lanes = np.arange(index * count, (index + 1) * count)

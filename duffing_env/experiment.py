@@ -180,12 +180,12 @@ class Experiment:
     def setup(self) -> Setup:
         """The experiment as the kernel is told of it."""
         prior, model = self.believed, self.model
-        first, noises = prior.record.copy(), np.empty(0)
+        first, noises = prior.record.copy(), np.empty((0, 5))
         if self.noise_hypotheses != 1:
             members = priors(prior, self.noise_hypotheses)
             weights = first_weights(members, self.balance)
             first = start(members, len(model.names), weights)
-            noises = np.column_stack([members[:, -4:], weights]).ravel()
+            noises = np.column_stack([members[:, -4:], weights])
         precisions = first[-2 - 2 * model.n_outputs :]
         names = parameter_names(self.truth_model)
         values: dict[str, Any] = {

@@ -67,19 +67,19 @@ def members_of(kind: Kind) -> Members:
 
     @inner
     def begin(members, environment, setup):
-        count = len(setup.hypotheses) // 5
+        count = len(setup.hypotheses)
         first = environment * count
         for m in range(count if first + count <= len(members) * LANES else 0):
             V, j = members[(first + m) // LANES], (first + m) % LANES
             for i in range(size - 4):
                 V[i * LANES + j] = setup.prior[i]
             for i in range(4):
-                V[(size - 4 + i) * LANES + j] = setup.hypotheses[5 * m + i]
-            V[weight + j] = setup.hypotheses[5 * m + 4]
+                V[(size - 4 + i) * LANES + j] = setup.hypotheses[m, i]
+            V[weight + j] = setup.hypotheses[m, 4]
 
     @inner
     def learn(W, members, block, setup):
-        count = len(setup.hypotheses) // 5
+        count = len(setup.hypotheses)
         first = block * LANES * count
         stop = min(first + LANES * count, len(members) * LANES)
         for b in range(first // LANES, stop // LANES):

@@ -99,8 +99,8 @@ class Setup(NamedTuple):
         prior: (size,) record that episodes start from.
         inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
         log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
-        hypotheses: (5 members,) shape and rate of γ and of ξ that each of several beliefs starts from, and its weight;
-            () for one.
+        hypotheses: (members, 5) shape and rate of γ and of ξ that each of several beliefs starts from, and its weight;
+            (0, 5) for one.
     """
 
     max_input: float
@@ -150,7 +150,7 @@ def unpacker(kind: Kind) -> Any:
         size = sizes.get(name)
         place = f"packed[{at}]" if size is None else f"packed[{at}:{at + size}]"
         if name == "hypotheses":  # the last
-            place = f"packed[{at}:]"
+            place = f"packed[{at}:].reshape(-1, 5)"
         told.append({int: f"int({place})", bool: f"{place} != 0.0"}.get(kind_of_value, place))
         at += 1 if size is None else size
     return _unpacker(", ".join(told))

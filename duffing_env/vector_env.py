@@ -111,7 +111,7 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         self.render_mode = None
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
         self.single_observation_space = observation_space(self.experiment)
-        each, seen = len(self.experiment.setup.hypotheses) // 5, int(np.prod(self.single_observation_space.shape))
+        each, seen = len(self.experiment.setup.hypotheses), int(np.prod(self.single_observation_space.shape))
         if num_envs * each > MOST_ENVS or num_envs * seen > _MOST_SHOWN:
             raise ValueError(
                 f"num_envs must leave room for {each or 1} beliefs and {seen} observed numbers in each of {num_envs} "

@@ -124,7 +124,7 @@ def close(first, second):
 
 ESTIMATED = {
     "difference": (DuffingEnv, Rig.silverbox("zero_order", 0)),
-    "continuous": (ContinuousEnv, Rig.silverbox("zero_order", 0)),
+    "continuous": (ContinuousEnv, Rig.silverbox("zero_order", -1)),  # an action acts before the sample that it brings
 }
 
 
@@ -304,9 +304,9 @@ def test_what_cannot_weigh_hypotheses_says_so(make, options):
 def test_one_hypothesis_is_the_prior_itself():
     one, many = SimulatedExperiment(), SimulatedExperiment(noise_hypotheses=9)
     assert not one.kind.weighs
-    assert one.setup.hypotheses.size == 0
+    assert one.setup.hypotheses.shape == (0, 5)
     np.testing.assert_array_equal(one.setup.prior, one.believed.record)
-    assert many.setup.hypotheses.shape == (27 * 5,)
+    assert many.setup.hypotheses.shape == (27, 5)
     assert many.kind == SimulatedExperiment(noise_hypotheses=4).kind  # a kernel does not know how many there are
     assert many.believed == one.believed
     np.testing.assert_allclose(many.setup.prior[:-4], one.setup.prior[:-4], rtol=1e-13)
