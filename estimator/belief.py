@@ -145,7 +145,9 @@ class Belief:
                 f"gamma must be a pair, and xi one for each of {list(model.outputs)}, but are {shown(gamma)} and "
                 f"{shown(xi)}"
             )
-        if not np.allclose(second, second.T, rtol=1e-9, atol=0):
+        # As correlations: rounding leaves a covariance near 0 in no proportion to itself.
+        std = np.sqrt(np.abs(np.diag(second)))
+        if np.any(np.abs(second - second.T) > 1e-9 * np.outer(std, std)):
             raise ValueError("cov must be symmetric; pass (C + C.T) / 2")
         record[:d] = first
         record[covariance_places(model)] = second

@@ -101,6 +101,16 @@ def test_nothing_can_be_written_into_it():
         one.step = 1.0
 
 
+def test_rounding_leaves_a_covariance_symmetric():
+    """As of a record whose fit leaves two parameters nearly uncorrelated."""
+    cov = covariance()
+    cov[3, 4], cov[4, 3] = 1e-17, -2e-17  # where the standard deviations are of 4e-5 and 2e3
+    np.testing.assert_allclose(belief(cov=cov).cov, cov, rtol=1e-14, atol=1e-16)
+    cov[4, 3] = 1e-6 * np.sqrt(cov[3, 3] * cov[4, 4])
+    with pytest.raises(ValueError, match="cov must be symmetric"):
+        belief(cov=cov)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
