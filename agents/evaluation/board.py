@@ -107,8 +107,8 @@ CAPTION = (
     "Score: interquartile mean over seeds and systems of the D-efficiency, against the certified optimum of each "
     "system that has one and else the best input that is known, with its 95 % bootstrap interval over systems. The "
     "others are means over 256 systems: information gained, 90 % intervals that cover, episodes that a limit ended, "
-    "and the Fisher information on systems whose parameters, noises, limits or equation are shifted. Budget: samples of "
-    "training (none: it learns nothing; open: more than 10 million). A star marks a score against an earlier oracle."
+    "and the Fisher information on systems whose parameters, noises, limits or equation are shifted. Budget: samples "
+    "of training (none: it learns nothing; open: more than 10 million). A star marks a score against an earlier oracle."
 )
 
 
