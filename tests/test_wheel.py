@@ -1,6 +1,7 @@
 """What a user installs: the wheel in a clean environment, without torch; it takes the dependencies from the index."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -38,8 +39,20 @@ print("played")
 """
 
 
+def interpreter(version):
+    """The Python of a version: the one that runs the tests, or one on the path; a test without one is skipped."""
+    if version == f"{sys.version_info.major}.{sys.version_info.minor}":
+        return sys.executable
+    found = shutil.which(f"python{version}")
+    if found is None or subprocess.run([found, "-c", ""], capture_output=True).returncode:
+        pytest.skip(f"python{version} is not on the path")
+    return found
+
+
 @pytest.mark.slow
-def test_a_clean_installation_is_light_and_works(tmp_path):
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13", "3.14"])
+def test_a_clean_installation_is_light_and_works(version, tmp_path):
+    python = interpreter(version)
     alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
     def run(*words, check=True):
@@ -50,7 +63,7 @@ def test_a_clean_installation_is_light_and_works(tmp_path):
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path], cwd=ROOT, check=True, timeout=600
     )
-    run(sys.executable, "-m", "venv", tmp_path / "venv")
+    run(python, "-m", "venv", tmp_path / "venv")
     (wheel,) = tmp_path.glob("*.whl")
     python = tmp_path / "venv" / "bin" / "python"
     done = run(python, "-m", "pip", "install", "--quiet", wheel, check=False)
@@ -61,7 +74,7 @@ def test_a_clean_installation_is_light_and_works(tmp_path):
     assert "***Test Failed***" not in tried.stdout
     (installed,) = (tmp_path / "venv" / "lib").glob("*/site-packages")
     size = sum(path.stat().st_size for path in installed.rglob("*") if path.is_file()) / 2**20
-    print(f"{wheel.name}: {size:.0f} MB in site-packages, with pip, bytecode and compiled kernels")
+    print(f"{wheel.name}, Python {version}: {size:.0f} MB in site-packages, with pip, bytecode and compiled kernels")
     assert size <= MOST
     trained = run(tmp_path / "venv" / "bin" / "duffing-env", "train", "--output", "out", check=False)
     assert trained.returncode == 2
