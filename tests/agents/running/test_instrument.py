@@ -97,7 +97,7 @@ def test_a_lost_connection_leaves_the_zero_to_the_watchdog(scpi, tmp_path):
 
 @pytest.mark.parametrize("scpi", [{"fault": "slow", "after": 20}], indirect=True)
 def test_late_samples_are_counted_marked_and_kept_from_the_estimator(scpi, tmp_path):
-    result = play(scpi, tmp_path / "run", samples=80)
+    result = play(scpi, tmp_path / "run", samples=200)
     assert result.ended == "complete"
     late = [row for row in rows(tmp_path / "run") if row["late"] == "1"]
     assert len(late) == result.late >= 10
