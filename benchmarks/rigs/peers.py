@@ -71,7 +71,10 @@ def write_problems(path: Path, names: Sequence[str], seeds: int) -> None:
 
 
 def run(names: Sequence[str], seeds: int, against: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Rig and method to errors (seeds, 4) and seconds (seeds,), or the reason why there are none. In turns."""
+    """Rig and method, ours and those ``against`` it, to errors (seeds, 4) and seconds (seeds,), in turns.
+
+    Or to the reason why there are none.
+    """
     from rich.console import Console
     from rich.progress import track
 
@@ -154,13 +157,15 @@ def show(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
     counts |= {peer: statements(function, *peer_rows.HELPERS[peer]) for peer, function in peer_rows.PEERS.items()}
     console.print("Statements of user code: " + ", ".join(f"{name} {count}" for name, count in counts.items()))
     console.print(f"{'PASS' if counts[OURS] <= MOST_STATEMENTS else 'MISS'}: at most {MOST_STATEMENTS} of ours")
-    times = [[seconds(here["dynamax"]), seconds(here[OURS])] for here in results.values() if "dynamax" in here]
-    slower = np.nanmedian(np.divide(*np.moveaxis(np.array(times), 1, 0)), axis=0) if times else np.array([])
-    whens = ("a rig's first record, dynamax's compilation included", "others")
-    for when, value in zip(whens, slower, strict=False):
+    slower: dict[str, float] = {}
+    if all("dynamax" in methods for methods in results.values()):
+        times = np.array([[seconds(methods["dynamax"]), seconds(methods[OURS])] for methods in results.values()])
+        whens = ("a rig's first record, dynamax's compilation included", "others")
+        slower = dict(zip(whens, np.nanmedian(times[:, 0] / times[:, 1], axis=0).tolist(), strict=True))
+    for when, value in slower.items():
         word = "PASS" if value >= TIME_BAR else "MISS"
         console.print(f"{word}: dynamax takes {value:.3g} times as long as ours (at least {TIME_BAR:g}), {when}")
-    return {"statements": counts, "slower": slower.tolist(), "rows": verdict}
+    return {"statements": counts, "slower": slower, "rows": verdict}
 
 
 def seconds(here: dict[str, Any]) -> tuple[float, float]:
