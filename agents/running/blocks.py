@@ -85,5 +85,5 @@ class Blocks:
         self._rows += len(u) + 1
         self._block += 1
         self._session.check(y)
-        self._follower.take(np.concatenate([[0.0], applied[:-1]]), y)
+        self._follower.take_block(applied, y)
         self._follower.pause(float(applied[-1]))

@@ -15,6 +15,7 @@ from agents.planner.motion import frequency, survey
 from estimator.arrays import copy as copy_numbers
 from estimator.belief import Belief, covariance_places
 from estimator.engine.motion import motion
+from estimator.identification.posterior import refit
 from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
@@ -94,6 +95,8 @@ class Follower:
         self._paused = 0
         self._starts: list[tuple[float, FloatArray, FloatArray]] = []
         self._rung: Drawn | None = None
+        self._rig, self._prior = rig, prior
+        self._blocks: list[tuple[FloatArray, FloatArray]] = []
         self.estimator = OnlineEstimator(
             prior.model, prior, paired, noise_hypotheses=(7, 7), expectations="sigma_points"
         )
@@ -124,6 +127,19 @@ class Follower:
             self.estimator.run(u, y, missing=True)
         else:
             self.estimator.restore(best)
+
+    def take_block(self, u: FloatArray, y: FloatArray) -> None:
+        """Take a block: outputs (N,) at its ticks, NaN where one is missing, and the inputs applied from each of them on.
+
+        The coefficients are then what all blocks tell together. The first, a silent one, tells nothing of them.
+
+        Raises:
+            ValueError: where the belief overflows; it is then as before.
+        """
+        self.take(np.concatenate([[0.0], u[:-1]]), y)
+        self._blocks.append((u, y))
+        if len(self._blocks) > 1:
+            self._put_coefficients(*refit(self._rig, self._blocks, self._prior, self.belief))
 
     def drawn(self, rng: np.random.Generator) -> Drawn:
         """States and coefficients (draws, d) and noises (draws, 2) of systems that are believed in now.
@@ -179,4 +195,12 @@ class Follower:
         n, places = model.n_states, covariance_places(model)
         arrays["records"][:, :n] = mean
         arrays["records"][:, places[:n, :n]] = cov
+        self.estimator.restore(arrays)
+
+    def _put_coefficients(self, mean: FloatArray, cov: FloatArray) -> None:
+        arrays, model = self.estimator.arrays(), self.estimator.model
+        n, d, places = model.n_states, len(model.names), covariance_places(model)
+        arrays["records"][:, n:d] = mean
+        arrays["records"][:, places[n:, n:]] = cov
+        arrays["records"][:, places[:n, n:]] = 0.0
         self.estimator.restore(arrays)

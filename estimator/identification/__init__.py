@@ -11,18 +11,16 @@ from typing import Any
 import numpy as np
 
 from estimator.belief import Belief
-from estimator.ensemble import matched_gamma
 from estimator.identification.checks import examine
 from estimator.identification.contraction import contraction
+from estimator.identification.posterior import posterior
 from estimator.identification.problem import Problem
 from estimator.identification.records import Record, records_of
 from estimator.identification.result import Result
-from estimator.identification.search import Found, search
-from estimator.models.duffing import KINDS
+from estimator.identification.search import search
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
-from estimator.rig_prior import about
 from estimator.units import Scales
 
 
@@ -74,7 +72,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         y = tuple(one.y / scales.output for one in read)
         found = search(Problem(rig, scales, u, y), tell)
         problem = found.fitter.problem
-        belief, noises = _belief(problem, found)
+        belief, noises = posterior(problem, found)
         tell("checking the result")
         forecasts = tuple(_forecast(belief, rig, one) for one in read)
         parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
@@ -92,38 +90,6 @@ def _scales(rig: Rig, records: list[Record]) -> Scales:
         input=scales.input if rig.input.limit else largest,
         output=scales.output if rig.output.range else widest,
     )
-
-
-def _belief(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[float, float]]]:
-    """The posterior of the rig's own model, and the noises' standard deviations in its units."""
-    rig, scales = problem.rig, problem.scales
-    belief = about(rig, scales, found.mean, found.cov)
-    shapes = np.full(len(found.weights), problem.samples / 2)
-    gamma, xi = (matched_gamma(found.weights, shapes, shapes * noise**2) for noise in found.noises)
-    belief = Belief.of(problem.believed, belief.mean, _with_start(belief, problem), gamma, xi, scales=scales)
-    gain = dict(zip(problem.model.coefficients, found.mean, strict=True))["gain"]
-    # What moves the velocity as much when it is held over a sample (`estimator.rig_prior`).
-    worth = scales.input * np.sqrt(3) / abs(gain), scales.output
-    noises = {
-        name: (float(found.weights @ values) * unit, _spread(found.weights, values, shapes) * unit)
-        for name, values, unit in zip(("input", "output"), found.noises, worth, strict=True)
-    }
-    return belief, noises
-
-
-def _with_start(belief: Belief, problem: Problem) -> FloatArray:
-    """The covariance, with a state that may be anywhere in the records' motion."""
-    cov, n = belief.cov, belief.model.n_states
-    cov[:n, :n] = problem.start + (cov[:n, :n] - np.diag(np.diag(cov[:n, :n])))
-    if KINDS[problem.rig.output.kind] == 0:
-        place = n + list(belief.model.coefficients).index("output_offset")
-        cov[0, 0] += cov[place, place]
-    return cov
-
-
-def _spread(weights: FloatArray, values: FloatArray, shapes: FloatArray) -> float:
-    mean = weights @ values
-    return float(np.sqrt(weights @ ((values - mean) ** 2 + values**2 / (4 * shapes))))
 
 
 def _forecast(belief: Belief, rig: Rig, record: Record) -> FloatArray:

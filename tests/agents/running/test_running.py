@@ -23,6 +23,7 @@ from agents.running.run import Plan, run
 from agents.running.session import Session, Tripped
 from agents.running.simulated import SimulatedPlant
 from estimator import OnlineEstimator, Rig, identify
+from estimator.identification.posterior import refit
 from estimator.rig_prior import HALF_WIDTH
 
 
@@ -217,6 +218,44 @@ def test_a_pause_forgets_the_phase_and_keeps_the_rest():
     np.testing.assert_array_equal(after.noises, before.noises)
     assert np.diag(after.state_cov)[0] > 100 * np.diag(before.state_cov)[0]
     assert np.sqrt(np.diag(after.state_cov)[0]) < np.abs(y).max() / RIG.scales.output
+
+
+def two_blocks(follower, plant, seed=0):
+    """What two blocks after a silent one put in and out; the follower has taken them, one by one."""
+    rng, played = np.random.default_rng(seed), []
+    for size in (0.0, 3.0, 3.0):
+        u, y = plant.play(size * np.repeat(rng.choice([-1.0, 1.0], 16), 8))
+        follower.take_block(u, y)
+        follower.pause(float(u[-1]))
+        played.append((u, y))
+    return played
+
+
+def test_blocks_tell_the_coefficients_together_as_identify_does():
+    follower, plant = Follower(RIG), Bench()
+    plant.arm(None)
+    played = two_blocks(follower, plant)
+    told, whole = follower.belief, identify(RIG, played).belief
+    std = np.sqrt(np.diag(whole.coefficients_cov))
+    np.testing.assert_allclose(told.coefficients_mean, whole.coefficients_mean, atol=0.05 * std.min(), rtol=0.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(told.coefficients_cov)), std, rtol=0.05)
+    for name, (mean, deviation, _) in told.parameters().items():
+        assert abs(mean - TRUTH.get(name, 0.0)) < 4 * deviation, name
+
+
+def test_where_a_fit_together_begins_does_not_matter_but_for_an_accelerometer():
+    follower, plant = Follower(RIG), Bench()
+    plant.arm(None)
+    played, prior = two_blocks(follower, plant), Follower(RIG).belief
+    first, second = (refit(RIG, played, prior, near) for near in (follower.belief, identify(RIG, played).belief))
+    std = np.sqrt(np.diag(first[1]))
+    np.testing.assert_allclose(first[0] / std, second[0] / std, atol=0.05)
+    np.testing.assert_allclose(first[1] / np.outer(std, std), second[1] / np.outer(std, std), atol=0.05)
+    shaker = replace(RIG, output=replace(RIG.output, kind="acceleration"))
+    near = Follower(shaker).belief
+    mean, cov = refit(shaker, played, near, near)
+    np.testing.assert_array_equal(mean, near.coefficients_mean)
+    np.testing.assert_array_equal(cov, near.coefficients_cov)
 
 
 # --- designs

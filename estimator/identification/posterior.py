@@ -1,0 +1,87 @@
+"""Beliefs of what a search left: the rig's own posterior, and that of all records at once, from a belief near it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from estimator.belief import Belief
+from estimator.ensemble import matched_gamma
+from estimator.identification.fit import Fitter, Hypothesis, Prior
+from estimator.identification.problem import Problem
+from estimator.identification.search import Found, enough_substeps, settle
+from estimator.models.duffing import KINDS
+from estimator.parameters import FloatArray
+from estimator.rig import Rig
+from estimator.rig_prior import about
+
+#: Factor of the ratio of the noises, either way, within which a search from a belief begins.
+_NEAR = 3.0
+
+
+def posterior(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[float, float]]]:
+    """The posterior of the rig's own model, and the noises' standard deviations in its units."""
+    rig, scales = problem.rig, problem.scales
+    belief = about(rig, scales, found.mean, found.cov)
+    shapes = np.full(len(found.weights), problem.samples / 2)
+    gamma, xi = (matched_gamma(found.weights, shapes, shapes * noise**2) for noise in found.noises)
+    belief = Belief.of(problem.believed, belief.mean, _with_start(belief, problem), gamma, xi, scales=scales)
+    gain = dict(zip(problem.model.coefficients, found.mean, strict=True))["gain"]
+    # What moves the velocity as much when it is held over a sample (`estimator.rig_prior`).
+    worth = scales.input * np.sqrt(3) / abs(gain), scales.output
+    noises = {
+        name: (float(found.weights @ values) * unit, _spread(found.weights, values, shapes) * unit)
+        for name, values, unit in zip(("input", "output"), found.noises, worth, strict=True)
+    }
+    return belief, noises
+
+
+def _with_start(belief: Belief, problem: Problem) -> FloatArray:
+    """The covariance, with a state that may be anywhere in the records' motion."""
+    cov, n = belief.cov, belief.model.n_states
+    cov[:n, :n] = problem.start + (cov[:n, :n] - np.diag(np.diag(cov[:n, :n])))
+    if KINDS[problem.rig.output.kind] == 0:
+        place = n + list(belief.model.coefficients).index("output_offset")
+        cov[0, 0] += cov[place, place]
+    return cov
+
+
+def _spread(weights: FloatArray, values: FloatArray, shapes: FloatArray) -> float:
+    mean = weights @ values
+    return float(np.sqrt(weights @ ((values - mean) ** 2 + values**2 / (4 * shapes))))
+
+
+def refit(
+    rig: Rig, records: Sequence[tuple[FloatArray, FloatArray]], prior: Belief, near: Belief
+) -> tuple[FloatArray, FloatArray]:
+    """What records tell of the coefficients together, where an estimator has come near it that took every sample once.
+
+    A Gaussian that takes every sample once becomes sure too soon where two coefficients at first show as one, such as
+    the cubic stiffness and the sensor's offset of a rig with two wells. All records at once do not.
+
+    Args:
+        rig: that they are of.
+        records: pairs (u, y) of arrays (T,) in the rig's units, paired by index; each may begin in any motion.
+        prior: what is believed before them.
+        near: the belief that the search begins at.
+
+    Returns:
+        Mean (K,) and covariance (K, K); those of ``near`` where the search leads nowhere, and with an accelerometer,
+        whose first outputs do not tell the displacement that a record begins at.
+    """
+    start, cov = near.coefficients_mean, near.coefficients_cov
+    u, y = (tuple(one[i] / scale for one in records) for i, scale in ((0, near.scales.input), (1, near.scales.output)))
+    problem = Problem(rig, near.scales, u, y)
+    if KINDS[rig.output.kind] == 2 or list(problem.model.coefficients) != list(near.model.coefficients):
+        return start, cov
+    q, r = near.noises[1] / near.noises[0], near.noises[3] / near.noises[2]
+    problem = Problem(rig, near.scales, u, y, enough_substeps(problem, start, cov))
+    precision = np.linalg.inv(prior.coefficients_cov)
+    fitter = Fitter(problem, Prior(prior.coefficients_mean, 0.5 * (precision + precision.T)))
+    hypothesis = Hypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)))
+    try:
+        found = settle(fitter, hypothesis, start, float(np.sqrt(r)), _NEAR)
+    except ValueError:
+        return start, cov
+    return found.mean, found.cov
