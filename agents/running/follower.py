@@ -129,7 +129,7 @@ class Follower:
             self.estimator.restore(best)
 
     def take_block(self, u: FloatArray, y: FloatArray) -> None:
-        """Take a block: outputs (N,) at its ticks, NaN where one is missing, and the inputs applied from each of them on.
+        """Take a block: outputs (N,) at its ticks, NaN where one is missing, each with the input applied from it on.
 
         The coefficients are then what all blocks tell together. The first, a silent one, tells nothing of them.
 
