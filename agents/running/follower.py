@@ -15,7 +15,7 @@ from agents.planner.motion import frequency, survey
 from estimator.arrays import copy as copy_numbers
 from estimator.belief import Belief, covariance_places
 from estimator.engine.motion import motion
-from estimator.identification.posterior import refit
+from estimator.identification.beliefs import refit
 from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from estimator.belief import Belief
+from estimator.identification.beliefs import posterior
 from estimator.identification.checks import examine
 from estimator.identification.contraction import contraction
-from estimator.identification.posterior import posterior
 from estimator.identification.problem import Problem
 from estimator.identification.records import Record, records_of
 from estimator.identification.result import Result

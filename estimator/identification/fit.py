@@ -158,6 +158,11 @@ class Fitter:
         cov = _inverted(curvature) * np.outer(self._scale, self._scale)
         return Fits(tuple(hypotheses), points, cov, levels, self._energy(loss, curvature))
 
+    def level(self, hypothesis: Hypothesis, point: FloatArray, level: float) -> float:
+        """The best σ_v at coefficients (K,), to first order from ``level``; that itself where the numbers run away."""
+        inputs = self._driven(hypothesis)[None]
+        return float(self._appraise(point[None], inputs, np.array([hypothesis.ratio]), np.array([level]))[3][0])
+
     def _driven(self, hypothesis: Hypothesis) -> FloatArray:
         key = hypothesis.interpolation, hypothesis.delay
         if key not in self._inputs:

@@ -23,7 +23,7 @@ from agents.running.run import Plan, run
 from agents.running.session import Session, Tripped
 from agents.running.simulated import SimulatedPlant
 from estimator import OnlineEstimator, Rig, identify
-from estimator.identification.posterior import refit
+from estimator.identification.beliefs import refit
 from estimator.rig_prior import HALF_WIDTH
 
 
@@ -243,7 +243,7 @@ def test_blocks_tell_the_coefficients_together_as_identify_does():
         assert abs(mean - TRUTH.get(name, 0.0)) < 4 * deviation, name
 
 
-def test_where_a_fit_together_begins_does_not_matter_but_for_an_accelerometer():
+def test_where_a_fit_of_all_blocks_begins_does_not_matter():
     follower, plant = Follower(RIG), Bench()
     plant.arm(None)
     played, prior = two_blocks(follower, plant), Follower(RIG).belief
@@ -251,9 +251,15 @@ def test_where_a_fit_together_begins_does_not_matter_but_for_an_accelerometer():
     std = np.sqrt(np.diag(first[1]))
     np.testing.assert_allclose(first[0] / std, second[0] / std, atol=0.05)
     np.testing.assert_allclose(first[1] / np.outer(std, std), second[1] / np.outer(std, std), atol=0.05)
-    shaker = replace(RIG, output=replace(RIG.output, kind="acceleration"))
-    near = Follower(shaker).belief
-    mean, cov = refit(shaker, played, near, near)
+
+
+def test_records_that_do_not_look_as_believed_change_nothing():
+    follower, plant = Follower(RIG), Bench()
+    plant.arm(None)
+    played, near = two_blocks(follower, plant), follower.belief
+    rng = np.random.default_rng(1)
+    noisy = [(u, y + 1e-3 * rng.standard_normal(len(y))) for u, y in played]
+    mean, cov = refit(RIG, noisy, Follower(RIG).belief, near)
     np.testing.assert_array_equal(mean, near.coefficients_mean)
     np.testing.assert_array_equal(cov, near.coefficients_cov)
 

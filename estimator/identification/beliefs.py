@@ -16,8 +16,9 @@ from estimator.parameters import FloatArray
 from estimator.rig import Rig
 from estimator.rig_prior import about
 
-#: Factor of the ratio of the noises, either way, within which a search from a belief begins.
-_NEAR = 3.0
+#: Factor of the ratio of the noises, either way, within which a search from a belief begins; and the most by which the
+#: noises that the belief has are too small for all records.
+_NEAR, _EXCESS = 3.0, 2.0
 
 
 def posterior(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[float, float]]]:
@@ -67,21 +68,25 @@ def refit(
         near: the belief that the search begins at.
 
     Returns:
-        Mean (K,) and covariance (K, K); those of ``near`` where the search leads nowhere, and with an accelerometer,
-        whose first outputs do not tell the displacement that a record begins at.
+        Mean (K,) and covariance (K, K); those of ``near`` where the search leads nowhere, and where the first outputs
+        of a record do not tell, to first order, what motion it begins in, such as those of an accelerometer: the
+        records do not look as ``near`` has them then.
     """
     start, cov = near.coefficients_mean, near.coefficients_cov
     u, y = (tuple(one[i] / scale for one in records) for i, scale in ((0, near.scales.input), (1, near.scales.output)))
     problem = Problem(rig, near.scales, u, y)
-    if KINDS[rig.output.kind] == 2 or list(problem.model.coefficients) != list(near.model.coefficients):
+    if list(problem.model.coefficients) != list(near.model.coefficients):
         return start, cov
     q, r = near.noises[1] / near.noises[0], near.noises[3] / near.noises[2]
     problem = Problem(rig, near.scales, u, y, enough_substeps(problem, start, cov))
     precision = np.linalg.inv(prior.coefficients_cov)
     fitter = Fitter(problem, Prior(prior.coefficients_mean, 0.5 * (precision + precision.T)))
     hypothesis = Hypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)))
+    level = float(np.sqrt(r))
+    if fitter.level(hypothesis, start, level) > _EXCESS * level:
+        return start, cov
     try:
-        found = settle(fitter, hypothesis, start, float(np.sqrt(r)), _NEAR)
+        found = settle(fitter, hypothesis, start, level, _NEAR)
     except ValueError:
         return start, cov
     return found.mean, found.cov
