@@ -198,19 +198,21 @@ class Swing(NamedTuple):
             does to the displacement in a sample, less that sample's own. Nothing done within this time takes it back.
         taught: (K, K) the mean of φ φᵀ over the samples, with φ the derivatives by the coefficients of what the first
             sensor shows a sample later.
+        built: samples until it comes near the limit; inf where it does not within `_SAMPLES`.
     """
 
     scales: FloatArray
     pace: int
     shaken: float
     taught: FloatArray
+    built: float
 
 
 @cache
 def _swinger(view: View) -> Any:
     """``swing(means, max_input, limit, peaks, taught)`` fills `Swing.taught`, and what the others are made of.
 
-    These are the peaks of states and sensor, then samples in a period, or 0.
+    These are the peaks of states and sensor, samples in a period, or 0, and samples until the limit is near, or 0.
     """
     found = motion(*view)
     at, sense, glance, step = found.layout, found.sense, found.glance, found.step
@@ -241,6 +243,7 @@ def _swinger(view: View) -> Any:
             glance(W)
             if abs(W[shown]) > _TURN * limit:
                 W[u] = -W[u]
+                peaks[n + 2] = t + 1.0 if peaks[n + 2] == 0.0 else peaks[n + 2]
             step(W)
             if not abs(W[shown]) < 2.0 * limit:
                 break
@@ -266,9 +269,9 @@ def swing_of(view: View, prior_means: npt.ArrayLike, max_input: float, limit: fl
         limit: of the first sensor.
     """
     model = view.model
-    peaks, taught = np.empty(model.n_states + 2), np.empty((model.n_coefficients, model.n_coefficients))
+    peaks, taught = np.empty(model.n_states + 3), np.empty((model.n_coefficients, model.n_coefficients))
     _swinger(view)(np.asarray(prior_means, dtype=np.float64), float(max_input), float(limit), peaks, taught)
-    sizes, peak, period = peaks[:-2], peaks[-2], peaks[-1]
+    sizes, (peak, period, built) = peaks[:-3], peaks[-3:]
     sensor = next(iter(model.outputs.values()))
     moves = zip(model.states, model.moves, strict=True)
     keeps = np.array([x == sensor or (not model.is_continuous and move == sensor) for x, move in moves])
@@ -276,4 +279,4 @@ def swing_of(view: View, prior_means: npt.ArrayLike, max_input: float, limit: fl
     scales = limit * np.divide(sizes, peak, out=np.ones(model.n_states), where=~keeps)
     # Kicks of the velocity, of variance 3 a sample, after a quarter period 2π/4ω: 3 (t/2ω²), of the displacement.
     shaken = max(0.0, 3.0 * period**3 / (32.0 * np.pi**2) - 1.0) * float(limit / scales[0]) ** 2
-    return Swing(scales, max(1, round(period / _MOVES)), float(shaken), taught)
+    return Swing(scales, max(1, round(period / _MOVES)), float(shaken), taught, float(built) or np.inf)

@@ -26,7 +26,7 @@ from scipy.special import ndtr, stdtrit
 from agents.planner.imagination import TAILS, Terms
 from agents.planner.motion import View, places, survey, swing_of
 from agents.planner.motion import seen as seen_part
-from agents.policies.imagined import BOUND, FEATURES, Ahead, imaginer
+from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, MARGIN, Outlook, feature_names, look_at
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
@@ -38,7 +38,7 @@ from estimator.parameters import FloatArray
 _DRIVE, _DRIVE_SPAN = 0.06, 0.1
 
 #: An oscillator that is within this part of the limit is at rest; it is pushed as if it moved by so much.
-REST, NUDGE = 0.007, 0.05
+_REST, _NUDGE = 0.007, 0.05
 
 #: A push alone changes the displacement by no more than half of this part of its limit in a move.
 _LEAP = 1.0
@@ -47,7 +47,8 @@ _LEAP = 1.0
 #: teach what such a swing does not, such as to rest with a push on.
 _USUAL = 0.1
 
-THRIFT = FEATURES.index("thrift")
+_THRIFT = FEATURES.index("thrift")
+_FREE = [FEATURES.index(f"free_{t}") for t in (1, 2, 3)]
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ class Foresight:
             states = view.features[:, first : first + self._view.model.n_states] / sizes
             at_rest_gain = survey(self._view.model, outlook.center, np.zeros(self._view.model.n_states)).gains[0]
             nudge = np.where(
-                np.abs(states).max(axis=1) < REST, NUDGE * outlook.max_output / abs(at_rest_gain), view.motions
+                np.abs(states).max(axis=1) < _REST, _NUDGE * outlook.max_output / abs(at_rest_gain), view.motions
             )
         return acted(choices, view, nudge, self._outlook.max_input)
 
@@ -190,17 +191,18 @@ class CommonForesight:
     observation itself it tells more of one model, and a policy plays environments of that. Outputs keep
     `agents.policies.prospects.MARGIN` standard deviations from the limit; where noises are weighed, as many as make the
     same chance under Student's t. On a rig the limit is lower by what a swing at it can hide between two samples. An
-    action is a push, where the energy is limited in proportion to what is left of it.
+    action is a push, where the energy is limited in proportion to what is left of it; or, as a ``drive``, how hard.
 
     Args:
         env: the unwrapped environment.
         own: whether the observation stands behind the features, turned upright.
+        drive: whether an action is how hard to push along the motion, where the energy is limited.
 
     Raises:
         ValueError: where an action is held for several samples, or ``env`` is not one of duffing_env.
     """
 
-    def __init__(self, env: Any, *, own: bool = False) -> None:
+    def __init__(self, env: Any, *, own: bool = False, drive: bool = False) -> None:
         experiment: Experiment | None = getattr(env, "experiment", None)
         if experiment is None:
             raise ValueError(
@@ -214,9 +216,13 @@ class CommonForesight:
         rate = _USUAL * swing.taught / sum(float(rate / shape) for shape, rate in (prior.noises[:2], prior.noises[2:4]))
         gain = abs(survey(self._view.model, center, np.zeros(self._view.model.n_states)).gains[0]) * swing.pace**2
         push = min(setup.max_input, _LEAP * setup.max_output / gain)
+        # A limit of energy allows for smaller pushes, under which a swing takes longer to build.
+        lasting = min(setup.max_input, HASTE * float(np.sqrt(setup.budget / setup.horizon)))
+        built = swing_of(self._view, center, lasting, setup.max_output).built / swing.pace
+        moves = look_ahead(built, setup.horizon / swing.pace)
         of_rig = getattr(experiment, "rig", None) is not None
         weighs = experiment.noise_hypotheses != 1 and not of_rig
-        self._ahead = Ahead(push, setup.horizon, setup.budget, rate)
+        self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate)
         self._terms = Terms(
             setup.max_input,
             np.inf,
@@ -231,6 +237,7 @@ class CommonForesight:
         odd = (*range(at.state, at.state + model.n_states), at.last_input)
         self._odd = (*odd, *range(at.last_output, at.last_output + model.n_outputs))
         self._own, self._env, self._push = own, env, push / setup.max_input
+        self._asked, self._nudge = drive, _NUDGE * setup.max_output / gain
 
     def to_tensors(self) -> dict[str, FloatArray]:
         """Nothing: all of it is taken from the environment at hand."""
@@ -238,7 +245,12 @@ class CommonForesight:
 
     def describe(self) -> dict[str, Any]:
         """As `Foresight.describe`."""
-        return {"is_common": True, "reads_belief": True}
+        return {"is_common": True, "drives": self._asked}
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether an action is how hard to push along the motion."""
+        return self._asked and bool(np.isfinite(self._ahead.energy))
 
     @property
     def observation_size(self) -> int:
@@ -278,11 +290,23 @@ class CommonForesight:
             upright = np.clip(seen, -BOUND, BOUND)
             upright[:, self._odd] *= signs[:, None].astype(np.float32)
             features = np.concatenate([features, upright], axis=1)
-        return Sight(features, safe, signs, np.zeros(n))
+        return Sight(features, safe, signs, self._motions(features, records, signs) if self.is_drive else np.zeros(n))
+
+    def _motions(self, features: npt.NDArray[np.float32], records: FloatArray, signs: FloatArray) -> FloatArray:
+        """(n,) the inputs that are all of a motion, upright: what it moves by in two samples, by itself."""
+        n, d = self._view.model.n_states, len(self._view.model.names)
+        found = survey(self._view.model, records[:, n:d], records[:, :n])
+        moves = found.velocities + signs * features[:, _FREE[0]] * self._terms.limit - found.shown
+        motions: FloatArray = signs * moves / self._terms.pace * found.gains / np.maximum(found.gains**2, 1e-300)
+        return motions
 
     def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
         """As `Foresight.act`."""
-        pushes = self._push * np.minimum(1.0, self._ahead.haste * view.features[:, THRIFT])
+        if self.is_drive:
+            at_rest = np.abs(view.features[:, _FREE]).max(axis=1) < _REST
+            motions = np.where(at_rest, self._nudge, view.motions)
+            return acted(choices, view, motions, self._terms.amplitude, self._push)
+        pushes = self._push * np.minimum(1.0, self._ahead.haste * view.features[:, _THRIFT])
         return acted(pushes * np.asarray(choices), view, None, self._terms.amplitude, pushes)
 
 

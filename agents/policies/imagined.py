@@ -1,18 +1,19 @@
 """What the beliefs of all oscillators have in common: what they expect of simple ways to go on, imagined exactly.
 
-From the belief the oscillator is imagined for `HORIZONS`[-1] moves, each held for as many samples as
+From the belief the oscillator is imagined for as many moves as `look_ahead` says, each held for as many samples as
 `agents.planner.motion.Swing` says. The first move is a push up, none, or a push down; then follows one of
 
-- the signs of the next five pushes, but all of them alike, and from there on pushes along the motion, but against it
-  where they would lead beyond the limit (the *best* of these thirty ways counts),
+- the signs of the next four pushes, and then pushes along the motion, but against it where they would lead beyond the
+  limit; or the same signs, and then none; or four pushes up, or down, and then along (the *best* of these thirty ways
+  counts),
 - *brake*: pushes against the motion,
 - *rest*: none.
 
 The ways of a first move lie side by side in the lanes of one block, and are imagined as the planner imagines its own:
 by belief propagation (`agents.planner.imagination`), so that what one sample teaches is not counted again by the next,
-and with what the rest of the episode will bring anyway. What a way is worth is in nats: the mean of what is known after
-it has been followed for each of the horizons up to the one that a feature is named by. By the last alone the best way
-may be to wait for a move, and so at every decision anew.
+and with what the rest of the episode will bring anyway. What a way is worth is in nats: what is known when *half* of
+it has been followed, and the mean of that and of what is known after the *whole*. By its end alone the best way may be
+to wait for a move, and so at every decision anew.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from estimator.lanes import LANES, kernel, part
 from estimator.parameters import FloatArray
 
 CONTINUATIONS = ("best", "brake", "rest")
-HORIZONS = (4, 8, 16)
+PARTS = ("half", "whole")
 FIRST_INPUTS = ("up", "none", "down")
 
 #: What all observations become.
 FEATURES = (
     "log_std_mean", "log_std_max", "last_input", "last_output", "log_gamma", "log_xi", "time_left", "thrift",
-    *(f"{c}_{way}_{h}" for c in CONTINUATIONS for h in HORIZONS for way in ("up", "none")),
+    *(f"{c}_{way}_{part}" for c in CONTINUATIONS for part in PARTS for way in ("up", "none")),
     *(f"{c}_peak_{first}" for c in CONTINUATIONS for first in FIRST_INPUTS),
     "free_1", "free_2", "free_3", "pushed_1", "pushed_2", "brings", "to_come",
 )  # fmt: skip
@@ -47,16 +48,20 @@ FEATURES = (
 #: Largest size of a feature; what a difference of one nat counts for before arcsinh.
 BOUND, _NAT = 10.0, 20.0
 
-#: Pushes after the first move whose signs are tried, by the lane's number plus one; the lanes of brake and rest.
-_TRIED = 5
-_BRAKE, _REST = LANES - 2, LANES - 1
+#: Pushes after the first move whose signs are tried, by the lane's number plus one; the first lanes of the ways that
+#: then rest, of those whose pushes are all alike, of brake and of rest.
+_TRIED = 4
+_STILL, _ALIKE, _BRAKE, _REST = LANES // 2 - 2, LANES - 4, LANES - 2, LANES - 1
+
+#: Moves that are looked ahead, at least and at most; and in parts of what a swing takes to build, and of the episode.
+_LEAST, _MOST, _PART = 8, 24, 1 / 3
 
 #: Moves in which an output can still be kept within the limit: nearly a period. Where pushes along the motion turn, in
 #: parts of the limit.
 _IN_REACH, _TURN = 8, 0.95
 
 #: Where the energy is limited a push has at most so many times the size that what is left would last for to the end.
-_HASTE = 2.0
+HASTE = 2.0
 
 
 class Ahead(NamedTuple):
@@ -64,17 +69,32 @@ class Ahead(NamedTuple):
 
     Attributes:
         push: largest push; no more than what moves the first sensor by a part of its limit in a move.
+        moves: that are looked ahead, an even number.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
         rate: (K, K) information about the coefficients that a sample brings.
-        haste: `_HASTE`.
+        haste: `HASTE`.
     """
 
     push: float
+    moves: int
     samples: float
     energy: float
     rate: FloatArray
-    haste: float = _HASTE
+    haste: float = HASTE
+
+
+def look_ahead(built: float, moves: float) -> int:
+    """How many moves to look ahead in an episode, where a swing takes ``built`` moves to come near the limit, or inf.
+
+    Where the limit is near, ways that go on for long lead beyond it, and what they would teach says little. Where it is
+    far, a swing has to be built, and pays late.
+
+    Example:
+        >>> look_ahead(5.0, 256), look_ahead(50.0, 256), look_ahead(float("inf"), 256), look_ahead(float("inf"), 48)
+        (8, 16, 24, 16)
+    """
+    return 2 * int(np.clip(_PART * min(built, moves), _LEAST, _MOST) / 2)
 
 
 @cache
@@ -129,8 +149,12 @@ def imaginer(view: View) -> Any:
                 W[U + j] = (1.0 - first) * push
             elif j == _REST:
                 W[U + j] = 0.0
+            elif j < _ALIKE and t <= _TRIED:
+                W[U + j] = push if ((j % _STILL + 1) >> (t - 1)) & 1 else -push
             elif j < _BRAKE and t <= _TRIED:
-                W[U + j] = push if ((j + 1) >> (t - 1)) & 1 else -push
+                W[U + j] = push if j == _ALIKE else -push
+            elif _STILL <= j < _ALIKE:
+                W[U + j] = 0.0
             else:
                 way, pump = along(W, j, still, push, unforeseen, terms)
                 W[U + j] = pump if j < _BRAKE else -way
@@ -148,7 +172,7 @@ def imaginer(view: View) -> Any:
     def look(records, observations, ahead, terms, features, safe, signs):
         W, still = np.zeros(size), np.zeros(width)
         M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(3 * LANES)
-        brought = np.empty((len(HORIZONS), 3 * LANES))
+        brought = np.empty((len(PARTS), 3 * LANES))
         free = np.empty((3, 3))
         factorise(ahead.rate, M)
         for i in range(len(observations)):
@@ -171,8 +195,8 @@ def imaginer(view: View) -> Any:
             unforeseen = terms.shaken * record[noise + 1] / record[noise]
             for first in range(3):
                 begin(W, record, lasts)
-                lane, h = first * LANES, 0
-                for t in range(HORIZONS[-1]):
+                lane = first * LANES
+                for t in range(ahead.moves):
                     choose(W, first, t, still, push, unforeseen, terms)
                     for _ in range(terms.pace):
                         advance(W, record, terms)
@@ -182,12 +206,14 @@ def imaginer(view: View) -> Any:
                                 peaks[lane + j] = max(peaks[lane + j], peak)
                     if t < 3:
                         free[t, first] = W[shown + _REST]
-                    if t + 1 == HORIZONS[h]:
+                    if 2 * (t + 1) % ahead.moves == 0:
                         appraise(W, M, np.sqrt(max(0.0, share * ahead.samples - (t + 1) * terms.pace)))
-                        for j in range(LANES):
-                            before = brought[h - 1, lane + j] if h > 0 else 0.0
-                            brought[h, lane + j] = before + (W[SCORE + j] - before) / (h + 1)
-                        h += 1
+                        for j in range(lane, lane + LANES):
+                            score = W[SCORE + j - lane]
+                            if t + 1 < ahead.moves:
+                                brought[0, j] = score
+                            else:
+                                brought[1, j] = 0.5 * (brought[0, j] + score)
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
             signs[i] = sign
             up, down = (0, 2) if sign > 0.0 else (2, 0)
@@ -201,7 +227,7 @@ def imaginer(view: View) -> Any:
             told[6], told[7] = seen[at.time_left], thrift
             to = 8
             for group in range(3):
-                for h in range(len(HORIZONS)):
+                for h in range(len(PARTS)):
                     rise, calm = best(brought[h], up, group), best(brought[h], 1, group)
                     fall = best(brought[h], down, group)
                     told[to] = np.arcsinh(_NAT * (rise - fall))

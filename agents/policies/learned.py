@@ -19,7 +19,6 @@ import numpy.typing as npt
 from agents.asked import check_state, starts
 from agents.policies.foresight import CommonForesight, Foresight
 from agents.policies.imagined import FEATURES
-from agents.policies.recalled import RecalledForesight
 from estimator.checks import numbers
 from estimator.files import whole_file
 
@@ -129,8 +128,8 @@ class LearnedPolicy:
                 model than a policy was trained on that sees its observations too.
         """
         if self._is_common:
-            looks = CommonForesight if self.card["foresight"].get("reads_belief") else RecalledForesight
-            foresight = looks(env, own=self._features > len(FEATURES))
+            drives = bool(self.card["foresight"].get("drives"))
+            foresight = CommonForesight(env, own=self._features > len(FEATURES), drive=drives)
             if foresight.features != self._features:
                 raise ValueError(
                     f"env must have {self._features} features for this policy, but has {foresight.features}: it is of "

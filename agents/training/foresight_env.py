@@ -96,7 +96,7 @@ class ForesightVecEnv(VecEnvWrapper):
 
 
 def foresight_of(
-    envs: DuffingVectorEnv, env_id: str, options: dict[str, Any], seed: int
+    envs: DuffingVectorEnv, env_id: str, options: dict[str, Any], seed: int, *, levels: int = 0
 ) -> Foresight | CommonForesight:
     """What a policy is trained with: of Eq. (2) its own foresight, which is better there; else that of all oscillators.
 
@@ -105,9 +105,10 @@ def foresight_of(
         env_id: of their track.
         options: of theirs.
         seed: of the example that `Foresight` needs.
+        levels: of the choices; a network that has none, and chooses any number, drives where the energy is limited.
     """
     if envs.experiment.model.is_continuous:
-        return CommonForesight(envs, own=True)
+        return CommonForesight(envs, own=True, drive=levels == 0)
     return Foresight.of(envs, example_rate(env_id, options, seed))
 
 

@@ -14,16 +14,14 @@ from agents.policies.imagined import FEATURES
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-#: Moves that the rule looks ahead.
-_AHEAD = 8
-_UP, _NONE = (FEATURES.index(f"best_{way}_{_AHEAD}") for way in ("up", "none"))
+_UP, _NONE = (FEATURES.index(f"best_{way}_whole") for way in ("up", "none"))
 
 #: How sharply a layer tells the sign of what it is given, and the logit of what brings most: small enough to explore.
 _SHARP, _LOGIT = 3.0, 1.0
 
 
 def rule(features: npt.NDArray[np.float32], levels: int) -> npt.NDArray[np.int64]:
-    """The choices (n,) of what brings most in `_AHEAD` moves, by features (n, len(FEATURES)): up, none, or down.
+    """The choices (n,) of what brings most, by features (n, len(FEATURES)): up, none, or down.
 
     Example:
         >>> import numpy as np

@@ -253,7 +253,7 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
     from agents.training.foresight_env import IN_NATS, ForesightVecEnv, foresight_of
 
     envs = DuffingVecEnv(config.env, asked.num_envs, seed=seed, **options)
-    foresight = foresight_of(envs.envs, config.env, config.options, config.seed)
+    foresight = foresight_of(envs.envs, config.env, config.options, config.seed, levels=levels)
     return ForesightVecEnv(envs, foresight, levels, in_nats=config.reward in IN_NATS)
 
 

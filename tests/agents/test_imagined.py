@@ -63,13 +63,17 @@ def reference(belief, seen, ahead, terms):
     def way(first, code):
         x, C, cost, peak, told, seen_at = z, P, 0.0, 0.0, [], []
         margin = 0.0
-        for t in range(16):
+        for t in range(ahead.moves):
             if t == 0:
                 u = (1 - first) * A
             elif code == 31:
                 u = 0.0
-            elif code < 30 and t <= 5:
-                u = A if (code + 1 >> (t - 1)) & 1 else -A
+            elif code < 28 and t <= 4:
+                u = A if (code % 14 + 1 >> (t - 1)) & 1 else -A
+            elif code < 30 and t <= 4:
+                u = A if code == 28 else -A
+            elif 14 <= code < 28:
+                u = 0.0
             else:
                 along = A if x[0] - x[1] >= 0 else -A
                 then = theta[0] * x[0] + theta[1] * x[0] ** 3 + theta[2] * x[1] + theta[3] * along
@@ -82,9 +86,9 @@ def reference(belief, seen, ahead, terms):
                 cost += 1e4 / L * max(0.0, reach - L)
                 peak = max(peak, reach) if t < 8 else peak
             seen_at.append(x[0])
-            if t + 1 in (4, 8, 16):
+            if t + 1 in (ahead.moves // 2, ahead.moves):
                 told.append(worth(C, max(0.0, share * ahead.samples - (t + 1) * terms.pace)) - cost)
-        return np.cumsum(told) / [1, 2, 3], peak, seen_at
+        return np.cumsum(told) / [1, 2], peak, seen_at
 
     ways = {(first, code): way(first, code) for first in range(3) for code in range(32)}
     free = np.array([[ways[first, 31][2][t] for first in range(3)] for t in range(3)])
@@ -95,13 +99,13 @@ def reference(belief, seen, ahead, terms):
     peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(3)] for codes in groups])
     told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, thrift]
     for group in range(3):
-        for h in range(3):
+        for h in range(2):
             rise, calm, fall = (brought(group, first, h) for first in (up, 1, down))
             told += [np.arcsinh(20 * (rise - fall)), np.arcsinh(20 * (calm - max(rise, fall)))]
     told += [peaks[group, first] / L for group in range(3) for first in (up, 1, down)]
     told += [*(sign * free[:, 1] / L), *((free[:2, 0] - free[:2, 2]) / L)]
     now = worth(P, share * ahead.samples)
-    told += [np.arcsinh(20 * (max(brought(0, first, 2) for first in range(3)) - now)), now - worth(P, 0.0)]
+    told += [np.arcsinh(20 * (max(brought(0, first, 1) for first in range(3)) - now)), now - worth(P, 0.0)]
     allowed = peaks.min(axis=0) <= max(L, peaks[0].min())
     return np.clip(told, -BOUND, BOUND), allowed if sign > 0 else allowed[::-1], sign
 
@@ -245,3 +249,24 @@ def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path):
     assert agrees.mean() > 0.9
     with pytest.raises(ValueError, match="another model than the policy was trained on"):
         make_policy(str(run.folder), make("duffing_env/Pendulum-v0", 1))
+
+
+def test_a_drive_pushes_along_the_motion_where_the_energy_is_limited():
+    envs = make("duffing_env/Power-v1", 8)
+    foresight = CommonForesight(envs, own=True, drive=True)
+    assert foresight.is_drive
+    assert foresight.describe()["drives"]
+    assert not CommonForesight(envs, own=True).is_drive
+    assert not CommonForesight(make("duffing_env/Amplitude-v1", 1), drive=True).is_drive
+    observations, _ = envs.reset(seed=0)
+    for t in range(24):
+        view = foresight.look(observations)
+        actions = foresight.act(np.ones(8), view)
+        if t > 8:
+            # The state is displacement and velocity, in parts of the limit.
+            velocity = envs.records[:, 1]
+            assert (np.sign(actions[:, 0]) == np.sign(velocity))[np.abs(velocity) > 0.05].all()
+            harder = np.abs(actions[:, 0]) >= np.abs(foresight.act(np.zeros(8), view)[:, 0])
+            assert harder[view.safe.all(axis=1)].all()
+        observations, *_ = envs.step(actions)
+    assert np.abs(envs.records[:, :2]).max() > 0.05, "it has been swung up"
