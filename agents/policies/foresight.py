@@ -43,6 +43,9 @@ _REST, _NUDGE = 0.007, 0.05
 #: A push alone changes the displacement by no more than half of this part of its limit in a move.
 _LEAP = 1.0
 
+#: As `agents.policies.imagined.HASTE`, of a drive, which saves energy for a burst.
+_BURST = 3.0
+
 #: What a sample of the rest of an episode brings, in parts of one of a swing at the limit. All of it praises ways that
 #: teach what such a swing does not, such as to rest with a push on.
 _USUAL = 0.1
@@ -222,7 +225,7 @@ class CommonForesight:
         moves = look_ahead(built, setup.horizon / swing.pace)
         of_rig = getattr(experiment, "rig", None) is not None
         weighs = experiment.noise_hypotheses != 1 and not of_rig
-        self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate)
+        self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, _BURST if drive else HASTE)
         self._terms = Terms(
             setup.max_input,
             np.inf,
@@ -302,25 +305,26 @@ class CommonForesight:
 
     def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
         """As `Foresight.act`."""
+        # What is foreseen to be safe is so for pushes that are no harder than these.
+        pushes = self._push * np.minimum(1.0, self._ahead.haste * view.features[:, _THRIFT])
         if self.is_drive:
             at_rest = np.abs(view.features[:, _FREE]).max(axis=1) < _REST
             motions = np.where(at_rest, self._nudge, view.motions)
-            return acted(choices, view, motions, self._terms.amplitude, self._push)
-        pushes = self._push * np.minimum(1.0, self._ahead.haste * view.features[:, _THRIFT])
+            return acted(choices, view, motions, self._terms.amplitude, pushes)
         return acted(pushes * np.asarray(choices), view, None, self._terms.amplitude, pushes)
 
 
 def acted(
     choices: npt.ArrayLike, view: Sight, motions: FloatArray | None, max_input: float, push: npt.ArrayLike = 1.0
 ) -> npt.NDArray[np.float32]:
-    """The actions (n, 1) of choices (n,); where there are ``motions`` (n,), a choice drives along them.
+    """The actions (n, 1) of choices (n,), which drive along ``motions`` (n,) where there are any, by at most a ``push``.
 
     One in whose direction no way is left within the limit becomes none or a ``push`` the other way.
     """
-    chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
+    chosen, most = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0), np.asarray(push)
     if motions is not None:
-        chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / max_input, -1.0, 1.0)
-    (up, none, down), most = view.safe.T, np.asarray(push)
+        chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / max_input, -most, most)
+    up, none, down = view.safe.T
     chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -most), chosen)
     chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, most), chosen)
     chosen = np.where((chosen == 0) & ~none, np.where(up, most, -most), chosen)
