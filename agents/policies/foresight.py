@@ -43,8 +43,8 @@ _REST, _NUDGE = 0.007, 0.05
 #: A push alone changes the displacement by no more than half of this part of its limit in a move.
 _LEAP = 1.0
 
-#: As `agents.policies.imagined.HASTE`, of a drive, which saves energy for a burst.
-_BURST = 3.0
+#: As `agents.policies.imagined.HASTE`, of a drive: it saves energy for a burst.
+_BURST = 6.0
 
 #: What a sample of the rest of an episode brings, in parts of one of a swing at the limit. All of it praises ways that
 #: teach what such a swing does not, such as to rest with a push on.
@@ -317,7 +317,7 @@ class CommonForesight:
 def acted(
     choices: npt.ArrayLike, view: Sight, motions: FloatArray | None, max_input: float, push: npt.ArrayLike = 1.0
 ) -> npt.NDArray[np.float32]:
-    """The actions (n, 1) of choices (n,), which drive along ``motions`` (n,) where there are any, by at most a ``push``.
+    """The actions (n, 1) of choices (n,), that drive along ``motions`` (n,) where there are any, by at most a ``push``.
 
     One in whose direction no way is left within the limit becomes none or a ``push`` the other way.
     """
