@@ -141,6 +141,10 @@ class Follower:
         if len(self._blocks) > 1:
             self._put_coefficients(*refit(self._rig, self._blocks, self._prior, self.belief))
 
+    def practise(self) -> None:
+        """Compile what `take_block` calls."""
+        refit(self._rig, [(np.zeros(8), np.zeros(8))] * 2, self._prior, self.belief)
+
     def drawn(self, rng: np.random.Generator) -> Drawn:
         """States and coefficients (draws, d) and noises (draws, 2) of systems that are believed in now.
 

@@ -173,6 +173,8 @@ def _warm_up(follower: Follower, observed: Observed, design: Design | None, poli
         policy.predict(observed.observation(0.0, 0.0, 0), None, deterministic=True)
         return
     futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
+    if plan.block:
+        follower.practise()
     if plan.block and not isinstance(policy, SignalPolicy):
         design.block(plan.block, futures, plan.bound)
     futures.probability(np.zeros(1))

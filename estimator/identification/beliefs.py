@@ -10,11 +10,15 @@ from estimator.belief import Belief
 from estimator.ensemble import matched_gamma
 from estimator.identification.fit import Fitter, Hypothesis, Prior
 from estimator.identification.problem import Problem
-from estimator.identification.search import Found, enough_substeps, settle
+from estimator.identification.search import Found, settle
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
 from estimator.rig_prior import about
+
+#: Steps of integration a sample: enough for motions of a third of a period a sample, and always the same, so that a run
+#: compiles before it begins.
+_SUBSTEPS = 16
 
 #: Factor of the ratio of the noises, either way, within which a search from a belief begins; and the most by which the
 #: noises that the belief has are too small for all records.
@@ -74,13 +78,11 @@ def refit(
     """
     start, cov = near.coefficients_mean, near.coefficients_cov
     u, y = (tuple(one[i] / scale for one in records) for i, scale in ((0, near.scales.input), (1, near.scales.output)))
-    problem = Problem(rig, near.scales, u, y)
+    problem = Problem(rig, near.scales, u, y, _SUBSTEPS)
     if list(problem.model.coefficients) != list(near.model.coefficients):
         return start, cov
     q, r = near.noises[1] / near.noises[0], near.noises[3] / near.noises[2]
-    problem = Problem(rig, near.scales, u, y, enough_substeps(problem, start, cov))
-    precision = np.linalg.inv(prior.coefficients_cov)
-    fitter = Fitter(problem, Prior(prior.coefficients_mean, 0.5 * (precision + precision.T)))
+    fitter = Fitter(problem, Prior.of(prior))
     hypothesis = Hypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)))
     level = float(np.sqrt(r))
     if fitter.level(hypothesis, start, level) > _EXCESS * level:

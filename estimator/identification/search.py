@@ -89,10 +89,7 @@ def prior_of(problem: Problem) -> Prior:
         natural = problem.natural()
         stds = np.array([_WIDE * natural[name] for name in problem.model.coefficients])
         return Prior(np.zeros(len(stds)), np.diag(stds**-2))
-    believed = rig_prior(problem.rig, problem.scales)
-    cov = believed.coefficients_cov
-    scale = np.sqrt(np.diag(cov))
-    return Prior(believed.coefficients_mean, np.linalg.inv(cov / np.outer(scale, scale)) / np.outer(scale, scale))
+    return Prior.of(rig_prior(problem.rig, problem.scales))
 
 
 def search(problem: Problem, tell: Callable[[str], None]) -> Found:
