@@ -221,8 +221,8 @@ class CommonForesight:
         push = min(setup.max_input, _LEAP * setup.max_output / gain)
         # A limit of energy allows for smaller pushes, under which a swing takes longer to build.
         lasting = min(setup.max_input, HASTE * float(np.sqrt(setup.budget / setup.horizon)))
-        built = swing_of(self._view, center, lasting, setup.max_output).built / swing.pace
-        moves = look_ahead(built, setup.horizon / swing.pace)
+        slow = swing if lasting == setup.max_input else swing_of(self._view, center, lasting, setup.max_output)
+        moves = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
         of_rig = getattr(experiment, "rig", None) is not None
         weighs = experiment.noise_hypotheses != 1 and not of_rig
         self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, _BURST if drive else HASTE)

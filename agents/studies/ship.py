@@ -52,7 +52,7 @@ def ship(config: Config) -> Path:
     Raises:
         ValueError: for runs that are not policy folders, are of several recipes, or have a seed in common.
     """
-    cards = [_card(run) for run in config.runs]
+    cards = [card_of(run) for run in config.runs]
     env, options, seeds = _recipe(config.runs, cards)
     evaluations = evaluate([str(run) for run in config.runs], env, config.systems, options=options)
     together = pooled(config.name, evaluations)
@@ -72,9 +72,7 @@ def ship(config: Config) -> Path:
         },
     }
     folder = policies.TRAINED / config.name
-    # The weights first: a card without them counts for nothing, and a second try mends a card that is older.
-    write_atomically(folder / WEIGHTS, (config.runs[chosen] / WEIGHTS).read_bytes())
-    write_json(folder / CARD, card)
+    put(folder, config.runs[chosen], card)
     print_table([together], f"{env}, {config.systems} systems")
     print(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
     return folder
@@ -85,11 +83,30 @@ def median_index(values: list[float]) -> int:
     return int(np.argsort(values, kind="stable")[(len(values) - 1) // 2])
 
 
-def _card(run: Path) -> dict[str, Any]:
+def card_of(run: Path) -> dict[str, Any]:
+    """The card of a finished run; of paths that begin at the root, which are of a machine, it keeps the names alone.
+
+    Raises:
+        ValueError: for a folder that holds no policy.
+    """
     if not (run / WEIGHTS).is_file() or not (run / CARD).is_file():
         raise ValueError(f"runs must hold {WEIGHTS} and {CARD}, but {run} does not; pass finished run folders")
     card: dict[str, Any] = json.loads((run / CARD).read_text())
+    card["command"] = [_name(word) for word in card.get("command", [])]
+    if card["config"].get("output"):
+        card["config"]["output"] = _name(card["config"]["output"])
     return card
+
+
+def _name(word: str) -> str:
+    return Path(word).name if Path(word).is_absolute() else word
+
+
+def put(folder: Path, run: Path, card: dict[str, Any]) -> None:
+    """Write a run's weights and a card into a folder of the package."""
+    # The weights first: a card without them counts for nothing, and a second try mends a card that is older.
+    write_atomically(folder / WEIGHTS, (run / WEIGHTS).read_bytes())
+    write_json(folder / CARD, card)
 
 
 def _recipe(runs: tuple[Path, ...], cards: list[dict[str, Any]]) -> tuple[str, dict[str, Any], list[int]]:

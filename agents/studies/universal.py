@@ -14,7 +14,6 @@ writes the run's policy into the package, as ppo/universal, with these figures o
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -27,10 +26,10 @@ import numpy.typing as npt
 from agents.cli import progress_bar, run_script
 from agents.evaluation.batch import TESTED, make
 from agents.policies import TRAINED, make_policy
-from agents.policies.learned import CARD, WEIGHTS
+from agents.policies.learned import CARD
 from agents.results import write_json
+from agents.studies.ship import card_of, put
 from agents.training.family import Member, draw_member
-from estimator.files import write_atomically
 
 PLANNER, SHIPPED = "efe", "ppo/universal"
 
@@ -151,10 +150,8 @@ def main(config: Config) -> None:
 
 def _ship(run: Path, scores: dict[str, Any]) -> Path:
     """Write a run's policy into the package."""
-    card = json.loads((run / CARD).read_text())
     folder = TRAINED / SHIPPED
-    write_atomically(folder / WEIGHTS, (run / WEIGHTS).read_bytes())
-    write_json(folder / CARD, card | {"track": "family", "version": version("duffing-env"), "scores": scores})
+    put(folder, run, card_of(run) | {"track": "family", "version": version("duffing-env"), "scores": scores})
     return folder
 
 

@@ -1,6 +1,7 @@
 """Shipping: the median seed goes out, with a card that tells of all."""
 
 import json
+import shutil
 
 import pytest
 from stable_baselines3 import PPO
@@ -8,9 +9,9 @@ from stable_baselines3 import PPO
 from agents import make_policy, policies
 from agents.evaluation.rollout import evaluate
 from agents.evaluation.systems import Systems
-from agents.policies.learned import load_policy
+from agents.policies.learned import CARD, load_policy
 from agents.policies.saving import save_policy
-from agents.studies.ship import Config, median_index, ship
+from agents.studies.ship import Config, card_of, median_index, ship
 from agents.vec_env import DuffingVecEnv
 
 SHORT = "duffing_env/Short-v0"
@@ -92,3 +93,15 @@ def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
 def test_the_median_of_an_even_number_is_the_lower_one():
     assert median_index([3.0, 1.0, 2.0]) == 2
     assert median_index([4.0, 1.0, 3.0, 2.0]) == 3
+
+
+def test_no_card_that_ships_tells_of_a_machine(tmp_path, runs):
+    for card in policies.TRAINED.glob(f"*/*/{CARD}"):
+        assert '"/' not in card.read_text(), card
+    run = shutil.copytree(runs[0], tmp_path / "mine")
+    card = json.loads((run / CARD).read_text())
+    card["config"]["output"], card["command"] = str(run), ["train.py", "--output", str(run), "--seed", "1"]
+    (run / CARD).write_text(json.dumps(card))
+    found = card_of(run)
+    assert found["config"]["output"] == "mine"
+    assert found["command"] == ["train.py", "--output", "mine", "--seed", "1"]
