@@ -234,9 +234,15 @@ def sampled(model: Model, u: FloatArray, degree: int = 0) -> FloatArray:
 
 
 def follow(
-    model: Model, points: FloatArray, inputs: FloatArray, y: FloatArray | None, noises: FloatArray, cov: FloatArray
+    model: Model,
+    points: FloatArray,
+    inputs: FloatArray,
+    y: FloatArray | None,
+    noises: FloatArray,
+    cov: FloatArray,
+    mean: FloatArray | float = 0.0,
 ) -> Followed:
-    """Run the filter over n series from rest.
+    """Run the filter over n series.
 
     Args:
         model: the equation.
@@ -245,15 +251,17 @@ def follow(
         y: (n, T, p) outputs, NaN where one is missing; None for the response without noise.
         noises: (1 + p,) or (n, 1 + p) variances of the process noise and of each sensor's.
         cov: (n_states, n_states) of the states at the start.
+        mean: (n, n_states) of the states at the start; at rest where it is 0.
     """
     k = model.n_coefficients
     lengths = lengths_of(inputs[:, :, 0])
     totals = np.zeros((len(inputs), len(path_results(model))))
-    start = cov[np.triu_indices(model.n_states)]
+    begin = np.empty((len(inputs), model.n_states + (model.n_states * (model.n_states + 1)) // 2))
+    begin[:, : model.n_states], begin[:, model.n_states :] = mean, cov[np.triu_indices(model.n_states)]
     outputs = np.zeros((0, 0, 0)) if y is None else y
     strengths = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs)).copy()
     degree = inputs.shape[2] - 1 if model.is_continuous else 0
-    follower(model, degree, y is not None)(points, inputs, outputs, lengths, start, strengths, totals)
+    follower(model, degree, y is not None)(points, inputs, outputs, lengths, begin, strengths, totals)
     information = np.empty((len(inputs), k, k))
     upper = np.triu_indices(k)
     information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
@@ -276,10 +284,10 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
     first_total, first_coefficient, live = at["LOSS"], at[next(iter(model.coefficients))], at["LIVE"]
     first_input, first_noise = at["U_0"], at["Q"]
     shown, n_totals = at[f"Y_{next(iter(model.outputs))}"] if observed else -1, len(path_results(model))
-    spreads = n * (n + 1) // 2
+    moments = n + n * (n + 1) // 2
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}_{int(observed)}")
-    def run(points, inputs, y, lengths, start, noises, totals):
+    def run(points, inputs, y, lengths, begin, noises, totals):
         W = np.empty(size * _LANES)
         for first in range(0, len(inputs), _LANES):
             lanes = min(_LANES, len(inputs) - first)
@@ -291,8 +299,8 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
                 W[live * _LANES + j] = 1.0
                 for c in range(k):
                     W[(first_coefficient + c) * _LANES + j] = points[i, c]
-                for c in range(spreads):
-                    W[(n + c) * _LANES + j] = start[c]
+                for c in range(moments):
+                    W[c * _LANES + j] = begin[i, c]
                 for c in range(1 + p):
                     W[(first_noise + c) * _LANES + j] = noises[i, c]
             for t in range(longest):

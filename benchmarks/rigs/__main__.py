@@ -19,14 +19,14 @@ CORES = os.cpu_count() or 1
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors and coverage on every rig, with guesses off by up to 30 % and with none."""
+    """Errors and coverage on every rig: with guesses off by up to 30 %, with none, and from records in pieces."""
 
     seeds: int = 200
     """Records of each rig and setting."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
     settings: tuple[str, ...] = accuracy.SETTINGS
-    """With a guess, and without."""
+    """With a guess, without, and without from 16 pieces that begin in motion."""
     workers: int = CORES
     """Processes."""
     json: Path | None = None

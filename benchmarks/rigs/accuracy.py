@@ -1,4 +1,4 @@
-"""Errors and coverage of `identify` on every rig, from a CSV and a rig file, with a guess and without."""
+"""Errors and coverage of `identify` on every rig, from a CSV and a rig file, with a guess, without, and in pieces."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from benchmarks.rigs.catalogue import BENCHES, PARAMETERS
 from benchmarks.rigs.judge import POOLED, Cell, Outcome, calibrated, identified, in_processes
 from benchmarks.rigs.records import guess, record
 
-SETTINGS = ("guess", "no guess")
+#: With a guess and without; and without one, from so many pieces of the record, of which all but the first begin in
+#: motion.
+SETTINGS, PIECES = ("guess", "no guess", "pieces"), 16
 
 Task = tuple[str, tuple[str, ...], int]
 
@@ -21,7 +23,9 @@ def trial(task: Task) -> list[Outcome]:
     name, settings, seed = task
     bench = BENCHES[name]
     made = record(bench, seed)
-    return [identified(made, guess(bench, seed) if setting == "guess" else None) for setting in settings]
+    guesses = {"guess": guess(bench, seed)}
+    pieces = {"pieces": PIECES}
+    return [identified(made, guesses.get(setting), pieces.get(setting, 1)) for setting in settings]
 
 
 def run(names: Sequence[str], settings: Sequence[str], seeds: int, workers: int) -> list[Cell]:

@@ -44,18 +44,24 @@ class Outcome:
     failure: str = ""
 
 
-def identified(made: Record, guess: dict[str, tuple[float, float]] | None, **changed: Any) -> Outcome:
-    """Write a record and its rig file, with ``changed`` settings, and identify from these two files."""
+def identified(made: Record, guess: dict[str, tuple[float, float]] | None, pieces: int = 1, **changed: Any) -> Outcome:
+    """Write a record and its rig file, with ``changed`` settings, and identify from these files.
+
+    A record is one file, or several that are ``pieces`` of it.
+    """
     from estimator import Rig, identify
 
     truth, bound = np.array(made.bench.truth), made.deviations
     with tempfile.TemporaryDirectory() as folder:
-        rig_file, data_file = Path(folder) / "rig.toml", Path(folder) / "data.csv"
+        rig_file = Path(folder) / "rig.toml"
+        data_files = [Path(folder) / f"data-{number}.csv" for number in range(pieces)]
         write_rig(rig_file, made.bench, guess, **changed)
-        write_record(data_file, made)
+        parts = zip(*(np.array_split(series, pieces) for series in (made.u, made.y)), strict=True)
+        for data_file, (u, y) in zip(data_files, parts, strict=True):
+            write_record(data_file, u, y)
         started = time.perf_counter()
         try:
-            result = identify(Rig.from_file(str(rig_file)), [str(data_file)])
+            result = identify(Rig.from_file(str(rig_file)), [str(data_file) for data_file in data_files])
         except Exception as error:  # whatever a user would meet
             failed = f"{type(error).__name__}: {error}"
             return Outcome([np.inf] * 4, [np.nan] * 4, [False] * 4, bound.tolist(), failure=failed)

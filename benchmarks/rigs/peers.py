@@ -105,7 +105,8 @@ def _turn(method: str, name: str, seed: int, folder: Path, peers: Peers) -> tupl
         return np.array(answer["parameters"]), answer["seconds"]
     bench = BENCHES[name]
     write_rig(folder / "rig.toml", bench, guess(bench, seed))
-    write_record(folder / "data.csv", record(bench, seed))
+    made = record(bench, seed)
+    write_record(folder / "data.csv", made.u, made.y)
     started = time.perf_counter()
     parameters = ours(str(folder / "rig.toml"), str(folder / "data.csv"))
     seconds = time.perf_counter() - started

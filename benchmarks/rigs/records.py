@@ -121,9 +121,9 @@ def guess(bench: Bench, seed: int) -> dict[str, tuple[float, float]]:
     return {name: tuple(sorted((0.7 * center, 1.3 * center))) for name, center in centers.items()}  # type: ignore[misc]
 
 
-def write_record(path: Path, made: Record) -> None:
+def write_record(path: Path, u: FloatArray, y: FloatArray) -> None:
     """A CSV file with a header and 10 digits."""
-    np.savetxt(path, np.column_stack([made.u, made.y]), fmt="%.10g", delimiter=",", header="u,y", comments="")
+    np.savetxt(path, np.column_stack([u, y]), fmt="%.10g", delimiter=",", header="u,y", comments="")
 
 
 def write_rig(path: Path, bench: Bench, intervals: dict[str, tuple[float, float]] | None, **changed: Any) -> None:

@@ -14,7 +14,7 @@ from estimator.belief import Belief
 from estimator.identification.beliefs import posterior
 from estimator.identification.checks import examine
 from estimator.identification.contraction import contraction
-from estimator.identification.problem import Problem
+from estimator.identification.problem import LATEST, Problem, told
 from estimator.identification.records import Record, records_of
 from estimator.identification.result import Result
 from estimator.identification.search import search
@@ -69,15 +69,16 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     with _teller(progress) as tell:
         scales = _scales(rig, read)
         u = tuple(one.u / scales.input for one in read)
-        y = tuple(one.y / scales.output for one in read)
+        y = tuple(told(one.y, rig, LATEST) / scales.output for one in read)
         found = search(Problem(rig, scales, u, y), tell)
         problem = found.fitter.problem
         belief, noises = posterior(problem, found)
         tell("checking the result")
-        forecasts = tuple(_forecast(belief, rig, one) for one in read)
+        forecasts = tuple(_forecast(belief, rig, one, motion) for one, motion in zip(read, found.motions, strict=True))
         parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
         warnings = examine(problem, found, parameters, noises["input"][0], read, forecasts)
-    return Result(rig, belief, warnings, tuple(read), forecasts, noises, partial(contraction, problem, found))
+    history = partial(contraction, problem, found, parameters)
+    return Result(rig, belief, warnings, tuple(read), forecasts, noises, history)
 
 
 def _scales(rig: Rig, records: list[Record]) -> Scales:
@@ -92,10 +93,15 @@ def _scales(rig: Rig, records: list[Record]) -> Scales:
     )
 
 
-def _forecast(belief: Belief, rig: Rig, record: Record) -> FloatArray:
-    """(T, 2) mean and variance of each output before it was seen, with coefficients and noises at their means."""
-    estimator = OnlineEstimator(belief.model, belief, rig)
-    return estimator.forecast(record.u, record.y)
+def _forecast(belief: Belief, rig: Rig, record: Record, motion: FloatArray) -> FloatArray:
+    """(T, 2) mean and variance of each output before it was seen, with coefficients and noises at their means.
+
+    The record begins in a motion (2,).
+    """
+    numbers = belief.record.copy()
+    numbers[: belief.model.n_states] = motion
+    estimator = OnlineEstimator(belief.model, replace(belief, record=numbers), rig)
+    return estimator.forecast(record.u, told(record.y, rig))
 
 
 class _teller:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from estimator.belief import Belief
 from estimator.ensemble import matched_gamma
 from estimator.identification.fit import Fitter, Hypothesis, Prior
-from estimator.identification.problem import Problem
+from estimator.identification.motions import motions
+from estimator.identification.problem import Problem, told
 from estimator.identification.search import Found, settle
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
@@ -20,9 +22,8 @@ from estimator.rig_prior import about
 #: compiles before it begins.
 _SUBSTEPS = 16
 
-#: Factor of the ratio of the noises, either way, within which a search from a belief begins; and the most by which the
-#: noises that the belief has are too small for all records.
-_NEAR, _EXCESS = 3.0, 2.0
+#: Factor of the ratio of the noises, either way, within which a search from a belief begins.
+_NEAR = 3.0
 
 
 def posterior(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[float, float]]]:
@@ -72,12 +73,11 @@ def refit(
         near: the belief that the search begins at.
 
     Returns:
-        Mean (K,) and covariance (K, K); those of ``near`` where the search leads nowhere, and where the first outputs
-        of a record do not tell, to first order, what motion it begins in, such as those of an accelerometer: the
-        records do not look as ``near`` has them then.
+        Mean (K,) and covariance (K, K); those of ``near`` where the search leads nowhere.
     """
     start, cov = near.coefficients_mean, near.coefficients_cov
-    u, y = (tuple(one[i] / scale for one in records) for i, scale in ((0, near.scales.input), (1, near.scales.output)))
+    u = tuple(inputs / near.scales.input for inputs, _ in records)
+    y = tuple(told(outputs, rig) / near.scales.output for _, outputs in records)
     problem = Problem(rig, near.scales, u, y, _SUBSTEPS)
     if list(problem.model.coefficients) != list(near.model.coefficients):
         return start, cov
@@ -85,8 +85,7 @@ def refit(
     fitter = Fitter(problem, Prior.of(prior))
     hypothesis = Hypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)))
     level = float(np.sqrt(r))
-    if fitter.level(hypothesis, start, level) > _EXCESS * level:
-        return start, cov
+    hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start, level))
     try:
         found = settle(fitter, hypothesis, start, level, _NEAR)
     except ValueError:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.identification.fit import Fitter, Hypothesis
-from estimator.identification.problem import EXTRA, Problem
+from estimator.identification.problem import EXTRA, LATEST, Problem, told
 from estimator.identification.records import Record, residuals
 from estimator.identification.result import Warning
 from estimator.identification.search import Found
@@ -24,7 +24,7 @@ _EVIDENCE = 7.0
 _RATIOS = (1.0, 0.1, 0.01)
 
 #: Samples by which the input may be earlier or later than is thought.
-_DELAYS = range(-3, 4)
+_DELAYS = range(-LATEST, LATEST + 1)
 
 #: Steps of a fit of another hypothesis, at most.
 _STEPS = 12
@@ -78,7 +78,7 @@ def examine(
         *_of_hypotheses(problem, found),
         *_of_noise(problem, disturbance),
         *_of_parameters(problem, found, parameters),
-        *_of_residuals(records, forecasts),
+        *_of_residuals(problem, records, forecasts),
     )
 
 
@@ -219,17 +219,17 @@ def _times(parameter: tuple[float, float], factor: float) -> tuple[float, float]
     return parameter[0] * factor, parameter[1] * factor
 
 
-def _of_residuals(records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Warning]:
+def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Warning]:
     """Whether what the forecasts left is white and normal."""
     from scipy.stats import chi2, norm
 
-    told = [residuals(one.y, forecast)[4:] for one, forecast in zip(records, forecasts, strict=True)]
-    values = np.concatenate(told)
+    left = [residuals(told(one.y, problem.rig), forecast)[4:] for one, forecast in zip(records, forecasts, strict=True)]
+    values = np.concatenate(left)
     n, warnings = len(values), list[Warning]()
     if n < 100:
         return warnings
     lags = 20
-    products = [sum(float(one[k:] @ one[: len(one) - k]) for one in told if len(one) > k) for k in range(lags + 1)]
+    products = [sum(float(one[k:] @ one[: len(one) - k]) for one in left if len(one) > k) for k in range(lags + 1)]
     statistic = n * sum((products[k] / products[0]) ** 2 for k in range(1, lags + 1))
     if statistic > chi2.isf(_ALARM, lags):
         message = "what the forecasts leave is not white: the equation, the input's way or the noise is another"

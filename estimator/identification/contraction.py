@@ -16,11 +16,11 @@ _STEPS = 12
 History = tuple[tuple[int, dict[str, tuple[float, float]]], ...]
 
 
-def contraction(problem: Problem, found: Found) -> History:
+def contraction(problem: Problem, found: Found, parameters: dict[str, tuple[float, float]]) -> History:
     """The parameters that the first half of every record leaves, the first quarter, and so on; shortest first.
 
     Each is a fit of its own from what all samples say, with the noises in the best ratio. One that runs away is left
-    out.
+    out. Last come the ``parameters`` that all leave.
     """
     longest, history = max(len(u) for u in problem.u), []
     for halvings in range(_HALVINGS, 0, -1):
@@ -33,4 +33,4 @@ def contraction(problem: Problem, found: Found) -> History:
             belief = about(problem.rig, problem.scales, fits.mean[0], fits.cov[0])
             told = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
             history.append((short.samples, told))
-    return tuple(history)
+    return (*history, (problem.samples, parameters))

@@ -14,7 +14,7 @@ first outputs of a record, as many as there are states, do not count: any motion
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -45,11 +45,14 @@ class Hypothesis:
         interpolation: of the input.
         delay: of the input, in samples.
         ratio: σ_w/σ_v inside.
+        motions: (records, 2) displacement and velocity a sample before each record, about which the filter is linear at
+            its first samples; at rest where it is None.
     """
 
     interpolation: str
     delay: int
     ratio: float = 1.0
+    motions: FloatArray | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +141,8 @@ class Fitter:
         count, k = len(hypotheses), len(self._scale)
         points = np.broadcast_to(start, (count, k)).copy()
         levels = np.broadcast_to(np.asarray(level, dtype=np.float64), count)
-        inputs = np.array([self._driven(h) for h in hypotheses])
-        ratios = np.array([h.ratio for h in hypotheses])
-        loss, slope, curvature, levels = self._appraise(points, inputs, ratios, levels)
+        held = self._held(hypotheses)
+        loss, slope, curvature, levels = self._appraise(points, held, levels)
         damping = np.full(count, _DAMPING)
         at = np.flatnonzero(np.isfinite(loss))
         for _ in range(iterations):
@@ -150,7 +152,7 @@ class Fitter:
             step = -_solved(damped, slope[at])
             promised = -0.5 * np.einsum("hk,hk->h", slope[at], step)
             trial = points[at] + self._scale * step
-            found = self._appraise(trial, inputs[at], ratios[at], levels[at])
+            found = self._appraise(trial, tuple(values[at] for values in held), levels[at])
             better = found[0] <= loss[at]  # False for what is not finite
             gained = np.where(better, loss[at] - found[0], promised)
             kept = at[better]
@@ -166,10 +168,14 @@ class Fitter:
         cov = _inverted(curvature) * np.outer(self._scale, self._scale)
         return Fits(tuple(hypotheses), points, cov, levels, self._energy(loss, curvature))
 
-    def level(self, hypothesis: Hypothesis, point: FloatArray, level: float) -> float:
-        """The best σ_v at coefficients (K,), to first order from ``level``; that itself where the numbers run away."""
-        inputs = self._driven(hypothesis)[None]
-        return float(self._appraise(point[None], inputs, np.array([hypothesis.ratio]), np.array([level]))[3][0])
+    def _held(self, hypotheses: Sequence[Hypothesis]) -> tuple[FloatArray, ...]:
+        """(H, records, T, rows) inputs, (H,) ratios and (H, records, 2) motions."""
+        rest = np.zeros((len(self.problem.u), 2))
+        return (
+            np.array([self._driven(h) for h in hypotheses]),
+            np.array([h.ratio for h in hypotheses]),
+            np.array([rest if h.motions is None else h.motions for h in hypotheses]),
+        )
 
     def _driven(self, hypothesis: Hypothesis) -> FloatArray:
         key = hypothesis.interpolation, hypothesis.delay
@@ -178,10 +184,11 @@ class Fitter:
         return self._inputs[key]
 
     def _appraise(
-        self, points: FloatArray, inputs: FloatArray, ratios: FloatArray, levels: FloatArray
+        self, points: FloatArray, held: tuple[FloatArray, ...], levels: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Loss (H,), its slope (H, K) and curvature (H, K, K) in units of the prior, and the best levels (H,)."""
-        problem, count, records = self.problem, len(points), len(self.problem.u)
+        (inputs, ratios, motions), problem = held, self.problem
+        count, records = len(points), len(problem.u)
         n = problem.samples - records * problem.model.n_states
         noises = np.stack([(ratios * levels) ** 2, levels**2], axis=1)
         found = follow(
@@ -191,10 +198,11 @@ class Fitter:
             np.tile(problem.outputs, (count, 1, 1)),
             np.repeat(noises, records, axis=0),
             problem.start,
+            motions.reshape(-1, 2),
         )
         total = lambda values: values.reshape(count, records, *values.shape[1:]).sum(axis=1)  # noqa: E731
-        loss, slope, information, misfit = (total(values) for values in found)
         with np.errstate(all="ignore"):
+            loss, slope, information, misfit = (total(values) for values in found)
             excess = misfit / n
             data = 0.5 * (2 * loss - misfit + n * np.log(excess) + n)
             away = points - self.prior.mean

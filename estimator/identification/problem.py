@@ -15,6 +15,9 @@ from estimator.parameters import FloatArray
 from estimator.rig import INTERPOLATIONS, Rig
 from estimator.units import Scales
 
+#: Samples by which the input may be later than the rig says: a check looks for it.
+LATEST = 3
+
 #: Terms that an equation may have beside those of Eq. (1) and the offsets: checks look for them.
 EXTRA = ("cubic_damping", "quintic")
 
@@ -103,10 +106,15 @@ class Problem:
         return self.size / self.frequency ** KINDS[self.rig.output.kind]
 
     @cached_property
+    def largest(self) -> FloatArray:
+        """(2,) the largest displacement and velocity of a sample, as far as the frequency tells."""
+        x = max(float(np.nanmax(np.abs(y))) for y in self.y) / self.frequency ** KINDS[self.rig.output.kind]
+        return np.array([x, x * max(self.frequency, 0.1)])
+
+    @property
     def start(self) -> FloatArray:
         """(2, 2) covariance of the state before a record: it may begin in any motion."""
-        largest = max(float(np.nanmax(np.abs(y))) for y in self.y) / self.frequency ** KINDS[self.rig.output.kind]
-        return np.diag([(3 * largest) ** 2, (3 * largest * max(self.frequency, 0.1)) ** 2])
+        return np.diag((3 * self.largest) ** 2)
 
     def natural(self) -> dict[str, float]:
         """Sizes of the coefficients at which each term is as large as the others."""
@@ -114,6 +122,23 @@ class Problem:
         sizes = {"stiffness": w**2, "cubic": w**2 / x**2, "damping": w, "gain": w**2 * x / self.strength}
         sizes |= {"force": w**2 * x, "output_offset": self.size}
         return sizes | {"cubic_damping": w / (w * x) ** 2, "quintic": w**2 / x**4}
+
+
+def told(y: FloatArray, rig: Rig, later: int = 0) -> FloatArray:
+    """Outputs (T,) of a record as far as its inputs tell of them; NaN where older inputs acted, which nobody recorded.
+
+    Those that only moved the oscillator before a seen output do not count: it may have been in any motion.
+
+    Args:
+        y: outputs.
+        rig: whose they are.
+        later: samples by which the input may be later than the rig says.
+    """
+    # An accelerometer shows the force itself, not only what it did.
+    moved = max(0, rig.delay) + later + (KINDS[rig.output.kind] == 2)
+    told = y.copy()
+    told[: min(moved, len(y) - 1)] = np.nan
+    return told
 
 
 def driven(model: Model, rig: Rig, u: FloatArray) -> FloatArray:

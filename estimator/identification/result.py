@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
@@ -81,7 +80,7 @@ class Result:
 
         From few samples to all, for the same oscillator in the same noise: `estimator.identification.contraction`.
         """
-        return (*self.contraction(), (sum(int(np.isfinite(one.y).sum()) for one in self.records), self.parameters))
+        return self.contraction()
 
     @property
     def estimator(self) -> OnlineEstimator:

@@ -9,6 +9,7 @@ import numpy as np
 
 from estimator.ensemble import half_cauchy
 from estimator.identification.fit import Fits, Fitter, Hypothesis, Prior, with_ratios
+from estimator.identification.motions import motions
 from estimator.identification.problem import Problem
 from estimator.identification.start import starts
 from estimator.parameters import FloatArray
@@ -40,6 +41,10 @@ _LOWEST, _HIGHEST = 1e-5, 1e4
 #: it is known only that a step should turn the motion by no more than an angle.
 _SUBSTEPS, _TOLERABLE, _ANGLE = (2, 4, 8, 16, 32), 0.02, 0.25
 
+#: Fits at most, each with the steps of integration and the motions that the one before asks for; and the change of the
+#: free energy by other motions that asks for one more [nats].
+_ROUNDS, _SMALL = 6, 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -70,6 +75,12 @@ class Found:
     def best(self) -> Hypothesis:
         """The most probable hypothesis."""
         return self.fits.hypotheses[int(np.argmax(self.weights))]
+
+    @property
+    def motions(self) -> FloatArray:
+        """(records, 2) displacement and velocity a sample before each record."""
+        assert self.best.motions is not None
+        return self.best.motions
 
     @property
     def level(self) -> float:
@@ -109,13 +120,23 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
     start, level, hypothesis, reach = looked.mean[0], float(looked.level[0]), looked.hypotheses[0], 30.0
     substeps = enough_substeps(problem, start, looked.cov[0] * share)
     tell("fitting coefficients and noises")
-    while True:
-        found = settle(fitter.on(replace(problem, substeps=substeps)), hypothesis, start, level, reach)
+    for _ in range(_ROUNDS):
+        problem = replace(problem, substeps=substeps)
+        hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start, level))
+        found = settle(fitter.on(problem), hypothesis, start, level, reach)
         start, level, hypothesis, reach = found.mean, found.level, found.best, 2.0
-        needed = enough_substeps(problem, found.mean, found.cov)
-        if needed <= substeps:
-            return found
-        substeps = needed
+        substeps = max(substeps, enough_substeps(problem, start, found.cov))
+        if substeps == problem.substeps and not _begins_otherwise(found):
+            break
+    return found
+
+
+def _begins_otherwise(found: Found) -> bool:
+    """Whether the records begin in motions other than the filter was linear about, and it matters."""
+    hypothesis = replace(found.best, motions=motions(found.fitter.problem, found.best, found.mean, found.level))
+    fits = found.fitter.fit([found.best, hypothesis], found.mean, found.level, iterations=0)
+    before, after = fits.free_energy
+    return not np.isclose(before, after, rtol=0.0, atol=_SMALL)
 
 
 def _look(fitter: Fitter) -> tuple[Fits, float]:
@@ -132,9 +153,10 @@ def _look(fitter: Fitter) -> tuple[Fits, float]:
             f"samples, or a guess to the rig"
         )
     ratios = _RATIOS * problem.frequency ** (2 - _order(problem))
-    base = Hypothesis(problem.rig.interpolation, problem.rig.delay)
-    hypotheses = [h for _ in candidates for h in with_ratios(base, ratios)]
-    points, level = np.repeat(np.array(candidates), len(_RATIOS), axis=0), np.full(len(hypotheses), 0.1 * problem.size)
+    base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]))
+    points, level = np.repeat(np.array(candidates), len(_RATIOS), axis=0), np.array(0.1 * problem.size)
+    begun = [replace(base, motions=motions(short.problem, base, point, float(level))) for point in candidates]
+    hypotheses = [h for one in begun for h in with_ratios(one, ratios)]
     for steps, kept in _LOOK:
         fits = short.fit(hypotheses, points, level, steps).best(kept)
         hypotheses, points, level = list(fits.hypotheses), fits.mean, fits.level

@@ -144,7 +144,7 @@ def test_guesses_are_off_by_at_most_30_percent(bench: Bench) -> None:
 def test_files_hold_what_a_user_would_write(tmp_path) -> None:
     bench = BENCHES["wells"]
     made = record(bench, 0, 50)
-    write_record(tmp_path / "data.csv", made)
+    write_record(tmp_path / "data.csv", made.u, made.y)
     write_rig(tmp_path / "rig.toml", bench, guess(bench, 0), interpolation="linear")
     assert np.loadtxt(tmp_path / "data.csv", delimiter=",", skiprows=1) == pytest.approx(
         np.column_stack([made.u, made.y]), rel=1e-9

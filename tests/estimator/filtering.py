@@ -69,9 +69,9 @@ def sample(model, interpolation, x, c, u, P, q):
     return joint[:n], joint[n:].reshape(n, n)
 
 
-def filtered(model, interpolation, c, u, y, q, r, state_variance=0.0):
+def filtered(model, interpolation, c, u, y, q, r, state_variance=0.0, state=0.0):
     """Innovations (T, p) and variances (T, p) of outputs (T, p), sensor by sensor; y None: they are as expected."""
-    x, P = np.zeros(model.n_states), state_variance * np.eye(model.n_states)
+    x, P = state + np.zeros(model.n_states), state_variance * np.eye(model.n_states)
     padded = np.concatenate([[0.0, 0.0], u])
     innovations, variances, expected = np.empty((3, len(u), model.n_outputs))
     for t in range(len(u)):
@@ -100,6 +100,6 @@ def information(model, interpolation, c, u, q, r, state_variance=0.0):
     return np.einsum("itp,jtp,tp->ij", told, told, 1 / variances)
 
 
-def log_likelihood(model, interpolation, c, u, y, q, r):
-    innovations, variances, _ = filtered(model, interpolation, c, u, y, q, r)
+def log_likelihood(model, interpolation, c, u, y, q, r, state_variance=0.0, state=0.0):
+    innovations, variances, _ = filtered(model, interpolation, c, u, y, q, r, state_variance, state)
     return -0.5 * np.sum(np.log(variances) + innovations**2 / variances)

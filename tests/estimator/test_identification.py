@@ -1,12 +1,16 @@
 """`identify`: from records to parameters with intervals, and to warnings. benchmarks/rigs judges it on many rigs."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from estimator import Channel, Rig, identify
 from estimator.free_run import free_run
+from estimator.identification.fit import Hypothesis
+from estimator.identification.motions import motions
+from estimator.identification.problem import LATEST, Problem, told
 from estimator.identification.records import clipped, read, records_of
 from estimator.models.duffing import KINDS, duffing
 from estimator.physical import coefficients_of
@@ -109,6 +113,47 @@ def test_gaps_clipped_samples_and_several_records():
     assert np.abs(deviations(result, BENCH[0])).max() < 5
 
 
+@pytest.mark.parametrize("kind", ["displacement", "velocity", "acceleration"])
+@pytest.mark.parametrize("delay", [0, 2])
+def test_records_may_begin_in_any_motion(kind, delay):
+    u, y = simulated(SOFT, kind=kind)
+    told = np.roll(u, -delay)  # recorded so many samples before it acts
+    places = np.arange(100, 1900, 150)
+    pieces = [(told[k : k + 140], y[k : k + 140]) for k in places]
+    result = identify(rig_of(SOFT, kind, delay=delay), pieces)
+    assert np.abs(deviations(result, SOFT[0])).max() < 4.5
+    assert all(std < 0.02 * abs(SOFT[0][name]) for name, (_, std) in list(result.parameters.items())[:4])
+    assert result.warnings == ()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_motion_before_each_record_is_found(kind):
+    truth, step, amplitude, _, hold = SOFT
+    places = np.array([200, 501, 777])
+    u = amplitude * np.repeat(np.random.default_rng(3).choice([-1.0, 1.0], 1000 // hold), hold)
+    u[places - 1] = 0.0  # a record does not tell what acts while its first output comes about
+    shown = {}
+    for sensor in ("displacement", "velocity", kind):
+        scales = Scales(step, amplitude, 1e-2, KINDS[sensor])
+        model = duffing(offsets=True, sensor=sensor)
+        known = coefficients_of(model, {p: truth.get(p, 0.0) for p in model.physical}, scales)
+        shown[sensor] = np.concatenate([[0.0], free_run(model, known, u / amplitude)[:-1]])
+    # Velocities inside are by the sample, of displacements in their own scale.
+    unit = Scales(step, amplitude, 1e-2).displacement / scales.displacement
+    v = shown["velocity"] * Scales(step, amplitude, 1e-2, 1).displacement / scales.displacement
+    rig = rig_of(SOFT, kind)
+    pieces = [slice(k, k + 100) for k in places]
+    problem = Problem(
+        rig, scales, tuple(u[p] / amplitude for p in pieces), tuple(told(shown[kind][p], rig) for p in pieces), 4
+    )
+    assert problem.model.digest == replace(model, substeps=4).digest
+    level = 1e-4 * np.abs(shown[kind]).max()
+    found = motions(problem, Hypothesis("zero_order", 0, 0.1), known, level)
+    size = np.array([np.abs(unit * shown["displacement"]).max(), np.abs(v).max()])
+    expected = np.stack([unit * shown["displacement"][places - 1], v[places - 1]], axis=1)
+    np.testing.assert_allclose(found / size, expected / size, atol=1e-3)
+
+
 def test_a_converter_s_levels_are_no_stop():
     _, y = simulated(BENCH)
     level = np.abs(y).max() / 100
@@ -168,7 +213,7 @@ def test_the_result_goes_on(tmp_path):
     inside = np.abs(y - forecast[:, 0])[5:] < 1.645 * np.sqrt(forecast[5:, 1])
     assert 0.87 < inside.mean() < 0.93
     counts, told = zip(*result.history, strict=True)
-    assert counts == (64, 128, 256, 512, 1024, 2048)
+    assert counts == tuple(count - LATEST for count in (64, 128, 256, 512, 1024, 2048))
     assert told[-1] == result.parameters
     for name in BENCH[0]:
         stds = np.array([one[name][1] for one in told])

@@ -219,6 +219,23 @@ def test_the_likelihood_of_any_model_is_that_of_a_filter_with_matrices(case):
     np.testing.assert_array_equal(found.information, np.swapaxes(found.information, 1, 2))
 
 
+@pytest.mark.parametrize("case", CASES)
+def test_a_series_may_begin_in_any_motion(case):
+    model, interpolation, c, size = CASES[case]
+    rng = np.random.default_rng(9)
+    u, q, r, spread = size * rng.uniform(-1, 1, (2, 20)), 2e-5, 1e-5, 1e-4
+    begin = 0.3 * size * rng.standard_normal((2, model.n_states))
+    noise = q**2, r**2, 0.0
+    y = np.array([filtering.filtered(model, interpolation, c, u[i], None, *noise, begin[i])[2] for i in range(2)])
+    y += r * rng.standard_normal(y.shape)
+    points, cov = np.array([c, c], dtype=np.float64), spread**2 * np.eye(model.n_states)
+    noises = np.array([q**2, *[r**2] * model.n_outputs])
+    found = follow(model, points, sampled(model, u, int(interpolation == "linear")), y, noises, cov, begin)
+    for row in range(2):
+        value = filtering.log_likelihood(model, interpolation, c, u[row], y[row], q**2, r**2, spread**2, begin[row])
+        assert -found.loss[row] == pytest.approx(value, rel=1e-6)
+
+
 def test_spare_lanes_and_other_series_change_nothing():
     rng = np.random.default_rng(8)
     systems, u = draw_systems(rng, 40), rng.choice([-0.1, 0.1], (40, 30))

@@ -1,0 +1,100 @@
+"""The motion that each record begins in.
+
+The filter of a fit is linear about where it believes the oscillator to be. A record may begin anywhere, and an
+accelerometer or a strong resonance does not tell where at once: a filter that begins at rest takes the difference for
+noise, and its coefficients are wrong. So it begins at the most probable motion, at the coefficients of the fit before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator.identification.fit import Hypothesis
+from estimator.identification.problem import Problem
+from estimator.information import follow
+from estimator.parameters import FloatArray
+
+#: A grid of so many displacements and velocities each, up to so much of the largest, is looked at first. What is judged
+#: is the first period of a record, of so many samples at least and at most.
+_GRID, _WIDEST, _PERIOD = 11, 1.5, (8, 256)
+
+#: With noises of at least so much of the output a filter comes to the motion from the nearest place of the grid, though
+#: the oscillator is not linear. Newton's method takes so many steps with them, and so many with the noises as they are.
+_COARSE, _STEPS = 0.3, (4, 6)
+
+#: Distance of finite differences, and the longest step, in parts of the largest.
+_APART, _FARTHEST = 1e-3, 0.3
+
+#: Parts of Newton's step that are tried.
+_PARTS = np.array([1.0, 0.3, 0.1, 0.01])
+
+#: Offsets of the points whose losses tell slope and curvature by x and v.
+_AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]], dtype=np.float64)
+
+
+def motions(problem: Problem, hypothesis: Hypothesis, point: FloatArray, level: float) -> FloatArray:
+    """The most probable displacement and velocity a sample before each record.
+
+    Args:
+        problem: the records.
+        hypothesis: about the input and the noises.
+        point: (K,) coefficients.
+        level: σ_v.
+
+    Returns:
+        (records, 2), scaled.
+    """
+    period = 2 * np.pi / problem.frequency
+    first = problem.shortened(int(np.clip(period, *_PERIOD)))
+    places = np.linspace(-_WIDEST, _WIDEST, _GRID)
+    grid = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 1, 2)
+    records, unit = np.arange(len(problem.u)), problem.largest
+
+    def losses(candidates: FloatArray, sensor: float) -> FloatArray:
+        return _losses(first, hypothesis, point, sensor, unit * candidates)
+
+    coarse = max(level, _COARSE * problem.size)
+    rows = np.split(np.repeat(grid, len(records), axis=1), _GRID)
+    found = grid[np.concatenate([losses(row, coarse) for row in rows]).argmin(axis=0), 0]
+    for sensor in np.repeat([coarse, level], _STEPS):
+        around = losses(found + _APART * _AROUND[:, None], sensor)
+        candidates = found + _PARTS[:, None, None] * _newton(around)
+        tried = losses(candidates, sensor)
+        best = tried.argmin(axis=0)
+        found = np.where((tried[best, records] < around[0])[:, None], candidates[best, records], found)
+    return np.asarray(unit * found)
+
+
+def _newton(around: FloatArray) -> FloatArray:
+    """(records, 2) steps to the minimum of parabolas through losses at `_AROUND`; downhill where they have none."""
+    here, right, left, up, down, both, neither = around
+    with np.errstate(invalid="ignore"):  # infinite where the numbers ran away
+        slope = np.stack([right - left, up - down], axis=1) / (2 * _APART)
+        xx, vv = right - 2 * here + left, up - 2 * here + down
+        xv = (both + neither - right - left - up - down + 2 * here) / 2
+        curvature = np.stack([np.stack([xx, xv], axis=1), np.stack([xv, vv], axis=1)], axis=1) / _APART**2
+    finite = np.isfinite(curvature).all(axis=(1, 2)) & np.isfinite(slope).all(axis=1)
+    slope[~finite], curvature[~finite] = 0.0, np.eye(2)
+    values, ways = np.linalg.eigh(curvature)
+    values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max(axis=1, keepdims=True) + 1e-300)
+    step = -np.einsum("rij,rj,rkj,rk->ri", ways, 1 / values, ways, slope)
+    length = np.abs(step).max(axis=1, keepdims=True)
+    return np.asarray(step * np.minimum(1.0, _FARTHEST / np.maximum(length, 1e-300)))
+
+
+def _losses(
+    problem: Problem, hypothesis: Hypothesis, point: FloatArray, level: float, candidates: FloatArray
+) -> FloatArray:
+    """(C, records) minus the log likelihood of each record, if it begins at candidates (C, records, 2)."""
+    count, records = candidates.shape[:2]
+    inputs = problem.inputs(hypothesis.interpolation, hypothesis.delay)
+    loss = follow(
+        problem.model,
+        np.tile(point, (count * records, 1)),
+        np.tile(inputs, (count, 1, 1)),
+        np.tile(problem.outputs, (count, 1, 1)),
+        np.array([(hypothesis.ratio * level) ** 2, level**2]),
+        np.zeros((2, 2)),
+        candidates.reshape(-1, 2),
+    ).loss
+    return np.where(np.isfinite(loss), loss, np.inf).reshape(count, records)
