@@ -214,20 +214,21 @@ class Planner:
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
         last = terms.amplitude * rows[:, at.last_input]
         due = np.flatnonzero(held == 0)
-        inputs, scores = np.empty((2, len(due)))
+        inputs = np.empty(len(due))
         searched = plans[due], rates[due], words[due]
         if self._energy is not None:
             energies, rule = (
                 rows[:, at.budget_left] * self._energy,
                 Rule(terms.amplitude, terms.limit, terms.margin, terms.shaken),
             )
-            self._pursue(records, left, energies, rule, last, *searched[::2], inputs, scores)
+            self._pursue(records, left, energies, rule, last, *searched[::2], inputs, np.empty(n))
         else:
             lasts = np.stack([last, before], axis=1)[due]
+            moved = np.empty_like(due)
             search(*self.view).plan(
-                records[due], left[due], self.horizon, self.rounds, terms, lasts, *searched, inputs, scores
+                records[due], left[due], self.horizon, self.rounds, terms, lasts, *searched, inputs, moved
             )
-            held[due] = np.clip(left[due], 1, terms.pace)
+            held[due] = moved
             held -= 1
         plans[due], rates[due], words[due] = searched
         chosen[due] = inputs

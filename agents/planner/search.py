@@ -9,7 +9,8 @@ the last plans. Without the latter a way would be praised for what every way tea
 The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
 line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.Swing`). Other
 states, and older inputs, are followed with their way, and do not tell ways apart. An input is held for
-`agents.planner.imagination.Terms.pace` samples, a *move*.
+`agents.planner.imagination.Terms.pace` samples, a *move*. Towards the end of an episode moves become shorter: a plan then
+still comes near to the end, and is as fine as it can be.
 
 The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one.
 """
@@ -49,7 +50,7 @@ class Search(NamedTuple):
     """The search for a model, compiled.
 
     Attributes:
-        plan: ``plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, scores)`` searches the
+        plan: ``plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, held)`` searches the
             best next inputs of n environments:
 
             - ``records`` (n, size): their beliefs;
@@ -63,7 +64,7 @@ class Search(NamedTuple):
               none yet; overwritten;
             - ``words`` (n, 4): streams of random numbers; overwritten;
             - ``actions`` (n,): receives the first input of the best plan;
-            - ``scores`` (n,): receives the best plan's score [nats].
+            - ``held`` (n,): receives the samples of its first move.
         play: ``play(record, first, horizon, rounds, terms, u, words)`` plans the inputs u (T,) from sample ``first``
             on, where the means of the belief are the truth. The inputs before it are followed as they are. Arguments as
             of ``plan``; ``words`` is (4,), and the record is overwritten.
@@ -219,9 +220,10 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
     @inner
     def improve(memory, record, left, rounds, terms, lasts, best, rate, words):
-        """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the plan's score [nats]."""
+        """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the samples of a move."""
         candidates, last = memory.candidates, lasts[0]
-        cells, pace = _CELLS, min(terms.pace, left)
+        moves = min(len(best), _LATE_HORIZON)
+        cells, pace = _CELLS, min(terms.pace, max(1, int(left / moves + 0.5)))
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
             cells, steps, rounds = _LATE_CELLS, min(steps, _LATE_HORIZON), _LATE_ROUNDS * rounds
@@ -260,13 +262,13 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             walks = walks or variance > 0.0
         if not walks:
             refresh(W, task, best, rate)
-        return score
+        return pace
 
     @entry
-    def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, scores):
+    def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, held):
         kept_memory = memory(horizon, _LATE_CELLS)
         for i in range(len(records)):
-            scores[i] = improve(
+            held[i] = improve(
                 kept_memory, records[i], max(1, left[i]), rounds, terms, lasts[i], plans[i], rates[i], words[i]
             )
             actions[i] = plans[i, 0]
@@ -275,12 +277,13 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     def play(record, first, horizon, rounds, terms, u, words):
         kept_memory = memory(horizon, _LATE_CELLS)
         best, rate, W = np.zeros(horizon), np.zeros((k, k)), np.empty(size)
-        lasts = np.zeros(2)
+        lasts, held = np.zeros(2), 0
         for t in range(len(u)):
             if t >= first:
-                if (t - max(first, 0)) % terms.pace == 0:
-                    improve(kept_memory, record, len(u) - t, rounds, terms, lasts, best, rate, words)
+                if held == 0:
+                    held = improve(kept_memory, record, len(u) - t, rounds, terms, lasts, best, rate, words)
                 u[t] = best[0]
+                held -= 1
             begin(W, record, lasts)
             for j in range(LANES):
                 W[U + j] = u[t]

@@ -136,10 +136,18 @@ class Follower:
         Raises:
             ValueError: where the belief overflows; it is then as before.
         """
-        self.take(np.concatenate([[0.0], u[:-1]]), y)
+        begun, starts, before = self.estimator.arrays(), self._starts, np.concatenate([[0.0], u[:-1]])
+        self.take(before, y)
         self._blocks.append((u, y))
-        if len(self._blocks) > 1:
-            self._put_coefficients(*refit(self._rig, self._blocks, self._prior, self.belief))
+        if len(self._blocks) == 1:
+            return
+        coefficients = refit(self._rig, self._blocks, self._prior, self.belief)
+        # Where the rig is now is what the block tells of a rig with these coefficients.
+        self.estimator.restore(begun)
+        self._starts = starts
+        self._put_coefficients(*coefficients)
+        self.take(before, y)
+        self._put_coefficients(*coefficients)
 
     def practise(self) -> None:
         """Compile what `take_block` calls."""
