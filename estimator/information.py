@@ -257,16 +257,19 @@ def follow(
     lengths = lengths_of(inputs[:, :, 0])
     totals = np.zeros((len(inputs), len(path_results(model))))
     begin = np.empty((len(inputs), model.n_states + (model.n_states * (model.n_states + 1)) // 2))
-    begin[:, : model.n_states], begin[:, model.n_states :] = mean, cov[np.triu_indices(model.n_states)]
+    begin[:, : model.n_states], begin[:, model.n_states :] = mean, cov[_upper(model.n_states)]
     outputs = np.zeros((0, 0, 0)) if y is None else y
     strengths = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs)).copy()
     degree = inputs.shape[2] - 1 if model.is_continuous else 0
     follower(model, degree, y is not None)(points, inputs, outputs, lengths, begin, strengths, totals)
     information = np.empty((len(inputs), k, k))
-    upper = np.triu_indices(k)
+    upper = _upper(k)
     information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
     return Followed(totals[:, 0], totals[:, 1 : 1 + k], information, totals[:, -1])
 
+
+#: (rows, columns) of the upper triangle of a square matrix.
+_upper = cache(np.triu_indices)
 
 #: Variance of what a missing output would have shown, in parts of a sensor's.
 _MISSING = 1e18

@@ -2,10 +2,13 @@
 
 The filter of a fit is linear about where it believes the oscillator to be. A record may begin anywhere, and an
 accelerometer or a strong resonance does not tell where at once: a filter that begins at rest takes the difference for
-noise, and its coefficients are wrong. So it begins at the most probable motion, at the coefficients of the fit before.
+noise, and its coefficients are wrong. So it begins at the most probable motion, at the coefficients of the fit before;
+unless all of the record is explained better by where it began then, or by rest.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,7 +19,10 @@ from estimator.parameters import FloatArray
 
 #: A grid of so many displacements and velocities each, up to so much of the largest, is looked at first. What is judged
 #: is the first period of a record, of so many samples at least and at most.
-_GRID, _WIDEST, _PERIOD = 11, 1.5, (8, 256)
+_GRID, _WIDEST, _PERIOD = 11, 1.5, (16, 256)
+
+#: Series that are judged at once, about.
+_AT_ONCE = 2048
 
 #: With noises of at least so much of the output a filter comes to the motion from the nearest place of the grid, though
 #: the oscillator is not linear. Newton's method takes so many steps with them, and so many with the noises as they are.
@@ -32,12 +38,16 @@ _PARTS = np.array([1.0, 0.3, 0.1, 0.01])
 _AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]], dtype=np.float64)
 
 
+#: Candidates (C, records, 2) and σ_v to losses (C, records).
+Judge = Callable[[FloatArray, float], FloatArray]
+
+
 def motions(problem: Problem, hypothesis: Hypothesis, point: FloatArray, level: float) -> FloatArray:
     """The most probable displacement and velocity a sample before each record.
 
     Args:
         problem: the records.
-        hypothesis: about the input and the noises.
+        hypothesis: about the input and the noises, with the motions that were found before.
         point: (K,) coefficients.
         level: σ_v.
 
@@ -50,19 +60,21 @@ def motions(problem: Problem, hypothesis: Hypothesis, point: FloatArray, level: 
     grid = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 1, 2)
     records, unit = np.arange(len(problem.u)), problem.largest
 
-    def losses(candidates: FloatArray, sensor: float) -> FloatArray:
-        return _losses(first, hypothesis, point, sensor, unit * candidates)
-
+    losses = _judge(first, hypothesis, point, np.zeros((2, 2)))
     coarse = max(level, _COARSE * problem.size)
-    rows = np.split(np.repeat(grid, len(records), axis=1), _GRID)
-    found = grid[np.concatenate([losses(row, coarse) for row in rows]).argmin(axis=0), 0]
+    # In parts, where many records make many series.
+    parts = np.array_split(np.repeat(grid, len(records), axis=1), -(-len(records) * len(grid) // _AT_ONCE))
+    found = grid[np.concatenate([losses(unit * part, coarse) for part in parts]).argmin(axis=0), 0]
     for sensor in np.repeat([coarse, level], _STEPS):
-        around = losses(found + _APART * _AROUND[:, None], sensor)
+        around = losses(unit * (found + _APART * _AROUND[:, None]), sensor)
         candidates = found + _PARTS[:, None, None] * _newton(around)
-        tried = losses(candidates, sensor)
+        tried = losses(unit * candidates, sensor)
         best = tried.argmin(axis=0)
         found = np.where((tried[best, records] < around[0])[:, None], candidates[best, records], found)
-    return np.asarray(unit * found)
+    rest = np.zeros_like(found)
+    choice = np.stack([rest, rest if hypothesis.motions is None else hypothesis.motions, unit * found])
+    chosen = _judge(problem, hypothesis, point, problem.start)(choice, level).argmin(axis=0)
+    return np.asarray(choice[chosen, records])
 
 
 def _newton(around: FloatArray) -> FloatArray:
@@ -82,19 +94,21 @@ def _newton(around: FloatArray) -> FloatArray:
     return np.asarray(step * np.minimum(1.0, _FARTHEST / np.maximum(length, 1e-300)))
 
 
-def _losses(
-    problem: Problem, hypothesis: Hypothesis, point: FloatArray, level: float, candidates: FloatArray
-) -> FloatArray:
-    """(C, records) minus the log likelihood of each record, if it begins at candidates (C, records, 2)."""
-    count, records = candidates.shape[:2]
-    inputs = problem.inputs(hypothesis.interpolation, hypothesis.delay)
-    loss = follow(
-        problem.model,
-        np.tile(point, (count * records, 1)),
-        np.tile(inputs, (count, 1, 1)),
-        np.tile(problem.outputs, (count, 1, 1)),
-        np.array([(hypothesis.ratio * level) ** 2, level**2]),
-        np.zeros((2, 2)),
-        candidates.reshape(-1, 2),
-    ).loss
-    return np.where(np.isfinite(loss), loss, np.inf).reshape(count, records)
+def _judge(problem: Problem, hypothesis: Hypothesis, point: FloatArray, cov: FloatArray) -> Judge:
+    """What gives minus the log likelihoods of records that begin about candidates, with a covariance (2, 2)."""
+    inputs, ratio = problem.inputs(hypothesis.interpolation, hypothesis.delay), hypothesis.ratio
+
+    def losses(candidates: FloatArray, sensor: float) -> FloatArray:
+        count, records = candidates.shape[:2]
+        loss = follow(
+            problem.model,
+            np.tile(point, (count * records, 1)),
+            np.tile(inputs, (count, 1, 1)),
+            np.tile(problem.outputs, (count, 1, 1)),
+            np.array([(ratio * sensor) ** 2, sensor**2]),
+            cov,
+            candidates.reshape(-1, 2),
+        ).loss
+        return np.where(np.isfinite(loss), loss, np.inf).reshape(count, records)
+
+    return losses

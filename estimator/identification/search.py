@@ -154,8 +154,10 @@ def _look(fitter: Fitter) -> tuple[Fits, float]:
         )
     ratios = _RATIOS * problem.frequency ** (2 - _order(problem))
     base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]))
-    points, level = np.repeat(np.array(candidates), len(_RATIOS), axis=0), np.array(0.1 * problem.size)
-    begun = [replace(base, motions=motions(short.problem, base, point, float(level))) for point in candidates]
+    level = np.array(0.1 * problem.size)
+    moving = [replace(base, motions=motions(short.problem, base, point, float(level))) for point in candidates]
+    begun = [base] * len(candidates) + moving
+    points = np.repeat(np.array([*candidates, *candidates]), len(_RATIOS), axis=0)
     hypotheses = [h for one in begun for h in with_ratios(one, ratios)]
     for steps, kept in _LOOK:
         fits = short.fit(hypotheses, points, level, steps).best(kept)
@@ -229,11 +231,15 @@ def _vertex(places: FloatArray, energies: FloatArray, best: int) -> tuple[float,
     """Mean and standard deviation of what has the free energies of the parabola through the best and its neighbours."""
     if not 0 < best < len(places) - 1:
         return float(places[best]), np.inf
-    near = slice(best - 1, best + 2)
-    curvature, slope, _ = np.polyfit(places[near] - places[best], energies[near], 2)
+    left, right = places[best] - places[best - 1], places[best + 1] - places[best]
+    if not left > 0 < right:
+        return float(places[best]), np.inf
+    before, after = (energies[best] - energies[best - 1]) / left, (energies[best + 1] - energies[best]) / right
+    curvature = 2 * (after - before) / (left + right)
     if not 0 < curvature < np.inf:
         return float(places[best]), np.inf
-    return float(places[best] - slope / (2 * curvature)), float(1 / np.sqrt(2 * curvature))
+    slope = (before * right + after * left) / (left + right)
+    return float(places[best] - slope / curvature), float(1 / np.sqrt(curvature))
 
 
 def _middle(problem: Problem) -> FloatArray:
