@@ -4,9 +4,10 @@ A block is planned for systems that are drawn from the belief, not for its means
 
     J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / aim - 1)²],
 
-by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. The
-*aim* is the limit, and less where too many of some hundred further draws leave it (`agents.planner.futures`): a block
-is played only when at most a given share of them does. It begins as the planner's own plan for the belief's means.
+by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. A block
+is played only when at most a given share of some hundred further draws leaves the limit (`agents.planner.futures`). Of
+those that do, some are then planned for, too, and the *aim* is a bit lower. It begins as the planner's own plan for the
+belief's means.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SYSTEMS = 32
 
 #: Steps of the gradient for a candidate, besides one for each sample and up to so many in all; and after every change
 #: of the aim.
-_STEPS, _MOST_STEPS, _MORE = 24, 128, 32
+_STEPS, _MOST_STEPS, _MORE = 160, 512, 64
 
 #: The first step (`agents.planner.ascent`), the part of a step that goes into the next, and the last step in parts of
 #: the first.
@@ -43,8 +44,10 @@ _RATE, _KEPT, _LAST = 0.05, 0.8, 0.05
 #: Runge-Kutta steps of a sample that are enough to plan by; how safe a block is, is judged with all.
 _COARSE = 2
 
-#: The aim in parts of the limit: at first, how it falls, and how often.
-_AIM, _LOWER, _AIMS = 0.985, 0.97, 16
+#: The aim in parts of the limit, and how often it falls: by this part of it at first, then by more and more, up to the
+#: last number. Each time so many systems that leave the limit are added to those that are planned for.
+_AIM, _AIMS, _ADDED = 0.998, 16, 8
+_FALL, _FASTER, _FASTEST = 0.005, 1.5, 0.05
 
 #: Penalty [nats] of what goes beyond the aim: one system of all must not leave it far for what the others tell.
 _PENALTY = 3e4
@@ -87,6 +90,19 @@ def systems_of(view: View, belief: Belief, futures: Futures, samples: int, last:
     shakes = np.ascontiguousarray(futures.disturbances(samples)[0][:SYSTEMS])
     coefficients = np.ascontiguousarray(futures.coefficients[:SYSTEMS])
     return Systems(coefficients, starts, futures.noises[:SYSTEMS] ** 2, shakes, precision)
+
+
+def _joined(systems: Systems, futures: Futures, more: list[int]) -> Systems:
+    """The systems, and more of the draws."""
+    starts = np.repeat(systems.starts[:1], len(more), axis=0)
+    starts[:, : futures.model.n_states] = futures.states[more]
+    return Systems(
+        np.concatenate([systems.coefficients, futures.coefficients[more]]),
+        np.concatenate([systems.starts, starts]),
+        np.concatenate([systems.noises, futures.noises[more] ** 2]),
+        np.concatenate([systems.shakes, futures.disturbances(systems.shakes.shape[1])[0][more]]),
+        systems.precision,
+    )
 
 
 @cache
@@ -161,11 +177,12 @@ def best_block(
     climbed = [np.array(candidate) for candidate in candidates]
     values = [ascend(systems, limits, steps, u) for u in climbed]
     u = climbed[int(np.argmax(values))]
-    for _ in range(_AIMS):
-        probability = futures.probability(u[:played], bound)
-        if probability < bound:
-            return u, 1.0, probability
-        limits = limits._replace(aim=_LOWER * limits.aim)
+    for k in range(_AIMS):
+        leaving = futures.leaving(u[:played], max(_ADDED, futures.enough(bound)))
+        if len(leaving) < futures.enough(bound):
+            return u, 1.0, futures.chance(len(leaving))
+        systems = _joined(systems, futures, leaving[:_ADDED])
+        limits = limits._replace(aim=limits.aim * (1 - min(_FALL * _FASTER**k, _FASTEST)))
         ascend(systems, limits, _MORE, u)
     share, probability = futures.share(u[:played], bound)
     return share * u, share, probability

@@ -116,23 +116,37 @@ class Futures:
         process, sensor = self._disturbed
         return process[:, :samples], sensor[:, :samples]
 
+    def leaving(self, u: FloatArray, most: int) -> list[int]:
+        """The first draws, and at most so many, that inputs (N,), in the belief's scale, take out of the limit."""
+        acting = np.concatenate([np.zeros(self.delay), u])[: len(u)]
+        process, sensor = self.disturbances(len(u))
+        found: list[int] = []
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, (state, coefficients, w, v) in enumerate(
+                zip(self.states, self.coefficients, process, sensor, strict=True)
+            ):
+                y = free_run(self.model, coefficients, acting + w, state, self.interpolation) + v
+                if not bool((np.abs(y) <= self.limit).all()):
+                    found.append(i)
+                    if len(found) >= most:
+                        break
+        return found
+
     def probability(self, u: FloatArray, bound: float = 1.0) -> float:
         """That inputs (N,), in the belief's scale, take the output out of its limit at any of the samples.
 
         The mean of what the draws tell of it, (k + 1) / (n + 2): it is never 0. Draws are counted until it is not below
         the bound any more.
         """
-        acting = np.concatenate([np.zeros(self.delay), u])[: len(u)]
-        process, sensor = self.disturbances(len(u))
-        most = bound * (len(self.states) + 2)
-        left = 1
-        with np.errstate(over="ignore", invalid="ignore"):
-            for state, coefficients, w, v in zip(self.states, self.coefficients, process, sensor, strict=True):
-                y = free_run(self.model, coefficients, acting + w, state, self.interpolation) + v
-                left += not bool((np.abs(y) <= self.limit).all())
-                if left >= most:
-                    break
-        return left / (len(self.states) + 2)
+        return self.chance(len(self.leaving(u, self.enough(bound))))
+
+    def chance(self, count: int) -> float:
+        """The probability of what so many of the draws do."""
+        return (count + 1) / (len(self.states) + 2)
+
+    def enough(self, bound: float) -> int:
+        """The least number of draws whose `chance` is not below a bound."""
+        return max(1, math.ceil(bound * (len(self.states) + 2) - 1))
 
     def share(self, u: FloatArray, bound: float) -> tuple[float, float]:
         """The largest share of inputs whose probability of leaving the limit is below a bound, and that probability.

@@ -9,8 +9,8 @@ the last plans. Without the latter a way would be praised for what every way tea
 The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
 line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.Swing`). Other
 states, and older inputs, are followed with their way, and do not tell ways apart. An input is held for
-`agents.planner.imagination.Terms.pace` samples, a *move*. Towards the end of an episode moves become shorter: a plan then
-still comes near to the end, and is as fine as it can be.
+`agents.planner.imagination.Terms.pace` samples, a *move*. Towards the end of an episode moves become shorter: a plan
+comes near to the end then, too, and is as fine as it can be.
 
 The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one.
 """
