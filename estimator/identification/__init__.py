@@ -14,7 +14,7 @@ from estimator.belief import Belief
 from estimator.identification.beliefs import posterior
 from estimator.identification.checks import examine
 from estimator.identification.contraction import contraction
-from estimator.identification.problem import LATEST, Problem, told
+from estimator.identification.problem import LATEST, Problem, explicable
 from estimator.identification.records import Record, records_of
 from estimator.identification.result import Result
 from estimator.identification.search import search
@@ -35,8 +35,9 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     Args:
         rig: a `Rig`, a dictionary, or the name of a rig file.
         records: pairs (u, y) of arrays (T,) in the rig's units, paired by index, or names of CSV or MAT files; one or a
-            list. Before its first sample a record may have been in any motion. An output that is NaN is missing; a
-            record is cut where an input is.
+            list. Before its first sample a record may have been in any motion; its first outputs, three and as many as
+            the input is late, are left out, because inputs before the record may still act. An output that is NaN is
+            missing; a record is cut where an input is.
         progress: tell on stderr what is being done.
 
     Returns:
@@ -69,7 +70,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     with _teller(progress) as tell:
         scales = _scales(rig, read)
         u = tuple(one.u / scales.input for one in read)
-        y = tuple(told(one.y, rig, LATEST) / scales.output for one in read)
+        y = tuple(explicable(one.y, rig, LATEST) / scales.output for one in read)
         found = search(Problem(rig, scales, u, y), tell)
         problem = found.fitter.problem
         belief, noises = posterior(problem, found)
@@ -101,7 +102,7 @@ def _forecast(belief: Belief, rig: Rig, record: Record, motion: FloatArray) -> F
     numbers = belief.record.copy()
     numbers[: belief.model.n_states] = motion
     estimator = OnlineEstimator(belief.model, replace(belief, record=numbers), rig)
-    return estimator.forecast(record.u, told(record.y, rig))
+    return estimator.forecast(record.u, explicable(record.y, rig))
 
 
 class _teller:

@@ -11,7 +11,7 @@ from estimator.belief import Belief
 from estimator.ensemble import matched_gamma
 from estimator.identification.fit import Fitter, Hypothesis, Prior
 from estimator.identification.motions import motions
-from estimator.identification.problem import Problem, told
+from estimator.identification.problem import Problem, explicable
 from estimator.identification.search import Found, settle
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
@@ -77,7 +77,7 @@ def refit(
     """
     start, cov = near.coefficients_mean, near.coefficients_cov
     u = tuple(inputs / near.scales.input for inputs, _ in records)
-    y = tuple(told(outputs, rig) / near.scales.output for _, outputs in records)
+    y = tuple(explicable(outputs, rig) / near.scales.output for _, outputs in records)
     problem = Problem(rig, near.scales, u, y, _SUBSTEPS)
     if list(problem.model.coefficients) != list(near.model.coefficients):
         return start, cov

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.identification.fit import Fitter, Hypothesis
-from estimator.identification.problem import EXTRA, LATEST, Problem, told
+from estimator.identification.problem import EXTRA, LATEST, Problem, explicable
 from estimator.identification.records import Record, residuals
 from estimator.identification.result import Warning
 from estimator.identification.search import Found
@@ -223,7 +223,10 @@ def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequen
     """Whether what the forecasts left is white and normal."""
     from scipy.stats import chi2, norm
 
-    left = [residuals(told(one.y, problem.rig), forecast)[4:] for one, forecast in zip(records, forecasts, strict=True)]
+    left = [
+        residuals(explicable(one.y, problem.rig), forecast)[4:]
+        for one, forecast in zip(records, forecasts, strict=True)
+    ]
     values = np.concatenate(left)
     n, warnings = len(values), list[Warning]()
     if n < 100:

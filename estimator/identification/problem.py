@@ -124,10 +124,10 @@ class Problem:
         return sizes | {"cubic_damping": w / (w * x) ** 2, "quintic": w**2 / x**4}
 
 
-def told(y: FloatArray, rig: Rig, later: int = 0) -> FloatArray:
-    """Outputs (T,) of a record as far as its inputs tell of them; NaN where older inputs acted, which nobody recorded.
+def explicable(y: FloatArray, rig: Rig, later: int = 0) -> FloatArray:
+    """Outputs (T,) of a record, NaN where inputs acted that came before it and that nobody recorded.
 
-    Those that only moved the oscillator before a seen output do not count: it may have been in any motion.
+    What these had done before the first output that is left does not count: the oscillator may be in any motion.
 
     Args:
         y: outputs.
@@ -136,9 +136,9 @@ def told(y: FloatArray, rig: Rig, later: int = 0) -> FloatArray:
     """
     # An accelerometer shows the force itself, not only what it did.
     moved = max(0, rig.delay) + later + (KINDS[rig.output.kind] == 2)
-    told = y.copy()
-    told[: min(moved, len(y) - 1)] = np.nan
-    return told
+    left = y.copy()
+    left[: min(moved, len(y) - 1)] = np.nan
+    return left
 
 
 def driven(model: Model, rig: Rig, u: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from estimator import Channel, Rig, identify
 from estimator.free_run import free_run
 from estimator.identification.fit import Hypothesis
 from estimator.identification.motions import motions
-from estimator.identification.problem import LATEST, Problem, told
+from estimator.identification.problem import LATEST, Problem, explicable
 from estimator.identification.records import clipped, read, records_of
 from estimator.models.duffing import KINDS, duffing
 from estimator.physical import coefficients_of
@@ -144,7 +144,7 @@ def test_the_motion_before_each_record_is_found(kind):
     rig = rig_of(SOFT, kind)
     pieces = [slice(k, k + 100) for k in places]
     problem = Problem(
-        rig, scales, tuple(u[p] / amplitude for p in pieces), tuple(told(shown[kind][p], rig) for p in pieces), 4
+        rig, scales, tuple(u[p] / amplitude for p in pieces), tuple(explicable(shown[kind][p], rig) for p in pieces), 4
     )
     assert problem.model.digest == replace(model, substeps=4).digest
     level = 1e-4 * np.abs(shown[kind]).max()
