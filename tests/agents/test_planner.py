@@ -234,3 +234,23 @@ def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track, tail):
     for risk in (0.05, 0.5):
         margin = make_policy("efe", env, risk=risk).terms.margin
         assert margin == pytest.approx(tail.isf(risk / 48), rel=1e-12)
+
+
+def test_moves_become_shorter_towards_the_end():
+    envs = make("Pendulum-v1", 3)
+    policy = make_policy("efe", envs, seed=0)
+    observations, _ = envs.reset(seed=0)
+    state, moves, left = None, [], np.zeros(3)
+    for _ in range(envs.horizon):
+        begun = left == 0
+        actions, state = policy.predict(observations, state)
+        if begun.all():
+            moves.append(state.held + 1)
+        left = state.held
+        observations, *_ = envs.step(actions)
+    lengths = np.array(moves)
+    assert (lengths == lengths[:, :1]).all(), "all plan at the same samples"
+    assert lengths[0, 0] == policy.terms.pace == 3
+    assert (np.diff(lengths[:, 0]) <= 0).all()
+    assert set(lengths[:, 0].tolist()) == {1, 2, 3}
+    assert lengths[:, 0].sum() == envs.horizon

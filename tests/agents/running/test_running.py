@@ -23,6 +23,7 @@ from agents.running.run import Plan, run
 from agents.running.session import Session, Tripped
 from agents.running.simulated import SimulatedPlant
 from estimator import OnlineEstimator, Rig, identify
+from estimator.free_run import free_run
 from estimator.identification.beliefs import refit
 from estimator.rig_prior import HALF_WIDTH
 
@@ -300,6 +301,25 @@ def test_the_probability_of_leaving_grows_with_the_input():
     share, probability = futures.share(30.0 * u, 0.05)
     assert 0.01 < share < 0.5
     assert probability < 0.05
+
+
+def test_the_draws_that_leave_are_those_whose_outputs_do():
+    follower, _ = listened(RIG, TRUTH, 0)
+    rng = np.random.default_rng(0)
+    futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
+    u = 3.0 * np.repeat([1.0, -1.0], 16)
+    process, sensor = futures.disturbances(len(u))
+    draws = zip(futures.coefficients, process, futures.states, strict=True)
+    outputs = np.array([free_run(futures.model, c, u + w, x) for c, w, x in draws])
+    leaving = np.flatnonzero(~(np.abs(outputs + sensor) <= 1.0).all(axis=1)).tolist()  # NaN has run away
+    assert 20 < len(leaving) < 280
+    assert futures.leaving(u, 1000) == leaving
+    assert futures.leaving(u, 7) == leaving[:7]
+    assert futures.probability(u) == futures.chance(len(leaving)) == (len(leaving) + 1) / (len(outputs) + 2)
+    for bound in (0.003, 0.01, 0.0125, 0.05, 0.5):
+        enough = futures.enough(bound)
+        assert futures.chance(enough) >= bound > futures.chance(enough - 1) or enough == 1
+        assert (futures.probability(u, bound) < bound) == (futures.chance(len(leaving)) < bound)
 
 
 def test_a_belief_that_cannot_be_safe_is_not_played(tmp_path):
