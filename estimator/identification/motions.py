@@ -3,7 +3,7 @@
 The filter of a fit is linear about where it believes the oscillator to be. A record may begin anywhere, and an
 accelerometer or a strong resonance does not tell where at once: a filter that begins at rest takes the difference for
 noise, and its coefficients are wrong. So it begins at the most probable motion, at the coefficients of the fit before;
-unless all of the record is explained better by where it began then, or by rest.
+unless all of the record is explained far better by where it began then, or by rest.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ _AT_ONCE = 2048
 #: With noises of at least so much of the output a filter comes to the motion from the nearest place of the grid, though
 #: the oscillator is not linear. Newton's method takes so many steps with them, and so many with the noises as they are.
 _COARSE, _STEPS = 0.3, (4, 6)
+
+#: Nats by which another motion must be better. A few do not tell: the filter is not linear about the same place.
+_BETTER = 10.0
 
 #: Distance of finite differences, and the longest step, in parts of the largest.
 _APART, _FARTHEST = 1e-3, 0.3
@@ -72,9 +75,10 @@ def motions(problem: Problem, hypothesis: Hypothesis, point: FloatArray, level: 
         best = tried.argmin(axis=0)
         found = np.where((tried[best, records] < around[0])[:, None], candidates[best, records], found)
     rest = np.zeros_like(found)
-    choice = np.stack([rest, rest if hypothesis.motions is None else hypothesis.motions, unit * found])
-    chosen = _judge(problem, hypothesis, point, problem.start)(choice, level).argmin(axis=0)
-    return np.asarray(choice[chosen, records])
+    choice = np.stack([unit * found, rest if hypothesis.motions is None else hypothesis.motions, rest])
+    chosen = _judge(problem, hypothesis, point, problem.start)(choice, level)
+    chosen[0] -= _BETTER
+    return np.asarray(choice[chosen.argmin(axis=0), records])
 
 
 def _newton(around: FloatArray) -> FloatArray:
