@@ -38,7 +38,7 @@ class Terms(NamedTuple):
         margin: predictive standard deviations that a plan keeps from it.
         walk: (K,) variances of the coefficients' random walk in a sample; zeros for constants.
         scales: (n,) sizes of the states when the first sensor is at its limit.
-        pace: samples that a planned input is held for.
+        pace: samples that a planned input is held for, at most.
         shaken: times the process noise's variance that a plan keeps from the limit besides (`agents.planner.motion`).
         price: nats for the square of an input.
         goal: mean of the goal prior of what the first sensor shows.

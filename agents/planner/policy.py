@@ -90,8 +90,8 @@ class Planner:
         env: the unwrapped environment, single or vector, whose beliefs it reads: `predict` must be called between
             its steps, with its observations.
         seed: of the search.
-        horizon: moves to plan for, each held for ``terms.pace`` samples, but no longer than the episode needs; by
-            default 24, and the whole episode sample by sample where the energy is limited. No more than 20 of the last
+        horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
+            by default 24, and the whole episode sample by sample where the energy is limited. No more than 20 of the last
             48 of an episode.
         rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 moves; of no
             effect on a plan of the whole episode.

@@ -141,12 +141,15 @@ class Follower:
         self._blocks.append((u, y))
         if len(self._blocks) == 1:
             return
-        coefficients = refit(self._rig, self._blocks, self._prior, self.belief)
+        coefficients, taken = refit(self._rig, self._blocks, self._prior, self.belief), self.estimator.arrays()
         # Where the rig is now is what the block tells of a rig with these coefficients.
         self.estimator.restore(begun)
         self._starts = starts
         self._put_coefficients(*coefficients)
-        self.take(before, y)
+        try:
+            self.take(before, y)
+        except ValueError:  # it overflows with these: the state stays that of the first time
+            self.estimator.restore(taken)
         self._put_coefficients(*coefficients)
 
     def practise(self) -> None:
