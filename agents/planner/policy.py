@@ -91,8 +91,8 @@ class Planner:
             its steps, with its observations.
         seed: of the search.
         horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
-            by default 24, and the whole episode sample by sample where the energy is limited. No more than 20 of the last
-            48 of an episode.
+            by default 24, and the whole episode sample by sample where the energy is limited. No more than 20 of the
+            last 48 of an episode.
         rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 moves; of no
             effect on a plan of the whole episode.
         risk: upper bound of the probability that an episode ends early, in (0, 1), where the belief is right.
