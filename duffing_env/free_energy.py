@@ -8,6 +8,7 @@ import numpy as np
 
 from duffing_env.layout import Kind, layout_of
 from duffing_env.rewards import Hooks, nothing, nothing_in_lane
+from estimator.arrays import copy
 from estimator.engine.free_energy import free_energies
 from estimator.inference import mean_field
 from estimator.lanes import LANES, part
@@ -20,35 +21,36 @@ def source(kind: Kind, loop: Any) -> str:
 
 def hooks(kind: Kind, code: Any) -> Hooks:
     """It reads what the update leaves."""
-    free_energy, work = _free_energy_of(kind), layout_of(kind)["WORK"] * LANES
+    find, work = _free_energies_of(kind), layout_of(kind)["WORK"] * LANES
 
     @part(kind.name)
     def after(W, setup):
+        found = np.empty(LANES)
+        find(W, found)
         for j in range(LANES):
-            W[work + j] = -free_energy(W, j)
+            W[work + j] = -found[j]
 
     return Hooks(nothing_in_lane, nothing, nothing, after)
 
 
-def _free_energy_of(kind: Kind) -> Any:
-    """``free_energy(W, j)``: what the last update left lane j with [nats]."""
+def _free_energies_of(kind: Kind) -> Any:
+    """``find(W, found)``: what the last update left every lane with [nats]."""
     place = layout_of(kind)
-    if kind.factorisation == "mean_field":
-        return mean_field.pieces(place).free_energy
     if kind.weighs:
         told = place["FREE_ENERGY"] * LANES
 
         @part(kind.name)
-        def of_the_mixture(W, j):
-            return W[told + j]
+        def of_the_mixture(W, found):
+            copy(found, 0, W[told:], LANES)
 
         return of_the_mixture
-    traced, last = free_energies(kind.belief, kind.iterations, LANES, place), kind.iterations - 1
+    if kind.factorisation == "mean_field":
+        free_energy = mean_field.pieces(place).free_energy
 
-    @part(kind.name)
-    def free_energy(W, j):
-        after = np.empty(last + 1)
-        traced(W, j, after)
-        return after[last]
+        @part(kind.name)
+        def of_mean_field(W, found):
+            for j in range(LANES):
+                found[j] = free_energy(W, j)
 
-    return free_energy
+        return of_mean_field
+    return free_energies(kind.belief, kind.iterations, LANES, place, every=False)

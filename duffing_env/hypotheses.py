@@ -13,18 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from duffing_env.layout import Kind, layout_of
+from estimator.arrays import copy
 from estimator.engine.free_energy import free_energies
 from estimator.engine.rows import belief_names, input_rows
 from estimator.engine.tasks import structured
 from estimator.inference.mixture import mix, weigh
 from estimator.inference.samples import forecaster
-from estimator.lanes import LANES, part
+from estimator.lanes import LANES, part, rows
 
 
 def member_layout(kind: Kind) -> Mapping[str, int]:
     """Name of a quantity to its row in a block of members."""
     place = _update(kind).layout
-    return {**place, "WEIGHT": max(place.values()) + 1}
+    return {**place, **rows("WEIGHT ENERGY", start=max(place.values()) + 1)}
 
 
 def _update(kind: Kind) -> Any:
@@ -59,9 +60,9 @@ def members_of(kind: Kind) -> Members:
     given = [*input_rows(model, kind.degree), f"Y_{sensor}"]
     fed = tuple((own[row] * LANES, place[row] * LANES) for row in given)
     walks = tuple(own[f"P_{c}_{c}"] * LANES for c in model.coefficients)
-    weight, free_energy = own["WEIGHT"] * LANES, place.get("FREE_ENERGY", -1) * LANES
+    weight, energy, free_energy = own["WEIGHT"] * LANES, own["ENERGY"] * LANES, place.get("FREE_ENERGY", -1) * LANES
     unsound = own.get("UNSOUND", -1) * LANES
-    energy_of = free_energies(model, kind.iterations, LANES, own, every=False)
+    energies_of = free_energies(model, kind.iterations, LANES, own, every=False)
     look = forecaster(kind.name, model, kind.iterations, LANES, own)
     inner = part(kind.name)
 
@@ -82,6 +83,7 @@ def members_of(kind: Kind) -> Members:
         count = len(setup.hypotheses)
         first = block * LANES * count
         stop = min(first + LANES * count, len(members) * LANES)
+        found = np.empty(LANES)
         for b in range(first // LANES, stop // LANES):
             V = members[b]
             for j in range(LANES):
@@ -95,6 +97,8 @@ def members_of(kind: Kind) -> Members:
             for j in range(LANES if unsound >= 0 else 0):
                 V[unsound + j] = 0.0
             update(V)
+            energies_of(V, found)
+            copy(V, energy, found, LANES)
         weights, shares = np.empty(count), np.empty(count)
         each, predictions = np.empty((count, 1)), np.empty((count, 1, 2))
         energies, forecasts = np.empty(1), np.empty((1, 2))
@@ -103,7 +107,7 @@ def members_of(kind: Kind) -> Members:
             for m in range(count):
                 V, k = members[(start + m) // LANES], (start + m) % LANES
                 weights[m] = V[weight + k]
-                energy_of(V, k, each[m])
+                each[m, 0] = V[energy + k]
                 if unsound >= 0 and V[unsound + k] > 0.0:
                     each[m, 0] = np.nan
                 look(V, k, predictions[m])

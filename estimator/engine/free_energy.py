@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
-from estimator.elementary import LOG_2PI, log_gamma_half_step
+from estimator.elementary import LOG_2PI, log, log1p, log_gamma_half_step
 from estimator.engine import cache as stored
-from estimator.lanes import jit
 from estimator.models.model import Model
 from estimator.straight import straight
 
@@ -30,13 +28,13 @@ def half_noise_powers(innovation, variance, q, r):
     return 0.5 * (w * w + q * (1.0 - q * weight)), 0.5 * (v * v + r * (1.0 - r * weight))
 
 
-@jit
+@straight
 def gaussian_part(innovation, total):
     """½ log 2πS + e²/2S: the Gaussian's own evidence at the noise variances of an iteration."""
-    return 0.5 * (LOG_2PI + math.log(total) + innovation * innovation / total)
+    return 0.5 * (LOG_2PI + log(total) + innovation * innovation / total)
 
 
-@jit
+@straight
 def precision_part(half_power, variance, shape, rate):
     """What the belief in a precision adds: the moment and logarithm it moved to, and its divergence from the prior.
 
@@ -48,16 +46,17 @@ def precision_part(half_power, variance, shape, rate):
 
     The three have terms in ψ(shape + 1/2), and in half_power/(rate + half_power), that cancel.
     """
-    moved = 0.5 * math.log((rate + half_power) / variance) - half_power / variance
-    return moved + shape * math.log1p(half_power / rate) - log_gamma_half_step(shape)
+    moved = 0.5 * log((rate + half_power) / variance) - half_power / variance
+    return moved + shape * log1p(half_power / rate) - log_gamma_half_step(shape)
 
 
 def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str, int], every: bool = True) -> Any:
-    """Compile ``f(W, lane, out)``: the free energy [nats] that the last update left a lane with, after each iteration.
+    """Compile ``f(W, out)``: the free energies [nats] that the last update left every lane with, after each iteration.
 
     F = KL[q(states, coefficients) || prior, transition, likelihood] + KL[q(γ) || prior] + KL[q(ξ) || prior] to first
     order, summed over the sensors: the first that shows the process noise counts for γ and its own ξ, each further one
-    for its ξ. A missing output counts for nothing. ``out`` is (iterations,), or (1,).
+    for its ξ. A missing output counts for nothing. ``out`` is (iterations * lanes,), or (lanes,), one iteration after
+    another; NaN where an update has left what is no variance.
 
     Args:
         model: whose belief.
@@ -69,31 +68,28 @@ def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str
     kept = range(iterations) if every else [iterations - 1]
 
     def make() -> str:
-        at = lambda row: f"W[{layout[row] * lanes} + lane]"  # noqa: E731
-        source = [
-            "@jit",
-            "def free_energy(W, lane, out):",
-            f"    for i in range({len(kept)}):",
-            "        out[i] = 0.0",
-        ]
-        for k, sensor in enumerate(model.outputs):
-            source += [
-                f"    if {at(f'Y_{sensor}')} == {at(f'Y_{sensor}')}:",
-                f"        e, s = {at(f'TRACE_{k}_innovation')}, {at(f'TRACE_{k}_variance')}",
-                "        # Shapes and rates before the sample; that of the process noise as the sensor shows it.",
-                f"        g, n = {at('GAMMA_SHAPE')} - 0.5, {at(f'XI_SHAPE_{sensor}')} - 0.5",
-                f"        g_rate, n_rate = g * {at(f'TRACE_{k}_q_0')}, n * {at(f'TRACE_{k}_r_0')}",
-            ]
-            for place, i in enumerate(kept):
-                source += [
-                    f"        q, r = {at(f'TRACE_{k}_q_{i}')}, {at(f'TRACE_{k}_r_{i}')}",
-                    "        half_w, half_v = half_noise_powers(e, s, q, r)",
-                    f"        out[{place}] += gaussian_part(e, s + q + r) + precision_part(half_v, r, n, n_rate)",
-                    "        if q > 0.0:",
-                    f"            out[{place}] += precision_part(half_w, q, g, g_rate)",
+        at = lambda row: f"W[{layout[row] * lanes} + LANE]"  # noqa: E731
+        lines = []
+        for place, i in enumerate(kept):
+            for k, sensor in enumerate(model.outputs):
+                found = f"F_{place}_{k}"
+                lines += [
+                    f"y, e, s = {at(f'Y_{sensor}')}, {at(f'TRACE_{k}_innovation')}, {at(f'TRACE_{k}_variance')}",
+                    "# Shapes and rates before the sample; that of the process noise as the sensor shows it.",
+                    f"g, n = {at('GAMMA_SHAPE')} - 0.5, {at(f'XI_SHAPE_{sensor}')} - 0.5",
+                    f"g_rate, n_rate = g * {at(f'TRACE_{k}_q_0')}, n * {at(f'TRACE_{k}_r_0')}",
+                    f"q, r = {at(f'TRACE_{k}_q_{i}')}, {at(f'TRACE_{k}_r_{i}')}",
+                    "half_w, half_v = half_noise_powers(e, s, q, r)",
+                    "value = gaussian_part(e, s + q + r) + precision_part(half_v, r, n, n_rate)",
+                    "value = value + (precision_part(half_w, q, g, g_rate) if q > 0.0 else 0.0)",
+                    "sound = s + q + r > 0.0 and r > 0.0 and n_rate > 0.0 and half_v >= 0.0 and q >= 0.0",
+                    f"{found} = (value if sound else NAN) if y == y else 0.0",
                 ]
-        return "\n".join(source) + "\n"
+            total = " + ".join(f"F_{place}_{k}" for k in range(model.n_outputs))
+            lines.append(f"B[{place * lanes} + LANE] = {total}")
+        loop = ["@straight", "def free_energies(W, B):", f"    for LANE in range({lanes}):"]
+        return "\n".join(loop + [f"        {line}" for line in lines]) + "\n"
 
-    names = {f.__name__: f for f in (gaussian_part, precision_part, half_noise_powers)}
+    names = {"NAN": float("nan")} | {f.__name__: f for f in (gaussian_part, precision_part, half_noise_powers)}
     key = repr((model.digest, iterations, lanes, sorted(layout.items()), every))
-    return stored.load(model.name, "free-energy", key, make, names).free_energy
+    return stored.load(model.name, "free-energy", key, make, names).free_energies

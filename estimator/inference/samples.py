@@ -70,18 +70,17 @@ def structured(model: Model, degree: int, iterations: int, expectations: str = "
             for j in range(lanes):
                 W[unsound + j] = 0.0
         update(W)
+        energies_of(W, before)
 
     look = forecaster(kind, model, iterations, lanes, place)
 
     @part(kind)
     def judge(W, j, before, values, forecasts):
-        energies_of(W, j, values)
-        if unsound >= 0 and W[unsound + j] > 0.0:
-            for i in range(iterations):
-                values[i] = np.nan
+        for i in range(iterations):
+            values[i] = np.nan if unsound >= 0 and W[unsound + j] > 0.0 else before[i * lanes + j]
         look(W, j, forecasts)
 
-    return Loop(_loop(kind, model, place, lanes, iterations, take, judge), place, lanes)
+    return Loop(_loop(kind, model, place, lanes, iterations * lanes, take, judge), place, lanes)
 
 
 def forecaster(kind: str, model: Model, iterations: int, lanes: int, place: Mapping[str, int]) -> Any:

@@ -25,10 +25,10 @@ def test_free_energies_equal_their_definition(name):
     samples[1][2][0] = np.nan
     samples[2][2][:] = np.nan
     W = updated(case, task, samples)
-    out = np.full(ITERATIONS, np.nan)
-    for lane, (belief, inputs, y) in enumerate(samples):
+    found = np.full((ITERATIONS, LANES), np.nan)
+    free_energy(W, found.ravel())
+    for out, (belief, inputs, y) in zip(found.T, samples, strict=False):
         expected = update(case.plant, case.model.n_states, belief, inputs, y, ITERATIONS)
-        free_energy(W, lane, out)
         total = np.sum([part for part in expected.free_energies if part] or [np.zeros(ITERATIONS)], axis=0)
         # Digamma and log Gamma of shapes up to 1e3 are up to 6e3 in size, and cancel to numbers of order one.
         tolerance = EPS * case.operations * expected.condition * 10 + 6e3 * 8 * EPS
@@ -58,7 +58,7 @@ def noise_variances(rng, precision, draws):
 def test_known_noises_make_it_the_surprise_of_a_kalman_filter():
     """With shapes of 1e12 the noises stay where they are; then F is -log N(y | prediction, S), which is exact."""
     case, task, free_energy = traced(ITERATIONS)
-    q, r, shape, out, rng = 0.01**2, 0.02**2, 1e12, np.empty(ITERATIONS), np.random.default_rng(4)
+    q, r, shape, found, rng = 0.01**2, 0.02**2, 1e12, np.empty((ITERATIONS, LANES)), np.random.default_rng(4)
     samples, surprises = [], []
     for belief, inputs, _ in some_samples(case, 4):
         mean, variance = predicted(belief, inputs[0])
@@ -67,8 +67,8 @@ def test_known_noises_make_it_the_surprise_of_a_kalman_filter():
         samples.append((replace(belief, gamma=(shape, shape * q), xi=[(shape, shape * r)]), inputs, [y]))
         surprises.append(-norm.logpdf(y, mean, std))
     W = updated(case, task, samples)
-    for lane, surprise in enumerate(surprises):
-        free_energy(W, lane, out)
+    free_energy(W, found.ravel())
+    for out, surprise in zip(found.T, surprises, strict=False):
         # Both KL[q(γ)] and KL[q(ξ)] are below (ν²/r)² / shape, which is 1e-8 nats here.
         assert out[-1] == pytest.approx(surprise, abs=1e-7)
 
@@ -76,7 +76,7 @@ def test_known_noises_make_it_the_surprise_of_a_kalman_filter():
 def test_it_never_rises_and_bounds_the_surprise():
     """The iterations are coordinate descent on F of the linearised model, and F >= -log p(y) for any noise prior."""
     case, task, free_energy = traced(10)
-    rng, draws, out = np.random.default_rng(5), 20_000, np.empty(10)
+    rng, draws, found = np.random.default_rng(5), 20_000, np.empty((10, LANES))
     samples, densities = [], []
     for belief, inputs, _ in some_samples(case, 5):
         mean, variance = predicted(belief, inputs[0])
@@ -86,8 +86,8 @@ def test_it_never_rises_and_bounds_the_surprise():
         samples.append((belief, inputs, [y]))
         densities.append(norm.pdf(y, mean, std))
     W = updated(case, task, samples)
-    for lane, density in enumerate(densities):
-        free_energy(W, lane, out)
+    free_energy(W, found.ravel())
+    for out, density in zip(found.T, densities, strict=False):
         assert np.diff(out).max() <= 1e-12  # some twenty terms, each of them to 5e-14 as `test_elementary` has it
         evidence, error = density.mean(), density.std() / np.sqrt(draws)
         assert out[-1] >= -np.log(evidence) - 5 * error / evidence
@@ -102,8 +102,8 @@ def test_it_never_rises_and_bounds_the_surprise():
 def test_it_is_finite_far_from_the_prior():
     """The rate of γ moves to 1e33 with this sample: the prior rate is then lost in the new one."""
     case, task, free_energy = traced(ITERATIONS)
-    belief, out = random_belief(case, np.random.default_rng(6)), np.empty(ITERATIONS)
+    belief, found = random_belief(case, np.random.default_rng(6)), np.empty((ITERATIONS, LANES))
     W = updated(case, task, [(belief, [0.0], [1e20])] * LANES)
-    free_energy(W, 0, out)
+    free_energy(W, found.ravel())
     expected = update(case.plant, case.model.n_states, belief, [0.0], [1e20], ITERATIONS)
-    np.testing.assert_allclose(out, np.sum(expected.free_energies, axis=0), rtol=1e-9)
+    np.testing.assert_allclose(found[:, 0], np.sum(expected.free_energies, axis=0), rtol=1e-9)
