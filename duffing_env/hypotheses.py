@@ -17,7 +17,7 @@ from estimator.arrays import copy
 from estimator.engine.free_energy import free_energies
 from estimator.engine.rows import belief_names, input_rows
 from estimator.engine.tasks import structured
-from estimator.inference.mixture import mix, weigh
+from estimator.inference.mixture import mixing, weigh
 from estimator.inference.samples import forecaster
 from estimator.lanes import LANES, part, rows
 
@@ -55,7 +55,8 @@ NONE = Members(None, None)
 def members_of(kind: Kind) -> Members:
     """Compile them for a kind of experiment."""
     place, own, model = layout_of(kind), member_layout(kind), kind.belief
-    update, names, size = _update(kind).update, len(model.names), len(belief_names(model))
+    update, size = _update(kind).update, len(belief_names(model))
+    memory_for, mix, _ = mixing(len(model.names))
     sensor = next(iter(model.outputs))
     given = [*input_rows(model, kind.degree), f"Y_{sensor}"]
     fed = tuple((own[row] * LANES, place[row] * LANES) for row in given)
@@ -86,10 +87,13 @@ def members_of(kind: Kind) -> Members:
         found = np.empty(LANES)
         for b in range(first // LANES, stop // LANES):
             V = members[b]
+            owner, mate = divmod(b * LANES - first, count)
             for j in range(LANES):
-                owner = (b * LANES + j - first) // count
                 for to, source in fed:
                     V[to + j] = W[source + owner]
+                mate += 1
+                if mate == count:
+                    owner, mate = owner + 1, 0
             if setup.drifts:
                 for c in range(len(walks)):
                     for j in range(LANES):
@@ -99,7 +103,7 @@ def members_of(kind: Kind) -> Members:
             update(V)
             energies_of(V, found)
             copy(V, energy, found, LANES)
-        weights, shares = np.empty(count), np.empty(count)
+        weights, memory = np.empty(count), memory_for(count)
         each, predictions = np.empty((count, 1)), np.empty((count, 1, 2))
         energies, forecasts = np.empty(1), np.empty((1, 2))
         for j in range((stop - first) // count):
@@ -114,7 +118,7 @@ def members_of(kind: Kind) -> Members:
             weigh(weights, each, predictions, energies, forecasts)
             for m in range(count):
                 members[(start + m) // LANES, weight + (start + m) % LANES] = weights[m]
-            mix(members, start, weights, names, shares, W, j, LANES)
+            mix(members, start, weights, memory, W, j, LANES)
             if free_energy >= 0:
                 W[free_energy + j] = energies[0]
 

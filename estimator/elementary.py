@@ -68,11 +68,12 @@ def log_gamma_half_step(a):
     below = a * (a + 1.0) * (a + 2.0) * (a + 3.0) * (a + 4.0) * (a + 5.0) * (a + 6.0) * (a + 7.0) * (a + 8.0)
     above = (a + 0.5) * (a + 1.5) * (a + 2.5) * (a + 3.5) * (a + 4.5) * (a + 5.5) * (a + 6.5) * (a + 7.5) * (a + 8.5)
     # Of a very large shape the products overflow, and are as good as equal.
-    stepped = (below / above) * ((a + 9.0) / (a + 9.5)) if a < 1e30 else 1.0
+    stepped = (below * (a + 9.0)) / (above * (a + 9.5)) if a < 1e30 else 1.0
     b = a + 10.0
-    z = 1.0 / (b * b)
+    inverse = 1.0 / b
+    z = inverse * inverse
     series = 1 / 640 - z * (17 / 14336 - z * (31 / 18432 - z * (691 / 180224 - z * (5461 / 425984))))
-    return log(stepped) + 0.5 * log(b) - (1 / 8 - z * (1 / 192 - z * series)) / b
+    return 0.5 * log(stepped * stepped * b) - inverse * (1 / 8 - z * (1 / 192 - z * series))
 
 
 @jit

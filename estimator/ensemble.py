@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.belief import Belief
-from estimator.inference.mixture import mixture
+from estimator.inference.mixture import mixing
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray
 
@@ -110,7 +110,7 @@ def half_cauchy(away: FloatArray) -> FloatArray:
 
 def start(records: FloatArray, names: int, weights: FloatArray) -> FloatArray:
     """(size,) the record of the mixture of members (M, size) with weights (M,), of so many states and coefficients."""
-    record: FloatArray = mixture(side_by_side(records, LANES), weights, names)[1]
+    record: FloatArray = mixing(names).mixture(side_by_side(records, LANES), weights)[1]
     return record
 
 
@@ -156,7 +156,7 @@ def matched_gamma(weights: FloatArray, shapes: FloatArray, rates: FloatArray) ->
     """Shape and rate of a Gamma density for a mixture of them, by mean and variance of the noise's variance.
 
     That of a density is taken as 1/E[g], as it acts in an update, with the relative variance 1/shape
-    (`estimator.inference.mixture.mix` does so in compiled code).
+    (`estimator.engine.moments` does so in compiled code).
     """
     variances = rates / shapes
     mean = weights @ variances

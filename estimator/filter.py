@@ -12,7 +12,7 @@ from estimator.belief import Belief, check_record, covariance_places
 from estimator.checks import numbers
 from estimator.ensemble import NoiseRatio, first_weights, log_ratio, priors, ratio_of, side_by_side
 from estimator.inference import samples
-from estimator.inference.mixture import mixture
+from estimator.inference.mixture import mixing
 from estimator.inputs import Feed, degree, feed
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -159,7 +159,7 @@ class Filter:
     @property
     def noise_ratio(self) -> NoiseRatio:
         """What the weights say, at the precisions that each member has learned."""
-        weights, _ = mixture(self._block, self._weights, len(self.model.names))
+        weights, _ = mixing(len(self.model.names)).mixture(self._block, self._weights)
         ratios = np.array([log_ratio(record[-4:]) for record in self.records[weights > 0]])
         records = priors(self.prior, self.settings.noise_hypotheses)
         first = np.array([log_ratio(record[-4:]) for record in records])
@@ -169,7 +169,7 @@ class Filter:
         """(size,) a record with the mixture's moments."""
         if self.members == 1:
             return self.records[0]
-        record: FloatArray = mixture(self._block, self._weights, len(self.model.names))[1]
+        record: FloatArray = mixing(len(self.model.names)).mixture(self._block, self._weights)[1]
         return record
 
     @property
@@ -265,7 +265,7 @@ class Filter:
                 check_record(name, self.model, record, _ROUNDING)
         if self.members > 1:  # their moments together may overflow, or vanish, where none of them does
             side = side_by_side(given["records"], self._loop.lanes)
-            _, record = mixture(side, weights, len(self.model.names))
+            _, record = mixing(len(self.model.names)).mixture(side, weights)
             check_record("records", self.model, record, _ROUNDING)
         for name in ("weights", "first", "walk", "begun"):
             setattr(self, f"_{name}", given[name])

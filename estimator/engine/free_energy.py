@@ -46,7 +46,8 @@ def precision_part(half_power, variance, shape, rate):
 
     The three have terms in ψ(shape + 1/2), and in half_power/(rate + half_power), that cancel.
     """
-    moved = 0.5 * log((rate + half_power) / variance) - half_power / variance
+    precision = 1.0 / variance
+    moved = 0.5 * log((rate + half_power) * precision) - half_power * precision
     return moved + shape * log1p(half_power / rate) - log_gamma_half_step(shape)
 
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from estimator.lanes import LANES, jit, kernel
+from estimator.arrays import fill
+from estimator.engine.moments import moments
+from estimator.lanes import LANES, jit, kernel, part
 
 #: Probability per sample that the hypothesis is drawn anew: no weight stays below it for good.
 SWITCHING = 1e-6
@@ -61,72 +66,127 @@ def weigh(weights, each, predictions, energies, forecasts):
         energies[i] = least - np.log(evidence)
 
 
-@jit
-def mix(blocks, first, weights, names, shares, record, at, stride):
-    """Write the record of a belief with the mixture's moments.
+class Mixing(NamedTuple):
+    """The moments of mixtures of beliefs, compiled.
 
-    Args:
-        blocks: (blocks, rows * LANES) in adjacent lanes of which the members' records lie.
-        first: lane of the first member, counted over all blocks.
-        weights: (M,) of the members.
-        names: number of states and coefficients.
-        shares: (M,) receives the weights of those members whose numbers are finite; they sum to 1.
-        record: flat array that receives the i-th number of the record at ``at + i * stride``.
-        at: see there.
-        stride: see there.
+    Attributes:
+        memory_for: ``memory_for(members)``: what ``mix`` writes on.
+        mix: ``mix(blocks, first, weights, memory, record, at, stride)`` writes the record of a belief with the mixture's
+            moments (`estimator.engine.moments`); all NaN where no member is finite. The mixture's ``memory`` then has
+            the weights of those members whose numbers are finite, which sum to 1: that of member m in lane m % LANES
+            of the first row of block m // LANES.
 
-    The noises' Gamma densities have the mean and variance of the noises' variances: that of a member is 1/E[g], as it
-    acts in an update, with the relative variance 1/shape. Where no member is finite, all results are NaN.
+            - ``blocks`` (blocks, rows * LANES), in adjacent lanes of which the members' records lie;
+            - ``first``: lane of the first member, counted over all blocks;
+            - ``weights`` (M,) of the members;
+            - ``record``: flat array that receives the i-th number of the record at ``at + i * stride``.
+        mixture: ``mixture(blocks, weights)`` of all members from the first lane on: those shares (M,), and the record.
     """
-    members, size = len(weights), names + names * (names + 1) // 2 + 4
-    total, likely = 0.0, 0
-    for m in range(members):
-        b, j = (first + m) // LANES, (first + m) % LANES
-        broken = 0.0
-        for i in range(size):
-            broken += blocks[b, i * LANES + j] - blocks[b, i * LANES + j]  # NaN of what is not finite
-        shares[m] = weights[m] if weights[m] > 0.0 and broken == 0.0 else 0.0
-        total += shares[m]
-        if shares[m] > shares[likely]:
-            likely = m
-    # Means are about those of the likeliest, so that what all members know stays as it is, to the last bit.
-    c, k = (first + likely) // LANES, (first + likely) % LANES
-    for i in range(size):
-        start = blocks[c, i * LANES + k] if i < names else 0.0
-        record[at + i * stride] = start if total > 0.0 else np.nan
-    for m in range(members):
-        shares[m] /= total
-        b, j = (first + m) // LANES, (first + m) % LANES
-        for i in range(names if shares[m] > 0.0 else 0):
-            record[at + i * stride] += shares[m] * (blocks[b, i * LANES + j] - blocks[c, i * LANES + k])
-    for m in range(members):
-        b, j = (first + m) // LANES, (first + m) % LANES
-        place = names
-        for i in range(names if shares[m] > 0.0 else 0):
-            one = blocks[b, i * LANES + j] - record[at + i * stride]
-            for n in range(i, names):
-                other = blocks[b, n * LANES + j] - record[at + n * stride]
-                record[at + place * stride] += shares[m] * (blocks[b, place * LANES + j] + one * other)
-                place += 1
-    for shape in range(size - 4, size, 2):
-        mean, spread = 0.0, 0.0
-        for again in range(2):
-            for m in range(members):
-                if shares[m] > 0.0:
-                    b, j = (first + m) // LANES, (first + m) % LANES
-                    worth = blocks[b, shape * LANES + j]
-                    variance = blocks[b, (shape + 1) * LANES + j] / worth
-                    if again:
-                        spread += shares[m] * ((variance / mean) ** 2 / worth + (variance / mean - 1.0) ** 2)
-                    else:
-                        mean += shares[m] * variance
-        if total > 0.0:
-            record[at + shape * stride], record[at + (shape + 1) * stride] = 1.0 / spread, mean / spread
+
+    memory_for: Any
+    mix: Any
+    mixture: Any
 
 
-@kernel
-def mixture(blocks, weights, names):
-    """`mix` of all members from the first lane on: their shares (M,), and the record."""
-    shares, record = np.empty(len(weights)), np.empty(names + names * (names + 1) // 2 + 4)
-    mix(blocks, 0, weights, names, shares, record, 0, 1)
-    return shares, record
+@cache
+def mixing(names: int) -> Mixing:
+    """The moments of beliefs in so many states and coefficients, of one sensor."""
+    found = moments(names)
+    place, check, means, spreads, tails = found.layout, found.check, found.means, found.spreads, found.tails
+    n_pairs = names * (names + 1) // 2
+    size, n_rows = names + n_pairs + 4, len(place)
+    record_at, about_at, told_at = place["X_0"], place["ABOUT_0"], place["T_0"]
+    shapes = size - 4
+    inner = part(str(names))
+
+    @inner
+    def memory_for(members):
+        # What no member stands in never becomes infinite.
+        return np.ones((-(-members // LANES), n_rows * LANES))
+
+    @inner
+    def collect(blocks, first, weights, memory):
+        """Copy the records of all members, and share out the weight among those that are finite.
+
+        The others get the record of the likeliest. Gives the weight that was left, and who is the likeliest.
+        """
+        members, m = len(weights), 0
+        while m < members:
+            b, j, c, k = (first + m) // LANES, (first + m) % LANES, m // LANES, m % LANES
+            count = min(members - m, LANES - j, LANES - k)
+            block, side = blocks[b], memory[c]
+            for i in range(size):
+                start, to = i * LANES + j, (record_at + i) * LANES + k
+                for n in range(count):
+                    side[to + n] = block[start + n]
+            m += count
+        for c in range(len(memory)):
+            check(memory[c])
+            fill(memory[c, max(0, min(LANES, members - c * LANES)) : LANES], 0.0)
+        total, likely, most = 0.0, 0, 0.0
+        for m in range(members):
+            c, k = m // LANES, m % LANES
+            memory[c, k] = weights[m] if weights[m] > 0.0 and memory[c, k] > 0.0 else 0.0
+            total += memory[c, k]
+            if memory[c, k] > most:
+                likely, most = m, memory[c, k]
+        for m in range(members):
+            c, k = m // LANES, m % LANES
+            if memory[c, k] == 0.0:
+                for row in range(record_at * LANES, (record_at + size) * LANES, LANES):
+                    memory[c, row + k] = memory[likely // LANES, row + likely % LANES]
+            memory[c, k] /= total
+        return total, likely
+
+    @inner
+    def told(memory, k):
+        """A sum over all members."""
+        value = 0.0
+        for c in range(len(memory)):
+            value += memory[c, (told_at + k) * LANES]
+        return value
+
+    @inner
+    def everywhere(memory, row, value):
+        for c in range(len(memory)):
+            fill(memory[c, row * LANES : (row + 1) * LANES], value)
+
+    @inner
+    def mix(blocks, first, weights, memory, record, at, stride):
+        total, likely = collect(blocks, first, weights, memory)
+        if not total > 0.0:
+            for i in range(size):
+                record[at + i * stride] = np.nan
+            return
+        for i in range(names):
+            start = memory[likely // LANES, (record_at + i) * LANES + likely % LANES]
+            record[at + i * stride] = start
+            everywhere(memory, about_at + i, start)
+        for c in range(len(memory)):
+            means(memory[c])
+        for i in range(names):
+            record[at + i * stride] += told(memory, i)
+            everywhere(memory, about_at + i, record[at + i * stride])
+        for c in range(len(memory)):
+            spreads(memory[c])
+        for p in range(n_pairs):
+            record[at + (names + p) * stride] = told(memory, p)
+        for k in range(2):
+            variance = told(memory, n_pairs + k)
+            record[at + (shapes + 2 * k + 1) * stride] = variance
+            everywhere(memory, about_at + names + k, variance)
+        for c in range(len(memory)):
+            tails(memory[c])
+        for k in range(2):
+            spread, rate = told(memory, k), at + (shapes + 2 * k + 1) * stride
+            record[rate - stride], record[rate] = 1.0 / spread, record[rate] / spread
+
+    @kernel(kind=str(names))
+    def mixture(blocks, weights):
+        memory, record, shares = memory_for(len(weights)), np.empty(size), np.empty(len(weights))
+        mix(blocks, 0, weights, memory, record, 0, 1)
+        for m in range(len(weights)):
+            shares[m] = memory[m // LANES, m % LANES]
+        return shares, record
+
+    return Mixing(memory_for, mix, mixture)

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from estimator import Channel, OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
 from estimator.belief import Belief
 from estimator.ensemble import FARTHEST, LEVELS, displaced, first_weights, matched_gamma, priors, side_by_side
-from estimator.inference.mixture import SWITCHING, mixture, weigh
+from estimator.inference.mixture import SWITCHING, mixing, weigh
 from estimator.lanes import LANES
 from estimator.rig_prior import rig_prior
 
@@ -145,7 +145,9 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
     assert 1 / shape == pytest.approx(variances.var() / variances.mean() ** 2, rel=0.01)
     # The same in compiled code, of two noises.
     records = np.column_stack([np.zeros((2, 2)), shapes, rates, shapes, 2 * rates])
-    np.testing.assert_allclose(mixture(side_by_side(records, LANES), weights, 1)[1][2:], [shape, rate, shape, 2 * rate])
+    np.testing.assert_allclose(
+        mixing(1).mixture(side_by_side(records, LANES), weights)[1][2:], [shape, rate, shape, 2 * rate]
+    )
 
 
 # --- The estimator -------------------------------------------------------------------------------------------------
