@@ -62,8 +62,8 @@ def run(peers: Peers, repetitions: int, on_row: Callable[[str], None]) -> Sectio
         "structured: 3 iterations, mean field: 10, both of Eq. (2); continuous: 3 iterations of Eq. (1), the noises "
         "known as there; noises unknown: the same with 21 hypotheses about the noises, as on the tracks of Eq. (1). "
         "`ours` is the whole step through make_vec: plant, noise, inference, reward, observation, autoreset, infos. "
-        "`plant only` and `estimator only` are the compiled pieces on one thread. SB3's policy is an untrained MlpPolicy "
-        "(64, 64) that samples its actions, through agents' VecEnv.",
+        "`plant only` and `estimator only` are the compiled pieces on one thread. SB3's policy is an untrained "
+        "MlpPolicy (64, 64) that samples its actions, through agents' VecEnv.",
         f"Up to {LANES} environments are one block, which one thread steps. SyncVectorEnv is left out at 16384: its "
         "rate does not change from 8 environments on.",
     ]

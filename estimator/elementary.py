@@ -1,8 +1,8 @@
 """Elementary functions in the form the kernels need.
 
-`log` and others that are `straight` are free of branches and calls, so that they vectorise. The Gamma functions are evaluated at the very large shapes
-of the paper's noise priors (1e8), where differences of library values would keep no digit of the divergence between
-a posterior and its prior.
+`log` and others that are `straight` are free of branches and calls, so that they vectorise. The Gamma functions are
+evaluated at the very large shapes of the paper's noise priors (1e8), where differences of library values would keep no
+digit of the divergence between a posterior and its prior.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ def digamma(a):
 
 @straight
 def log1p(x):
-    """log(1 + x) of x > -1, to 4 units in the last place, also where 1 + x has lost most digits of x."""
+    """Logarithm of 1 + x, x > -1, to 4 units in the last place, also where 1 + x has lost most digits of x."""
     u = 1.0 + x
     return log(u) + (x - (u - 1.0)) / u
 
 
 @straight
 def log_gamma_half_step(a):
-    """log Gamma(a + 1/2) - log Gamma(a) of a > 0, to rounding also where both are of the order of 1e9, without branches.
+    """Log Gamma(a + 1/2) - log Gamma(a) of a > 0, to rounding also where both are of the order of 1e9.
 
     Ten steps of the recurrence, then the asymptotic series of Gamma(a + 1/2) / Gamma(a).
     """

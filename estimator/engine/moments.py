@@ -31,8 +31,8 @@ class Moments:
     Attributes:
         check: ``check(B)``: SHARE becomes 1 where all numbers of a record are finite, and 0 elsewhere.
         means: ``means(B)``: T_i becomes Σ s (X_i - ABOUT_i) of every state and coefficient i.
-        spreads: ``spreads(B)``: T_p becomes Σ s (P_p + (X_i - ABOUT_i)(X_j - ABOUT_j)) of every pair p = (i, j), i <= j;
-            the T after them Σ s v of each noise. The rates become v.
+        spreads: ``spreads(B)``: T_p becomes Σ s (P_p + (X_i - ABOUT_i)(X_j - ABOUT_j)) of every pair p = (i, j) with
+            i <= j; the T after them Σ s v of each noise. The rates become v.
         tails: ``tails(B)``: T_k becomes the relative variance of noise k, with its V in the row ``V_<k>``.
         layout: rows of the block: the members' shares ``SHARE``; their records, as `estimator.Belief` keeps them, from
             the row ``X_0`` on; what is the same in all lanes; and the sums.

@@ -71,10 +71,10 @@ class Mixing(NamedTuple):
 
     Attributes:
         memory_for: ``memory_for(members)``: what ``mix`` writes on.
-        mix: ``mix(blocks, first, weights, memory, record, at, stride)`` writes the record of a belief with the mixture's
-            moments (`estimator.engine.moments`); all NaN where no member is finite. The mixture's ``memory`` then has
-            the weights of those members whose numbers are finite, which sum to 1: that of member m in lane m % LANES
-            of the first row of block m // LANES.
+        mix: ``mix(blocks, first, weights, memory, record, at, stride)`` writes the record of a belief with the moments
+            of the mixture (`estimator.engine.moments`); all NaN where no member is finite. ``memory`` then has the
+            weights of those members whose numbers are finite, which sum to 1: that of member m in lane m % LANES of
+            the first row of block m // LANES.
 
             - ``blocks`` (blocks, rows * LANES), in adjacent lanes of which the members' records lie;
             - ``first``: lane of the first member, counted over all blocks;
