@@ -70,7 +70,10 @@ class PlannerState(NamedTuple):
 
 
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
-_HORIZON = 24
+_HORIZON = 40
+
+#: Moves that an episode has at least, where one can have so many: more are finer, and take longer.
+_LEAST_MOVES = 24
 
 #: Moves of a plan, at most.
 _MOST_MOVES = 100_000
@@ -91,7 +94,7 @@ class Planner:
             its steps, with its observations.
         seed: of the search.
         horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
-            by default 24, and the whole episode sample by sample where the energy is limited. No more than 20 of the
+            by default 40, and the whole episode sample by sample where the energy is limited. No more than 20 of the
             last 48 of an episode.
         rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 moves; of no
             effect on a plan of the whole episode.
@@ -172,7 +175,7 @@ class Planner:
             * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
             scales=swing.scales,
-            pace=min(swing.pace, -(-env.horizon // horizon)),  # a plan need not look beyond the episode
+            pace=min(swing.pace, -(-env.horizon // min(horizon, _LEAST_MOVES))),
             shaken=swing.shaken,
             price=float(input_cost),
             goal=float(goal),

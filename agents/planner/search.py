@@ -29,11 +29,13 @@ from estimator.arrays import copy, copy_scaled, fill, highest
 from estimator.lanes import LANES, jit, kernel, part
 from estimator.models.model import Model
 
-#: Cells of the map along each axis, from minus a state's scale to plus.
-_CELLS = 24
+#: Cells of the map along each axis, from minus a state's scale to plus: for so many first moves, and for those after
+#: them, which are planned again before they are played. A plan that looks far on a coarse map is better than one that
+#: looks less far on a fine one, in less time.
+_CELLS, _NEAR, _FAR_CELLS = 24, 10, 12
 
 #: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: the map is then
-#: finer, the rounds are more by this factor, and plans look no further than so many moves.
+#: finer everywhere, the rounds are more by this factor, and plans look no further than so many moves.
 _LATE, _LATE_CELLS, _LATE_ROUNDS, _LATE_HORIZON = 48, 32, 4, 20
 
 #: Inputs that are tried at every cell.
@@ -107,6 +109,8 @@ class Task(NamedTuple):
         terms: `agents.planner.imagination.Terms`.
         lasts: (2,) the inputs that were applied last, newest first.
         M: (K, K) factor of the information per sample that is to come.
+        cells: of the map along each axis.
+        far_cells: the same after the first moves.
     """
 
     record: Any
@@ -116,6 +120,8 @@ class Task(NamedTuple):
     terms: Any
     lasts: Any
     M: Any
+    cells: int
+    far_cells: int
 
 
 @cache
@@ -160,15 +166,16 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         return count
 
     @inner
-    def find_way(memory, task, cells, found, words):
+    def find_way(memory, task, found, words):
         """Build a plan by the best ways into the cells of the map, which is laid anew at random every time."""
         ways, continued, terms = memory.ways, memory.continued, task.terms
-        n_cells = cells * cells if is_plane else cells
-        best, ends = np.empty(n_cells), np.empty(n_cells, np.int64)
+        most = task.cells * task.cells if is_plane else task.cells
+        best, ends = np.empty(most), np.empty(most, np.int64)
         right, up = uniform(words), uniform(words)
         begin(ways[0], task.record, task.lasts)
         count = 1
         for h in range(task.steps):
+            cells = task.cells if h < _NEAR else task.far_cells
             fill(best, -np.inf)
             for b in range(_CHOICES * (-(-count // LANES))):
                 W = continued[b]
@@ -223,13 +230,14 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the samples of a move."""
         candidates, last = memory.candidates, lasts[0]
         moves = min(len(best), _LATE_HORIZON)
-        cells, pace = _CELLS, min(terms.pace, max(1, int(left / moves + 0.5)))
+        cells, far, pace = _CELLS, _FAR_CELLS, min(terms.pace, max(1, int(left / moves + 0.5)))
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
-            cells, steps, rounds = _LATE_CELLS, min(steps, _LATE_HORIZON), _LATE_ROUNDS * rounds
+            cells = far = _LATE_CELLS
+            steps, rounds = min(steps, _LATE_HORIZON), _LATE_ROUNDS * rounds
         M = np.zeros((k, k))
         factorise(rate, M)
-        task = Task(record, left, steps, pace, terms, lasts, M)
+        task = Task(record, left, steps, pace, terms, lasts, M, cells, far)
         turned = -best[0]
         for h in range(len(best) - 1):
             best[h] = best[h + 1]
@@ -238,7 +246,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         copy(candidates[0], 0, best, len(best))
         fill(candidates[1], 0.0)
         bound(candidates[1], steps, last, terms)
-        find_way(memory, task, cells, candidates[2], words)
+        find_way(memory, task, candidates[2], words)
         for j in range(3, LANES):
             copy(candidates[j], 0, candidates[2 * (j % 2)], len(best))
             change(candidates[j], steps, terms.amplitude, words)
@@ -303,7 +311,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             collect(W, record)
             lasts[1], lasts[0] = lasts[0], u[t]
         left = len(u) - first
-        find_way(memory(left, cells), Task(record, left, left, 1, terms, lasts, M), cells, u[first:], words)
+        find_way(memory(left, cells), Task(record, left, left, 1, terms, lasts, M, cells, cells), u[first:], words)
 
     return Search(plan, play, through)
 
