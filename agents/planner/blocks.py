@@ -6,8 +6,8 @@ A block is planned for systems that are drawn from the belief, not for its means
 
 by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. A block
 is played only when at most a given share of some hundred further draws leaves the limit (`agents.planner.futures`). Of
-those that do, some are then planned for, too, and the *aim* is a bit lower. It begins as the planner's own plan for the
-belief's means.
+those that do, some are then planned for, too, and tell no longer how safe a block is; and the *aim* is a bit lower. It
+begins as the planner's own plan for the belief's means.
 """
 
 from __future__ import annotations
@@ -177,10 +177,13 @@ def best_block(
     climbed = [np.array(candidate) for candidate in candidates]
     values = [ascend(systems, limits, steps, u) for u in climbed]
     u = climbed[int(np.argmax(values))]
+    planned = set(range(SYSTEMS))
     for k in range(_AIMS):
-        leaving = futures.leaving(u[:played], max(_ADDED, futures.enough(bound)))
-        if len(leaving) < futures.enough(bound):
-            return u, 1.0, futures.chance(len(leaving))
+        enough = futures.enough(bound, len(planned))
+        leaving = futures.leaving(u[:played], max(_ADDED, enough), planned)
+        if len(leaving) < enough:
+            return u, 1.0, futures.chance(len(leaving), len(planned))
+        planned.update(leaving[:_ADDED])
         systems = _joined(systems, futures, leaving[:_ADDED])
         limits = limits._replace(aim=limits.aim * (1 - min(_FALL * _FASTER**k, _FASTEST)))
         ascend(systems, limits, _MORE, u)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 import numpy as np
 
@@ -116,8 +117,14 @@ class Futures:
         process, sensor = self._disturbed
         return process[:, :samples], sensor[:, :samples]
 
-    def leaving(self, u: FloatArray, most: int) -> list[int]:
-        """The first draws, and at most so many, that inputs (N,), in the belief's scale, take out of the limit."""
+    def leaving(self, u: FloatArray, most: int, planned: Collection[int] = ()) -> list[int]:
+        """The first draws, and at most so many, that inputs (N,), in the belief's scale, take out of the limit.
+
+        Args:
+            u: the inputs.
+            most: see there.
+            planned: draws that the inputs were planned for, and which therefore do not tell how safe they are.
+        """
         acting = np.concatenate([np.zeros(self.delay), u])[: len(u)]
         process, sensor = self.disturbances(len(u))
         found: list[int] = []
@@ -125,6 +132,8 @@ class Futures:
             for i, (state, coefficients, w, v) in enumerate(
                 zip(self.states, self.coefficients, process, sensor, strict=True)
             ):
+                if i in planned:
+                    continue
                 y = free_run(self.model, coefficients, acting + w, state, self.interpolation) + v
                 if not bool((np.abs(y) <= self.limit).all()):
                     found.append(i)
@@ -140,13 +149,13 @@ class Futures:
         """
         return self.chance(len(self.leaving(u, self.enough(bound))))
 
-    def chance(self, count: int) -> float:
-        """The probability of what so many of the draws do."""
-        return (count + 1) / (len(self.states) + 2)
+    def chance(self, count: int, planned: int = 0) -> float:
+        """The probability of what so many of the draws do, not counting so many that were planned for."""
+        return (count + 1) / (len(self.states) - planned + 2)
 
-    def enough(self, bound: float) -> int:
+    def enough(self, bound: float, planned: int = 0) -> int:
         """The least number of draws whose `chance` is not below a bound."""
-        return max(1, math.ceil(bound * (len(self.states) + 2) - 1))
+        return max(1, math.ceil(bound * (len(self.states) - planned + 2) - 1))
 
     def share(self, u: FloatArray, bound: float) -> tuple[float, float]:
         """The largest share of inputs whose probability of leaving the limit is below a bound, and that probability.
