@@ -60,5 +60,5 @@ def show(found: Any) -> None:
     made += f", made smaller to {found.share:.2g} of it" if found.share < 1 else ""
     print_all(
         table(("", "mean", "90 % interval now", "expected after", "times narrower", "unit"), rows),
-        f"{made}; {found.gain:.1f} nats more; out of the range with probability {found.probability:.1g}.",
+        f"{made}; {found.gain:.1f} nats more; out of the range with a probability of at most {found.probability:.1g}.",
     )

@@ -167,8 +167,8 @@ def best_block(
         played: samples that are asked to be safe; all where None.
 
     Returns:
-        Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and the
-        probability that they leave the limit.
+        Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and
+        `Futures.chance` of leaving the limit.
     """
     model = replace(view.model, substeps=_COARSE) if view.model.is_continuous else view.model
     ascend = _climber(model, view.degree)
@@ -181,8 +181,9 @@ def best_block(
     for k in range(_AIMS):
         enough = futures.enough(bound, len(planned))
         leaving = futures.leaving(u[:played], max(_ADDED, enough), planned)
-        if len(leaving) < enough:
-            return u, 1.0, futures.chance(len(leaving), len(planned))
+        probability = futures.chance(len(leaving), len(planned))
+        if probability < bound:
+            return u, 1.0, probability
         planned.update(leaving[:_ADDED])
         systems = _joined(systems, futures, leaving[:_ADDED])
         limits = limits._replace(aim=limits.aim * (1 - min(_FALL * _FASTER**k, _FASTEST)))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection
 
 import numpy as np
+from scipy.special import betaincinv
 
 from estimator.belief import Belief, covariance_places
 from estimator.free_run import free_run
@@ -14,7 +15,13 @@ from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 
 #: Systems that are drawn from a belief, at least.
-DRAWS = 300
+DRAWS = 500
+
+#: Draws that a block may be planned for, at most: they do not tell how safe it is.
+MOST_PLANNED = 160
+
+#: How certain it is that a probability is no more than what the draws tell of it.
+_CONFIDENCE = 0.95
 
 #: An input that is too large is tried again at this share, so often: down to a thousandth.
 _LESS, _TRIALS = 0.8, 31
@@ -27,8 +34,8 @@ Drawn = tuple[FloatArray, FloatArray]
 
 
 def draws_for(bound: float) -> int:
-    """Systems that can tell a probability below a bound."""
-    return max(DRAWS, math.ceil(2.0 / bound))
+    """Systems that can tell a probability below a bound: if none of those that are left leaves the limit."""
+    return max(DRAWS, math.ceil(-math.log(1.0 - _CONFIDENCE) / bound) + MOST_PLANNED)
 
 
 def drawn_from_records(
@@ -142,23 +149,27 @@ class Futures:
         return found
 
     def probability(self, u: FloatArray, bound: float = 1.0) -> float:
-        """That inputs (N,), in the belief's scale, take the output out of its limit at any of the samples.
+        """That inputs (N,), in the belief's scale, take the output out of its limit at any of the samples: `chance`.
 
-        The mean of what the draws tell of it, (k + 1) / (n + 2): it is never 0. Draws are counted until it is not below
-        the bound any more.
+        Draws are counted until it is not below the bound any more.
         """
         return self.chance(len(self.leaving(u, self.enough(bound))))
 
     def chance(self, count: int, planned: int = 0) -> float:
-        """The probability of what so many of the draws do, not counting so many that were planned for."""
-        return (count + 1) / (len(self.states) - planned + 2)
+        """The upper 95 % limit of the probability of what so many of the draws do: it is never 0.
+
+        The exact limit (Clopper and Pearson), without so many draws that were planned for.
+        """
+        draws = len(self.states) - planned
+        return float(betaincinv(count + 1, draws - count, _CONFIDENCE)) if count < draws else 1.0
 
     def enough(self, bound: float, planned: int = 0) -> int:
-        """The least number of draws whose `chance` is not below a bound."""
-        return max(1, math.ceil(bound * (len(self.states) - planned + 2) - 1))
+        """The least number of draws whose `chance` is not below a bound, 1 at least."""
+        draws = len(self.states) - planned
+        return max(1, next((k for k in range(draws) if self.chance(k, planned) >= bound), draws))
 
     def share(self, u: FloatArray, bound: float) -> tuple[float, float]:
-        """The largest share of inputs whose probability of leaving the limit is below a bound, and that probability.
+        """The largest share of inputs whose `probability` of leaving the limit is below a bound, and that probability.
 
         Returns:
             The share, in (0, 1], or 0 where even no input is too much; and the probability at it.

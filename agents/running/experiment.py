@@ -49,7 +49,7 @@ class Designed:
         after: parameter to the standard deviation that is to be expected after it: the median over the belief.
         gain: nats that the coefficients are expected to gain.
         share: of what the policy chose that is safe.
-        probability: that the output leaves the rig's range, under the belief.
+        probability: at most that of leaving the range, under the belief (`agents.planner.futures.Futures.chance`).
     """
 
     rig: Rig

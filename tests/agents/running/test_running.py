@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from loopback import RIG, RIG_FILE, TRUTH
+from scipy.stats import binomtest
 
 import duffing_env  # noqa: F401
 from agents import make_policy
@@ -315,7 +316,10 @@ def test_the_draws_that_leave_are_those_whose_outputs_do():
     assert 20 < len(leaving) < 280
     assert futures.leaving(u, 1000) == leaving
     assert futures.leaving(u, 7) == leaving[:7]
-    assert futures.probability(u) == futures.chance(len(leaving)) == (len(leaving) + 1) / (len(outputs) + 2)
+    most = binomtest(len(leaving), len(outputs), alternative="less").proportion_ci(0.95).high
+    assert futures.probability(u) == futures.chance(len(leaving)) == pytest.approx(most, rel=1e-9)
+    assert futures.leaving(u, 1000, planned=leaving[:9]) == leaving[9:]
+    assert futures.chance(0, planned=200) == pytest.approx(1 - 0.05 ** (1 / (len(outputs) - 200)), rel=1e-9)
     for bound in (0.003, 0.01, 0.0125, 0.05, 0.5):
         enough = futures.enough(bound)
         assert futures.chance(enough) >= bound > futures.chance(enough - 1) or enough == 1
