@@ -150,6 +150,41 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
     )
 
 
+@pytest.mark.parametrize("first", [0, 21])
+@pytest.mark.parametrize("members", [1, 21, 40])
+def test_a_mixture_has_the_moments_of_its_finite_members(members, first):
+    """Wherever they lie, also over three blocks; and to the last bit the same wherever they do."""
+    names, rng = 3, np.random.default_rng(members)
+    means, roots = rng.standard_normal((members, names)), rng.standard_normal((members, names, names))
+    covs, noises = roots @ roots.swapaxes(1, 2), rng.uniform(1.0, 5.0, (members, 4))
+    upper = np.triu_indices(names)
+    records = np.column_stack([means, covs[:, upper[0], upper[1]], noises])
+    weights = rng.dirichlet(np.ones(members))
+    if members > 1:
+        records[1, 4], records[2, 0], weights[3] = np.nan, np.inf, 0.0
+    found = mixing(names)
+    before = np.full((first, records.shape[1]), np.nan)
+    memory, record = found.memory_for(members), np.empty(records.shape[1])
+    found.mix(side_by_side(np.concatenate([before, records]), LANES), first, weights, memory, record, 0, 1)
+    kept = np.isfinite(records).all(axis=1) & (weights > 0)
+    shares = np.where(kept, weights, 0.0) / weights[kept].sum()
+    mean = shares[kept] @ means[kept]
+    off = means[kept] - mean
+    cov = np.einsum("m,mij->ij", shares[kept], covs[kept] + off[:, :, None] * off[:, None, :])
+    gammas = [matched_gamma(shares[kept], noises[kept, k], noises[kept, k + 1]) for k in (0, 2)]
+    expected = np.concatenate([mean, cov[upper], *gammas])
+    np.testing.assert_allclose(record, expected, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(memory[:, :LANES].ravel()[:members], shares, rtol=1e-14)
+    side, at_begin = found.mixture(side_by_side(records, LANES), weights)
+    np.testing.assert_array_equal(record, at_begin)
+    np.testing.assert_allclose(side, shares, rtol=1e-14)
+
+
+def test_a_mixture_of_no_finite_member_is_nothing():
+    records = np.full((2, 3 + 6 + 4), np.nan)
+    assert np.isnan(mixing(3).mixture(side_by_side(records, LANES), np.full(2, 0.5))[1]).all()
+
+
 # --- The estimator -------------------------------------------------------------------------------------------------
 
 
