@@ -30,7 +30,11 @@ _EQUATION_1 = "duffing_env/Continuous-v0"
 if _EQUATION_1 not in gym.registry:
     _EQUATION_1 = "duffing_env/Amplitude-v1"
 KNOWN: dict[str, Any] = {"noise_range": 1.0, "noise_hypotheses": 1} if _EQUATION_1.endswith("1") else {}
-TRACKS = {"Eq. (2)": "duffing_env/Amplitude-v0", "Eq. (1)": _EQUATION_1}
+TRACKS = {
+    "Eq. (2)": "duffing_env/Amplitude-v0",
+    "Eq. (1)": _EQUATION_1,
+    "Eq. (1), noises unknown": "duffing_env/Amplitude-v1",
+}
 HAS_ENGINE = find_spec("estimator.engine") is not None
 
 Action = Callable[[int], float]
@@ -114,6 +118,7 @@ def inference(equation: str) -> Action:
 def steps(equation: str) -> Action:
     """The whole step through make_vec, with resets and endings; steps that only start an episode do not count."""
     options: Any = {"num_envs": SIZE, "vectorization_mode": "vector_entry_point", "threads": 2}
+    options |= KNOWN if equation == "Eq. (1)" else {}
     envs = gym.make_vec(TRACKS[equation], **options)
     actions = np.random.default_rng(0).uniform(-1, 1, (DRAWN_ACTIONS, SIZE, 1)).astype(np.float32)
     envs.reset(seed=1)

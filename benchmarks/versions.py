@@ -23,6 +23,7 @@ ROWS = {
     "inference Eq. (1)": ("env-steps/s", 0.95),
     "steps Eq. (2)": ("env-steps/s", 1.3),
     "steps Eq. (1)": ("env-steps/s", None),
+    "steps Eq. (1), noises unknown": ("env-steps/s", None),
     "samples Eq. (2)": ("µs/sample", None),
     "samples Eq. (1)": ("µs/sample", None),
 }
