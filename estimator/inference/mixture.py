@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimator.arrays import fill
 from estimator.engine.moments import moments
 from estimator.lanes import LANES, jit, kernel, part
 
@@ -105,24 +104,29 @@ def mixing(names: int) -> Mixing:
         return np.ones((-(-members // LANES), n_rows * LANES))
 
     @inner
+    def nothing(memory):
+        # Numbers of turns that the compiler does not know: those that it does it writes out, which takes seconds.
+        return memory.shape[1] // LANES - n_rows
+
+    @inner
     def collect(blocks, first, weights, memory):
         """Copy the records of all members, and share out the weight among those that are finite.
 
         The others get the record of the likeliest. Gives the weight that was left, and who is the likeliest.
         """
-        members, m = len(weights), 0
+        members, m, zero = len(weights), 0, nothing(memory)
         while m < members:
             b, j, c, k = (first + m) // LANES, (first + m) % LANES, m // LANES, m % LANES
             count = min(members - m, LANES - j, LANES - k)
-            block, side = blocks[b], memory[c]
-            for i in range(size):
+            for i in range(size + zero):
                 start, to = i * LANES + j, (record_at + i) * LANES + k
                 for n in range(count):
-                    side[to + n] = block[start + n]
+                    memory[c, to + n] = blocks[b, start + n]
             m += count
         for c in range(len(memory)):
             check(memory[c])
-            fill(memory[c, max(0, min(LANES, members - c * LANES)) : LANES], 0.0)
+            for k in range(max(0, members - c * LANES), LANES):
+                memory[c, k] = 0.0
         total, likely, most = 0.0, 0, 0.0
         for m in range(members):
             c, k = m // LANES, m % LANES
@@ -149,35 +153,37 @@ def mixing(names: int) -> Mixing:
     @inner
     def everywhere(memory, row, value):
         for c in range(len(memory)):
-            fill(memory[c, row * LANES : (row + 1) * LANES], value)
+            for k in range(row * LANES, (row + 1) * LANES):
+                memory[c, k] = value
 
     @inner
     def mix(blocks, first, weights, memory, record, at, stride):
+        zero = nothing(memory)
         total, likely = collect(blocks, first, weights, memory)
         if not total > 0.0:
-            for i in range(size):
+            for i in range(size + zero):
                 record[at + i * stride] = np.nan
             return
-        for i in range(names):
+        for i in range(names + zero):
             start = memory[likely // LANES, (record_at + i) * LANES + likely % LANES]
             record[at + i * stride] = start
             everywhere(memory, about_at + i, start)
         for c in range(len(memory)):
             means(memory[c])
-        for i in range(names):
+        for i in range(names + zero):
             record[at + i * stride] += told(memory, i)
             everywhere(memory, about_at + i, record[at + i * stride])
         for c in range(len(memory)):
             spreads(memory[c])
-        for p in range(n_pairs):
+        for p in range(n_pairs + zero):
             record[at + (names + p) * stride] = told(memory, p)
-        for k in range(2):
+        for k in range(2 + zero):
             variance = told(memory, n_pairs + k)
             record[at + (shapes + 2 * k + 1) * stride] = variance
             everywhere(memory, about_at + names + k, variance)
         for c in range(len(memory)):
             tails(memory[c])
-        for k in range(2):
+        for k in range(2 + zero):
             spread, rate = told(memory, k), at + (shapes + 2 * k + 1) * stride
             record[rate - stride], record[rate] = 1.0 / spread, record[rate] / spread
 
