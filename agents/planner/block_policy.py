@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from agents.planner.blocks import best_block, drafts, systems_of
+from agents.planner.blocks import MOST_PLANNED, best_block, drafts, systems_of
 from agents.planner.futures import Futures, drawn_from_records, draws_for
 from agents.planner.motion import places
 from agents.planner.policy import Planner
@@ -92,7 +92,7 @@ class BlockPlanner:
         (belief,) = self._env.experiment.believed.with_records(record[None])
         bound = max(_FINEST, self._bound * samples)
         records, weights = self._env.mixture(i)
-        drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound))
+        drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound, MOST_PLANNED))
         futures = Futures(view.model, drawn, self._limit, rng, degree=view.degree)
         systems = systems_of(view, belief, futures, seen, last)
         u, *_ = best_block(

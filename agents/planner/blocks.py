@@ -5,9 +5,9 @@ A block is planned for systems that are drawn from the belief, not for its means
     J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / aim - 1)²],
 
 by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. A block
-is played only when at most a given share of some hundred further draws leaves the limit (`agents.planner.futures`). Of
-those that do, some are then planned for, too, and tell no longer how safe a block is; and the *aim* is a bit lower. It
-begins as the planner's own plan for the belief's means.
+is played only when so few of some hundred further draws leave the limit that the probability is below a bound, with a
+confidence of 95 % (`agents.planner.futures`). Of those that leave, some are then planned for, too, and tell no longer
+how safe a block is; and the *aim* is a bit lower. It begins as the planner's own plan for the belief's means.
 """
 
 from __future__ import annotations
@@ -48,6 +48,9 @@ _COARSE = 2
 #: last number. Each time so many systems that leave the limit are added to those that are planned for.
 _AIM, _AIMS, _ADDED = 0.998, 16, 8
 _FALL, _FASTER, _FASTEST = 0.005, 1.5, 0.05
+
+#: Draws that a block is planned for, at most.
+MOST_PLANNED = SYSTEMS + _AIMS * _ADDED
 
 #: Penalty [nats] of what goes beyond the aim: one system of all must not leave it far for what the others tell.
 _PENALTY = 3e4

@@ -17,9 +17,6 @@ from estimator.parameters import FloatArray
 #: Systems that are drawn from a belief, at least.
 DRAWS = 500
 
-#: Draws that a block may be planned for, at most: they do not tell how safe it is.
-MOST_PLANNED = 160
-
 #: How certain it is that a probability is no more than what the draws tell of it.
 _CONFIDENCE = 0.95
 
@@ -33,9 +30,9 @@ _HELD = np.sqrt(3.0)
 Drawn = tuple[FloatArray, FloatArray]
 
 
-def draws_for(bound: float) -> int:
-    """Systems that can tell a probability below a bound: if none of those that are left leaves the limit."""
-    return max(DRAWS, math.ceil(-math.log(1.0 - _CONFIDENCE) / bound) + MOST_PLANNED)
+def draws_for(bound: float, planned: int) -> int:
+    """Systems that can tell a probability below a bound, also where so many of them are planned for."""
+    return max(DRAWS, math.ceil(-math.log(1.0 - _CONFIDENCE) / bound) + planned)
 
 
 def drawn_from_records(

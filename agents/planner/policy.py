@@ -72,7 +72,7 @@ class PlannerState(NamedTuple):
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
 _HORIZON = 40
 
-#: Moves that an episode has at least, where one can have so many: more are finer, and take longer.
+#: Moves that a short episode is divided into: none is longer than these need to reach its end.
 _LEAST_MOVES = 24
 
 #: Moves of a plan, at most.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from agents.planner.blocks import Systems, best_block, drafts, expected, systems_of
+from agents.planner.blocks import MOST_PLANNED, Systems, best_block, drafts, expected, systems_of
 from agents.planner.futures import Futures, drawn_at_rest, draws_for, rests
 from agents.planner.motion import View
 from agents.planner.policy import Planner
@@ -120,7 +120,7 @@ def design(
     observed = Observed(rig, belief, int(samples))
     rng = np.random.default_rng(seed)
     view, limit = View.of(observed.experiment), float(observed.experiment.max_output)
-    drawn = drawn_at_rest(belief, rng, draws_for(bound))
+    drawn = drawn_at_rest(belief, rng, draws_for(bound, MOST_PLANNED))
     futures = Futures(view.model, drawn, limit, rng, max(0, rig.delay), view.degree)
     systems = systems_of(view, belief, futures, int(samples))
     chooser = make_policy(policy, observed, seed=seed)  # type: ignore[arg-type]
