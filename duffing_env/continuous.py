@@ -160,6 +160,7 @@ class ContinuousEnv(DuffingEnv):
     >>> import duffing_env
     >>> env = gym.make("duffing_env/Amplitude-v1")
     >>> observation, info = env.reset(seed=1)
+    >>> _ = env.action_space.seed(1)
     >>> truncated = False
     >>> while not truncated:
     ...     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())

@@ -165,6 +165,7 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     >>> import duffing_env
     >>> env = gym.make("duffing_env/Amplitude-v0", reward="log_posterior")
     >>> observation, info = env.reset(seed=1)
+    >>> _ = env.action_space.seed(1)
     >>> total = 0.0
     >>> for _ in range(256):
     ...     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
