@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.experiment import Experiment
-from duffing_env.hypotheses import member_layout
+from duffing_env.hypotheses import abreast, blocks_of_members
 from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, noise_rows, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
@@ -49,7 +49,8 @@ class Batch:
         self._kind = experiment.kind
         self._kernel = compiled(self._kind)
         self._place = layout_of(self._kind)
-        self._packed = pack(experiment.setup._replace(hold=hold, limit=limit))
+        self._setup = experiment.setup._replace(hold=hold, limit=limit, abreast=abreast(size))
+        self._packed = pack(self._setup)
         self._prior = experiment.believed
         model, drawn = experiment.truth_model, experiment.setup.noise_range > 1
         self._truth = {name: f"PARAM_{name}" for name in parameter_names(model)} | (noise_rows(model) if drawn else {})
@@ -61,9 +62,8 @@ class Batch:
         padded = n_blocks * LANES
         self._blocks = np.zeros((n_blocks, n_rows, LANES))
         self._flat_blocks = self._blocks.reshape(n_blocks, -1)
-        count = len(experiment.setup.hypotheses) * size
-        n_member_rows = max(member_layout(self._kind).values()) + 1 if count else 0
-        self._members = np.zeros((-(-count // LANES), n_member_rows * LANES))
+        n_members = blocks_of_members(size, len(self._setup.hypotheses))
+        self._members = np.zeros((n_members, (record_size(experiment.model) + 1) * LANES))
         self._ended = np.zeros_like(self._blocks)
         self._flat_ended = self._ended.reshape(n_blocks, -1)
         self._saved = np.zeros((threads, 2 * n_rows * LANES))
@@ -125,7 +125,7 @@ class Batch:
 
         Standard deviations that ``truth`` has as NaN stay as they were drawn.
         """
-        setup, n = self.experiment.setup, len(parameter_names(self.experiment.truth_model))
+        setup, n = self._setup, len(parameter_names(self.experiment.truth_model))
         kept = [place for name, place in self._place.items() if name.startswith(("STREAM_", "JUMP_"))]
         noises = [self._place[row] for row in noise_rows(self.experiment.truth_model).values()]
         for row in np.flatnonzero(mask).tolist():
@@ -211,12 +211,14 @@ class Batch:
 
     def mixture(self, index: int) -> tuple[FloatArray, FloatArray]:
         """Records (m, size) and weights (m,) of the beliefs that environment ``index`` weighs: one, or its members."""
-        size, count = record_size(self.experiment.model), len(self.experiment.setup.hypotheses)
+        count = len(self._setup.hypotheses)
         if not count:
             return self.records()[index : index + 1], np.ones(1)
-        lanes = np.arange(index * count, (index + 1) * count)
-        members = self._members.reshape(len(self._members), -1, LANES)[lanes // LANES, :, lanes % LANES]
-        return members[:, :size].copy(), members[:, member_layout(self._kind)["WEIGHT"]].copy()
+        (block, lane), n = divmod(index, LANES), self._setup.abreast
+        places = block * blocks_of_members(n, count) * LANES + np.arange(count) * n + lane
+        rows = self._members.reshape(len(self._members), -1, LANES).swapaxes(1, 2)
+        members = rows[places // LANES, places % LANES]
+        return members[:, :-1].copy(), members[:, -1].copy()
 
     def belief(self, index: int) -> Belief:
         """The belief of environment ``index``."""

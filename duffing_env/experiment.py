@@ -214,6 +214,7 @@ class Experiment:
             "terminated_return": float(self.terminated_return or 0.0),
             "as_published": False,
             "delay": 0,
+            "abreast": 1,
             "prior": first,
             "inverse_std": 1.0 / np.sqrt(np.diag(prior.coefficients_cov)),
             "log_precisions": np.log(precisions[::2] / precisions[1::2]),

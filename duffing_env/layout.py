@@ -96,6 +96,7 @@ class Setup(NamedTuple):
         terminated_return: see there.
         as_published: whether mean field departs from the paper as its published run did.
         delay: samples between a recorded input and the output it acts on.
+        abreast: environments of a block whose members lie beside each other (`duffing_env.hypotheses`).
         prior: (size,) record that episodes start from.
         inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
         log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
@@ -128,6 +129,7 @@ class Setup(NamedTuple):
     terminated_return: float
     as_published: bool
     delay: int
+    abreast: int
     prior: npt.NDArray[np.float64]
     inverse_std: npt.NDArray[np.float64]
     log_precisions: npt.NDArray[np.float64]

@@ -7,6 +7,7 @@ raise for other shapes, with all that writes numbers as text.
 from __future__ import annotations
 
 from estimator.lanes import jit
+from estimator.straight import straight
 
 
 @jit
@@ -14,6 +15,16 @@ def copy(into, at, given, count):
     """The first ``count`` numbers of ``given`` go into ``into``, from ``at`` on; both are flat."""
     for i in range(count):
         into[at + i] = given[i]
+
+
+@straight
+def copy_lanes(into, at, given, start, count):
+    """``count`` numbers of ``given`` from ``start`` on go into ``into`` from ``at`` on, at least one; both are flat.
+
+    Straight, so that it takes several numbers at a time: NumPy's places may be counted from the end, these may not.
+    """
+    for i in range(count):
+        into[at + i] = given[start + i]
 
 
 @jit

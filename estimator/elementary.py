@@ -23,21 +23,32 @@ _LN2_LOW = 1.90821492927058770002e-10
 
 
 @straight
-def log(x):
-    """Natural logarithm of a positive, normal number, to 3 units in the last place.
-
-    x = 2^k m with m in [sqrt(1/2), sqrt(2)) and log m = 2 artanh(s), s = (m - 1)/(m + 1), by the minimax polynomial
-    in s^2 of fdlibm's ``log``. Zero, infinities and NaN give a finite or NaN value without meaning.
-    """
+def _split(x):
+    """The k and m with x = 2^k m and m in [sqrt(1/2), sqrt(2)), of a positive, normal number."""
     bits = np.float64(x).view(np.int64)
     k = (bits - _SQRT_HALF_BITS) >> _MANTISSA_BITS
-    m = np.int64(bits - (k << _MANTISSA_BITS)).view(np.float64)
-    s = (m - 1.0) / (m + 1.0)
+    return k, np.int64(bits - (k << _MANTISSA_BITS)).view(np.float64)
+
+
+@straight
+def _joined_log(k, f):
+    """log(2^k (1 + f)), with log(1 + f) = 2 artanh(s), s = f/(2 + f), by the minimax polynomial of fdlibm's ``log``."""
+    s = f / (2.0 + f)
     z = s * s
     p = 0.1531383769920937332 + z * 0.1479819860511658591
     p = 0.2222219843214978396 + z * (0.1818357216161805012 + z * p)
     p = 0.6666666666666735130 + z * (0.3999999999940941908 + z * (0.2857142874366239149 + z * p))
     return k * _LN2_HIGH + (2.0 * s + (s * (z * p) + k * _LN2_LOW))
+
+
+@straight
+def log(x):
+    """Natural logarithm of a positive, normal number, to 3 units in the last place.
+
+    Zero, infinities and NaN give a finite or NaN value without meaning.
+    """
+    k, m = _split(x)
+    return _joined_log(k, m - 1.0)
 
 
 @jit
@@ -56,24 +67,32 @@ def digamma(a):
 def log1p(x):
     """Logarithm of 1 + x, x > -1, to 4 units in the last place, also where 1 + x has lost most digits of x."""
     u = 1.0 + x
-    return log(u) + (x - (u - 1.0)) / u
+    k, m = _split(u)
+    lost = (x - (u - 1.0)) * (np.int64((1023 - k) << _MANTISSA_BITS).view(np.float64))
+    return _joined_log(k, (m - 1.0) + lost)
 
 
 @straight
-def log_gamma_half_step(a):
-    """Log Gamma(a + 1/2) - log Gamma(a) of a > 0, to rounding also where both are of the order of 1e9.
+def gamma_half_step(a):
+    """The r and t with Γ(a + 1/2) / Γ(a) = exp(-t) / sqrt(r), of a > 0, to rounding up to a of 1e9 and more.
 
-    Ten steps of the recurrence, then the asymptotic series of Gamma(a + 1/2) / Gamma(a).
+    Ten steps of the recurrence, then the asymptotic series of Γ(a + 1/2) / Γ(a).
     """
     below = a * (a + 1.0) * (a + 2.0) * (a + 3.0) * (a + 4.0) * (a + 5.0) * (a + 6.0) * (a + 7.0) * (a + 8.0)
     above = (a + 0.5) * (a + 1.5) * (a + 2.5) * (a + 3.5) * (a + 4.5) * (a + 5.5) * (a + 6.5) * (a + 7.5) * (a + 8.5)
     # Of a very large shape the products overflow, and are as good as equal.
-    stepped = (below * (a + 9.0)) / (above * (a + 9.5)) if a < 1e30 else 1.0
-    b = a + 10.0
-    inverse = 1.0 / b
+    stepped = (above * (a + 9.5)) / (below * (a + 9.0)) if a < 1e30 else 1.0
+    inverse = 1.0 / (a + 10.0)
     z = inverse * inverse
     series = 1 / 640 - z * (17 / 14336 - z * (31 / 18432 - z * (691 / 180224 - z * (5461 / 425984))))
-    return 0.5 * log(stepped * stepped * b) - inverse * (1 / 8 - z * (1 / 192 - z * series))
+    return stepped * stepped * inverse, inverse * (1 / 8 - z * (1 / 192 - z * series))
+
+
+@straight
+def log_gamma_half_step(a):
+    """Log Gamma(a + 1/2) - log Gamma(a) of a > 0, to rounding also where both are of the order of 1e9."""
+    r, t = gamma_half_step(a)
+    return -0.5 * log(r) - t
 
 
 @jit

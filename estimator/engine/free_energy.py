@@ -5,38 +5,32 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from estimator.elementary import LOG_2PI, log, log1p, log_gamma_half_step
+from estimator.elementary import LOG_2PI, gamma_half_step, log, log1p
 from estimator.engine import cache as stored
 from estimator.models.model import Model
 from estimator.straight import straight
 
 
 @straight
-def half_noise_powers(innovation, variance, q, r):
+def half_noise_powers(step, weight, q, r):
     """Half of E[w²] and of E[v²] under the Kalman step with noise variances q and r.
 
     Args:
-        innovation: what was seen less what was predicted.
-        variance: of the prediction, without this sample's noises.
+        step: the innovation, what was seen less what was predicted, times the weight.
+        weight: inverse of the prediction's variance with this sample's noises.
         q: variance of the process noise as the sensor shows it, 1/E[γ].
         r: variance of the sensor's noise, 1/E[ξ].
     """
-    weight = 1.0 / (variance + q + r)
-    step = innovation * weight
     w = q * step
     v = r * step
     return 0.5 * (w * w + q * (1.0 - q * weight)), 0.5 * (v * v + r * (1.0 - r * weight))
 
 
 @straight
-def gaussian_part(innovation, total):
-    """½ log 2πS + e²/2S: the Gaussian's own evidence at the noise variances of an iteration."""
-    return 0.5 * (LOG_2PI + log(total) + innovation * innovation / total)
-
-
-@straight
 def precision_part(half_power, variance, shape, rate):
     """What the belief in a precision adds: the moment and logarithm it moved to, and its divergence from the prior.
+
+    The three have terms in ψ(shape + 1/2), and in half_power/(rate + half_power), that cancel.
 
     Args:
         half_power: half of the noise's second moment.
@@ -44,11 +38,12 @@ def precision_part(half_power, variance, shape, rate):
         shape: of the precision before the sample.
         rate: of the precision before the sample.
 
-    The three have terms in ψ(shape + 1/2), and in half_power/(rate + half_power), that cancel.
+    Returns:
+        f and t: it adds ½ log f + t. The logarithms of a sample are taken of one product: they are most of the work.
     """
     precision = 1.0 / variance
-    moved = 0.5 * log((rate + half_power) * precision) - half_power * precision
-    return moved + shape * log1p(half_power / rate) - log_gamma_half_step(shape)
+    r, t = gamma_half_step(shape)
+    return (rate + half_power) * precision * r, shape * log1p(half_power / rate) - half_power * precision + t
 
 
 def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str, int], every: bool = True) -> Any:
@@ -80,9 +75,14 @@ def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str
                     f"g, n = {at('GAMMA_SHAPE')} - 0.5, {at(f'XI_SHAPE_{sensor}')} - 0.5",
                     f"g_rate, n_rate = g * {at(f'TRACE_{k}_q_0')}, n * {at(f'TRACE_{k}_r_0')}",
                     f"q, r = {at(f'TRACE_{k}_q_{i}')}, {at(f'TRACE_{k}_r_{i}')}",
-                    "half_w, half_v = half_noise_powers(e, s, q, r)",
-                    "value = gaussian_part(e, s + q + r) + precision_part(half_v, r, n, n_rate)",
-                    "value = value + (precision_part(half_w, q, g, g_rate) if q > 0.0 else 0.0)",
+                    "weight = 1.0 / (s + q + r)",
+                    "step = e * weight",
+                    "half_w, half_v = half_noise_powers(step, weight, q, r)",
+                    "# The Gaussian's own evidence is ½ log 2πS + e²/2S at the noise variances of the iteration.",
+                    "f, t = precision_part(half_v, r, n, n_rate)",
+                    "f_w, t_w = precision_part(half_w, q, g, g_rate)",
+                    "f, t = (f * f_w if q > 0.0 else f), (t + t_w if q > 0.0 else t)",
+                    "value = 0.5 * (LOG_2PI + log((s + q + r) * f) + e * step) + t",
                     "sound = s + q + r > 0.0 and r > 0.0 and n_rate > 0.0 and half_v >= 0.0 and q >= 0.0",
                     f"{found} = (value if sound else NAN) if y == y else 0.0",
                 ]
@@ -91,6 +91,7 @@ def free_energies(model: Model, iterations: int, lanes: int, layout: Mapping[str
         loop = ["@straight", "def free_energies(W, B):", f"    for LANE in range({lanes}):"]
         return "\n".join(loop + [f"        {line}" for line in lines]) + "\n"
 
-    names = {"NAN": float("nan")} | {f.__name__: f for f in (gaussian_part, precision_part, half_noise_powers)}
+    names = {"NAN": float("nan"), "LOG_2PI": LOG_2PI, "log": log}
+    names |= {f.__name__: f for f in (precision_part, half_noise_powers)}
     key = repr((model.digest, iterations, lanes, sorted(layout.items()), every))
     return stored.load(model.name, "free-energy", key, make, names).free_energies

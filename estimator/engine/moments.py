@@ -1,6 +1,6 @@
-"""The first two moments of a mixture of beliefs, whose members lie side by side in the lanes of a block.
+"""The first two moments of mixtures of beliefs, one member after another, for several systems at once.
 
-With shares s_m, means x_m and covariances P_m, and x* the mean of one of them,
+With shares s_m, means x_m and covariances P_m, and x* the mean of one of the members,
 
     x = x* + Σ_m s_m (x_m - x*),   P = Σ_m s_m (P_m + (x_m - x)(x_m - x)ᵀ):
 
@@ -11,100 +11,68 @@ of the noises' variances: that of a member is v_m = rate/shape, as it acts in an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from itertools import combinations_with_replacement
 from typing import Any
 
 from estimator.engine import cache as stored
-from estimator.lanes import LANES, rows
+from estimator.lanes import LANES
 
 #: Noises of a belief: of the process and of a sensor.
-_NOISES = 2
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Sums over the lanes of a block (`estimator.lanes`), which they leave in the first lane of the rows ``T_<k>``.
-
-    Attributes:
-        check: ``check(B)``: SHARE becomes 1 where all numbers of a record are finite, and 0 elsewhere.
-        means: ``means(B)``: T_i becomes Σ s (X_i - ABOUT_i) of every state and coefficient i.
-        spreads: ``spreads(B)``: T_p becomes Σ s (P_p + (X_i - ABOUT_i)(X_j - ABOUT_j)) of every pair p = (i, j) with
-            i <= j; the T after them Σ s v of each noise. The rates become v.
-        tails: ``tails(B)``: T_k becomes the relative variance of noise k, with its V in the row ``V_<k>``.
-        layout: rows of the block: the members' shares ``SHARE``; their records, as `estimator.Belief` keeps them, from
-            the row ``X_0`` on; what is the same in all lanes; and the sums.
-    """
-
-    check: Any
-    means: Any
-    spreads: Any
-    tails: Any
-    layout: Mapping[str, int]
+NOISES = 2
 
 
 @cache
-def moments(names: int) -> Moments:
-    """The moments of beliefs in so many states and coefficients, of one sensor."""
+def moments(names: int) -> Any:
+    """The moments of beliefs in so many states and coefficients, of one sensor.
+
+    The functions are of one member of each of n systems. Their records lie in lanes ``at`` to ``at + n`` of a block B,
+    number i in row i (`estimator.Belief`), and their shares are S[s] to S[s + n]; what has no share does not count,
+    whatever its numbers. The mixtures' records lie in another block X, from lane 0 on.
+
+    Returns:
+        A namespace of
+
+        - ``check(B, at, S, s, n)``: S becomes 0 where all numbers of the record are finite, and NaN elsewhere;
+        - ``means(B, at, S, s, A, X, n)``: adds s (x - x*) to X, with x* in the rows of a block A;
+        - ``spreads(B, at, S, s, X, n)``: adds s (P + (x - X)(x - X)ᵀ) and, in the rows of the rates, s v;
+        - ``tails(B, at, S, s, X, n)``: adds the relative variances of the noises in the rows of the shapes.
+    """
+    return stored.load("mixture", "moments", str(names), lambda: _source(names), {})
+
+
+def _source(names: int) -> str:
     pairs = list(combinations_with_replacement(range(names), 2))
-    place = rows(
-        "SHARE",
-        " ".join(f"X_{i}" for i in range(names)),
-        " ".join(f"P_{i}_{j}" for i, j in pairs),
-        " ".join(f"SHAPE_{k} RATE_{k}" for k in range(_NOISES)),
-        " ".join(f"ABOUT_{i}" for i in range(names)),
-        " ".join(f"V_{k}" for k in range(_NOISES)),
-        " ".join(f"T_{k}" for k in range(len(pairs) + _NOISES)),
-    )
-    code = stored.load("mixture", "moments", str(names), lambda: _source(names, pairs, place), {})
-    return Moments(code.check, code.means, code.spreads, code.tails, place)
+    shapes = [names + len(pairs) + 2 * k for k in range(NOISES)]
+    size = names + len(pairs) + 2 * NOISES
 
+    def own(i: int) -> str:
+        return f"B[{i * LANES} + at + LANE]"
 
-def _source(names: int, pairs: list[tuple[int, int]], place: Mapping[str, int]) -> str:
-    import sympy as sp
+    def mixed(i: int) -> str:
+        return f"X[{i * LANES} + LANE]"
 
-    from estimator.engine import emit
-    from estimator.engine.derive import symbol
+    def adding(i: int, told: str) -> str:
+        return f"{mixed(i)} = {mixed(i)} + ({told} if share > 0.0 else 0.0)"
 
-    share, record = symbol("SHARE"), list(place)[1 : place["ABOUT_0"]]
-    sound = [("sound", sp.Mul(*(sp.Function("finite")(symbol(row)) for row in record)))]
-    off = [symbol(f"X_{i}") - symbol(f"ABOUT_{i}") for i in range(names)]
-    means = [(f"told_{i}", share * off[i]) for i in range(names)]
+    def loop(name: str, arguments: str, lines: list[str]) -> str:
+        head = f"@straight\ndef {name}(B, at, S, s, {arguments}n):\n    for LANE in range(n):\n"
+        return head + "".join(f"        {line}\n" for line in lines)
 
-    away = [(f"off_{i}", off[i]) for i in range(names)]
-    spreads = [
-        (f"told_{p}", share * (symbol(f"P_{i}_{j}") + symbol(f"off_{i}") * symbol(f"off_{j}")))
-        for p, (i, j) in enumerate(pairs)
-    ]
-    variances = [(f"variance_{k}", symbol(f"RATE_{k}") / symbol(f"SHAPE_{k}")) for k in range(_NOISES)]
-    spreads += [(f"told_{len(pairs) + k}", share * symbol(f"variance_{k}")) for k in range(_NOISES)]
-
-    ratios = [(f"ratio_{k}", symbol(f"RATE_{k}") / symbol(f"V_{k}")) for k in range(_NOISES)]
-    tails = [
-        (f"told_{k}", share * (symbol(f"ratio_{k}") ** 2 / symbol(f"SHAPE_{k}") + (symbol(f"ratio_{k}") - 1) ** 2))
-        for k in range(_NOISES)
-    ]
-
-    def summed(name: str, lines: Any, count: int, kept: Mapping[str, str]) -> str:
-        """A loop over the lanes, and the sums of what it leaves in the first rows T, half by half."""
-        results = {f"T_{k}": f"told_{k}" for k in range(count)}
-        source = emit.lane_loop(name, lines, results | dict(kept), place, LANES, doc="Sums over the lanes.")
-        width = LANES // 2
-        while width:
-            source += f"    for LANE in range({width}):\n"
-            for k in range(count):
-                at = place[f"T_{k}"] * LANES
-                source += f"        W[{at} + LANE] = W[{at} + LANE] + W[{at + width} + LANE]\n"
-            width //= 2
-        return "@straight\n" + source
-
-    rates = {f"RATE_{k}": f"variance_{k}" for k in range(_NOISES)}
-    checked = emit.lane_loop("check", sound, {"SHARE": "sound"}, place, LANES, doc="Whose numbers are all finite.")
+    share = "share = S[s + LANE]"
+    check = [f"S[s + LANE] = {' + '.join(f'0.0 * {own(i)}' for i in range(size))}"]
+    means = [share, *(adding(i, f"share * ({own(i)} - A[{i * LANES} + LANE])") for i in range(names))]
+    spreads = [share, *(f"off_{i} = {own(i)} - {mixed(i)}" for i in range(names))]
+    spreads += [adding(names + p, f"share * ({own(names + p)} + off_{i} * off_{j})") for p, (i, j) in enumerate(pairs)]
+    spreads += [adding(i + 1, f"share * ({own(i + 1)} / {own(i)})") for i in shapes]
+    tails = [share]
+    for k, i in enumerate(shapes):
+        tails += [
+            f"inverse_{k} = 1.0 / {own(i)}",
+            f"away_{k} = {own(i + 1)} * inverse_{k} / {mixed(i + 1)} - 1.0",
+            adding(i, f"share * ((away_{k} + 1.0) * (away_{k} + 1.0) * inverse_{k} + away_{k} * away_{k})"),
+        ]
     return (
-        f"@straight\n{checked}"
-        + summed("means", means, names, {})
-        + summed("spreads", away + variances + spreads, len(pairs) + _NOISES, rates)
-        + summed("tails", ratios + tails, _NOISES, {})
-    )
+        loop("check", "", check) + loop("means", "A, X, ", means)
+        + loop("spreads", "X, ", spreads) + loop("tails", "X, ", tails)
+    )  # fmt: skip

@@ -1,4 +1,8 @@
-"""The mixture of hypotheses about the noises (`estimator.ensemble`), compiled: their weights, and its moments."""
+"""Mixtures of hypotheses about the noises (`estimator.ensemble`), compiled: their weights, and their moments.
+
+Everything here is of n systems at once, so that the compiler may work on several at a time. Of one system, each sum
+over the members goes from the first to the last, so that a system comes out the same however many there are.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimator.engine.moments import moments
+from estimator.arrays import fill
+from estimator.elementary import exp, log
+from estimator.engine.moments import NOISES, moments
 from estimator.lanes import LANES, jit, kernel, part
 
 #: Probability per sample that the hypothesis is drawn anew: no weight stays below it for good.
@@ -15,74 +21,99 @@ SWITCHING = 1e-6
 
 
 @jit
-def weigh(weights, each, predictions, energies, forecasts):
-    """Weigh the members by their free energies of one sample.
+def switch(weights, each):
+    """Let the hypothesis be drawn anew, and leave out the members that are no longer finite.
 
     Args:
-        weights: (M,) before it; overwritten with those after it.
-        each: (M, iterations) free energies of the members [nats].
-        predictions: (M, sensors, 2) mean and variance of each output before it was seen.
-        energies: (iterations,) receives those of the mixture, from the weights before.
-        forecasts: (sensors, 2) receives mean and variance of the mixture before the output was seen.
-
-    A member whose numbers are not finite has no weight. Where none is left, all results are NaN.
+        weights: (M, n) of the members; overwritten. NaN where none is left.
+        each: (M, n) their free energies of the next sample.
     """
-    members, iterations = each.shape
-    before = np.zeros(members)
-    total = 0.0
+    members, n = weights.shape
+    total = np.zeros(n)
     for m in range(members):
-        told = each[m, iterations - 1]
-        for k in range(len(forecasts)):
-            told += predictions[m, k, 0] + predictions[m, k, 1]
-        if np.isfinite(told):
-            before[m] = (1.0 - SWITCHING) * weights[m] + SWITCHING / members
-        total += before[m]
+        for j in range(n):
+            kept = (1.0 - SWITCHING) * weights[m, j] + SWITCHING / members
+            weights[m, j] = kept if np.isfinite(each[m, j]) else 0.0
+            total[j] += weights[m, j]
     for m in range(members):
-        before[m] /= total
+        for j in range(n):
+            weights[m, j] /= total[j]
+
+
+@jit
+def weigh(weights, each, energies):
+    """Weigh the members by their free energies of a sample.
+
+    Args:
+        weights: (M, n) before it, as `switch` leaves them; overwritten with those after it.
+        each: (M, n) free energies of the members [nats]; of no effect where there is no weight.
+        energies: (n,) receives those of the mixtures; not finite where no member is left.
+    """
+    members, n = weights.shape
+    evidence = np.zeros(n)
+    fill(energies, np.inf)
+    for m in range(members):
+        for j in range(n):
+            energies[j] = each[m, j] if weights[m, j] > 0.0 and each[m, j] < energies[j] else energies[j]
+    for m in range(members):
+        for j in range(n):
+            told = exp(energies[j] - each[m, j])
+            weights[m, j] = weights[m, j] * told if weights[m, j] > 0.0 else 0.0
+            evidence[j] += weights[m, j]
+    for m in range(members):
+        for j in range(n):
+            weights[m, j] /= evidence[j]
+    for j in range(n):
+        energies[j] -= log(evidence[j])
+
+
+@jit
+def leave_out(each, predictions):
+    """Make all free energies (iterations,) of a member NaN where one is not finite, or a prediction (sensors, 2)."""
+    told = 0.0
+    for k in range(len(predictions)):
+        told += predictions[k, 0] + predictions[k, 1]
+    for i in range(len(each)):
+        told += each[i]
+    for i in range(len(each)):
+        each[i] = each[i] if np.isfinite(told) else np.nan
+
+
+@jit
+def foretell(weights, predictions, forecasts):
+    """Mean and variance of the mixture of one system's predictions.
+
+    Args:
+        weights: (M, n), of which the first column counts, as `switch` leaves it.
+        predictions: (M, sensors, 2) means and variances of the members.
+        forecasts: (sensors, 2) receives those of the mixture; NaN where no member is left.
+    """
     for k in range(len(forecasts)):
-        mean, variance = 0.0, 0.0
-        for m in range(members):
-            if before[m] > 0.0:
-                mean += before[m] * predictions[m, k, 0]
-        for m in range(members):
-            if before[m] > 0.0:
-                variance += before[m] * (predictions[m, k, 1] + (predictions[m, k, 0] - mean) ** 2)
-        forecasts[k, 0] = mean if total > 0.0 else np.nan
-        forecasts[k, 1] = variance if total > 0.0 else np.nan
-    for i in range(iterations):
-        least = np.inf
-        for m in range(members):
-            if before[m] > 0.0:
-                least = min(least, each[m, i])
-        evidence = 0.0
-        for m in range(members):
-            weights[m] = 0.0
-            if before[m] > 0.0:
-                weights[m] = before[m] * np.exp(least - each[m, i])
-                evidence += weights[m]
-        for m in range(members):
-            weights[m] /= evidence
-        energies[i] = least - np.log(evidence)
+        mean, variance = 0.0, 0.0 * weights[0, 0]
+        for m in range(len(weights)):
+            if weights[m, 0] > 0.0:
+                mean += weights[m, 0] * predictions[m, k, 0]
+        for m in range(len(weights)):
+            if weights[m, 0] > 0.0:
+                variance += weights[m, 0] * (predictions[m, k, 1] + (predictions[m, k, 0] - mean) ** 2)
+        forecasts[k, 0], forecasts[k, 1] = mean + 0.0 * weights[0, 0], variance
 
 
 class Mixing(NamedTuple):
     """The moments of mixtures of beliefs, compiled.
 
     Attributes:
-        memory_for: ``memory_for(members)``: what ``mix`` writes on.
-        mix: ``mix(blocks, first, weights, memory, record, at, stride)`` writes the record of a belief with the moments
-            of the mixture (`estimator.engine.moments`); all NaN where no member is finite. ``memory`` then has the
-            weights of those members whose numbers are finite, which sum to 1: that of member m in lane m % LANES of
-            the first row of block m // LANES.
+        mix: ``mix(blocks, first, weights, shares, records, stride)`` writes the records of beliefs with the moments of
+            n mixtures (`estimator.engine.moments`); all NaN where no member is finite.
 
-            - ``blocks`` (blocks, rows * LANES), in adjacent lanes of which the members' records lie;
-            - ``first``: lane of the first member, counted over all blocks;
-            - ``weights`` (M,) of the members;
-            - ``record``: flat array that receives the i-th number of the record at ``at + i * stride``.
-        mixture: ``mixture(blocks, weights)`` of all members from the first lane on: those shares (M,), and the record.
+            - ``blocks`` (blocks, rows * LANES): member m of system j stands in lane m n + j, counted from block
+              ``first`` on, with the numbers of its record in the first rows; n divides `LANES`;
+            - ``weights`` (M, n) of the members;
+            - ``shares`` (M n,) receives those of the members whose numbers are finite, which sum to 1 for a system;
+            - ``records``: flat array that receives number i of system j at ``i * stride + j``.
+        mixture: ``mixture(blocks, weights)``, of one system with weights (M,): the shares (M,), and the record.
     """
 
-    memory_for: Any
     mix: Any
     mixture: Any
 
@@ -90,109 +121,56 @@ class Mixing(NamedTuple):
 @cache
 def mixing(names: int) -> Mixing:
     """The moments of beliefs in so many states and coefficients, of one sensor."""
-    found = moments(names)
-    place, check, means, spreads, tails = found.layout, found.check, found.means, found.spreads, found.tails
-    n_pairs = names * (names + 1) // 2
-    size, n_rows = names + n_pairs + 4, len(place)
-    record_at, about_at, told_at = place["X_0"], place["ABOUT_0"], place["T_0"]
-    shapes = size - 4
-    inner = part(str(names))
+    found, inner = moments(names), part(str(names))
+    check, means, spreads, tails = found.check, found.means, found.spreads, found.tails
+    size = names + names * (names + 1) // 2 + 2 * NOISES
 
     @inner
-    def memory_for(members):
-        # What no member stands in never becomes infinite.
-        return np.ones((-(-members // LANES), n_rows * LANES))
-
-    @inner
-    def nothing(memory):
-        # Numbers of turns that the compiler does not know: those that it does it writes out, which takes seconds.
-        return memory.shape[1] // LANES - n_rows
-
-    @inner
-    def collect(blocks, first, weights, memory):
-        """Copy the records of all members, and share out the weight among those that are finite.
-
-        The others get the record of the likeliest. Gives the weight that was left, and who is the likeliest.
-        """
-        members, m, zero = len(weights), 0, nothing(memory)
-        while m < members:
-            b, j, c, k = (first + m) // LANES, (first + m) % LANES, m // LANES, m % LANES
-            count = min(members - m, LANES - j, LANES - k)
-            for i in range(size + zero):
-                start, to = i * LANES + j, (record_at + i) * LANES + k
-                for n in range(count):
-                    memory[c, to + n] = blocks[b, start + n]
-            m += count
-        for c in range(len(memory)):
-            check(memory[c])
-            for k in range(max(0, members - c * LANES), LANES):
-                memory[c, k] = 0.0
-        total, likely, most = 0.0, 0, 0.0
+    def share_out(blocks, first, weights, shares, likeliest):
+        """Share out the weight among the members that are finite, and note who is the likeliest (n,)."""
+        members, n = weights.shape
+        total, most = np.zeros(n), np.zeros(n)
         for m in range(members):
-            c, k = m // LANES, m % LANES
-            memory[c, k] = weights[m] if weights[m] > 0.0 and memory[c, k] > 0.0 else 0.0
-            total += memory[c, k]
-            if memory[c, k] > most:
-                likely, most = m, memory[c, k]
+            at = m * n
+            check(blocks[first + at // LANES], at % LANES, shares, at, n)
+            for j in range(n):
+                share = weights[m, j] if shares[at + j] == 0.0 and weights[m, j] > 0.0 else 0.0
+                shares[at + j] = share
+                total[j] += share
+                likeliest[j] = m if share > most[j] else likeliest[j]
+                most[j] = max(most[j], share)
         for m in range(members):
-            c, k = m // LANES, m % LANES
-            if memory[c, k] == 0.0:
-                for row in range(record_at * LANES, (record_at + size) * LANES, LANES):
-                    memory[c, row + k] = memory[likely // LANES, row + likely % LANES]
-            memory[c, k] /= total
-        return total, likely
+            for j in range(n):
+                shares[m * n + j] /= total[j]
 
     @inner
-    def told(memory, k):
-        """A sum over all members."""
-        value = 0.0
-        for c in range(len(memory)):
-            value += memory[c, (told_at + k) * LANES]
-        return value
-
-    @inner
-    def everywhere(memory, row, value):
-        for c in range(len(memory)):
-            for k in range(row * LANES, (row + 1) * LANES):
-                memory[c, k] = value
-
-    @inner
-    def mix(blocks, first, weights, memory, record, at, stride):
-        zero = nothing(memory)
-        total, likely = collect(blocks, first, weights, memory)
-        if not total > 0.0:
-            for i in range(size + zero):
-                record[at + i * stride] = np.nan
-            return
-        for i in range(names + zero):
-            start = memory[likely // LANES, (record_at + i) * LANES + likely % LANES]
-            record[at + i * stride] = start
-            everywhere(memory, about_at + i, start)
-        for c in range(len(memory)):
-            means(memory[c])
-        for i in range(names + zero):
-            record[at + i * stride] += told(memory, i)
-            everywhere(memory, about_at + i, record[at + i * stride])
-        for c in range(len(memory)):
-            spreads(memory[c])
-        for p in range(n_pairs + zero):
-            record[at + (names + p) * stride] = told(memory, p)
-        for k in range(2 + zero):
-            variance = told(memory, n_pairs + k)
-            record[at + (shapes + 2 * k + 1) * stride] = variance
-            everywhere(memory, about_at + names + k, variance)
-        for c in range(len(memory)):
-            tails(memory[c])
-        for k in range(2 + zero):
-            spread, rate = told(memory, k), at + (shapes + 2 * k + 1) * stride
-            record[rate - stride], record[rate] = 1.0 / spread, record[rate] / spread
+    def mix(blocks, first, weights, shares, records, stride):
+        members, n = weights.shape
+        X, begun, likeliest = np.zeros(size * LANES), np.empty(names * LANES), np.zeros(n, np.int64)
+        share_out(blocks, first, weights, shares, likeliest)
+        for j in range(n):
+            at = likeliest[j] * n + j
+            for i in range(names):
+                begun[i * LANES + j] = X[i * LANES + j] = blocks[first + at // LANES, i * LANES + at % LANES]
+        for at in range(0, members * n, n):
+            means(blocks[first + at // LANES], at % LANES, shares, at, begun, X, n)
+        for at in range(0, members * n, n):
+            spreads(blocks[first + at // LANES], at % LANES, shares, at, X, n)
+        for at in range(0, members * n, n):
+            tails(blocks[first + at // LANES], at % LANES, shares, at, X, n)
+        for k in range(size - 2 * NOISES, size, 2):
+            for j in range(n):
+                spread = X[k * LANES + j]
+                X[k * LANES + j] = 1.0 / spread
+                X[(k + 1) * LANES + j] /= spread
+        for i in range(size):
+            for j in range(n):
+                records[i * stride + j] = X[i * LANES + j] if shares[j] >= 0.0 else np.nan
 
     @kernel(kind=str(names))
     def mixture(blocks, weights):
-        memory, record, shares = memory_for(len(weights)), np.empty(size), np.empty(len(weights))
-        mix(blocks, 0, weights, memory, record, 0, 1)
-        for m in range(len(weights)):
-            shares[m] = memory[m // LANES, m % LANES]
+        shares, record = np.empty(len(weights)), np.empty(size)
+        mix(blocks, 0, weights.reshape((-1, 1)), shares, record, 1)
         return shares, record
 
-    return Mixing(memory_for, mix, mixture)
+    return Mixing(mix, mixture)

@@ -18,7 +18,7 @@ from estimator.engine.cache import digest_of
 from estimator.engine.free_energy import free_energies
 from estimator.engine.rows import belief_names
 from estimator.inference import mean_field
-from estimator.inference.mixture import weigh
+from estimator.inference.mixture import foretell, leave_out, switch, weigh
 from estimator.lanes import LANES, kernel, part
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -176,7 +176,7 @@ def _loop(kind: str, model: Model, place: Mapping[str, int], lanes: int, scratch
         for c in range(1, len(walks)):
             changes = changes or walk[c] > 0.0
         before = np.empty(scratch)
-        single = np.empty((members, iterations))
+        single, shares = np.empty((members, iterations)), np.empty((members, iterations))
         predictions = np.empty((members, sensors, 2))
         old_weights = np.empty(members)
         for m in range(members):
@@ -199,7 +199,15 @@ def _loop(kind: str, model: Model, place: Mapping[str, int], lanes: int, scratch
                 for k in range(sensors):
                     forecasts[here, k, 0], forecasts[here, k, 1] = predictions[0, k, 0], predictions[0, k, 1]
             else:
-                weigh(weights, single, predictions, energies[here], forecasts[here])
+                for m in range(members):
+                    leave_out(single[m], predictions[m])
+                    for i in range(iterations):
+                        shares[m, i] = weights[m]
+                switch(shares, single)
+                foretell(shares, predictions, forecasts[here])
+                weigh(shares, single, energies[here])
+                for m in range(members):
+                    weights[m] = shares[m, iterations - 1]
             if not judged:
                 continue
             whole = True

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from estimator import Channel, OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
 from estimator.belief import Belief
 from estimator.ensemble import FARTHEST, LEVELS, displaced, first_weights, matched_gamma, priors, side_by_side
-from estimator.inference.mixture import SWITCHING, mixing, weigh
+from estimator.inference.mixture import SWITCHING, foretell, leave_out, mixing, switch, weigh
 from estimator.lanes import LANES
 from estimator.rig_prior import rig_prior
 
@@ -65,6 +65,18 @@ def mixed(weights, energies, predictions):
     return np.exp(log_weights), np.array(free_energies), np.array(forecasts)
 
 
+def take(weights, energies, predictions, free_energies, forecasts):
+    """One sample as the estimator takes it: energies (M, iterations), predictions (M, 2); gives the weights."""
+    energies, predictions = energies.copy(), predictions[:, None].copy()
+    for each, predicted in zip(energies, predictions, strict=True):
+        leave_out(each, predicted)
+    shares = np.repeat(weights[:, None], energies.shape[1], axis=1)
+    switch(shares, energies)
+    foretell(shares, predictions, forecasts[None])
+    weigh(shares, energies, free_energies)
+    return shares[:, -1]
+
+
 @pytest.mark.parametrize("scale", [0.1, 10.0, 1000.0])
 def test_weigh_equals_its_twin(scale):
     rng = np.random.default_rng(0)
@@ -75,8 +87,7 @@ def test_weigh_equals_its_twin(scale):
     expected = mixed(weights, energies, predictions)
     free_energies, forecasts = np.empty((50, 3)), np.empty((50, 2))
     for t in range(50):
-        one = np.ascontiguousarray(predictions[:, t, None])
-        weigh(weights, np.ascontiguousarray(energies[:, t]), one, free_energies[t], forecasts[t, None])
+        weights = take(weights, energies[:, t], predictions[:, t], free_energies[t], forecasts[t])
     np.testing.assert_allclose(weights, expected[0], rtol=1e-8, atol=1e-290)
     np.testing.assert_allclose(free_energies, expected[1], rtol=1e-10, atol=1e-12 * scale)
     np.testing.assert_allclose(forecasts, expected[2], rtol=1e-8)
@@ -89,14 +100,14 @@ def test_a_hypothesis_comes_back_when_it_is_true_again():
     energies[0, 1960:] = 1.0
     weights, predictions = np.full(2, 0.5), np.ones((2, 2000, 2))
     for t in range(2000):
-        weigh(weights, energies[:, t].copy(), predictions[:, t, None].copy(), np.empty(1), np.empty((1, 2)))
+        weights = take(weights, energies[:, t], predictions[:, t], np.empty(1), np.empty(2))
     assert weights[1] > 0.99
     assert weights.sum() == pytest.approx(1)
 
 
 def test_nothing_left_is_not_finite():
-    free_energies, forecasts = np.zeros(1), np.zeros((1, 2))
-    weigh(np.full(2, 0.5), np.full((2, 1), np.nan), np.ones((2, 1, 2)), free_energies, forecasts)
+    free_energies, forecasts = np.zeros(1), np.zeros(2)
+    take(np.full(2, 0.5), np.full((2, 1), np.nan), np.ones((2, 2)), free_energies, forecasts)
     assert not np.isfinite(free_energies).any()
     assert np.isnan(forecasts).all()
 
@@ -150,34 +161,37 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
     )
 
 
-@pytest.mark.parametrize("first", [0, 21])
+@pytest.mark.parametrize("n", [1, 8, 32])
 @pytest.mark.parametrize("members", [1, 21, 40])
-def test_a_mixture_has_the_moments_of_its_finite_members(members, first):
-    """Wherever they lie, also over three blocks; and to the last bit the same wherever they do."""
+def test_mixtures_have_the_moments_of_their_finite_members(members, n):
+    """Of one system or of several beside each other, also over many blocks; to the last bit the same."""
     names, rng = 3, np.random.default_rng(members)
-    means, roots = rng.standard_normal((members, names)), rng.standard_normal((members, names, names))
-    covs, noises = roots @ roots.swapaxes(1, 2), rng.uniform(1.0, 5.0, (members, 4))
+    means, roots = rng.standard_normal((members, n, names)), rng.standard_normal((members, n, names, names))
+    covs, noises = roots @ roots.swapaxes(2, 3), rng.uniform(1.0, 5.0, (members, n, 4))
     upper = np.triu_indices(names)
-    records = np.column_stack([means, covs[:, upper[0], upper[1]], noises])
-    weights = rng.dirichlet(np.ones(members))
+    records = np.concatenate([means, covs[:, :, upper[0], upper[1]], noises], axis=2)
+    weights = rng.dirichlet(np.ones(members), n).T.copy()
     if members > 1:
-        records[1, 4], records[2, 0], weights[3] = np.nan, np.inf, 0.0
-    found = mixing(names)
-    before = np.full((first, records.shape[1]), np.nan)
-    memory, record = found.memory_for(members), np.empty(records.shape[1])
-    found.mix(side_by_side(np.concatenate([before, records]), LANES), first, weights, memory, record, 0, 1)
-    kept = np.isfinite(records).all(axis=1) & (weights > 0)
-    shares = np.where(kept, weights, 0.0) / weights[kept].sum()
-    mean = shares[kept] @ means[kept]
-    off = means[kept] - mean
-    cov = np.einsum("m,mij->ij", shares[kept], covs[kept] + off[:, :, None] * off[:, None, :])
-    gammas = [matched_gamma(shares[kept], noises[kept, k], noises[kept, k + 1]) for k in (0, 2)]
-    expected = np.concatenate([mean, cov[upper], *gammas])
-    np.testing.assert_allclose(record, expected, rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(memory[:, :LANES].ravel()[:members], shares, rtol=1e-14)
-    side, at_begin = found.mixture(side_by_side(records, LANES), weights)
-    np.testing.assert_array_equal(record, at_begin)
-    np.testing.assert_allclose(side, shares, rtol=1e-14)
+        records[1, :, 4], records[2, : n // 2 + 1, 0], weights[3] = np.nan, np.inf, 0.0
+    found, size = mixing(names), records.shape[2]
+    before = np.full((LANES, size), np.nan)
+    blocks = side_by_side(np.concatenate([before, records.reshape(-1, size)]), LANES)
+    shares, mixed_records = np.empty(members * n), np.empty((size, LANES))
+    found.mix(blocks, 1, weights, shares, mixed_records.reshape(-1), LANES)
+    for j in range(n):
+        kept = np.isfinite(records[:, j]).all(axis=1) & (weights[:, j] > 0)
+        own = weights[kept, j] / weights[kept, j].sum()
+        mean = own @ means[kept, j]
+        off = means[kept, j] - mean
+        cov = np.einsum("m,mij->ij", own, covs[kept, j] + off[:, :, None] * off[:, None, :])
+        gammas = [matched_gamma(own, noises[kept, j, k], noises[kept, j, k + 1]) for k in (0, 2)]
+        expected = np.concatenate([mean, cov[upper], *gammas])
+        np.testing.assert_allclose(mixed_records[:, j], expected, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(shares.reshape(members, n)[kept, j], own, rtol=1e-14)
+        assert (shares.reshape(members, n)[~kept, j] == 0).all()
+        of_one, record = found.mixture(side_by_side(records[:, j], LANES), weights[:, j].copy())
+        np.testing.assert_array_equal(record, mixed_records[:, j])
+        np.testing.assert_array_equal(of_one, shares.reshape(members, n)[:, j])
 
 
 def test_a_mixture_of_no_finite_member_is_nothing():
