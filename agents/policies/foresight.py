@@ -225,7 +225,8 @@ class CommonForesight:
         moves = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
         of_rig = getattr(experiment, "rig", None) is not None
         weighs = experiment.noise_hypotheses != 1 and not of_rig
-        self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, _BURST if drive else HASTE)
+        known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
+        self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, known, _BURST if drive else HASTE)
         self._terms = Terms(
             setup.max_input,
             np.inf,
@@ -288,7 +289,7 @@ class CommonForesight:
         n = len(seen)
         features, safe = np.empty((n, len(FEATURES)), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
         signs = np.empty(n)
-        imaginer(self._view)(records, seen, self._ahead, self._terms, features, safe, signs)
+        imaginer(self._view)(records, seen, self._ahead, self._ahead.blocks, self._terms, features, safe, signs)
         if self._own:
             upright = np.clip(seen, -BOUND, BOUND)
             upright[:, self._odd] *= signs[:, None].astype(np.float32)

@@ -3,17 +3,17 @@
 From the belief the oscillator is imagined for as many moves as `look_ahead` says, each held for as many samples as
 `agents.planner.motion.Swing` says. The first move is a push up, none, or a push down; then follows one of
 
-- the signs of the next four pushes, and then pushes along the motion, but against it where they would lead beyond the
-  limit; or the same signs, and then none; or four pushes up, or down, and then along (the *best* of these thirty ways
-  counts),
+- the signs of the next four to six pushes, and then pushes along the motion, but against it where they would lead
+  beyond the limit; or the same signs, and then none; or all of these pushes up, or down, and then along (the *best* of
+  these ways counts),
 - *brake*: pushes against the motion,
 - *rest*: none.
 
-The ways of a first move lie side by side in the lanes of one block, and are imagined as the planner imagines its own:
-by belief propagation (`agents.planner.imagination`), so that what one sample teaches is not counted again by the next,
-and with what the rest of the episode will bring anyway. What a way is worth is in nats: what is known when *half* of
-it has been followed, and the mean of that and of what is known after the *whole*. By its end alone the best way may be
-to wait for a move, and so at every decision anew.
+The ways of a first move lie side by side in the lanes of one to four blocks, and are imagined as the planner imagines
+its own: by belief propagation (`agents.planner.imagination`), so that what one sample teaches is not counted again by
+the next, and with what the rest of the episode will bring anyway, at the rate at which the episode has taught so far.
+What a way is worth is in nats: what is known when *half* of it has been followed, and the mean of that and of what is
+known after the *whole*. By its end alone the best way may be to wait for a move, and so at every decision anew.
 """
 
 from __future__ import annotations
@@ -48,17 +48,21 @@ FEATURES = (
 #: Largest size of a feature; what a difference of one nat counts for before arcsinh.
 BOUND, _NAT = 10.0, 20.0
 
-#: Pushes after the first move whose signs are tried, by the lane's number plus one; the first lanes of the ways that
-#: then rest, of those whose pushes are all alike, of brake and of rest.
-_TRIED = 4
-_STILL, _ALIKE, _BRAKE, _REST = LANES // 2 - 2, LANES - 4, LANES - 2, LANES - 1
-
 #: Moves that are looked ahead, at least and at most; and in parts of what a swing takes to build, and of the episode.
-_LEAST, _MOST, _PART = 8, 24, 1 / 3
+_LEAST, _MOST, _PART = 8, 40, 2 / 3
 
-#: Moves in which an output can still be kept within the limit: nearly a period. Where pushes along the motion turn, in
-#: parts of the limit.
-_IN_REACH, _TURN = 8, 0.95
+#: Blocks of ways for a first move, by the moves that are looked ahead at most. Near the limit many ways are tried, far
+#: from it long ones: in about the same time.
+_BLOCKS = {12: 4, 24: 2, _MOST: 1}
+
+#: Of ways that lie behind one another, the last: two whose first pushes are all alike, brake, and rest.
+_LAST = 4
+
+#: Moves in which an output can still be kept within the limit: nearly a period.
+_IN_REACH = 8
+
+#: Samples of an episode that the usual rate of information stands for, before the episode has told its own.
+_USUALLY = 32.0
 
 #: Where the energy is limited a push has at most so many times the size that what is left would last for to the end.
 HASTE = 2.0
@@ -72,7 +76,8 @@ class Ahead(NamedTuple):
         moves: that are looked ahead, an even number.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
-        rate: (K, K) information about the coefficients that a sample brings.
+        rate: (K, K) information about the coefficients that a sample usually brings.
+        known: (K, K) what is known of them before the episode, the inverse of their covariance.
         haste: `HASTE`.
     """
 
@@ -81,7 +86,13 @@ class Ahead(NamedTuple):
     samples: float
     energy: float
     rate: FloatArray
+    known: FloatArray
     haste: float = HASTE
+
+    @property
+    def blocks(self) -> int:
+        """Blocks of ways for a first move."""
+        return next(blocks for moves, blocks in _BLOCKS.items() if self.moves <= moves)
 
 
 def look_ahead(built: float, moves: float) -> int:
@@ -91,25 +102,25 @@ def look_ahead(built: float, moves: float) -> int:
     far, a swing has to be built, and pays late.
 
     Example:
-        >>> look_ahead(5.0, 256), look_ahead(50.0, 256), look_ahead(float("inf"), 256), look_ahead(float("inf"), 48)
-        (8, 16, 24, 16)
+        >>> look_ahead(5.0, 256), look_ahead(18.0, 256), look_ahead(float("inf"), 256), look_ahead(float("inf"), 48)
+        (8, 12, 40, 32)
     """
     return 2 * int(np.clip(_PART * min(built, moves), _LEAST, _MOST) / 2)
 
 
 @cache
 def imaginer(view: View) -> Any:
-    """``look(records, observations, ahead, terms, features, safe, signs)``: what n beliefs of a model become.
+    """``look(records, observations, ahead, blocks, terms, features, safe, signs)``: what n beliefs of a model become.
 
     - ``records`` (n, size): the beliefs, as `estimator.Belief` keeps them;
     - ``observations`` (n, entries) float32, as they were shown with them;
-    - ``ahead``: `Ahead`; ``terms``: `agents.planner.imagination.Terms`;
+    - ``ahead``: `Ahead`, and its ``blocks``; ``terms``: `agents.planner.imagination.Terms`;
     - ``features`` (n, len(FEATURES)) float32, receives the features, upright, all finite and at most `BOUND` in size;
     - ``safe`` (n, 3) bool, receives which first moves need not lead beyond the limit; one of them is the safest;
     - ``signs`` (n,) receives -1.0 where up and down changed places, so that the motion is upwards without input.
     """
     model = view.model
-    size, _, U, SCORE, begin, _, advance, appraise, _ = mind(*view)
+    size, _, U, SCORE, begin, _, advance, appraise, precision = mind(*view)
     found, at, place = motion(*view), places(model), imagination(*view).layout
     row, sense, glance = found.layout, found.sense, found.glance
     shown, spread = place["SHOWN"] * LANES, place["SPREAD"] * LANES
@@ -139,42 +150,61 @@ def imaginer(view: View) -> Any:
         still[u] = way
         glance(still)
         ahead = still[later] + (terms.pace - 1) * (still[later] - still[now])
-        return way, -way if abs(ahead) > _TURN * (terms.limit - room(W, j, unforeseen, terms)) else way
+        return way, -way if abs(ahead) > terms.limit - room(W, j, unforeseen, terms) else way
 
     @inner
-    def choose(W, first, t, still, push, unforeseen, terms):
-        """Put the inputs of move t into all lanes, whose first move is ``first``."""
+    def choose(W, c, blocks, first, t, still, push, unforeseen, terms):
+        """Put the inputs of move t into all lanes of block c, whose first move is ``first``.
+
+        The signs of pushes are the digits of a way's number plus one: ways then go on along the motion, or rest.
+        """
+        half = blocks * LANES // 2 - _LAST // 2
+        is_tried = blocks * LANES // 2 >> t > 0
         for j in range(LANES):
+            way = c * LANES + j
+            last = way - 2 * half
             if t == 0:
                 W[U + j] = (1.0 - first) * push
-            elif j == _REST:
+            elif last == 3:
                 W[U + j] = 0.0
-            elif j < _ALIKE and t <= _TRIED:
-                W[U + j] = push if ((j % _STILL + 1) >> (t - 1)) & 1 else -push
-            elif j < _BRAKE and t <= _TRIED:
-                W[U + j] = push if j == _ALIKE else -push
-            elif _STILL <= j < _ALIKE:
+            elif last < 0 and is_tried:
+                W[U + j] = push if ((way % half + 1) >> (t - 1)) & 1 else -push
+            elif 0 <= last < 2 and is_tried:
+                W[U + j] = push if last == 0 else -push
+            elif half <= way < 2 * half:
                 W[U + j] = 0.0
             else:
-                way, pump = along(W, j, still, push, unforeseen, terms)
-                W[U + j] = pump if j < _BRAKE else -way
+                onward, pump = along(W, j, still, push, unforeseen, terms)
+                W[U + j] = pump if last < 2 else -onward
 
     @inner
-    def best(values, first, group):
+    def best(values, blocks, first, group):
         """The best of a first move's ways in a group of continuations, which are 0 best, 1 brake, 2 rest."""
-        begin_at = first * LANES + (0 if group == 0 else _BRAKE - 1 + group)
+        ways = blocks * LANES
+        begin_at = first * ways + (0 if group == 0 else ways - 3 + group)
         found = values[begin_at]
-        for j in range(begin_at + 1, begin_at + (_BRAKE if group == 0 else 1)):
+        for j in range(begin_at + 1, begin_at + (ways - 2 if group == 0 else 1)):
             found = max(found, values[j])
         return found
 
+    @inner
+    def learn_rate(W, ahead, elapsed, now, rate, M):
+        """The factor M of the information per sample, of the usual one and of what the episode has told so far."""
+        precision(W, now)
+        for a in range(k):
+            for b in range(k):
+                told = now[a, b] - ahead.known[a, b]
+                rate[a, b] = (_USUALLY * ahead.rate[a, b] + told) / (_USUALLY + elapsed)
+        factorise(rate, M)
+        if not M[0, 0] > 0.0:
+            factorise(ahead.rate, M)
+
     @entry
-    def look(records, observations, ahead, terms, features, safe, signs):
+    def look(records, observations, ahead, blocks, terms, features, safe, signs):
         W, still = np.zeros(size), np.zeros(width)
-        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(3 * LANES)
-        brought = np.empty((len(PARTS), 3 * LANES))
-        free = np.empty((3, 3))
-        factorise(ahead.rate, M)
+        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(3 * blocks * LANES)
+        brought = np.empty((len(PARTS), 3 * blocks * LANES))
+        free, now, rate = np.empty((3, 3)), np.empty((k, k)), np.empty((k, k))
         for i in range(len(observations)):
             record, seen, told = records[i], observations[i], features[i]
             lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
@@ -187,17 +217,18 @@ def imaginer(view: View) -> Any:
                 thrift = min(1.0, np.sqrt(max(0.0, seen[at.budget_left]) * ahead.energy / left) / ahead.push)
             push = ahead.push * min(1.0, ahead.haste * thrift)
             begin(W, record, lasts)
+            learn_rate(W, ahead, (1.0 - seen[at.time_left]) * ahead.samples, now, rate, M)
             appraise(W, none, 0.0)
             known = W[SCORE]
             appraise(W, M, np.sqrt(share * ahead.samples))
             to_come = W[SCORE]
             fill(peaks, 0.0)
             unforeseen = terms.shaken * record[noise + 1] / record[noise]
-            for first in range(3):
+            for lane in range(0, 3 * blocks * LANES, LANES):
+                first, c = lane // LANES // blocks, lane // LANES % blocks
                 begin(W, record, lasts)
-                lane = first * LANES
                 for t in range(ahead.moves):
-                    choose(W, first, t, still, push, unforeseen, terms)
+                    choose(W, c, blocks, first, t, still, push, unforeseen, terms)
                     for _ in range(terms.pace):
                         advance(W, record, terms)
                         if t < _IN_REACH:
@@ -205,7 +236,7 @@ def imaginer(view: View) -> Any:
                                 peak = abs(W[shown + j]) + room(W, j, unforeseen, terms)
                                 peaks[lane + j] = max(peaks[lane + j], peak)
                     if t < 3:
-                        free[t, first] = W[shown + _REST]
+                        free[t, first] = W[shown + LANES - 1]  # at last that of rest
                     if 2 * (t + 1) % ahead.moves == 0:
                         appraise(W, M, np.sqrt(max(0.0, share * ahead.samples - (t + 1) * terms.pace)))
                         for j in range(lane, lane + LANES):
@@ -228,29 +259,31 @@ def imaginer(view: View) -> Any:
             to = 8
             for group in range(3):
                 for h in range(len(PARTS)):
-                    rise, calm = best(brought[h], up, group), best(brought[h], 1, group)
-                    fall = best(brought[h], down, group)
+                    rise, calm = best(brought[h], blocks, up, group), best(brought[h], blocks, 1, group)
+                    fall = best(brought[h], blocks, down, group)
                     told[to] = np.arcsinh(_NAT * (rise - fall))
                     told[to + 1] = np.arcsinh(_NAT * (calm - max(rise, fall)))
                     to += 2
-            for j in range(3 * LANES):
+            for j in range(len(peaks)):
                 peaks[j] = -peaks[j]
             for group in range(3):
                 for first in (up, 1, down):
-                    told[to] = -best(peaks, first, group) / terms.limit
+                    told[to] = -best(peaks, blocks, first, group) / terms.limit
                     to += 1
             for t in range(3):
                 told[to + t] = sign * free[t, 1] / terms.limit
             for t in range(2):
                 told[to + 3 + t] = (free[t, 0] - free[t, 2]) / terms.limit
-            most = max(best(brought[-1], 0, 0), best(brought[-1], 1, 0), best(brought[-1], 2, 0))
+            most = max(
+                best(brought[-1], blocks, 0, 0), best(brought[-1], blocks, 1, 0), best(brought[-1], blocks, 2, 0)
+            )
             told[to + 5] = np.arcsinh(_NAT * (most - to_come))
             told[to + 6] = to_come - known
             lowest = np.inf
             for first in range(3):
-                lowest = min(lowest, -best(peaks, first, 0))
+                lowest = min(lowest, -best(peaks, blocks, first, 0))
             for first in range(3):
-                peak = -max(best(peaks, first, 0), best(peaks, first, 1), best(peaks, first, 2))
+                peak = -max(best(peaks, blocks, first, 0), best(peaks, blocks, first, 1), best(peaks, blocks, first, 2))
                 safe[i, first if sign > 0.0 else 2 - first] = peak <= terms.limit or peak <= lowest
             for j in range(len(told)):
                 # NaN becomes 0.

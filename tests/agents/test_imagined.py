@@ -45,6 +45,10 @@ def reference(belief, seen, ahead, terms):
     thrift = min(1.0, np.sqrt(seen[21] * ahead.energy / max(1.0, time_left * ahead.samples)) / ahead.push)
     A = ahead.push * min(1.0, 2.0 * thrift)
     share = 0.5 * (time_left + seen[21]) if ahead.energy < np.inf else time_left
+    told_so_far = np.linalg.inv(P[2:, 2:]) - ahead.known
+    rate = (32 * ahead.rate + told_so_far) / (32 + (1 - time_left) * ahead.samples)
+    number = 32 * ahead.blocks
+    half, tried = number // 2 - 2, int(np.log2(number // 2))
 
     def sample(z, P, u):
         moved = np.array([theta[0] * z[0] + theta[1] * z[0] ** 3 + theta[2] * z[1] + theta[3] * u, z[0]])
@@ -58,7 +62,7 @@ def reference(belief, seen, ahead, terms):
         return moved, P - np.outer(gain, P[0]), spread
 
     def worth(P, left):
-        return 0.5 * np.linalg.slogdet(np.linalg.inv(P[2:, 2:]) + left * ahead.rate)[1]
+        return 0.5 * np.linalg.slogdet(np.linalg.inv(P[2:, 2:]) + left * rate)[1]
 
     def way(first, code):
         x, C, cost, peak, told, seen_at = z, P, 0.0, 0.0, [], []
@@ -66,19 +70,19 @@ def reference(belief, seen, ahead, terms):
         for t in range(ahead.moves):
             if t == 0:
                 u = (1 - first) * A
-            elif code == 31:
+            elif code == number - 1:
                 u = 0.0
-            elif code < 28 and t <= 4:
-                u = A if (code % 14 + 1 >> (t - 1)) & 1 else -A
-            elif code < 30 and t <= 4:
-                u = A if code == 28 else -A
-            elif 14 <= code < 28:
+            elif code < 2 * half and t <= tried:
+                u = A if (code % half + 1 >> (t - 1)) & 1 else -A
+            elif code < number - 2 and t <= tried:
+                u = A if code == 2 * half else -A
+            elif half <= code < 2 * half:
                 u = 0.0
             else:
                 along = A if x[0] - x[1] >= 0 else -A
                 then = theta[0] * x[0] + theta[1] * x[0] ** 3 + theta[2] * x[1] + theta[3] * along
-                pump = -along if abs(then + (terms.pace - 1) * (then - x[0])) > 0.95 * (L - margin) else along
-                u = pump if code < 30 else -along
+                pump = -along if abs(then + (terms.pace - 1) * (then - x[0])) > L - margin else along
+                u = pump if code < number - 2 else -along
             for _ in range(terms.pace):
                 x, C, spread = sample(x, C, u)
                 margin = min(terms.margin * np.sqrt(spread + terms.shaken * q), 0.5 * L)
@@ -90,11 +94,11 @@ def reference(belief, seen, ahead, terms):
                 told.append(worth(C, max(0.0, share * ahead.samples - (t + 1) * terms.pace)) - cost)
         return np.cumsum(told) / [1, 2], peak, seen_at
 
-    ways = {(first, code): way(first, code) for first in range(3) for code in range(32)}
-    free = np.array([[ways[first, 31][2][t] for first in range(3)] for t in range(3)])
+    ways = {(first, code): way(first, code) for first in range(3) for code in range(number)}
+    free = np.array([[ways[first, number - 1][2][t] for first in range(3)] for t in range(3)])
     sign = 1.0 if free[0, 1] >= 0 else -1.0
     up, down = (0, 2) if sign > 0 else (2, 0)
-    groups = [range(30), [30], [31]]
+    groups = [range(number - 2), [number - 2], [number - 1]]
     brought = lambda group, first, h: max(ways[first, code][0][h] for code in groups[group])  # noqa: E731
     peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(3)] for codes in groups])
     told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, thrift]
@@ -118,10 +122,11 @@ def test_features_are_those_of_the_matrices(track, pace):
     terms = foresight._terms._replace(pace=pace, shaken=3.0)
     features, safe = np.empty((12, len(FEATURES)), np.float32), np.empty((12, 3), np.bool_)
     signs = np.empty(12)
-    imaginer(View(difference()))(envs.records, seen, foresight._ahead, terms, features, safe, signs)
+    ahead = foresight._ahead
+    imaginer(View(difference()))(envs.records, seen, ahead, ahead.blocks, terms, features, safe, signs)
     assert {*signs} == {-1.0, 1.0}
     for i in range(12):
-        told, allowed, sign = reference(envs.belief(i), seen[i], foresight._ahead, terms)
+        told, allowed, sign = reference(envs.belief(i), seen[i], ahead, terms)
         np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
         np.testing.assert_array_equal(safe[i], allowed)
         assert signs[i] == sign
