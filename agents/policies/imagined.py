@@ -3,13 +3,13 @@
 From the belief the oscillator is imagined for as many moves as `look_ahead` says, each held for as many samples as
 `agents.planner.motion.Swing` says. The first move is a push up, none, or a push down; then follows one of
 
-- the signs of the next four to six pushes, and then pushes along the motion, but against it where they would lead
+- the signs of the next five or six pushes, and then pushes along the motion, but against it where they would lead
   beyond the limit; or the same signs, and then none; or all of these pushes up, or down, and then along (the *best* of
   these ways counts),
 - *brake*: pushes against the motion,
 - *rest*: none.
 
-The ways of a first move lie side by side in the lanes of one to four blocks, and are imagined as the planner imagines
+The ways of a first move lie side by side in the lanes of two or four blocks, and are imagined as the planner imagines
 its own: by belief propagation (`agents.planner.imagination`), so that what one sample teaches is not counted again by
 the next, and with what the rest of the episode will bring anyway, at the rate at which the episode has taught so far.
 What a way is worth is in nats: what is known when *half* of it has been followed, and the mean of that and of what is
@@ -48,12 +48,12 @@ FEATURES = (
 #: Largest size of a feature; what a difference of one nat counts for before arcsinh.
 BOUND, _NAT = 10.0, 20.0
 
-#: Moves that are looked ahead, at least and at most; and in parts of what a swing takes to build, and of the episode.
-_LEAST, _MOST, _PART = 8, 40, 2 / 3
+#: Moves that are looked ahead, at least and at most; in parts of what a swing takes to build, and of the episode.
+_LEAST, _MOST, _BUILT, _PART = 8, 24, 2 / 3, 1 / 3
 
 #: Blocks of ways for a first move, by the moves that are looked ahead at most. Near the limit many ways are tried, far
 #: from it long ones: in about the same time.
-_BLOCKS = {12: 4, 24: 2, _MOST: 1}
+_BLOCKS = {12: 4, _MOST: 2}
 
 #: Of ways that lie behind one another, the last: two whose first pushes are all alike, brake, and rest.
 _LAST = 4
@@ -103,9 +103,9 @@ def look_ahead(built: float, moves: float) -> int:
 
     Example:
         >>> look_ahead(5.0, 256), look_ahead(18.0, 256), look_ahead(float("inf"), 256), look_ahead(float("inf"), 48)
-        (8, 12, 40, 32)
+        (8, 12, 24, 16)
     """
-    return 2 * int(np.clip(_PART * min(built, moves), _LEAST, _MOST) / 2)
+    return 2 * int(np.clip(min(_BUILT * built, _PART * moves), _LEAST, _MOST) / 2)
 
 
 @cache
