@@ -58,7 +58,8 @@ def members_of(kind: Kind) -> Members:
     task = structured(model, kind.degree, iterations=kind.iterations, trace=True, expectations=expectations)
     update, own, size = task.update, task.layout, len(belief_names(model))
     mix = mixing(len(model.names)).mix
-    fed = tuple((own[row] * LANES, place[row] * LANES) for row in (*input_rows(model, kind.degree), *_sensors(model)))
+    given = [*input_rows(model, kind.degree), *(f"Y_{sensor}" for sensor in model.outputs)]
+    fed = tuple((own[row] * LANES, place[row] * LANES) for row in given)
     walks = tuple(own[f"P_{c}_{c}"] * LANES for c in model.coefficients)
     weight, scratch, free_energy = size * LANES, (max(own.values()) + 1) * LANES, place.get("FREE_ENERGY", -1) * LANES
     unsound = own.get("UNSOUND", -1) * LANES
@@ -115,7 +116,3 @@ def members_of(kind: Kind) -> Members:
             copy_lanes(W, free_energy, energies, 0, n)
 
     return Members(begin, learn)
-
-
-def _sensors(model: Any) -> list[str]:
-    return [f"Y_{name}" for name in model.outputs]

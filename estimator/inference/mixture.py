@@ -88,15 +88,16 @@ def foretell(weights, predictions, forecasts):
         predictions: (M, sensors, 2) means and variances of the members.
         forecasts: (sensors, 2) receives those of the mixture; NaN where no member is left.
     """
+    nothing = 0.0 * weights[0, 0]  # NaN where no member is left
     for k in range(len(forecasts)):
-        mean, variance = 0.0, 0.0 * weights[0, 0]
+        mean, variance = nothing, nothing
         for m in range(len(weights)):
             if weights[m, 0] > 0.0:
                 mean += weights[m, 0] * predictions[m, k, 0]
         for m in range(len(weights)):
             if weights[m, 0] > 0.0:
                 variance += weights[m, 0] * (predictions[m, k, 1] + (predictions[m, k, 0] - mean) ** 2)
-        forecasts[k, 0], forecasts[k, 1] = mean + 0.0 * weights[0, 0], variance
+        forecasts[k, 0], forecasts[k, 1] = mean, variance
 
 
 class Mixing(NamedTuple):
