@@ -224,7 +224,7 @@ class Planner:
                 rows[:, at.budget_left] * self._energy,
                 Rule(terms.amplitude, terms.limit, terms.margin, terms.shaken),
             )
-            self._pursue(records, left, energies, rule, last, *searched[::2], inputs, np.empty(n))
+            self._pursue(records, left, energies, rule, last, *searched[::2], inputs)
         else:
             lasts = np.stack([last, before], axis=1)[due]
             moved = np.empty_like(due)

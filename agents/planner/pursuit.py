@@ -44,8 +44,8 @@ class Pursuit(NamedTuple):
     """Compiled functions of one model and interpolation of the input.
 
     Attributes:
-        pursue: ``pursue(records, left, energies, rule, last, plans, words, actions, scores)``: improve the
-            plans of n environments by some gradient steps.
+        pursue: ``pursue(records, left, energies, rule, last, plans, words, actions)``: improve the plans of n
+            environments by some gradient steps.
 
             - ``records`` (n, size): their beliefs, as `estimator.Belief` keeps them.
             - ``left`` (n,) samples, and ``energies`` (n,) energy, left in their episodes.
@@ -53,7 +53,7 @@ class Pursuit(NamedTuple):
             - ``last`` (n,): the inputs applied last.
             - ``plans`` (n, T): the last plans, begun one sample ago; all zeros where there is none. Overwritten.
             - ``words`` (n, 4): streams of random numbers; overwritten.
-            - ``actions`` (n,) receives the first input of each plan, ``scores`` (n,) its worth [nats].
+            - ``actions`` (n,) receives the first input of each plan.
         begin: ``begin(mean, cov, precision, start)``: from the moments of states and coefficients the inverse (K, K) of
             the coefficients' covariance, and what a path starts with (`agents.planner.design`).
         swings: ``swings(known, limit, energy, inputs, words)``: fill inputs (k, T) with bursts from rest, which push as
@@ -127,7 +127,7 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
                 x = 0.0
 
     @kernel(kind=kind)
-    def pursue(records, left, energies, rule, last, plans, words, actions, scores):
+    def pursue(records, left, energies, rule, last, plans, words, actions):
         T = plans.shape[1]
         start, precision, coefficients = np.zeros(start_size), np.empty((k, k)), np.empty(k)
         mean, cov, variances = np.empty(n + k), np.empty((n + k, n + k)), np.empty(sensors + 1)
@@ -158,10 +158,10 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
             project(u, rule.amplitude, energies[i])
             swing(known, start, rule.limit, energies[i], fresh, other, words[i], memory.tape)
             project(other, rule.amplitude, energies[i])
-            scores[i] = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
-            if fresh or ascend(known, limits, _RATE, _TRIAL, start, other, best[:steps], memory) > scores[i]:
+            score = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
+            if fresh or ascend(known, limits, _RATE, _TRIAL, start, other, best[:steps], memory) > score:
                 copy(u, 0, other, steps)
-                scores[i] = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
+                ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
             # The gradient may not have come down from where it began.
             for _ in range(_SOFTER):
                 _, peak = worth(known, aim, 0.0, start, u, memory)
