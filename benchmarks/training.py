@@ -129,16 +129,8 @@ def _train_a_while(output: Path, seed: int, cache: Path) -> list[Path]:
 
     Its schedule is that of a whole run, of which this is the beginning.
     """
-    command = [
-        sys.executable,
-        "train.py",
-        "--output",
-        str(output),
-        "--seed",
-        str(seed),
-        "--checkpoints",
-        str(CHECKPOINTS),
-    ]
+    words = f"--output {output} --seed {seed} --checkpoints {CHECKPOINTS}".split()
+    command = [sys.executable, "train.py", *words]
     with open(output.with_suffix(".log"), "w+") as log:
         process = subprocess.Popen(
             command, cwd=ROOT, env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, stdout=log, stderr=log

@@ -37,13 +37,24 @@ def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, An
 
 
 class Specified:
-    """An environment whose specification says after how many steps an episode ends, as wrappers of Gymnasium ask.
+    """What an environment tells of its experiment, and its specification.
 
-    It is not registered with them, because Gymnasium would then cut a longer ``horizon`` short.
+    That says after how many steps an episode ends, as wrappers of Gymnasium ask. It is not registered,
+    because Gymnasium would then cut a longer ``horizon`` short.
     """
 
     experiment: Experiment
     _spec: EnvSpec | None = None
+
+    @property
+    def max_input(self) -> float:
+        """Input of the action 1 [V]."""
+        return self.experiment.max_input
+
+    @property
+    def horizon(self) -> int:
+        """Samples of an episode that no limit ends."""
+        return self.experiment.samples
 
     @property
     def spec(self) -> EnvSpec | None:

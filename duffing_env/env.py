@@ -200,16 +200,6 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         self._screen: Screen | None = None
 
     @property
-    def max_input(self) -> float:
-        """Input of the action 1 [V]."""
-        return self.experiment.max_input
-
-    @property
-    def horizon(self) -> int:
-        """Samples of an episode that no limit ends."""
-        return self.experiment.samples
-
-    @property
     def belief(self) -> Belief:
         """The posterior now."""
         return self._batch.belief(0)

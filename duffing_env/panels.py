@@ -8,11 +8,10 @@ import numpy as np
 
 from estimator.models.duffing import DIMENSIONS
 from estimator.parameters import FloatArray
-from estimator.units import Scales
+from estimator.units import SUPERSCRIPTS, Scales
 
 NAMES = ("m", "c", "a", "b")
 _WORDS = ("mass m", "damping c", "stiffness a", "cubic b")
-_SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
 SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"
@@ -28,7 +27,7 @@ def labels(scales: Scales, believed: FloatArray) -> list[tuple[str, float]]:
         unit = scales.unit(DIMENSIONS[name])
         power = int(np.floor(np.log10(abs(value)))) if np.isfinite(value) and value != 0 else 0
         power = 0 if -1 <= power <= 1 else power
-        words = [f"10{str(power).translate(_SUPERSCRIPTS)}"] * (power != 0) + [unit] * (unit != "1")
+        words = [f"10{str(power).translate(SUPERSCRIPTS)}"] * (power != 0) + [unit] * (unit != "1")
         named.append((f"{word} [{' '.join(words)}]" if words else word, 10.0**power))
     return named
 

@@ -1,15 +1,9 @@
-"""The environment as a picture: input and output on the left, what is believed of m, c, a and b on the right.
-
-``python -m duffing_env.rendering PATH.png`` draws an episode of uniform noise.
-"""
+"""The environment as a picture: input and output on the left, what is believed of m, c, a and b on the right."""
 
 from __future__ import annotations
 
-import argparse
-import io
 from collections import deque
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -19,9 +13,9 @@ import numpy.typing as npt
 from duffing_env.panels import GREY, INK, NAMES, RULE, ParameterPanel, SignalPanel, labels
 from estimator.belief import Belief
 from estimator.extras import need
-from estimator.files import write_atomically
 from estimator.parameters import FloatArray, Parameters
 from estimator.physical import propagate
+from estimator.rig_prior import HALF_WIDTH
 from estimator.units import VOLTS, Scales
 
 Frame = npt.NDArray[np.uint8]
@@ -31,9 +25,6 @@ WIDTH, HEIGHT = 960, 540
 
 SPAN = 256
 """Samples on the time axes. Longer episodes scroll: more samples would hide the single periods."""
-
-HALF_90 = 1.6449
-"""Half of the central 90 % of a Gaussian, in standard deviations."""
 
 
 class Screen:
@@ -143,7 +134,6 @@ class _Picture:
         self._figure = Figure((WIDTH / 100, HEIGHT / 100), dpi=100, facecolor="white")
         self._canvas = FigureCanvasAgg(self._figure)
         self._milliseconds = 1e3 * scales.step
-        scales.input * max_input, scales.output * max_output
         self._background: Any = None
         self._extent: tuple[int, int] | None = None
 
@@ -199,7 +189,7 @@ class _Picture:
         for signal_panel, values in zip(self._signals, signals, strict=True):
             signal_panel.update(times, values)
         for parameter_panel, mean, std, true in zip(self._parameters, means, stds, truth, strict=True):
-            parameter_panel.update(times, mean, HALF_90 * std, true)
+            parameter_panel.update(times, mean, HALF_WIDTH * std, true)
 
         self._canvas.restore_region(self._background)
         for panel in self._panels:
@@ -277,26 +267,3 @@ class _Window:
 
     def close(self) -> None:
         self._pygame.display.quit()
-
-
-def main() -> None:
-    """Write the picture of an episode of uniform noise, as PNG."""
-    parser = argparse.ArgumentParser(prog="python -m duffing_env.rendering", description=main.__doc__)
-    parser.add_argument("path", type=Path, help="the file to write")
-    path: Path = parser.parse_args().path
-    import matplotlib.image
-
-    env = gym.make("duffing_env/Amplitude-v0", render_mode="rgb_array")
-    env.reset(seed=1)
-    env.action_space.seed(1)
-    ended = False
-    while not ended:
-        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-        ended = terminated or truncated
-    picture = io.BytesIO()
-    matplotlib.image.imsave(picture, np.asarray(env.render()), format="png")
-    write_atomically(path, picture.getvalue())
-
-
-if __name__ == "__main__":
-    main()

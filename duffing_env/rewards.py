@@ -137,10 +137,9 @@ def rewarding(reward: str | Callable[..., Any]) -> Reward:
     return Reward((0.0, 0.0, 0.0, 0.0)) if callable(reward) else REWARDS[reward]
 
 
-def check_reward(name: str | Callable[..., Any]) -> str | Callable[..., Any]:
-    """The name, or the function, itself; ValueError for an unknown one."""
+def check_reward(name: str | Callable[..., Any]) -> None:
+    """ValueError for an unknown name."""
     if not callable(name) and not (isinstance(name, str) and name in REWARDS):
         near = difflib.get_close_matches(str(name), REWARDS, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"reward must be one of {list(REWARDS)} or a function, but is {name!r}{hint}")
-    return name

@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+from estimator.models.pendulum import STEP
+
 #: On Eq. (1) the noises are drawn for every episode, over a decade each, and known to nobody.
 _UNKNOWN = {"noise_range": 10.0, "noise_hypotheses": 7}
 
@@ -12,7 +14,7 @@ _UNKNOWN = {"noise_range": 10.0, "noise_hypotheses": 7}
 _PENDULUM = {
     "mean": {"p1": 14.7, "p2": 0.0, "p3": 3.0},
     "std": {"p1": 0.1**0.5, "p2": 0.1, "p3": 0.1**0.5},
-    "sampling_step": 0.05,
+    "sampling_step": STEP,
     "measurement_noise": 1e-6,
     "noise_shape": 1e6,
     "horizon": 50,

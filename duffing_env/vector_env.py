@@ -138,16 +138,6 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         return self._autoreset_mode
 
     @property
-    def max_input(self) -> float:
-        """Input of the action 1 [V]."""
-        return self.experiment.max_input
-
-    @property
-    def horizon(self) -> int:
-        """Samples of an episode that no limit ends."""
-        return self.experiment.samples
-
-    @property
     def records(self) -> FloatArray:
         """(num_envs, size) the posteriors now, as the flat records of `estimator.Belief`; a copy."""
         return self._batch.records()

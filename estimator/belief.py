@@ -20,9 +20,6 @@ from estimator.units import VOLTS, Scales
 
 Self = TypeVar("Self", bound="Belief")
 
-#: The Silverbox's: input and output in volts, as they are.
-_VOLTS = Scales()
-
 
 @cache
 def covariance_places(model: Model) -> npt.NDArray[np.intp]:

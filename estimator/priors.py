@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -193,12 +193,8 @@ def silverbox_prior(
     if model.name not in _TWINS or not {"m", "c", "a"} <= set(model.physical) <= {"m", "c", "a", "b"}:
         raise ValueError(f"model must have the parameters m, c, a and b, but {model.name} has {list(model.physical)}")
     number("spread", spread, 1e-9, 1 - 1e-9, "pass the range's relative half width")
-    return weak_prior(model, *_twin_moments(model, spread), process_noise, measurement_noise, noise_shape, state_std)
-
-
-@cache
-def _twin_moments(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
-    return log_uniform_moments(model, _TWINS[model.name], spread)
+    moments = log_uniform_moments(model, _TWINS[model.name], spread)
+    return weak_prior(model, *moments, process_noise, measurement_noise, noise_shape, state_std)
 
 
 def published_run_prior(nonlinear: bool = True, model: Model | None = None) -> Belief:

@@ -20,7 +20,7 @@ Dimension = tuple[int, int, int]
 #: Smallest and largest size of anything, in its unit: products of several stay within what numbers can hold.
 SIZES = 1e-30, 1e30
 
-_SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _DIGITS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _ATOM = re.compile(r"([^\s·/\d⁰¹²³⁴⁵⁶⁷⁸⁹⁻^-]+)(?:\^?(-?\d+))?")
 
@@ -103,4 +103,4 @@ def written(powers: Mapping[str, int]) -> str:
 
 
 def _power(power: int) -> str:
-    return "" if power == 1 else str(power).translate(_SUPERSCRIPTS)
+    return "" if power == 1 else str(power).translate(SUPERSCRIPTS)

@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
 from agents.evaluation.rollout import Evaluation
 from agents.results import show, table, write_json
-
-FloatArray = npt.NDArray[np.float64]
+from estimator.parameters import FloatArray
 
 _RESAMPLES = 2000
 

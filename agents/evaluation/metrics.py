@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
 from agents.planner.plants import plant_of
@@ -15,10 +14,9 @@ from estimator.free_run import free_run
 from estimator.information import fisher_information
 from estimator.models.difference import difference
 from estimator.models.model import Model
+from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of, to_physical
 from estimator.units import Scales
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Nominal levels of the intervals whose coverage is reported, by their metric.
 LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}

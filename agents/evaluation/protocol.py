@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from agents.evaluation.batch import TESTED
 from agents.evaluation.leaderboard import IQM, METRICS, Metric, center_and_interval
@@ -27,8 +26,7 @@ from agents.loading import load_object
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import CARD, WEIGHTS
 from agents.results import versions
-
-FloatArray = npt.NDArray[np.float64]
+from estimator.parameters import FloatArray
 
 #: Of the protocol: entries of another version do not compare.
 VERSION = 1
@@ -52,7 +50,7 @@ SCORE = Metric("score / %", 1, 100, IQM, IQM)
 BESIDE = ("information_gain", "log_posterior_gain", "coverage", "ended_early", "decision_time")
 SHIFTED = ("fisher_gain", "log_posterior_gain", "coverage", "ended_early")
 
-_PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy")
+PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy")
 
 
 def shifts_of(track: str) -> dict[str, tuple[str, dict[str, Any]]]:
@@ -134,7 +132,7 @@ def measure(
         },
         "policies": {member: fingerprint(member) for member in members},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions(*_PACKAGES),
+        "versions": versions(*PACKAGES),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
     }
 

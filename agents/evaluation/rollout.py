@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from agents.evaluation import metrics
 from agents.evaluation.batch import TESTED, make
 from agents.planner.plants import plant_of
 from agents.policies import make_policy
+from agents.policies.learned import CARD
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
@@ -25,13 +25,11 @@ from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
-from estimator.parameters import Parameters
+from estimator.parameters import FloatArray, Parameters
 from estimator.physical import coefficients_of
 from estimator.posteriors import posteriors
 from estimator.rig import Rig
 from estimator.units import Scales
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Who else identifies the systems from what a policy left behind, beside the environment's own estimator.
 AUDITOR = "auditor"
@@ -149,7 +147,7 @@ def members_of(name: Any) -> tuple[str | None, list[Any]]:
     title, equals, pattern = name.partition("=")
     if not equals or Path(name).exists():
         return None, [name]
-    found = sorted(path for path in glob.glob(pattern) if (Path(path) / "policy.json").is_file())
+    found = sorted(path for path in glob.glob(pattern) if (Path(path) / CARD).is_file())
     if not title or len(found) < 2:
         raise ValueError(
             f"policies must name a group as TITLE=PATTERN, whose pattern two policy folders or more match, but "

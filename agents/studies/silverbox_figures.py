@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from agents.evaluation.figures import new_figure
-from agents.studies.silverbox_protocol import NINETY, WITHOUT_EXTRAPOLATION
+from agents.studies.silverbox_protocol import WITHOUT_EXTRAPOLATION
 from estimator import duffing
+from estimator.rig_prior import HALF_WIDTH
 from estimator.units import Scales
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def _parameters(outcomes: Mapping[str, Outcome]) -> Figure:
             if not all(parameter in parameters for parameters in told.values()) or not told:
                 continue  # it is known
             mean, std = np.array([parameters[parameter][:2] for parameters in told.values()]).T
-            low, high, samples = mean - NINETY * std, mean + NINETY * std, np.array(list(told))
+            low, high, samples = mean - HALF_WIDTH * std, mean + HALF_WIDTH * std, np.array(list(told))
             panels[parameter].fill_between(samples, low, high, color=_COLOURS[name], alpha=0.2, linewidth=0)
             panels[parameter].plot(samples, mean, color=_COLOURS[name], label=name, linewidth=1)
             limits[parameter] += [low[samples >= _SHOWN_FROM].min(), high[samples >= _SHOWN_FROM].max()]

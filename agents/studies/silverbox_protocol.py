@@ -22,6 +22,7 @@ from duffing_env.silverbox import Regime, SilverboxRecord
 from estimator import Model, OnlineEstimator, Rig, difference, duffing, published_run_prior, silverbox_prior
 from estimator.belief import Belief
 from estimator.parameters import FloatArray
+from estimator.rig_prior import HALF_WIDTH
 
 MULTISINE = slice(40_650, 127_400)
 TRAINING_SAMPLES = 65_062
@@ -40,7 +41,6 @@ LENGTHS = (50, 100, 200, 300, 500, 1_000, 2_000, 5_000, 20_000, TRAINING_SAMPLES
 CLOSE = 1e-3
 """Simulation error on the arrow [V] that the learning curve is timed by."""
 
-NINETY = 1.6448536269514722
 """Half width of a central 90 % interval in standard deviations."""
 
 TIMINGS = 3
@@ -143,11 +143,6 @@ class Outcome:
     beliefs: dict[int, Belief]
     arrow_error: FloatArray
 
-    @property
-    def samples_until_close(self) -> int | None:
-        """The first of `LENGTHS` from which on the arrow error is below `CLOSE`; None if the last is above."""
-        return samples_until_close(self.learning)
-
 
 def cut(record: SilverboxRecord) -> Sections:
     """The training section, and the three tests."""
@@ -232,4 +227,4 @@ def coverage_of(forecasts: FloatArray, y: FloatArray) -> float:
     mean, variance = forecasts.T
     if np.isnan(variance).any():
         return float("nan")
-    return float(np.mean(np.abs(y - mean) <= NINETY * np.sqrt(variance)))
+    return float(np.mean(np.abs(y - mean) <= HALF_WIDTH * np.sqrt(variance)))

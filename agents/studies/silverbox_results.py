@@ -21,6 +21,7 @@ from agents.studies.silverbox_protocol import (
     Sections,
     cut,
     evaluate,
+    samples_until_close,
 )
 from duffing_env.silverbox import load_record
 from estimator.belief import Belief
@@ -94,7 +95,7 @@ def summarise(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
             "prediction_rmse": outcome.prediction_rmse,
             "coverage": outcome.coverage,
             "seconds_per_sample": outcome.seconds,
-            "samples_until_1_mV": outcome.samples_until_close,
+            "samples_until_1_mV": samples_until_close(outcome.learning),
             "free_energy": outcome.free_energy,
             "arrow_rmse_after": {str(samples): error for samples, error in outcome.learning.items()},
             "parameters": _parameters(outcome.beliefs[TRAINING_SAMPLES]),
@@ -140,7 +141,7 @@ def as_table(outcomes: Mapping[str, Outcome]) -> Any:
                 *(f"{1e3 * outcome.rmse[test]:.3f}" for test in TESTS),
                 f"{1e3 * outcome.prediction_rmse:.3f}",
                 "-" if np.isnan(outcome.coverage) else f"{outcome.coverage:.3f}",
-                str(outcome.samples_until_close or "never"),
+                str(samples_until_close(outcome.learning) or "never"),
                 f"{1e6 * outcome.seconds:.2f}",
                 f"{outcome.free_energy:.0f}",
             )

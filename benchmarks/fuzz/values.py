@@ -68,26 +68,8 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
 
 #: What JSON and TOML can hold.
 _HELD = [
-    None,
-    True,
-    0,
-    -1,
-    1,
-    3,
-    2**40,
-    10**400,
-    0.5,
-    -2.5,
-    1e300,
-    1e-300,
-    "",
-    "abc",
-    "u*x",
-    [],
-    [1],
-    [[]],
-    {},
-    {"a": 1},
+    *(None, True, 0, -1, 1, 3, 2**40, 10**400, 0.5, -2.5, 1e300, 1e-300),
+    *("", "abc", "u*x", [], [1], [[]], {}, {"a": 1}),
 ]
 
 

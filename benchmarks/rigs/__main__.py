@@ -18,7 +18,23 @@ CORES = os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
-class Accuracy:
+class Written:
+    """What is kept of a part."""
+
+    json: Path | None = None
+    """File for all that came out."""
+
+
+@dataclass(frozen=True)
+class Spread(Written):
+    """A part whose runs are spread over processes."""
+
+    workers: int = CORES
+    """Processes."""
+
+
+@dataclass(frozen=True)
+class Accuracy(Spread):
     """Errors and coverage on every rig: with guesses off by up to 30 %, with none, and from records in pieces."""
 
     seeds: int = 200
@@ -27,10 +43,6 @@ class Accuracy:
     """Names of rigs."""
     settings: tuple[str, ...] = accuracy.SETTINGS
     """With a guess, without, and without from 16 pieces that begin in motion."""
-    workers: int = CORES
-    """Processes."""
-    json: Path | None = None
-    """File for every outcome."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
@@ -39,17 +51,13 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class Faults:
+class Faults(Spread):
     """Deliberate faults on rigs a and e: the share that is named, and of good records the share that is flagged."""
 
     seeds: int = 100
     """Records of each rig and fault."""
     faults: tuple[str, ...] = tuple(faults.EXPECTED)
     """Names of faults."""
-    workers: int = CORES
-    """Processes."""
-    json: Path | None = None
-    """File for every outcome."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
@@ -57,7 +65,7 @@ class Faults:
 
 
 @dataclass(frozen=True)
-class Against:
+class Against(Written):
     """Errors, times and statements against dynamax, SciPy and pysindy, in .venv-peers."""
 
     seeds: int = 20
@@ -66,8 +74,6 @@ class Against:
     """Names of rigs."""
     against: tuple[str, ...] = tuple(peer_rows.PEERS)
     """The others: dynamax, scipy, pysindy."""
-    json: Path | None = None
-    """File for all errors and times."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
@@ -76,15 +82,11 @@ class Against:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class Sweep(Spread):
     """From 6 to 800 samples per period, and from the linear range to the limit."""
 
     seeds: int = 50
     """Records of each cell."""
-    workers: int = CORES
-    """Processes."""
-    json: Path | None = None
-    """File for every outcome."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
@@ -93,7 +95,7 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Loop:
+class Loop(Spread):
     """256 samples on the integrator, through Rig-v0 and in blocks, by signals and by the planner."""
 
     seeds: int = 100
@@ -104,10 +106,6 @@ class Loop:
     """Who chooses: the planner efe, and signals."""
     ways: tuple[str, ...] = loop.WAYS
     """Sample by sample, and in blocks of 64."""
-    workers: int = CORES
-    """Processes."""
-    json: Path | None = None
-    """File for every run."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
@@ -117,7 +115,7 @@ class Loop:
 
 
 @dataclass(frozen=True)
-class Experiment:
+class Experiment(Spread):
     """The next experiment of 256 samples, designed on a record: what was expected of it beside what came."""
 
     seeds: int = 20
@@ -128,10 +126,6 @@ class Experiment:
     """Who designs."""
     samples: int = 512
     """Of the record before; 0: designed on the guess, with the noises known."""
-    workers: int = CORES
-    """Processes."""
-    json: Path | None = None
-    """File for every experiment."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""

@@ -13,9 +13,6 @@ from estimator.models.model import Model
 #: Seconds between two samples.
 STEP = 0.05
 
-#: Diffusion of q'' in rad/s^1.5, and the prior of p1, p2 and p3 (s⁻², s⁻¹, s⁻²): means and variances.
-DIFFUSION, PRIOR_MEAN, PRIOR_VARIANCE = 0.1, (14.7, 0.0, 3.0), (0.1, 0.01, 0.1)
-
 #: Both states are seen. Time is counted in samples, so the angular velocity w is in rad per sample and the coefficients
 #: are p1 δ², p2 δ and p3 δ². Noise of unit strength would move q by 1 within a sample.
 PENDULUM = Model(

@@ -72,7 +72,7 @@ def outcome(**changes):
     ],
 )
 def test_samples_until_the_error_stays_close(errors, samples):
-    assert outcome(learning=dict(zip((50, 100, 1000), errors, strict=True))).samples_until_close == samples
+    assert module.samples_until_close(dict(zip((50, 100, 1000), errors, strict=True))) == samples
 
 
 def test_the_submission_line():

@@ -265,12 +265,3 @@ def test_mode_human_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(DependencyNotInstalled, match=r'pip install "duffing-env\[human\]"'):
         Screen("human", 0.15, 0.6, 30)
-
-
-def test_the_command_writes_a_picture(tmp_path, monkeypatch):
-    from matplotlib.image import imread
-
-    monkeypatch.setattr(sys, "argv", ["rendering", str(tmp_path / "episode.png")])
-    rendering.main()
-    assert [path.name for path in tmp_path.iterdir()] == ["episode.png"]
-    assert imread(tmp_path / "episode.png").shape[:2] == (HEIGHT, WIDTH)

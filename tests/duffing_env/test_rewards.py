@@ -274,7 +274,8 @@ def test_an_episode_that_diverges_returns_what_was_said():
 
 
 def test_rewards_by_name():
-    assert [check_reward(name) for name in REWARDS] == list(REWARDS)
+    for name in REWARDS:
+        check_reward(name)
     with pytest.raises(ValueError, match="did you mean 'information_gain'"):
         check_reward("infomation_gain")
     for unknown in ("entropy!", None, 0, []):
