@@ -54,6 +54,8 @@ class Run:
         show(result)
         if result.exit_status:
             print(f"duffing-env: ended early ({result.ended}): {result.message}", file=sys.stderr)
+        elif result.message:
+            print(f"duffing-env: warning: {result.message}", file=sys.stderr)
         sys.exit(result.exit_status)
 
 

@@ -21,7 +21,7 @@ class Plan:
         watchdog: seconds of silence after which the plant zeroes its input. None: 2, or 20 sampling steps if that is
             longer; and a block's length besides.
         no_watchdog: run on a plant that has none.
-        stale: outputs in a row that are missing, or the same number again, which end the run; 0: never.
+        stale: outputs in a row that are missing, late, or the same number again, which end the run; 0: never.
         seed: of the policy, and of the systems that are drawn from the belief.
 
     Raises:

@@ -38,11 +38,11 @@ class Run:
     Attributes:
         rig: of the run.
         folder: with manifest.json, samples.csv, events.jsonl, parameters.json and estimator.npz.
-        ended: ``complete``; ``range``, ``stale``, ``input``, ``plant`` or ``design`` for what tripped
+        ended: ``complete``; ``range``, ``stale``, ``late``, ``input``, ``plant`` or ``design`` for what tripped
             (`agents.running.session.Tripped`); or the name of a signal.
-        message: why, where it is not complete.
+        message: why, where it is not complete; else a warning, or nothing.
         belief: at the end, from all that was measured.
-        late: ticks that were missed.
+        late: ticks that were missed, those of the silence included.
         exit_status: for a shell: 0, 1 after a trip, 128 + its number after a signal.
     """
 
@@ -149,6 +149,7 @@ def run(
                     assert chooser is not None
                     session.arm()
                     ticker.play(chooser, plan.samples, told)
+                    message = ticker.warning
                 finally:
                     late = ticker.late
         ended, status = "complete", 0

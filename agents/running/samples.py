@@ -13,11 +13,16 @@ from agents.running.clock import Clock
 from agents.running.follower import Follower
 from agents.running.observed import Observed
 from agents.running.recording import Recording
-from agents.running.session import Session
+from agents.running.session import Session, Tripped
 from estimator.parameters import FloatArray
 
 #: A tick that is met later than this, in parts of the sampling step, is missed.
 TOLERANCE = 0.1
+
+#: More lost outputs than this, in parts of all, are worth a warning.
+_MANY = 0.1
+
+_REMEDY = "play blocks (--block 64), or take a longer step"
 
 
 class Chooser(Protocol):
@@ -69,23 +74,34 @@ class Ticker:
         recording: of the rows.
         clock: of the ticks.
         step: between them [s].
+
+    Attributes:
+        tick: the next one.
+        late: ticks that were missed, or whose output or input was late.
+        lost: outputs that came too late, or that nobody was there to read.
     """
 
     def __init__(self, session: Session, follower: Follower, recording: Recording, clock: Clock, step: float) -> None:
         self._session, self._follower, self._recording = session, follower, recording
         self._clock, self._step = clock, step
         self._begin = clock.now()
-        self.tick = 0
-        self.late = 0
+        self.tick = self.late = self.lost = 0
+        self._lost_in_a_row = 0
+        self._took = 0.0, 0.0
         self._in_force = self._last_mean = 0.0
         self._last = math.nan
 
     def listen(self, samples: int) -> None:
-        """Take samples without input; the plant may be disarmed."""
+        """Take samples without input; the plant may be disarmed.
+
+        Raises:
+            Tripped: if none of them came in time.
+        """
         for _ in range(samples):
-            self._miss(late=False)
+            self._miss(late=True)
             self._clock.wait(self._due)
             self._sample(0.0, apply=False)
+        self._check_time(samples)
 
     def skip(self) -> None:
         """Nobody looked for a while: the ticks that have passed are missing, and none of them is late."""
@@ -115,6 +131,12 @@ class Ticker:
                 asked = chooser.next(self.tick - start, self._last_mean, self._last)
 
     @property
+    def warning(self) -> str:
+        """What speaks against a run that was complete; empty where nothing does."""
+        many = self.lost > _MANY * self.tick
+        return f"{self.lost} of {self.tick} outputs came too late to be used; {_REMEDY}" if many else ""
+
+    @property
     def _due(self) -> float:
         """When the next tick is."""
         return self._begin + self.tick * self._step
@@ -125,7 +147,7 @@ class Ticker:
         if behind <= 0:
             return False
         missed = math.ceil(behind)
-        self._take([self._in_force] * missed, [math.nan] * missed, None, late)
+        self._take([self._in_force] * missed, [math.nan] * missed, None, late, missed if late else 0)
         return True
 
     def _sample(self, asked: float, apply: bool = True) -> None:
@@ -136,6 +158,7 @@ class Ticker:
         read = now()
         applied = self._session.apply(asked) if apply else 0.0
         done = now()
+        self._took = read - begun, done - read
         at = (begun + read) / 2
         in_time = at <= due + TOLERANCE * self._step
         before = self._in_force
@@ -147,29 +170,44 @@ class Ticker:
             [before] * int(whole) + [(1.0 - part) * applied + part * before],
             [y if in_time else math.nan] + [math.nan] * int(whole),
             asked,
-            apply and (not in_time or passed > TOLERANCE),
-            None if in_time else y,
+            not in_time or passed > TOLERANCE,
+            int(whole) + (not in_time),
+            y,
         )
 
     def _take(
-        self, u: list[float], y: list[float], asked: float | None, late: bool, untimely: float | None = None
+        self, u: list[float], y: list[float], asked: float | None, late: bool, lost: int, read: float | None = None
     ) -> None:
         """Ticks with the mean inputs of their samples, and their outputs: write them down, judge them, learn from them.
 
-        What is late is so in all of them.
+        What is late is so in all of them, and the lost outputs are the last of them; what was read at the first is not
+        among its outputs where it came too late.
         """
         count, clock = len(u), self._clock.now() - self._begin
         places = range(self.tick, self.tick + count)
         rows = [[k, k * self._step, u[i], y[i], asked, 0, int(late), clock, None] for i, k in enumerate(places)]
-        rows[0][-1] = untimely
+        if lost == count:
+            rows[0][-1] = read
         self._recording.add(rows)
         if late:
             self.late += count
             self._recording.note("late", tick=self.tick, ticks=count)
-        seen = y if untimely is None else [untimely, *y[1:]]
-        # Outputs that are not there while nobody looked say nothing about the sensor.
-        if late or asked is not None:
-            self._session.check(np.array(seen))
+        self.lost += lost
+        self._lost_in_a_row = self._lost_in_a_row + lost if lost == count else lost
+        if read is not None:
+            self._session.check(np.array([read]))
         self._follower.take([self._last_mean, *u[:-1]], y)
-        self._last_mean, self._last = u[-1], seen[-1]
+        self._last_mean, self._last = u[-1], y[-1] if count > 1 or read is None else read
         self.tick += count
+        if self._session.stale:
+            self._check_time(self._session.stale)
+
+    def _check_time(self, most: int) -> None:
+        """Refuse to go on where so many outputs in a row were lost."""
+        if self._lost_in_a_row >= most:
+            read, apply = (f"{1e3 * seconds:.4g} ms" for seconds in self._took)
+            raise Tripped(
+                "late",
+                f"{self._lost_in_a_row} outputs in a row came too late: read() took {read} and apply() {apply} of a "
+                f"step of {1e3 * self._step:.4g} ms; {_REMEDY}",
+            )

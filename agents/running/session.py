@@ -24,8 +24,8 @@ class Tripped(RuntimeError):
     """The run was ended for safety.
 
     Attributes:
-        reason: ``range`` (the output left its range), ``stale`` (no new output), ``input`` (the plant applied more than
-            the limit), ``plant`` (it raised an exception).
+        reason: ``range`` (the output left its range), ``stale`` (no new output), ``late`` (none in time), ``input``
+            (the plant applied more than the limit), ``plant`` (it raised an exception), ``design`` (no input is safe).
     """
 
     def __init__(self, reason: str, message: str) -> None:
@@ -41,7 +41,7 @@ class Session:
         rig: with a limit of the input and a range of the output.
         note: is told what happens: ``note(event, **details)``.
         watchdog: seconds of silence after which the plant zeroes its input by itself; None: without.
-        stale: outputs in a row that are missing, or the very same number, which trip; 0: never.
+        stale: outputs in a row that are missing, late, or the very same number, which trip; 0: never.
 
     Raises:
         ValueError: as `check_session`.

@@ -467,6 +467,52 @@ def test_late_inputs_count_for_what_they_were(tmp_path):
     assert all(abs(result.parameters[name][0] / TRUTH[name] - 1) < 0.08 for name in TRUTH)
 
 
+def slow_to_read(steps, after=0):
+    """A plant whose reads after the first ones take so many sampling steps."""
+    plant = Bench()
+    read = plant.read
+
+    def slow():
+        value = read()
+        plant.clock.wait(plant.clock.now() + (steps * RIG.step if plant.reads > after else 0.0))
+        return value
+
+    plant.read = slow
+    return plant
+
+
+@pytest.mark.parametrize("steps", [0.4, 5])
+def test_a_read_that_is_too_slow_is_told_before_anything_is_armed(steps, tmp_path):
+    plant = slow_to_read(steps)
+    result = play(tmp_path / "run", plant)
+    assert (result.ended, result.exit_status) == ("late", 1)
+    assert f"came too late: read() took {20 * steps:g} ms and apply() 0 ms of a step of 20 ms; play" in result.message
+    assert result.late == len(rows(tmp_path / "run")) >= 16
+    assert not any(told[0] == "arm" for told in plant.told)
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["message"] == result.message
+
+
+def test_a_read_that_hangs_while_listening_counts_as_late(tmp_path):
+    result = play(tmp_path / "run", slow_to_read(400, after=3))
+    assert (result.ended, result.late) == ("late", 400)
+
+
+@pytest.mark.parametrize("steps", [0.4, 3])
+def test_a_read_that_becomes_slow_ends_the_run_as_a_dead_sensor_does(steps, tmp_path):
+    plant = slow_to_read(steps, after=16)
+    result = play(tmp_path / "run", plant, samples=128)
+    assert (result.ended, result.exit_status, plant.applied) == ("late", 1, 0.0)
+    assert result.message.startswith("32 outputs in a row came too late")
+
+
+def test_a_complete_run_that_lost_many_outputs_warns(tmp_path):
+    result = play(tmp_path / "run", slow_to_read(3, after=16), samples=128, stale=0)
+    assert (result.ended, result.exit_status, result.late) == ("complete", 0, 132)
+    assert result.message.startswith("132 of 148 outputs came too late to be used; play blocks")
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["message"] == result.message
+    assert play(tmp_path / "other").message == ""
+
+
 def test_the_folder_of_another_run_is_left_alone(tmp_path):
     play(tmp_path / "run", samples=8)
     before = (tmp_path / "run" / "samples.csv").read_bytes()
