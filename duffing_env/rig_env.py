@@ -10,7 +10,7 @@ import numpy as np
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import Experiment, SimulatedExperiment
-from duffing_env.rig_plant import AnyRig, Plant, RigNumbers, RigPlantEnv, checked_rig
+from duffing_env.rig_plant import ONE_PLANT, AnyRig, Plant, RigNumbers, RigPlantEnv, checked_rig
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 from estimator.ensemble import Hypotheses
@@ -236,8 +236,5 @@ class RigVectorEnv(DuffingVectorEnv):
 
     def __init__(self, num_envs: int = 1, *, plant: Plant | None = None, **options: Any) -> None:
         if plant is not None:
-            raise ValueError(
-                "plant must be left out of make_vec: one plant is one environment; for several use "
-                "gymnasium.vector.SyncVectorEnv([lambda: gym.make('duffing_env/Rig-v0', rig=rig, plant=plant_1), ...])"
-            )
+            raise ValueError(f"plant must be left out of make_vec: {ONE_PLANT}")
         super().__init__(num_envs, **options)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, SupportsFloat
+from weakref import WeakValueDictionary
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 
 from duffing_env.checked import check_prior
 from duffing_env.contract import checked_options
@@ -25,6 +27,12 @@ from estimator.rig_prior import balance, rig_prior
 from estimator.units import Scales
 
 AnyRig = Rig | Mapping[str, Any] | str | Path
+
+#: How several plants are played.
+ONE_PLANT = (
+    "one plant is one environment; for several use "
+    "gymnasium.vector.SyncVectorEnv([lambda: gym.make('duffing_env/Rig-v0', rig=rig, plant=plant_1), ...])"
+)
 
 
 class Plant(Protocol):
@@ -196,7 +204,9 @@ class RigPlantEnv(DuffingEnv):
     reset, and None otherwise. An exception in ``plant.reset()`` comes out of ``reset``, and no episode has begun.
 
     A plant and a prior are Python objects, so the specification of an environment made with them is not JSON-able; and
-    an environment is copied and pickled with its plant, if the plant can be. One plant is one environment.
+    an environment is copied and pickled with its plant, if the plant can be. One plant is one environment: that which
+    reset it last. Another one around it, whose episode was still going on, raises ``ResetNeeded`` in ``step``, and the
+    plant gets nothing.
 
     Args:
         plant: it stays the caller's, who closes it.
@@ -206,6 +216,9 @@ class RigPlantEnv(DuffingEnv):
 
     experiment_kind: ClassVar[type[Experiment]] = RigPlantExperiment
     _reported: ClassVar[tuple[str, ...]] = ("information_gain",)
+
+    #: Identity of a plant to the environment that reset it last.
+    _drivers: ClassVar[WeakValueDictionary[int, RigPlantEnv]] = WeakValueDictionary()
 
     def __init__(self, plant: Plant, *, render_mode: str | None = None, **options: Any) -> None:
         for method in ("reset", "step"):
@@ -232,10 +245,13 @@ class RigPlantEnv(DuffingEnv):
         """Bring the plant to rest and start an episode; ``options`` has no keys, and the plant is not told the seed."""
         checked_options(options)
         self._running, self.plant_error = False, None
+        self._drivers[id(self.plant)] = self
         self.plant.reset()
         return super().reset(seed=seed, options=options)
 
     def _apply(self, action: float) -> None:
+        if self._drivers.get(id(self.plant), self) is not self:
+            raise ResetNeeded(f"plant must not be shared, but another environment has reset it meanwhile: {ONE_PLANT}")
         scales = self.experiment.scales
         u = self.max_input * float(np.float32(action))
         try:

@@ -257,6 +257,30 @@ def test_several_plants_are_several_environments():
     assert [plant.inputs for plant in plants] == [[0.15], [-0.15]]
 
 
+def test_one_plant_is_not_driven_by_two_environments():
+    plant = Difference()
+    options = {"prior": silverbox_prior(), "noise_hypotheses": 1, "max_input": 0.15}
+    envs = gym.make_vec("duffing_env/Rig-v0", num_envs=2, rig=VOLTS, plant=plant, vectorization_mode="sync", **options)
+    envs.reset()
+    with pytest.raises(ResetNeeded, match=r"plant must not be shared.*one plant is one environment; for several use"):
+        envs.step(np.ones((2, 1), dtype=np.float32))
+    assert plant.inputs == []
+
+
+def test_an_environment_is_made_anew_around_a_plant_of_another():
+    plant = Difference()
+    first, second = around(plant), around(plant)
+    for env in (first, second, first):  # the last to reset the plant has it
+        env.reset()
+        env.step([1.0])
+    assert plant.inputs == [0.15] * 3
+    with pytest.raises(ResetNeeded, match="plant must not be shared"):
+        second.step([1.0])
+    del first, env
+    second.reset()
+    second.step([1.0])
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_copies_continue_apart(copied):
     env = around(Difference(), max_output=1.0)
