@@ -10,6 +10,8 @@ from typing import Any, ClassVar, Protocol, SupportsFloat
 from weakref import WeakValueDictionary
 
 import numpy as np
+import numpy.typing as npt
+from gymnasium import logger
 from gymnasium.error import ResetNeeded
 
 from duffing_env.checked import check_prior
@@ -18,7 +20,7 @@ from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import MOST_SAMPLES, Experiment
 from duffing_env.rewards import rewarding
 from estimator.belief import Belief
-from estimator.checks import whole
+from estimator.checks import shown, whole
 from estimator.ensemble import Hypotheses
 from estimator.models.model import Model
 from estimator.parameters import Parameters
@@ -41,8 +43,11 @@ class Plant(Protocol):
     def reset(self) -> object:
         """Bring the plant to rest, with no input; what is returned is not looked at."""
 
-    def step(self, u: float) -> SupportsFloat:
-        """Apply the input u for one sampling step, and give the output at its end, both in the rig's units."""
+    def step(self, u: float) -> SupportsFloat | npt.NDArray[Any]:
+        """Apply the input u for one sampling step, and give the output at its end, both in the rig's units.
+
+        The output is one number, or an array that holds one.
+        """
         ...
 
 
@@ -200,8 +205,9 @@ class RigPlantEnv(DuffingEnv):
     Rewards that compare with the true oscillator are refused, because nobody knows it: there is no
     ``log_posterior_gain`` in the info, and ``env.unwrapped.truth`` raises AttributeError. A plant that raises an
     exception or gives something that is not a finite number ends the episode (``info["diverged"]``), and leaves the
-    belief as it was before that step; ``env.unwrapped.plant_error`` is the exception's type and message until the next
-    reset, and None otherwise. An exception in ``plant.reset()`` comes out of ``reset``, and no episode has begun.
+    belief as it was before that step. Where it raised, or gave what is no number at all, there is a warning, too, and
+    ``env.unwrapped.plant_error`` is the exception's type and message until the next reset; otherwise it is None, also
+    after NaN. An exception in ``plant.reset()`` comes out of ``reset``, and no episode has begun.
 
     A plant and a prior are Python objects, so the specification of an environment made with them is not JSON-able; and
     an environment is copied and pickled with its plant, if the plant can be. One plant is one environment: that which
@@ -221,6 +227,9 @@ class RigPlantEnv(DuffingEnv):
     _drivers: ClassVar[WeakValueDictionary[int, RigPlantEnv]] = WeakValueDictionary()
 
     def __init__(self, plant: Plant, *, render_mode: str | None = None, **options: Any) -> None:
+        if isinstance(plant, type):
+            name = plant.__name__
+            raise ValueError(f"plant must be an object with reset and step, but is the class {name}; pass {name}()")
         for method in ("reset", "step"):
             if not callable(getattr(plant, method, None)):
                 raise ValueError(f"plant must have methods reset() and step(u), but {plant!r} has no {method}()")
@@ -255,9 +264,18 @@ class RigPlantEnv(DuffingEnv):
         scales = self.experiment.scales
         u = self.max_input * float(np.float32(action))
         try:
-            y = float(self.plant.step(scales.input * u)) / scales.output
+            y = _number(self.plant.step(scales.input * u)) / scales.output
         except Exception as error:  # whatever it is: the episode ends in order, and its belief is told
             self.plant_error = f"{type(error).__name__}: {error}"
+            logger.warn(f"plant.step failed, which ends the episode: {self.plant_error}")
             y = np.nan
         self._batch.measure(u, y)
         self._batch.step(action)
+
+
+def _number(given: Any) -> float:
+    """The output that a plant gave."""
+    try:
+        return float(given.item() if isinstance(given, np.ndarray) else given)
+    except (TypeError, ValueError):
+        raise TypeError(f"step must give one number, but gave {shown(given)}") from None

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from contextlib import nullcontext
 from dataclasses import replace
 
 import gymnasium as gym
@@ -122,17 +123,29 @@ def test_a_plant_that_fails_ends_the_episode_flagged_with_the_belief_before(outp
     assert not terminated
     assert not info["diverged"]
     before = env.belief
-    observation, reward, terminated, truncated, info = env.step([0.5])
+    is_bug = not isinstance(output, float)
+    with pytest.warns(UserWarning, match=r"plant\.step failed, which ends") if is_bug else nullcontext():
+        observation, reward, terminated, truncated, info = env.step([0.5])
     assert (reward, terminated, truncated, info["diverged"], info["information_gain"]) == (0.0, True, False, True, 0.0)
     assert observation in env.observation_space
     np.testing.assert_array_equal(env.belief.record, before.record)
-    assert (env.plant_error is not None) == (not isinstance(output, float))
-    if isinstance(output, OSError):
-        assert env.plant_error == "OSError: cable"
+    told = f"TypeError: step must give one number, but gave {output!r}" if is_bug else None
+    assert env.plant_error == ("OSError: cable" if isinstance(output, OSError) else told)
     with pytest.raises(ResetNeeded):
         env.step([0.5])
     np.testing.assert_array_equal(env.reset()[0], first)
     assert env.plant_error is None
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+def test_an_output_may_be_an_array_of_one_number(shape):
+    told = []
+    for outputs in ([0.01, -0.02], [np.full(shape, 0.01), np.full(shape, -0.02, dtype=np.float64)]):
+        env = around(Scripted(outputs))
+        env.reset(seed=0)
+        told.append([env.step([0.5])[0] for _ in outputs])
+        assert env.plant_error is None
+    np.testing.assert_array_equal(*told)
 
 
 def test_a_plant_that_cannot_be_reset_begins_no_episode():
@@ -194,7 +207,8 @@ def test_nobody_knows_the_truth():
     ("plant", "options", "message"),
     [
         (object(), {}, r"methods reset\(\) and step\(u\), but .* has no reset"),
-        (type("Half", (), {"reset": print}), {}, r"has no step\(\)"),
+        (type("Half", (), {"reset": print})(), {}, r"has no step\(\)"),
+        (Difference, {}, r"object with reset and step, but is the class Difference; pass Difference\(\)"),
         (Difference(), {"prior": "flat"}, r"prior must be an estimator.Belief or None, but is 'flat'"),
         (Difference(), {"prior": weak_prior(PENDULUM, np.ones(3), np.eye(3))}, "of a model with one sensor"),
         (Difference(), {"horizon": 0}, "horizon must be a whole number"),
