@@ -9,6 +9,7 @@ import tyro
 from agents.cli import told_in_one_line
 from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, train_seeds, tune
 from agents.training.family import FAMILY
+from agents.training.runs import LEARNING
 from estimator.checks import whole
 
 DESCRIPTION = """Train a policy that chooses the input, and compare it with the reference policies.
@@ -73,7 +74,10 @@ class Config(TrainConfig):
             run = resume(self.resume)
         print(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
         self._compare(str(run.folder), run.config, run.folder)
-        print(run.folder / "learning_curve.png")
+        if (picture := run.folder / LEARNING).exists():
+            print(picture)
+        else:
+            print("No episode ended, so there is no learning curve; take more steps.")
 
     def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
         """Compare what was trained with the usual policies."""

@@ -35,6 +35,9 @@ from estimator.extras import need
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
+#: Picture of the returns in a run folder.
+LEARNING = "learning_curve.png"
+
 #: After a signal, the update that is on its way may take so many seconds, before nothing more is saved.
 _PATIENCE = 60.0
 
@@ -72,7 +75,7 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     - ``evaluations.csv``, ``best/``: where ``eval_every`` is given, the policy's worth on held-out systems on the
       way, and the policy that was best by its log posterior gain,
     - ``events.out.tfevents.*``: both logs for TensorBoard, where ``tensorboard`` is set,
-    - ``learning_curve.png``.
+    - ``learning_curve.png``, where an episode ended.
 
     Until it is finished, the latest checkpoint also holds what `resume` goes on from.
 
@@ -161,7 +164,8 @@ class _Training:
             self._model.set_logger(logger)
             self._learn()
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
-        save(figure_of_learning(curve, self._config.reward), self._folder / "learning_curve.png")
+        if not all(math.isnan(mean) for *_, mean in curve):
+            save(figure_of_learning(curve, self._config.reward), self._folder / LEARNING)
         save_policy(self._folder, self._model, self._card())
         drop_states(self._folder)
         self._envs.close()
@@ -183,7 +187,8 @@ class _Training:
             def on_rollout(steps: int, mean_return: float) -> None:
                 self._progress.curve.append((steps, self._seconds(), None if math.isnan(mean_return) else mean_return))
                 rate = (steps - begun) / (time.perf_counter() - started)
-                status = f"{steps:,} samples, {rate:,.0f}/s, return {mean_return:.2f}"
+                ended = "no episode has ended" if math.isnan(mean_return) else f"return {mean_return:.2f}"
+                status = f"{steps:,} samples, {rate:,.0f}/s, {ended}"
                 bar.update(task, completed=min(steps, total), status=status)
 
             def on_update() -> None:

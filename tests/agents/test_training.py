@@ -15,6 +15,7 @@ from safetensors.numpy import load_file
 
 import agents.vec_env
 from agents import make_policy
+from agents.commands.train import Config
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.leaderboard import summarise
 from agents.evaluation.rollout import evaluate
@@ -205,6 +206,18 @@ def test_a_folder_that_holds_a_run_is_refused_untouched(runs):
     with pytest.raises(ValueError, match=r"output must be a new folder, but .*other holds a run; remove it or name"):
         tiny(folder)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_training_in_which_no_episode_ended_says_so(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    settings = {"hyperparameters": TINY, "systems": 0, "reward": "information_gain"}
+    Config(steps=256, output=tmp_path / "run", options={"max_output": 10.0}, **settings).run()
+    told = capsys.readouterr().out
+    assert "256 samples" in told
+    assert "no episode has ended" in told
+    assert "No episode ended, so there is no learning curve" in told
+    assert "nan" not in told
+    assert not (tmp_path / "run" / "learning_curve.png").exists()
 
 
 def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch):
