@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from signal import SIGINT
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from agents.policies.learned import CARD
 from agents.policies.saving import save_policy
 from agents.results import write_json
-from agents.running.stopping import Stopper
+from agents.running.stopping import Stopped, Stopper
 from agents.training.checkpoints import (
     Progress,
     begin_with,
@@ -80,11 +81,14 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     Until it is finished, the latest checkpoint also holds what `resume` goes on from.
 
     Raises:
+        Stopped: after a signal; its ``left`` says whether anything was kept, and how to go on.
         ModuleNotFoundError: without the packages of the extra ``train``.
         ValueError: for settings that make no sense, before anything is written.
     """
     need("torch", "stable_baselines3", "matplotlib", *contrib(config))
-    return _Training(config, _run_folder(config), on_evaluation).run()
+    folder = _run_folder(config)
+    with _saying_what_is_left(folder):
+        return _Training(config, folder, on_evaluation).run()
 
 
 def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None) -> Run:
@@ -105,7 +109,8 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
         raise ValueError(f"resume must be a run folder, which holds config.json, but is {folder}")
     if (folder / CARD).exists():
         raise ValueError(f"resume must be a run that was stopped, but {folder} is finished; it holds its policy")
-    return _Training(read_config(folder), folder, on_evaluation).run()
+    with _saying_what_is_left(folder):
+        return _Training(read_config(folder), folder, on_evaluation).run()
 
 
 def carry_on(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found: None) -> None:
@@ -115,6 +120,24 @@ def carry_on(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, fo
         train(config, on_evaluation)
     elif not (config.output / CARD).exists():
         resume(config.output, on_evaluation)
+
+
+@contextmanager
+def _saying_what_is_left(folder: Path) -> Iterator[None]:
+    """Let a signal that ends a training say what is left of it, whenever it comes."""
+    try:
+        yield
+    except (KeyboardInterrupt, Stopped) as stopped:
+        signum, left = (stopped.signum, stopped.left) if isinstance(stopped, Stopped) else (SIGINT, "")
+        raise Stopped(signum, left or _left(folder)) from stopped
+
+
+def _left(folder: Path) -> str:
+    """What is left of a training that is being stopped, and how to go on."""
+    command = f"duffing-env train --resume {folder}"
+    if latest_checkpoint(folder) is not None:
+        return f"go on with: {command}"
+    return "nothing was kept" + (f"; begin again with: {command}" if (folder / CONFIG).exists() else "")
 
 
 class _Training:
@@ -195,7 +218,7 @@ class _Training:
                 self._on_update()
                 if stopper.is_asked and self._model.num_timesteps < total:
                     self._save()
-                    stopper.check(f"go on with: duffing-env train --resume {self._folder}")
+                    stopper.check(_left(self._folder))
 
             stopper = stack.enter_context(Stopper(_PATIENCE))
             self._model.learn(

@@ -275,3 +275,27 @@ def test_after_a_signal_the_update_is_finished_and_all_is_kept(tmp_path, number,
     checkpoint = latest_checkpoint(tmp_path / "run")
     assert load_progress(checkpoint).steps == 384
     assert resume(tmp_path / "run").curve[-1][0] == STEPS
+
+
+@pytest.mark.parametrize(
+    ("where", "left"),
+    [("_make_envs", "nothing was kept"), ("_Training._learn", "nothing was kept; begin again with: duffing-env train")],
+)
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), Stopped(signal.SIGTERM)])
+def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, monkeypatch, where, left, error):
+    def stop(*arguments):
+        raise error
+
+    monkeypatch.setattr(f"agents.training.runs.{where}", stop)
+    with pytest.raises(Stopped) as caught:
+        train(config("ppo", tmp_path / "run"))
+    assert caught.value.signum == getattr(error, "signum", signal.SIGINT)
+    assert caught.value.left == left + (f" --resume {tmp_path / 'run'}" if "begin" in left else "")
+
+
+def test_a_stop_before_the_first_update_of_a_resumed_run_says_how_to_go_on(tmp_path, monkeypatch):
+    folder = stopped("ppo", tmp_path / "run", at=400)
+    monkeypatch.setattr("agents.training.runs._Training._learn", lambda self: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(Stopped) as caught:
+        resume(folder)
+    assert caught.value.left == f"go on with: duffing-env train --resume {folder}"
