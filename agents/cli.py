@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -82,6 +83,7 @@ def check_track(env_id: str) -> None:
     import gymnasium as gym
     from gymnasium.envs.registration import load_env_creator
 
+    from duffing_env import TRACKS
     from duffing_env.vector_env import DuffingVectorEnv
     from estimator.checks import shown
 
@@ -95,7 +97,11 @@ def check_track(env_id: str) -> None:
             f"env must be the id of a track such as duffing_env/Short-v0, but is {env_id}: {error}"
         ) from error
     except gym.error.Error as error:
-        raise type(error)(f"env must be the id of a track such as duffing_env/Short-v0: {error}") from error
+        near = [] if "/" in env_id else difflib.get_close_matches(f"duffing_env/{env_id}", TRACKS, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise type(error)(
+            f"env must be the id of a track such as duffing_env/Short-v0: {str(error).rstrip('.')}{hint}"
+        ) from error
     if entry is None or (isinstance(entry, type) and not issubclass(entry, DuffingVectorEnv)):
         raise ValueError(
             f"env must be a track, which has a vector environment of duffing_env, but is {env_id}; "

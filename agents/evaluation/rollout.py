@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import inspect
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -209,6 +210,7 @@ def roll_out(
     """One episode of every system; the beliefs it ended with, the truth and the experiment."""
     envs = make(env_id, systems, options)
     policy = make_policy(name, envs, seed=seed)
+    _check_predict(policy, name)
     hold = envs.experiment.hold
     if hold > 1:  # applied sample by sample instead, which is the same, so that every sample is seen
         envs = make(env_id, systems, {**options, "hold": 1})
@@ -229,7 +231,10 @@ def roll_out(
     for t in range(horizon):
         if t % hold == 0:
             started = time.process_time()
-            actions, state = policy.predict(observations, state, episode_start, deterministic=True)
+            try:
+                actions, state = policy.predict(observations, state, episode_start, deterministic=True)
+            except ValueError as error:
+                raise ValueError(f"policy {title_of(name)} does not play {env_id}: {error}") from error
             deciding.append(time.process_time() - started)
             episode_start = np.zeros(systems, dtype=np.bool_)
         observations, _, terminated, truncated, infos = envs.step(actions)
@@ -269,6 +274,21 @@ def roll_out(
     }
     seen = outputs[..., 0] if sensors == 1 else outputs
     return Evaluation(title_of(name), values, curve, inputs, seen, prior.scales), beliefs, truth, envs.experiment
+
+
+def _check_predict(policy: Any, name: Any) -> None:
+    """Refuse a policy of one's own whose ``predict`` takes other arguments than it is called with."""
+    try:
+        taken = inspect.signature(policy.predict)
+    except ValueError:  # that of a builtin is not known
+        return
+    try:
+        taken.bind(None, None, None, deterministic=True)
+    except TypeError as error:
+        raise ValueError(
+            f"policy {title_of(name)} must have predict(observation, state, episode_start, deterministic), but its "
+            f"predict is {taken}: {error}; give it those"
+        ) from error
 
 
 def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:

@@ -97,6 +97,28 @@ def test_policies_in_a_file_are_found_by_module_and_name(tmp_path, monkeypatch):
         evaluate([Push(0), Push(1)], **SHORT)
 
 
+class Forgetful:
+    """Takes two arguments only."""
+
+    def predict(self, observation, state=None):
+        raise AssertionError("it is refused before it is asked")
+
+
+class Picky:
+    """Takes observations of another track only."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        raise ValueError("observation must have 35 entries")
+
+
+def test_what_a_policy_refuses_is_told_with_its_name(monkeypatch):
+    told = r"policy Forgetful must have predict\(observation, .*, but its predict is \(observation, state=None\)"
+    with pytest.raises(ValueError, match=told):
+        evaluate([Forgetful()], **SHORT)
+    with pytest.raises(ValueError, match="policy Picky does not play duffing_env/Short-v0: observation must have 35"):
+        evaluate([Picky()], **SHORT)
+
+
 def normalised_model(kind=PPO, **settings):
     envs = VecNormalize(VecCheckNan(DuffingVecEnv("duffing_env/Short-v0", 4, seed=0)), clip_obs=2.0)
     steps = {"n_steps": 8} if kind in (PPO, A2C) else {"learning_starts": 4, "buffer_size": 100}
