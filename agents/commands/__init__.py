@@ -1,14 +1,14 @@
 """``duffing-env``: the command for a user's own oscillator.
 
 Each command is a module here: a dataclass of what it takes, whose docstring is its help, with a method ``run`` that
-imports what is heavy. To add one, put it into `Command`.
+imports what is heavy. To add one, put it into `COMMANDS`.
 """
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Union
 
 import tyro
 
@@ -23,28 +23,32 @@ from agents.commands.run import Run
 
 NAME = "duffing-env"
 
-_subcommand = tyro.conf.subcommand
-
 
 @dataclass(frozen=True)
 class Train:
     """Train a policy (PPO, SAC, TD3, TQC, recurrent PPO) on any track or rig."""
 
 
-#: What the command line chooses from: a name for each command, and commands of a group under one name.
-Command = (
-    Annotated[Identify, _subcommand("identify")]
-    | Annotated[Design, _subcommand("design")]
-    | Annotated[Run, _subcommand("run")]
-    | Annotated[Train, _subcommand("train")]  # its settings follow from the algorithm: `agents.commands.train`
-    | Annotated[Evaluate, _subcommand("evaluate")]
-    | Annotated[Export, _subcommand("export")]
-    | Annotated[Report, _subcommand("report")]
-    | Annotated[
-        Annotated[Init, _subcommand("init")] | Annotated[List, _subcommand("list")],
-        _subcommand("rig", description="Describe your rig in a file; list the rigs that ship."),
-    ]
-)
+#: What each command takes, by its name; commands of a group are under one.
+COMMANDS: dict[str, Any] = {
+    "identify": Identify,
+    "design": Design,
+    "run": Run,
+    "train": Train,  # its settings follow from the algorithm: `agents.commands.train`
+    "evaluate": Evaluate,
+    "export": Export,
+    "report": Report,
+    "rig": Annotated[Init, tyro.conf.subcommand("init")] | Annotated[List, tyro.conf.subcommand("list")],
+}
+
+_RIG = "Describe your rig in a file; list the rigs that ship."
+
+
+def _listed() -> Any:
+    """The commands, each with the first paragraph of its help: examples would be broken into several lines here."""
+    said = {name: _RIG if name == "rig" else (kind.__doc__ or "").split("\n\n")[0] for name, kind in COMMANDS.items()}
+    kinds = (Annotated[kind, tyro.conf.subcommand(name, description=said[name])] for name, kind in COMMANDS.items())
+    return Union[tuple(kinds)]  # noqa: UP007
 
 
 def main(words: list[str] | None = None) -> None:
@@ -57,16 +61,16 @@ def main(words: list[str] | None = None) -> None:
         SystemExit: with status 2 where a value or a file is bad, and 130 after Ctrl-C.
     """
     words = sys.argv[1:] if words is None else words
-    if words[:1] == ["train"]:
+    name, *rest = words or [""]
+    if name == "train":
         from agents.commands.train import main as train
 
-        return train(f"{NAME} train", words[1:])
+        return train(f"{NAME} train", rest)
     with told_in_one_line(NAME):
-        command: Any = tyro.cli(
-            Command,
-            prog=NAME,
-            description="Identify an oscillator; choose the input that tells most. Each command has its own --help.",
-            args=words,
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
-        command.run()
+        config = (tyro.conf.FlagCreatePairsOff,)
+        if name in COMMANDS:
+            about = _RIG if name == "rig" else None
+            tyro.cli(COMMANDS[name], prog=f"{NAME} {name}", description=about, args=rest, config=config).run()
+        else:
+            about = "Identify an oscillator; choose the input that tells most. Each command has its own --help."
+            tyro.cli(_listed(), prog=NAME, description=about, args=words, config=config)

@@ -173,6 +173,15 @@ def test_examples_in_the_help_keep_lines_of_their_own(name, monkeypatch):
     assert all(line.startswith("$ duffing-env ") and line.count("$") == 1 and len(line) < 80 for line in lines)
 
 
+def test_the_list_of_commands_has_no_examples_that_would_be_broken(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    code = "from agents.commands import main; main(['--help'])"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT).stdout
+    assert "$" not in told
+    assert "• evaluate  Compare policies on common random numbers" in told
+    assert "• rig       Describe your rig in a file" in told
+
+
 def test_help_of_the_command_is_quick():
     """It imports nothing that computes."""
     code = (
