@@ -34,7 +34,7 @@ class Identify:
     report: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """Write a page with figures here, which opens without a network."""
     save: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Write what is known now here, for duffing-env design, and estimator.load_estimator."""
+    """Write what is known now here, a NumPy archive (.npz), for duffing-env design, and estimator.load_estimator."""
     json: bool = False
     """Print JSON instead of the table."""
 

@@ -203,7 +203,7 @@ def print_estimators(evaluations: list[Evaluation]) -> None:
     """Print the two-way table, where there is something in it."""
     heads, rows = two_way_table(evaluations)
     if rows:
-        show(table(heads, rows, title="the same inputs and outputs in other hands"), width=130)
+        show(table(heads, rows, title="what other estimators make of the same inputs and outputs"), width=130)
 
 
 def in_order(evaluations: list[Evaluation]) -> list[Evaluation]:

@@ -97,7 +97,7 @@ def _estimators(evaluations: list[Evaluation]) -> str:
     if not rows:
         return ""
     return (
-        "<h2>The same inputs and outputs in other hands</h2>"
+        "<h2>What other estimators make of the same inputs and outputs</h2>"
         "<p>The auditor, an offline maximum a posteriori fit that knows the noises, ranks the inputs; the rows of one "
         "policy rank the estimators.</p>" + table(heads, [[html.escape(cell) for cell in row] for row in rows])
     )

@@ -13,16 +13,17 @@ class Plan:
     """What a run is to do.
 
     Attributes:
-        policy: a signal or ``efe`` (`agents.make_policy`); sample by sample also any other policy.
-        samples: of the run.
-        block: samples of a block; None: sample by sample, against the clock.
-        bound: of the probability that a block, or a whole signal, takes the output out of its range.
-        listen: samples without input at the start, which tell where the rig stands.
-        watchdog: seconds of silence after which the plant zeroes its input. None: 2, or 20 sampling steps if that is
-            longer; and a block's length besides.
-        no_watchdog: run on a plant that has none.
-        stale: outputs in a row that are missing, late, or the same number again, which end the run; 0: never.
-        seed: of the policy, and of the systems that are drawn from the belief.
+        policy: the name of a signal, or ``efe`` (`agents.make_policy`); without ``block`` also of any other policy.
+        samples: number of inputs to play, in all.
+        block: number of inputs that are chosen and played at once; where None, each input is chosen by itself, against
+            the clock.
+        bound: largest probability that a block, or a whole signal, may have of taking the output out of its range.
+        listen: number of samples without input at the start, which tell where the rig stands.
+        watchdog: seconds of silence after which the plant zeroes its input; where None, 2 s, or 20 sampling steps if
+            that is longer, and twice the length of a block besides.
+        no_watchdog: whether to run a plant that has no watchdog.
+        stale: number of outputs in a row that are missing, late, or the same number again, which end the run; 0: never.
+        seed: seed of the policy, and of the systems that are drawn from the belief.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.

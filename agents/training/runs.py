@@ -106,7 +106,7 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
         ValueError: where it is no run folder, or the run is finished.
     """
     if not (folder / CONFIG).is_file():
-        raise ValueError(f"resume must be a run folder, which holds config.json, but is {folder}")
+        raise ValueError(f"resume must be a run folder, which holds {CONFIG}, but {folder} is not one; name a run's")
     if (folder / CARD).exists():
         raise ValueError(f"resume must be a run that was stopped, but {folder} is finished; it holds its policy")
     with _saying_what_is_left(folder):

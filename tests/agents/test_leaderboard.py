@@ -204,7 +204,7 @@ def test_the_two_way_table_has_a_row_for_each_policy_and_estimator(capsys):
     ]
     print_estimators(evaluations)
     printed = capsys.readouterr().out
-    assert "the same inputs and outputs in other hands" in printed
+    assert "what other estimators make of the same inputs and outputs" in printed
     heads, rows = two_way_table(evaluations)
     assert heads[2:] == [METRICS[name].title for name in names]
     assert all(cell in printed for row in rows for cell in row)
