@@ -6,11 +6,14 @@ beliefs. With the Kalman filter's innovations ν_t and their variances S_t at th
     L(ψ) = ½ Σ_t (ν_t² / S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0)
 
 by Gauss-Newton steps (Λ0 + F)⁻¹, damped after Levenberg and Marquardt, with the sensitivities and the information F of
-`estimator.information`. The inverse of Λ0 + F at the minimum is the posterior's covariance by Laplace's approximation.
+`estimator.information`. They begin at the prior's mean, and at other points where such are given: where the prior is
+wide, L has minima far from the truth, and the deepest that is found is kept. The inverse of Λ0 + F at the minimum is
+the posterior's covariance by Laplace's approximation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +29,8 @@ from estimator.parameters import FloatArray
 _STEPS, _SMALL = 60, 1e-6
 #: Damping at the start, its change after a step that fails or succeeds, and where a system is given up.
 _DAMPING, _UP, _DOWN, _STUCK = 1e-4, 10.0, 0.1, 1e12
+#: Two minima whose depths differ by less are one.
+_SAME = 1e-3
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,7 @@ def maximum_a_posteriori(
     process_noise: npt.ArrayLike,
     measurement_noise: npt.ArrayLike,
     interpolation: str = "zero_order",
+    starts: Sequence[FloatArray] = (),
 ) -> Fit:
     """Fit a model's coefficients to whole records, each from rest.
 
@@ -66,6 +72,8 @@ def maximum_a_posteriori(
         measurement_noise: the sensors' standard deviations, positive: one number, or one for each; (n, p) of each
             record.
         interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
+        starts: (n, K) coefficients each, from which the records are fitted besides the prior's mean; of each record the
+            fit with the smallest L is kept.
 
     Raises:
         ValueError: naming the argument, for shapes that do not fit, or a number that is out of range.
@@ -96,12 +104,34 @@ def maximum_a_posteriori(
         curvature = found.information[:, free[:, None], free] * np.outer(scale, scale) + precision
         return loss, scale * found.slope[:, free] + pull, curvature
 
-    points = np.zeros((len(inputs), len(free)))
+    points, loss, curvature, converged = _search(appraise, np.zeros((len(inputs), len(free))))
+    for start in starts:
+        others = _search(appraise, (np.asarray(start)[:, free] - center[free]) / scale)
+        deeper = others[1] < loss - _SAME
+        points[deeper], loss[deeper], curvature[deeper], converged[deeper] = (found[deeper] for found in others)
+    posterior = np.zeros((len(inputs), *cov.shape))
+    posterior[:, free[:, None], free] = np.linalg.inv(curvature) * np.outer(scale, scale)
+    return Fit(at(points), posterior, converged)
+
+
+def _search(
+    appraise: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]], points: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.bool_]]:
+    """Go downhill from points (n, free).
+
+    Args:
+        appraise: loss, slope and curvature at points.
+        points: to begin with.
+
+    Returns:
+        Where it ended, the loss and the curvature there, and whether the last step was small.
+    """
+    points = points.copy()
     loss, slope, curvature = appraise(points)
-    damping = np.full(len(inputs), _DAMPING)
-    converged = np.zeros(len(inputs), dtype=np.bool_)
+    damping = np.full(len(points), _DAMPING)
+    converged = np.zeros(len(points), dtype=np.bool_)
     for _ in range(_STEPS):
-        damped = curvature + damping[:, None, None] * curvature * np.eye(len(free))
+        damped = curvature + damping[:, None, None] * curvature * np.eye(points.shape[1])
         step = -np.linalg.solve(damped, slope[:, :, None])[:, :, 0]
         step[converged | (damping > _STUCK)] = 0.0
         new_loss, new_slope, new_curvature = appraise(points + step)
@@ -114,6 +144,4 @@ def maximum_a_posteriori(
         converged |= better & (size < _SMALL)
         if (converged | (damping > _STUCK)).all():
             break
-    posterior = np.zeros((len(inputs), *cov.shape))
-    posterior[:, free[:, None], free] = np.linalg.inv(curvature) * np.outer(scale, scale)
-    return Fit(at(points), posterior, converged)
+    return points, loss, curvature, converged

@@ -294,8 +294,9 @@ def _check_predict(policy: Any, name: Any) -> None:
 def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:
     """What every estimator of the plant, and the auditor, make of the inputs and outputs of a policy.
 
-    The auditor fits the plant's own equation. That of the paper, on another plant whose input goes linearly from one
-    action to the next, takes as an environment does the input at the sample before.
+    The auditor fits the plant's own equation, from the prior's mean and from where estimators of it ended: of a wide
+    guess, the prior's mean alone may lead to a minimum far off. The equation of the paper, on a plant whose
+    input goes linearly from one action to the next, takes as an environment does the input at the sample before.
     """
     u, y = evaluation.inputs.T, np.swapaxes(evaluation.outputs, 0, 1)
     plant, interpolation, own_prior, process_noise, sensor_noises = plant_of(experiment, truth)
@@ -309,11 +310,13 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
             earlier = u if not experiment.degree else np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
             hands |= {f"nlarx_{name}": (experiment.prior_of(difference(), name), earlier) for name in FACTORISATIONS}
     found: dict[str, dict[str, FloatArray]] = {}
+    starts: list[FloatArray] = []
     for name, (prior, acting) in hands.items():
         beliefs = posteriors(acting, y, prior, rig if prior.model.is_continuous else None)
         means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
         found[name] = metrics.estimate_metrics(means, covs, truth, prior.model, prior.scales)
-    fit = maximum_a_posteriori(plant, u, y, own_prior, process_noise, sensor_noises, interpolation)
+        starts += [means] if prior.model == plant else []
+    fit = maximum_a_posteriori(plant, u, y, own_prior, process_noise, sensor_noises, interpolation, starts)
     found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, plant, experiment.scales)
     return found
 

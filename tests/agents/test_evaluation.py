@@ -459,6 +459,15 @@ def test_on_the_continuous_track_others_identify_too(without_record):
     assert by_paper.metrics["coverage"].mean() < 0.4
 
 
+def test_the_auditor_is_not_led_astray_by_a_wide_guess(without_record):
+    """From the prior's mean alone, three of these fits end far from the truth, with a nees of millions."""
+    guess = {"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (0.0, 1e8)}
+    rig = {"step": 1e-3, "input": {"unit": "N", "limit": 10.0}, "output": {"unit": "m", "range": 0.02}, "guess": guess}
+    (found,) = evaluate(["prbs"], "duffing_env/Rig-v0", 32, options={"rig": rig, "noise_hypotheses": 1})
+    assert 0.5 < found.estimators["auditor"]["nees"].mean() < 2.0
+    assert found.estimators["auditor"]["nees"].max() < 6.0
+
+
 @pytest.mark.parametrize("track", ["Pendulum", "WienerHammerstein"])
 def test_tracks_of_other_models_are_evaluated_and_shown(track, tmp_path):
     (evaluation,) = compare(["uniform"], f"duffing_env/{track}-v0", 6, {}, tmp_path, seed=SEED, report=True)

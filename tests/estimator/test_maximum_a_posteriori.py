@@ -14,7 +14,7 @@ NOISES = (5e-4, 5e-4)
 PRIOR = silverbox_prior(PAPER, 0.3, *NOISES)
 
 
-def simulate(systems, samples, rng):
+def simulate(systems, samples, rng, process=NOISES[0]):
     """Systems from rest under uniform inputs: true coefficients (n, 4), u and y (n, T)."""
     center = np.array([SILVERBOX_TWIN.m, SILVERBOX_TWIN.c, SILVERBOX_TWIN.a, SILVERBOX_TWIN.b])
     drawn = center * np.exp(rng.uniform(np.log(0.7), np.log(1.3), (systems, 4)))
@@ -23,7 +23,7 @@ def simulate(systems, samples, rng):
     x = last = np.zeros(systems)
     for t in range(samples):
         w, v = rng.standard_normal((2, systems))
-        x, last = psi[:, 0] * x + psi[:, 1] * x**3 + psi[:, 2] * last + psi[:, 3] * u[:, t] + NOISES[0] * w, x
+        x, last = psi[:, 0] * x + psi[:, 1] * x**3 + psi[:, 2] * last + psi[:, 3] * u[:, t] + process * w, x
         y[:, t] = x + NOISES[1] * v
     return psi, u, y
 
@@ -64,6 +64,24 @@ def test_it_is_calibrated():
     assert fit.converged.all()
     assert (covered > 0.84).all()
     assert (covered < 0.96).all()
+
+
+def test_of_several_starts_the_deepest_minimum_is_kept():
+    rng = np.random.default_rng(4)
+    psi, u, y = simulate(20, 256, rng, process=1e-5)
+    wide = np.array([0.3, 0.4, 0.3, 0.1])
+    prior = weak_prior(PAPER, psi.mean(axis=0) - wide, np.diag(wide**2))
+    alone = maximum_a_posteriori(PAPER, u, y, prior, 1e-5, NOISES[1])
+    fit = maximum_a_posteriori(PAPER, u, y, prior, 1e-5, NOISES[1], starts=[psi])
+    worst = [
+        (np.abs(found.mean - psi) / np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))).max() for found in (alone, fit)
+    ]
+    assert worst[0] > 1000, "the prior's mean leads astray"
+    assert worst[1] < 4
+    assert fit.converged.all()
+    # A start that leads nowhere, or to the same minimum, changes nothing.
+    again = maximum_a_posteriori(PAPER, u, y, prior, 1e-5, NOISES[1], starts=[psi, fit.mean, psi + 100.0])
+    np.testing.assert_array_equal(again.mean, fit.mean)
 
 
 def test_episodes_of_different_lengths_fit_into_one_array():
