@@ -1,0 +1,41 @@
+"""Oscillators that tests identify: their records, and their rigs."""
+
+import numpy as np
+
+from estimator import Channel, Rig
+from estimator.free_run import free_run
+from estimator.models.duffing import KINDS, duffing
+from estimator.physical import coefficients_of
+from estimator.units import Scales
+
+#: A bench of 0.4 kg at 1 kHz, and a softening oscillator at 100 Hz: truth, step, amplitude, sensor noise, and samples
+#: that the input is held for.
+BENCH = ({"m": 0.4, "c": 0.6, "a": 2500.0, "b": 4e7}, 1e-3, 6.0, 5e-6, 8)
+SOFT = ({"m": 1.0, "c": 0.5, "a": 400.0, "b": -4000.0}, 1e-2, 6.0, 1e-4, 4)
+
+
+def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3):
+    """Input and output of a record that begins at rest, with the force disturbed by so many parts of the input.
+
+    The plant is the engine's, without what the benchmark's own integrator is for.
+    """
+    truth, step, amplitude, noise, hold = case
+    rng = np.random.default_rng(seed)
+    u = amplitude * np.repeat(rng.choice([-1.0, 1.0], samples // hold), hold)
+    model = duffing(offsets=True, sensor=kind)
+    scales = Scales(step, amplitude, 1e-2, KINDS[kind])
+    known = {p: truth.get(p, 0.0) for p in model.physical}
+    disturbed = u / amplitude + force * rng.standard_normal(samples)
+    y = scales.output * free_run(model, coefficients_of(model, known, scales), disturbed)
+    y = np.concatenate([[0.0], y[:-1]])
+    sensor = noise if kind == "displacement" else 2e-3 * y.std()
+    return u, y + sensor * rng.standard_normal(samples)
+
+
+def rig_of(case, kind="displacement", **others):
+    unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}[kind]
+    return Rig(case[1], input=Channel("N"), output=Channel(unit, kind=kind), **others)
+
+
+def deviations(result, truth):
+    return np.array([(result.parameters[p][0] - truth[p]) / result.parameters[p][1] for p in truth])

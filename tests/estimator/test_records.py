@@ -1,0 +1,102 @@
+"""Records as users have them: arrays, CSV and MAT files; what is cut, and what is refused."""
+
+import re
+
+import numpy as np
+import pytest
+from oscillators import BENCH, SOFT, rig_of, simulated
+
+from estimator import identify
+from estimator.identification.records import clipped, read, records_of
+
+
+def test_a_converter_s_levels_are_no_stop():
+    _, y = simulated(BENCH)
+    level = np.abs(y).max() / 100
+    assert not clipped(level * np.round(y / level)).any()
+    assert not clipped(np.concatenate([np.full(100, y.min()), y])).any()
+
+
+def test_a_stop_that_single_samples_meet_is_found():
+    rng = np.random.default_rng(0)
+    y = np.sin(2.2 * np.arange(500)) + 0.01 * rng.standard_normal(500)
+    assert np.array_equal(clipped(np.minimum(y, 0.98)), y >= 0.98)
+    assert np.diff(np.flatnonzero(y >= 0.98)).min() > 1
+    assert not clipped(y).any()
+
+
+def test_files(tmp_path):
+    u, y = simulated(SOFT, samples=400)
+    lines = [f"{k * 0.01:.6f},{a},{b}" for k, (a, b) in enumerate(zip(u, y, strict=True))]
+    plain, named = tmp_path / "plain.csv", tmp_path / "named.csv"
+    plain.write_text("\n".join(lines))
+    lines[7] = lines[7].rsplit(",", 1)[0] + ","
+    named.write_text("# a comment\nTime [s],Force [N],Displacement [m]\n" + "\n".join(lines) + "\n")
+    one, other = records_of([plain, str(named)], 0.01)
+    np.testing.assert_array_equal(one.u, u)
+    assert (one.missing, other.missing) == (0, 1)
+    from scipy.io import savemat
+
+    savemat(tmp_path / "r.mat", {"u": u, "y": y})
+    np.testing.assert_array_equal(records_of(tmp_path / "r.mat", 0.01)[0].y, y)
+    whole = bytearray((tmp_path / "r.mat").read_bytes())
+    whole[176] ^= 1  # an unknown kind of number, of which SciPy's reader dies
+    (tmp_path / "r.mat").write_bytes(whole)
+    with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file .*, but is not: the reader died"):
+        records_of(tmp_path / "r.mat", 0.01)
+    (tmp_path / "r.mat").write_bytes(b"none")
+    with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file"):
+        records_of(tmp_path / "r.mat", 0.01)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "u;y\n0,5;1\n1,5;-2e-1\n;3\n",
+        "\ufeffu\ty\n0.5\t1\n\n1.5\t-0.2\n\t3\n",
+        "# written by a tool, with; signs\n0.5 1\n  1.5   -0.2 \nnan 3\n",
+        "response [mm], time [ms], force [N]\n1, 10, 0.5\n-0.2, 20, 1.5\n3, 30, \n",
+    ],
+)
+def test_tables_as_programs_write_them(tmp_path, text):
+    (tmp_path / "r.csv").write_text(text, encoding="utf-8")
+    u, y = read(tmp_path / "r.csv", 0.01)
+    np.testing.assert_array_equal(u, [0.5, 1.5, np.nan])
+    np.testing.assert_array_equal(y, [1.0, -0.2, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("u,y\n1,2\n3", "line 3: must have 2 columns, but has 1"),
+        ("u,y\n1,2\n3,x4", "line 3: 'x4' must be a number"),
+        ("a_column,b_column\n1,2", "must have one column of inputs and one of outputs"),
+        ("1,2,3,4\n1,2,3,4", "must have two columns, u and y"),
+        ("t,u,y\n0,1,2\n0.5,1,3\n1.0,2,3\n", "times are 0.5 s apart, but the rig's step is 0.01 s"),
+        ("t,u,y\n0,1,2\n0.01,1,3\n0.5,2,3\n", "samples must be evenly spaced"),
+        ("t [days],u,y\n0,1,2\n1,1,3\n", "times must be in one of s, ms, us,"),
+        ("", "must hold numbers, but holds none"),
+    ],
+)
+def test_errors_of_files_name_the_line(tmp_path, text, message):
+    (tmp_path / "r.csv").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        records_of(tmp_path / "r.csv", 0.01)
+    assert "r.csv" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("records", "message"),
+    [
+        ([], "records must hold at least one pair"),
+        (3, "records must be a list of pairs"),
+        ([3], "record 0 must be a pair (u, y) or a file name, but is 3"),
+        ([(np.ones(100), np.ones(99))], "u and y of record 0 must have one length, but have 100 and 99"),
+        ([(np.ones(20), np.arange(20.0))], "records must have at least 50 outputs"),
+        ([(np.ones(100), np.arange(100.0))], "u must vary, but is constant"),
+        ([(np.full(100, np.inf), np.arange(100.0))], "u of record 0 must be finite"),
+    ],
+)
+def test_errors_name_the_record(records, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        identify(rig_of(BENCH), records)
