@@ -42,8 +42,8 @@ _VAGUE = 1 / 3
 #: Largest cubic force, in parts of the linear one, of a spring that is called linear.
 _LINEAR = 0.05
 
-#: Standard deviations from the guess that are far. A step is called wrong that is nearer to a factor of 2, either way,
-#: than to 1, where the guess of m and c together has less than 1 % of a chance.
+#: Standard deviations from the guess, or below zero, that are far. A step is called wrong that is nearer to a factor
+#: of 2, either way, than to 1, where the guess of m and c together has less than 1 % of a chance.
 _FAR, _FACTOR, _UNLIKELY = 5.0, 0.5 * np.log(2), 9.2
 
 #: Fewest samples in a period.
@@ -77,6 +77,7 @@ def examine(
         *_of_records(problem, records),
         *_of_hypotheses(problem, found),
         *_of_noise(problem, disturbance),
+        *_of_signs(parameters),
         *_of_parameters(problem, found, parameters),
         *_of_residuals(problem, records, forecasts),
     )
@@ -156,6 +157,18 @@ def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
         f"equation another?"
     )
     return [Warning("process_noise", message)]
+
+
+def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Warning]:
+    """Whether m is negative, or c without it: a channel that is turned round changes the sign of all four."""
+    m, c = parameters["m"], parameters["c"]
+    if m[0] < -_FAR * m[1]:
+        message = "m is negative: the polarity of the sensor or of the input is turned round; change the sign of u or y"
+    elif c[0] < -_FAR * c[1]:
+        message = "c is negative: energy flows in, so that the oscillator is driven by more than u, such as a feedback"
+    else:
+        return []
+    return [Warning("sign", message)]
 
 
 def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[float, float]]) -> list[Warning]:

@@ -20,6 +20,17 @@ def test_faults_are_named(change, name):
     assert name in [warning.name for warning in result.warnings]
 
 
+def test_a_channel_that_is_turned_round_and_energy_that_flows_in_are_named():
+    u, y = simulated(BENCH)
+    for records in ((u, -y), (-u, y)):
+        result = identify(rig_of(BENCH), records)
+        assert [warning.name for warning in result.warnings] == ["sign"]
+        assert "m is negative: the polarity" in result.warnings[0].message
+    fed = (SOFT[0] | {"c": -0.02}, *SOFT[1:])
+    (warning,) = identify(rig_of(fed), simulated(fed)).warnings
+    assert (warning.name, warning.message.split(":")[0]) == ("sign", "c is negative")
+
+
 def test_a_wrong_step_and_a_parameter_that_does_nothing_are_named():
     u, y = simulated(BENCH)
     guess = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
