@@ -97,10 +97,11 @@ def test_numbers_that_are_near_enough(want, got, near):
 
 
 def test_every_check_is_explained():
-    from estimator.identification import checks
+    from estimator.identification import checks, guesses
 
-    source = Path(checks.__file__).read_text()
+    source = "".join(Path(module.__file__).read_text() for module in (checks, guesses))
     names = set(re.findall(r'Warning\("(\w+)"', source)) | set(checks._TERMS) | {"delay", "interpolation"}
+    names |= {slip.check for slip in guesses._SLIPS}
     assert len(names) > 10
     explained = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "checks.md").read_text(), re.MULTILINE)
     assert set(explained) == names

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.identification.fit import Fitter, Hypothesis
+from estimator.identification.guesses import astray, of_guess, without_guess
 from estimator.identification.problem import EXTRA, LATEST, Problem, explicable
 from estimator.identification.records import Record, residuals
 from estimator.identification.result import Warning
@@ -15,7 +16,6 @@ from estimator.identification.search import Found
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
 from estimator.rig import INTERPOLATIONS
-from estimator.rig_prior import HALF_WIDTH
 
 #: Nats by which another hypothesis must be better.
 _EVIDENCE = 7.0
@@ -42,9 +42,8 @@ _VAGUE = 1 / 3
 #: Largest cubic force, in parts of the linear one, of a spring that is called linear.
 _LINEAR = 0.05
 
-#: Standard deviations from the guess, or below zero, that are far. A step is called wrong that is nearer to a factor
-#: of 2, either way, than to 1, where the guess of m and c together has less than 1 % of a chance.
-_FAR, _FACTOR, _UNLIKELY = 5.0, 0.5 * np.log(2), 9.2
+#: Standard deviations below zero that are far.
+_FAR = 5.0
 
 #: Fewest samples in a period.
 _SLOWEST = 5.0
@@ -73,14 +72,20 @@ def examine(
         records: as they were read.
         forecasts: of their outputs.
     """
-    return (
-        *_of_records(problem, records),
+    guess, of_records = problem.rig.guess, _of_records(problem, records)
+    of_fit = [
         *_of_hypotheses(problem, found),
         *_of_noise(problem, disturbance),
         *_of_signs(parameters),
         *_of_parameters(problem, found, parameters),
+        *([] if guess is None else of_guess(guess, parameters)),
         *_of_residuals(problem, records, forecasts),
-    )
+    ]
+    if guess is not None and of_fit:
+        alone, gain = without_guess(problem, found)
+        if gain > _EVIDENCE:  # the other checks judge a fit that the guess has spoilt
+            return (*of_records, *_of_signs(alone), *astray(guess, parameters, alone, gain))
+    return (*of_records, *of_fit)
 
 
 def _of_records(problem: Problem, records: Sequence[Record]) -> list[Warning]:
@@ -179,21 +184,6 @@ def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[f
         if "b" in vague and (part := _cubic(problem, parameters)) < _LINEAR:
             message += f"; the spring is linear to {100 * part:.2g} %, as far as the oscillator moved"
         warnings.append(Warning("not_identified", message))
-    if problem.rig.guess is None:
-        return warnings
-    far = {name: off for name, off in _surprise(problem.rig.guess, parameters).items() if off > _FAR}
-    # m goes with the square of the sampling step, c with the step itself; a and b do not.
-    middle = sum(problem.rig.guess["m"]) / 2
-    factor = float(np.sqrt(max(parameters["m"][0] / middle, 1e-12)))
-    told = {"m": parameters["m"], "c": parameters["c"]}
-    mended = {"m": _times(told["m"], factor**-2), "c": _times(told["c"], 1 / factor)}
-    before, after = (sum(o**2 for o in _surprise(problem.rig.guess, p).values()) for p in (told, mended))
-    if "a" not in far and abs(np.log(factor)) > _FACTOR and before > max(after, _UNLIKELY):
-        message = f"m and c would be those of the guess if the sampling step were {1 / factor:.2f} times the rig's"
-        warnings.append(Warning("step", message))
-    elif far:
-        message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
-        warnings.append(Warning("guess", message))
     return warnings
 
 
@@ -215,21 +205,6 @@ def _told(problem: Problem, found: Found) -> dict[str, float]:
     parameters, spread = propagate(model, mean, alone)
     deviations = np.sqrt(np.diag(spread)) / np.maximum(np.abs(parameters), 1e-300)
     return {name: float(value) for name, value in zip(model.physical, deviations, strict=True) if name in "mcab"}
-
-
-def _surprise(
-    guess: Mapping[str, tuple[float, float]], parameters: Mapping[str, tuple[float, float]]
-) -> dict[str, float]:
-    """Standard deviations between what is guessed of parameters and what was found."""
-    spreads = {name: (guess[name][1] - guess[name][0]) / 2 / HALF_WIDTH for name in parameters if name in guess}
-    return {
-        name: float(abs(parameters[name][0] - sum(guess[name]) / 2) / np.hypot(spread, parameters[name][1]))
-        for name, spread in spreads.items()
-    }
-
-
-def _times(parameter: tuple[float, float], factor: float) -> tuple[float, float]:
-    return parameter[0] * factor, parameter[1] * factor
 
 
 def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Warning]:

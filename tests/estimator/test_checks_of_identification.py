@@ -1,10 +1,14 @@
 """What `identify` warns of: each check names its fault. benchmarks/rigs says how often, and that good records pass."""
 
+import re
+
 import numpy as np
 import pytest
 from oscillators import BENCH, SOFT, rig_of, simulated
 
 from estimator import Channel, Rig, identify
+
+GUESS = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
 
 
 @pytest.mark.parametrize(
@@ -22,8 +26,8 @@ def test_faults_are_named(change, name):
 
 def test_a_channel_that_is_turned_round_and_energy_that_flows_in_are_named():
     u, y = simulated(BENCH)
-    for records in ((u, -y), (-u, y)):
-        result = identify(rig_of(BENCH), records)
+    for records, guess in (((u, -y), None), ((-u, y), None), ((u, -y), GUESS)):
+        result = identify(rig_of(BENCH, guess=guess), records)
         assert [warning.name for warning in result.warnings] == ["sign"]
         assert "m is negative: the polarity" in result.warnings[0].message
     fed = (SOFT[0] | {"c": -0.02}, *SOFT[1:])
@@ -31,14 +35,45 @@ def test_a_channel_that_is_turned_round_and_energy_that_flows_in_are_named():
     assert (warning.name, warning.message.split(":")[0]) == ("sign", "c is negative")
 
 
+@pytest.mark.parametrize(
+    ("change", "slip"),
+    [
+        ({"m": 1000}, "check the units of guess and columns"),  # in grams
+        ({"a": 0.01}, "a: far outside"),
+        ({"m": 30, "c": 30, "a": 30, "b": 30}, "if the input were about 31 times"),
+        # in m, with an output in mm
+        ({"m": 1e3, "c": 1e3, "a": 1e3, "b": 1e9}, "if the output were about 0.00095 times"),
+    ],
+)
+def test_a_guess_that_leads_the_fit_astray_is_named_and_nothing_else(change, slip):
+    u, y = simulated(BENCH, samples=256)
+    guess = {name: tuple(change.get(name, 1) * end for end in ends) for name, ends in GUESS.items()}
+    (warning,) = identify(rig_of(BENCH, guess=guess), (u, y)).warnings
+    assert warning.name == "guess"
+    assert re.search(r"by \d+ nats the records speak for m = 0\.(4|39\d+|40\d+) and not ", warning.message)
+    assert slip in warning.message
+
+
+@pytest.mark.parametrize(
+    ("channel", "factor"), [("input", 4.45), ("input", 1 / 4.45), ("output", 3), ("output", 1 / 3)]
+)
+def test_a_wrong_scale_is_told_from_a_wrong_step(channel, factor):
+    u, y = simulated(BENCH)
+    records = (u / factor, y) if channel == "input" else (u, y / factor)
+    (warning,) = identify(rig_of(BENCH, guess=GUESS), records).warnings
+    assert warning.name == "guess"
+    told = re.search(rf"if the {channel} were about (\S+) times what is recorded", warning.message)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(factor, rel=0.1)
+
+
 def test_a_wrong_step_and_a_parameter_that_does_nothing_are_named():
     u, y = simulated(BENCH)
-    guess = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
     for factor in (0.5, 2):
-        wrong = Rig(factor * BENCH[1], input=Channel("N"), output=Channel("m"), guess=guess)
+        wrong = Rig(factor * BENCH[1], input=Channel("N"), output=Channel("m"), guess=GUESS)
         assert "step" in [warning.name for warning in identify(wrong, (u, y)).warnings]
     weak = (BENCH[0], BENCH[1], 0.05, 5e-6, 8)
-    for known in (None, guess):
+    for known in (None, GUESS):
         warnings = identify(rig_of(weak, guess=known), simulated(weak)).warnings
         told = [warning.message for warning in warnings if warning.name == "not_identified"]
         assert [message.split(":")[0] for message in told] == ["b"]

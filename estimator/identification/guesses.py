@@ -1,0 +1,120 @@
+"""Checks of the rig's guess: beside what was found, and beside what the records say without it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator.identification.fit import Fitter
+from estimator.identification.problem import Problem
+from estimator.identification.result import Warning
+from estimator.identification.search import Found, search
+from estimator.rig_prior import HALF_WIDTH, about
+
+#: Parameter to mean and standard deviation, in the rig's units.
+Parameters = Mapping[str, tuple[float, float]]
+
+#: Parameter to its central 90 % interval.
+Guess = Mapping[str, tuple[float, float]]
+
+#: Standard deviations from the guess that are far.
+_FAR = 5.0
+
+#: A wrong step or scale is looked for that is nearer to a factor of 2, either way, than to 1, where the guess of the
+#: parameters that it changes has less than 1 % of a chance: chi square is larger, of so many of them.
+_FACTOR, _UNLIKELY = 0.5 * np.log(2), {2: 9.21, 4: 13.28}
+
+
+@dataclass(frozen=True)
+class _Slip:
+    """A number that may be wrong by a factor.
+
+    Attributes:
+        check: its name.
+        message: with a place for the factor.
+        powers: parameter to the power of the factor that would mend it.
+    """
+
+    check: str
+    message: str
+    powers: Mapping[str, int]
+
+
+_SLIPS = (
+    _Slip(
+        "step",
+        "m and c would be those of the guess if the sampling step were about {:.2g} times the rig's",
+        {"m": 2, "c": 1},
+    ),
+    _Slip(
+        "guess",
+        "m, c, a and b would be those of the guess if the input were about {:.2g} times what is recorded; check its "
+        "unit and calibration, and those of the guess",
+        {"m": 1, "c": 1, "a": 1, "b": 1},
+    ),
+    _Slip(
+        "guess",
+        "m, c, a and b would be those of the guess if the output were about {:.2g} times what is recorded; check its "
+        "unit and calibration, and those of the guess",
+        {"m": -1, "c": -1, "a": -1, "b": -3},
+    ),
+)
+
+
+def of_guess(guess: Guess, parameters: Parameters) -> list[Warning]:
+    """Whether parameters are far from the guess, and what would explain it; a negative mass is no matter of it."""
+    if parameters["m"][0] <= 0:
+        return []
+    off, warnings = _surprise(guess, parameters), list[Warning]()
+    far = [name for name, squared in off.items() if squared > _FAR**2]
+    if far:
+        message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
+        warnings = [Warning("guess", message)]
+    least = sum(off.values())
+    for slip in _SLIPS:
+        # The guess of m is of one sign, and tells the factor.
+        factor = float((sum(guess["m"]) / 2 / parameters["m"][0]) ** (1 / slip.powers["m"]))
+        mended = {name: _times(parameters[name], factor ** slip.powers.get(name, 0)) for name in guess}
+        left = sum(_surprise(guess, mended).values())
+        unlikely = sum(off[name] for name in slip.powers) > _UNLIKELY[len(slip.powers)]
+        if abs(np.log(factor)) > _FACTOR and unlikely and left < least:
+            least, warnings = left, [Warning(slip.check, slip.message.format(factor))]
+    return warnings
+
+
+def _surprise(guess: Guess, parameters: Parameters) -> dict[str, float]:
+    """Squared standard deviations between what is guessed of parameters and what was found."""
+    spreads = {name: (high - low) / 2 / HALF_WIDTH for name, (low, high) in guess.items()}
+    return {
+        name: float((parameters[name][0] - sum(guess[name]) / 2) ** 2 / (spread**2 + parameters[name][1] ** 2))
+        for name, spread in spreads.items()
+    }
+
+
+def _times(parameter: tuple[float, float], factor: float) -> tuple[float, float]:
+    return parameter[0] * factor, parameter[1] * factor
+
+
+def without_guess(problem: Problem, found: Found) -> tuple[Parameters, float]:
+    """The parameters that the records alone give, and the nats by which the records are more probable with them.
+
+    Both fits are judged as if nothing were guessed, so that it does not count how improbable the guess holds them.
+    """
+    try:
+        alone = search(replace(problem, rig=replace(problem.rig, guess=None)), lambda text: None)
+    except ValueError:  # the records tell too little without a guess
+        return {}, 0.0
+    judge = Fitter(found.fitter.problem, alone.fitter.prior)
+    own = judge.fit([found.best], found.mean, found.level, iterations=0).free_energy[0]
+    told = about(problem.rig, problem.scales, alone.mean, alone.cov).parameters()
+    return {name: (mean, std) for name, (mean, std, _) in told.items()}, float(own - alone.fits.free_energy.min())
+
+
+def astray(guess: Guess, parameters: Parameters, alone: Parameters, gain: float) -> list[Warning]:
+    """That the guess has led the fit astray: by so many nats the records are more probable with what they say alone."""
+    values = ", ".join(f"{name} = {alone[name][0]:.4g} and not {parameters[name][0]:.4g}" for name in guess)
+    led = f"the guess leads the fit astray: by {gain:.0f} nats the records speak for {values}"
+    why = of_guess(guess, alone) or [Warning("guess", "check the units of guess and columns, or leave out the guess")]
+    return [Warning(one.name, f"{led}; {one.message}") for one in why]
