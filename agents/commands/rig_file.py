@@ -47,8 +47,8 @@ def text_of(rig: Rig, told: str = "") -> str:
         _known("range", sink.range, "an experiment stops outside of it, in either direction"),
         _known("noise", sink.noise, "standard deviation of the sensor's noise, where you know it"),
         "",
-        "# What you believe before any record: a low and a high end for each, which hold it with 90 %. identify does",
-        "# without.",
+        "# What you believe before any record: a low and a high end for each, which hold it with 90 %.",
+        "# identify needs none of it.",
     ]
     units = {name: rig.scales.unit(rig.model.dimensions[name]) for name in "mcab"}
     if rig.guess is None:

@@ -158,8 +158,8 @@ def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
         return []
     message = (
         f"the force is disturbed by {disturbance:.3g} {channel.unit} in every sample, "
-        f"{100 * disturbance / strength:.1f} % of the input: is the input measured with noise, or the "
-        f"equation another?"
+        f"{100 * disturbance / strength:.1f} % of the input; either the recorded input is noisy, or "
+        f"the equation lacks something"
     )
     return [Warning("process_noise", message)]
 
@@ -180,7 +180,7 @@ def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[f
     vague = [name for name, deviation in _told(problem, found).items() if deviation > _VAGUE]
     warnings = []
     if vague:
-        message = f"{', '.join(vague)}: not identified by this input; what is said of it is hardly from the records"
+        message = f"{', '.join(vague)}: not identified by this input; the records leave more than a third of it open"
         if "b" in vague and (part := _cubic(problem, parameters)) < _LINEAR:
             message += f"; the spring is linear to {100 * part:.2g} %, as far as the oscillator moved"
         warnings.append(Warning("not_identified", message))
@@ -223,11 +223,13 @@ def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequen
     products = [sum(float(one[k:] @ one[: len(one) - k]) for one in left if len(one) > k) for k in range(lags + 1)]
     statistic = n * sum((products[k] / products[0]) ** 2 for k in range(1, lags + 1))
     if statistic > chi2.isf(_ALARM, lags):
-        message = "what the forecasts leave is not white: the equation, the input's way or the noise is another"
+        message = (
+            "errors of the forecasts can be foreseen: the equation, the way of the input or the noise is not as assumed"
+        )
         warnings.append(Warning("residuals_not_white", message))
     centred = (values - values.mean()) / values.std()
     kurtosis = (np.mean(centred**4) - 3) * np.sqrt(n / 24)
     if abs(kurtosis) > 6.0 or np.abs(centred).max() > norm.isf(_ALARM / n / 2):
-        message = "what the forecasts leave is not normal: outliers, or a noise that comes and goes"
+        message = "errors of the forecasts are not normal: there are outliers, or the noise comes and goes"
         warnings.append(Warning("residuals_not_normal", message))
     return warnings
