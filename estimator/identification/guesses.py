@@ -64,7 +64,7 @@ _SLIPS = (
 
 
 def of_guess(guess: Guess, parameters: Parameters) -> list[Warning]:
-    """Whether parameters are far from the guess, and what would explain it; a negative mass is no matter of it."""
+    """Whether parameters are far from the guess, and what explains most of it; a negative mass is no matter of it."""
     if parameters["m"][0] <= 0:
         return []
     off, warnings = _surprise(guess, parameters), list[Warning]()
@@ -72,7 +72,7 @@ def of_guess(guess: Guess, parameters: Parameters) -> list[Warning]:
     if far:
         message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
         warnings = [Warning("guess", message)]
-    least = sum(off.values())
+    least = sum(off.values()) / 2
     for slip in _SLIPS:
         # The guess of m is of one sign, and tells the factor.
         factor = float((sum(guess["m"]) / 2 / parameters["m"][0]) ** (1 / slip.powers["m"]))
