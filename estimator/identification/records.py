@@ -23,8 +23,8 @@ _LARGEST_FILE = 2**30
 #: A level of the output is a stop where the signal comes to it this often, and so many times as often as to the next.
 _OFTEN, _MORE = 3, 4
 
-#: Fewer outputs identify nothing.
-_FEWEST = 50
+#: Fewer outputs identify nothing, and a piece of fewer tells next to nothing.
+_FEWEST, _SHORTEST = 50, 8
 
 
 #: Reads a MAT file in a process of its own: SciPy's reader is ended by a segmentation fault at some damaged ones.
@@ -60,7 +60,8 @@ class Record:
 def records_of(given: Any, step: float) -> list[Record]:
     """Records from a pair (u, y), a file name, or a list of these.
 
-    A record is cut in two where an input is missing; clipped outputs are taken as missing.
+    A record is cut in two where an input is missing; clipped outputs are taken as missing. Pieces of fewer than 8
+    outputs are left out, but not a whole record. A record may not be given twice: its samples would count twice.
 
     Args:
         given: what the caller has.
@@ -78,7 +79,7 @@ def records_of(given: Any, step: float) -> list[Record]:
         raise ValueError(f"records must be a list of pairs (u, y) or file names, but are {given!r:.60}") from error
     if not listed:
         raise ValueError("records must hold at least one pair (u, y) or file name, but are empty")
-    found = []
+    found, names = list[Record](), dict[int, str]()
     for number, one in enumerate(listed):
         name = str(one) if isinstance(one, str | Path) else f"record {number}"
         if isinstance(one, str | Path):
@@ -86,12 +87,27 @@ def records_of(given: Any, step: float) -> list[Record]:
         elif _is_pair(one):
             u, y = (series(f"{part} of {name}", values, missing=True) for part, values in zip("uy", one, strict=True))
         else:
-            raise ValueError(f"{name} must be a pair (u, y) or a file name, but is {one!r:.60}")
+            raise ValueError(
+                f"{name} must be a pair (u, y) or a file name, but is {one!r:.60}; pass (u, y) as one tuple"
+            )
         if len(u) != len(y):
             raise ValueError(f"u and y of {name} must have one length, but have {len(u)} and {len(y)}; cut the longer")
-        found += _cut(Record(name, u, y))
-    if sum(int(np.isfinite(one.y).sum()) for one in found) < _FEWEST:
-        raise ValueError(f"records must have at least {_FEWEST} outputs in all; add samples")
+        first = names.setdefault(hash((u.tobytes(), y.tobytes())), name)
+        if len(names) <= number:
+            raise ValueError(
+                f"{name} must not be a record twice, but has the samples of {first}; leave one of them out"
+            )
+        pieces = _cut(Record(name, u, y))
+        if not pieces:
+            count = int((np.isfinite(u) & np.isfinite(y)).sum())
+            raise ValueError(
+                f"{name} must have {_SHORTEST} outputs or more between missing inputs, but of its {len(u)} samples "
+                f"{count} have both input and output; add samples, or leave it out"
+            )
+        found += pieces
+    count = sum(int(np.isfinite(one.y).sum()) for one in found)
+    if count < _FEWEST:
+        raise ValueError(f"records must have at least {_FEWEST} outputs in all, but have {count}; add samples")
     for part in "uy":
         if all(np.ptp(values) == 0 for one in found if len(values := _seen(getattr(one, part)))):
             raise ValueError(f"{part} must vary, but is constant in all records; excite the system")
@@ -114,7 +130,7 @@ def _cut(record: Record) -> list[Record]:
     pieces = []
     for piece in np.ma.clump_unmasked(np.ma.masked_invalid(record.u)):
         seen = np.flatnonzero(np.isfinite(y[piece]))
-        if len(seen) < 8:
+        if len(seen) < _SHORTEST:
             continue
         part = slice(piece.start, piece.start + seen[-1] + 1)
         told = int(stops[part].sum()), int(missing[part].sum())

@@ -80,10 +80,13 @@ def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
     assert "No check speaks against this result." in told
     page = Path("out/page.html").read_text()
     assert "duffing-env identify rig.toml record.csv --report out/page.html" in page
-    status, told, _ = run("identify", "rig.toml", "record.csv", "record.csv", "--json")
+    lines = Path("record.csv").read_text().splitlines()
+    Path("first.csv").write_text("\n".join(lines[:600]))
+    Path("second.csv").write_text("\n".join([lines[0], *lines[600:]]))
+    status, told, _ = run("identify", "rig.toml", "first.csv", "second.csv", "--json")
     assert status == 0
     described = json.loads(told)
-    assert [one["samples"] for one in described["records"]] == [1024, 1024]
+    assert [one["samples"] for one in described["records"]] == [599, 425]
     units = {"m": 1e-3, "c": 1e-3, "a": 1e-3, "b": 1e-9}
     for name, truth in TRUTH.items():
         found = described["parameters"][name]

@@ -25,6 +25,15 @@ def test_a_stop_that_single_samples_meet_is_found():
     assert not clipped(y).any()
 
 
+def test_a_short_piece_between_missing_inputs_is_left_out():
+    u, y = simulated(SOFT, samples=400)
+    u[[200, 205]] = np.nan
+    assert [(one.name, len(one.u)) for one in records_of((u, y), 0.01)] == [
+        ("record 0", 200),
+        ("record 0, from sample 206", 194),
+    ]
+
+
 def test_files(tmp_path):
     u, y = simulated(SOFT, samples=400)
     lines = [f"{k * 0.01:.6f},{a},{b}" for k, (a, b) in enumerate(zip(u, y, strict=True))]
@@ -90,9 +99,16 @@ def test_errors_of_files_name_the_line(tmp_path, text, message):
     [
         ([], "records must hold at least one pair"),
         (3, "records must be a list of pairs"),
-        ([3], "record 0 must be a pair (u, y) or a file name, but is 3"),
+        ([3], "record 0 must be a pair (u, y) or a file name, but is 3; pass (u, y) as one tuple"),
         ([(np.ones(100), np.ones(99))], "u and y of record 0 must have one length, but have 100 and 99"),
-        ([(np.ones(20), np.arange(20.0))], "records must have at least 50 outputs"),
+        ([(np.ones(20), np.arange(20.0))], "must have at least 50 outputs in all, but have 20"),
+        (
+            [(np.ones(4000), np.full(4000, np.nan))],
+            "record 0 must have 8 outputs or more between missing inputs, but of "
+            "its 4000 samples 0 have both input and output",
+        ),
+        ([simulated(SOFT, samples=400), (np.ones(5), np.arange(5.0))], "record 1 must have 8 outputs or more"),
+        ([simulated(SOFT, samples=400)] * 2, "record 1 must not be a record twice, but has the samples of record 0"),
         ([(np.ones(100), np.arange(100.0))], "u must vary, but is constant"),
         ([(np.full(100, np.inf), np.arange(100.0))], "u of record 0 must be finite"),
     ],
