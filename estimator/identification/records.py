@@ -94,9 +94,7 @@ def records_of(given: Any, step: float) -> list[Record]:
             raise ValueError(f"u and y of {name} must have one length, but have {len(u)} and {len(y)}; cut the longer")
         first = names.setdefault(hash((u.tobytes(), y.tobytes())), name)
         if len(names) <= number:
-            raise ValueError(
-                f"{name} must not be a record twice, but has the samples of {first}; leave one of them out"
-            )
+            raise ValueError(f"{name} must be a record of its own, but has the samples of {first}; leave one out")
         pieces = _cut(Record(name, u, y))
         if not pieces:
             count = int((np.isfinite(u) & np.isfinite(y)).sum())

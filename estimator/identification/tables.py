@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from estimator.parameters import FloatArray
 
@@ -24,6 +25,9 @@ _TIMES = ("t", "time")
 #: What a time column may be in [s].
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 
+#: What stands for a missing number, in lower case.
+_MISSING = ("", "na", "n/a", "#n/a", "null", "none", "-")
+
 #: Steps of a time column may be uneven by so much, which rounding does.
 _UNEVEN = 0.2
 
@@ -35,7 +39,8 @@ class Table:
     Attributes:
         path: of the file.
         names: of its columns, as they stand there; empty where it has numbers alone.
-        columns: (C, T) numbers; NaN where a field is empty.
+        columns: (C, T) numbers; NaN where one is missing.
+        lines: (T,) of the file.
         time: which column is the time; None where there is none.
         u: which column is the input.
         y: which column is the output.
@@ -44,12 +49,15 @@ class Table:
     path: Path
     names: tuple[str, ...]
     columns: FloatArray
+    lines: npt.NDArray[np.int64]
     time: int | None
     u: int
     y: int
 
     def step(self) -> float | None:
         """Sampling step [s], of the time column; None where there is none.
+
+        Times are those of the lines that have an input, and may leap where an input is missing: there a record is cut.
 
         Raises:
             ValueError: for times that are missing, do not grow, are unevenly spaced, or in a unit that is unknown.
@@ -59,15 +67,35 @@ class Table:
         unit = self.unit(self.time) or "s"
         if unit not in _SECONDS:
             raise ValueError(f"{self.path}: times must be in one of {', '.join(_SECONDS)}, but are in {unit!r:.40}")
-        time = self.columns[self.time] * _SECONDS[unit]
-        steps = np.diff(time)
-        if not len(steps) or not np.isfinite(steps).all() or (steps <= 0).any():
-            raise ValueError(f"{self.path}: times must be there and grow, but do not; mend the column, or remove it")
-        if (np.abs(steps - np.median(steps)) > _UNEVEN * np.median(steps)).any():
+        time, driven = self.columns[self.time] * _SECONDS[unit], np.isfinite(self.columns[self.u])
+        for k in np.flatnonzero(driven & np.isnan(time))[:1]:
             raise ValueError(
-                f"{self.path}: samples must be evenly spaced, but steps are {steps.min():.6g} to {steps.max():.6g} s"
+                f"{self._line(k)}: there must be a time beside the input, but there is none; fill it in, or remove "
+                f"the column of times"
             )
-        return float((time[-1] - time[0]) / len(steps))
+        later = np.flatnonzero(driven[1:] & driven[:-1]) + 1
+        if not len(later):
+            raise ValueError(
+                f"{self.path} must have two samples in a row with time and input, but has none; add samples"
+            )
+        steps = time[later] - time[later - 1]
+        for k in later[steps <= 0][:1]:
+            raise ValueError(
+                f"{self._line(k)}: times must grow, but {time[k]:.9g} s comes after {time[k - 1]:.9g} s; mend the "
+                f"line, or set records apart by an empty row"
+            )
+        usual = np.median(steps)
+        for k in later[np.abs(steps - usual) > _UNEVEN * usual][:1]:
+            raise ValueError(
+                f"{self._line(k)}: samples must be evenly spaced, by {usual:.6g} s, but this one comes "
+                f"{time[k] - time[k - 1]:.6g} s after the last; give every lost sample a line with empty fields, or "
+                f"resample"
+            )
+        return float(steps.mean())
+
+    def _line(self, row: np.int64) -> str:
+        """The file, and the line of a row."""
+        return f"{self.path}, line {self.lines[row]}"
 
     def unit(self, place: int) -> str | None:
         """What stands in brackets behind the name of a column, as N in ``force [N]``; None where nothing does."""
@@ -82,9 +110,10 @@ class Table:
 def read_table(path: Path) -> Table:
     """Read a CSV file.
 
-    Fields stand between commas, or semicolons or tabs (then 0,5 is a number), or blanks. Empty ones are missing. Lines
-    that begin with # are passed over. The first line may hold names, such as ``u,y`` or ``time [ms],force [N],x [mm]``;
-    of numbers alone there are the columns u and y, or time, u and y.
+    Fields stand between commas, or semicolons or tabs (then 0,5 is a number), or blanks. Empty ones are missing, and
+    NaN, NA, N/A, null, none or - in them. Lines that begin with # are passed over; one of separators alone sets records
+    apart. The first line may hold names, such as ``u,y`` or ``time [ms],force [N],x [mm]``, and the next one units,
+    such as ``ms,N,mm``; of numbers alone there are the columns u and y, or time, u and y.
 
     Raises:
         ValueError: naming the file, the line and what is wrong.
@@ -93,29 +122,47 @@ def read_table(path: Path) -> Table:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} must be text in UTF-8, but is not: {error}; save it as CSV again") from error
-    rows: list[list[float]] = []
+    rows, lines = list[list[float]](), list[int]()
     names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
     width = 0
     for number, words in _fields(text):
+        if not any(word.strip() for word in words):
+            if rows:
+                rows.append([math.nan] * width)
+                lines.append(number)
+            continue
         values = [_number(word) for word in words]
         if not width and None in values:
             names, width = tuple(word.strip() for word in words), len(words)
             continue
         width = width or len(words)
         if len(words) != width:
-            raise ValueError(f"{path}, line {number}: must have {width} columns, but has {len(words)}; mend the line")
+            where, remedy = ("", "mend the line")
+            if not rows:
+                where, remedy = " as the names", "begin lines before the names with #, or mend the line"
+            raise ValueError(f"{path}, line {number}: must have {width} columns{where}, but has {len(words)}; {remedy}")
+        if None in values and not rows and not units and not any(map(_told, values)):
+            units = tuple(words)
+            continue
         if None in values:
             bad = words[values.index(None)]
             raise ValueError(f"{path}, line {number}: {bad!r:.40} must be a number; leave it empty where it is missing")
         rows.append([value for value in values if value is not None])
+        lines.append(number)
     if not rows:
         raise ValueError(f"{path} must hold numbers, but holds none")
+    if units:
+        names = tuple(
+            f"{name} [{unit.strip()}]" if _number(unit) is None else name
+            for name, unit in zip(names, units, strict=True)
+        )
     columns = np.array(rows).T
-    return Table(path, names, columns, *_chosen(path, names, len(columns)))
+    return Table(path, names, columns, np.array(lines), *_chosen(path, names, len(columns)))
 
 
 def _fields(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and fields of the lines that hold something."""
+    """Numbers and fields of the lines that hold something, if only separators."""
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     first = "".join(line for _, line in lines[:2])
     separator = next((mark for mark in "\t;," if mark in first), None)
@@ -123,19 +170,23 @@ def _fields(text: str) -> Iterator[tuple[int, list[str]]]:
         yield from ((number, line.split()) for number, line in lines)
         return
     for (number, _), words in zip(lines, csv.reader((line for _, line in lines), delimiter=separator), strict=False):
-        if any(word.strip() for word in words):
-            yield number, words if separator == "," else [word.replace(",", ".") for word in words]
+        yield number, words if separator == "," else [word.replace(",", ".") for word in words]
 
 
 def _number(word: str) -> float | None:
-    """The number that a field holds, NaN where it is empty; None where it is no finite number."""
-    if not word.strip():
+    """The number that a field holds, NaN where it is missing; None where it is no finite number."""
+    if word.strip().lower() in _MISSING:
         return math.nan
     try:
         value = float(word)
     except ValueError:
         return None
     return None if math.isinf(value) else value
+
+
+def _told(value: float | None) -> bool:
+    """Whether a field holds a number that is not missing."""
+    return value is not None and not math.isnan(value)
 
 
 def _word(name: str) -> str:

@@ -65,6 +65,9 @@ def test_files(tmp_path):
         "\ufeffu\ty\n0.5\t1\n\n1.5\t-0.2\n\t3\n",
         "# written by a tool, with; signs\n0.5 1\n  1.5   -0.2 \nnan 3\n",
         "response [mm], time [ms], force [N]\n1, 10, 0.5\n-0.2, 20, 1.5\n3, 30, \n",
+        "time,force,displacement\ns,N,mm\n0,0.5,1\n0.01,1.5,-0.2\n0.02,n/a,3\n",
+        "u y\n0.5 1\n1.5 -0.2\nNA 3\n",
+        ",,,\nu,y\n,\n0.5,1\n1.5,-0.2\nnull,3\n",
     ],
 )
 def test_tables_as_programs_write_them(tmp_path, text):
@@ -72,6 +75,12 @@ def test_tables_as_programs_write_them(tmp_path, text):
     u, y = read(tmp_path / "r.csv", 0.01)
     np.testing.assert_array_equal(u, [0.5, 1.5, np.nan])
     np.testing.assert_array_equal(y, [1.0, -0.2, 3.0])
+
+
+def test_times_are_even_between_missing_inputs_only(tmp_path):
+    (tmp_path / "r.csv").write_text("t,u,y\n0,1,2\n0.01,1,3\n,,\n7,1,2\n7.01,2,3\n7.02,,3\n9,2,2\n9.01,2,2\n,,,,\n")
+    u, _ = read(tmp_path / "r.csv", 0.01)
+    np.testing.assert_array_equal(u, [1, 1, np.nan, 1, 2, np.nan, 2, 2, np.nan])
 
 
 @pytest.mark.parametrize(
@@ -82,7 +91,17 @@ def test_tables_as_programs_write_them(tmp_path, text):
         ("a_column,b_column\n1,2", "must have one column of inputs and one of outputs"),
         ("1,2,3,4\n1,2,3,4", "must have two columns, u and y"),
         ("t,u,y\n0,1,2\n0.5,1,3\n1.0,2,3\n", "times are 0.5 s apart, but the rig's step is 0.01 s"),
-        ("t,u,y\n0,1,2\n0.01,1,3\n0.5,2,3\n", "samples must be evenly spaced"),
+        (
+            "t,u,y\n0,1,2\n0.01,1,3\n0.02,1,3\n0.03,1,3\n0.05,2,3\n",
+            "line 6: samples must be evenly spaced, by 0.01 s, but this one comes 0.02 s after the last",
+        ),
+        ("t,u,y\n0,1,2\n0.01,1,3\n0.01,2,3\n", "line 4: times must grow, but 0.01 s comes after 0.01 s"),
+        ("t,u,y\n0,1,2\n,1,3\n0.02,2,3\n", "line 3: there must be a time beside the input, but there is none"),
+        ("t,u,y\n0,,2\n0.01,,3\n", "must have two samples in a row with time and input, but has none"),
+        (
+            "Made by X\nt,u,y\n0,1,2\n",
+            "line 2: must have 1 columns as the names, but has 3; begin lines before the names with #",
+        ),
         ("t [days],u,y\n0,1,2\n1,1,3\n", "times must be in one of s, ms, us,"),
         ("", "must hold numbers, but holds none"),
     ],
@@ -108,7 +127,7 @@ def test_errors_of_files_name_the_line(tmp_path, text, message):
             "its 4000 samples 0 have both input and output",
         ),
         ([simulated(SOFT, samples=400), (np.ones(5), np.arange(5.0))], "record 1 must have 8 outputs or more"),
-        ([simulated(SOFT, samples=400)] * 2, "record 1 must not be a record twice, but has the samples of record 0"),
+        ([simulated(SOFT, samples=400)] * 2, "record 1 must be a record of its own, but has the samples of record 0"),
         ([(np.ones(100), np.arange(100.0))], "u must vary, but is constant"),
         ([(np.full(100, np.inf), np.arange(100.0))], "u of record 0 must be finite"),
     ],
