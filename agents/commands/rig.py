@@ -22,9 +22,9 @@ class Init:
     path: Annotated[Path, tyro.conf.Positional] = Path("rig.toml")
     """The file that is written."""
     source: Annotated[str | None, tyro.conf.arg(name="from", metavar="DATA|NAME")] = None
-    """CSV file of a record, or the name of a rig that ships."""
+    """CSV or MAT file of a record, or the name of a rig that ships."""
     step: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Sampling step, for a record without a column of times."""
+    """Sampling step, for a record without a column of times, such as a MAT file."""
     force: bool = False
     """Replace the file where there is one."""
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from estimator.checks import printable
+from estimator.identification.records import read
 from estimator.identification.tables import Table, read_table
 from estimator.models.duffing import KINDS
 from estimator.rig import INTERPOLATIONS, Channel, Rig
@@ -16,6 +18,15 @@ from estimator.rig import INTERPOLATIONS, Channel, Rig
 _EQUATION = "#   m x'' + c x' + a x + b x³ = u - u0 + w,   seen: {seen} + y0 + noise"
 _SEEN = {"displacement": "x", "velocity": "x'", "acceleration": "x''"}
 _INTERPOLATION = '# Of the input between samples: "zero_order": held, as by a converter; "linear"; "spline": smooth.'
+
+#: Kind of an output to the words that name it, and the units that only it has.
+_WORDS = {
+    "displacement": ("displacement", "disp", "position", "pos"),
+    "velocity": ("velocity", "vel", "v"),
+    "acceleration": ("acceleration", "acc", "a"),
+}
+_UNITS_OF = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "acceleration": r".+/s(²|\^?2|/s)|m?g"}
+
 _UNKNOWN = "not known"
 _UNITS = '  # such as "N", "V", "mm" or "m/s"; "1" is a pure number'
 
@@ -70,8 +81,10 @@ def _quoted(text: str) -> str:
 def from_record(path: Path, step: float | None = None) -> str:
     """The file for a record: step from its column of times, units and kind from the names of its columns.
 
+    A MAT file tells none of these.
+
     Args:
-        path: of a CSV file.
+        path: of a CSV or MAT file.
         step: sampling step [s]; None: that of the times.
 
     Raises:
@@ -79,9 +92,16 @@ def from_record(path: Path, step: float | None = None) -> str:
         FileNotFoundError: if there is no such file.
     """
     if not path.exists():
-        raise FileNotFoundError(f"from must be a CSV file or the name of a rig that ships, but there is no {path}")
-    if path.suffix.lower() == ".mat" or not path.is_file():
-        raise ValueError(f"from must be a CSV file, but is {path}; leave --from away, and answer the questions")
+        raise FileNotFoundError(
+            f"from must be a CSV or MAT file, or the name of a rig that ships, but there is no {path}"
+        )
+    if not path.is_file():
+        raise ValueError(f"from must be a CSV or MAT file, but is {path}; leave --from away, and answer the questions")
+    if path.suffix.lower() == ".mat":
+        if step is None:
+            raise ValueError(f"{path} must be a CSV file to tell the step, but is a MAT file; add --step SECONDS")
+        read(path, step)
+        return text_of(Rig(step), f", from {printable(path.name)}")
     table = read_table(path)
     own = table.step()
     if step is None and own is None:
@@ -95,11 +115,14 @@ def from_record(path: Path, step: float | None = None) -> str:
 
 def _output(table: Table) -> Channel:
     word, unit = table.word(table.y), table.unit(table.y) or "1"
-    kind = {"v": "velocity", "vel": "velocity", "a": "acceleration", "acc": "acceleration"}.get(word, word)
-    if kind not in KINDS:
-        ends = {"velocity": ("/s",), "acceleration": ("/s²", "/s^2", "/s2", "g")}
-        kind = next((kind for kind, known in ends.items() if unit.endswith(known)), "displacement")
-    return Channel(unit, kind=kind)
+    kind = next((one for one, known in _WORDS.items() if word in known), None)
+    told = next((one for one, known in _UNITS_OF.items() if re.fullmatch(known, unit)), None)
+    if kind and told and kind != told:
+        raise ValueError(
+            f"{table.path}: unit of {table.names[table.y]!r:.60} must be of a kind with the name, {kind}, but tells "
+            f"{told}; mend one of them"
+        )
+    return Channel(unit, kind=kind or told or "displacement")
 
 
 def ask() -> Rig:

@@ -121,6 +121,15 @@ def test_warnings_are_told(run, folder, monkeypatch):
         (["rig", "init", "new.toml", "--from", "plain.csv"], "add --step SECONDS"),
         (["rig", "init", "new.toml", "--from", "uneven.csv"], "samples must be evenly spaced"),
         (["rig", "init", "new.toml", "--from", "fortnights.csv"], "times must be in one of s, ms"),
+        (
+            ["rig", "init", "new.toml", "--from", "r.mat"],
+            "r.mat must be a CSV file to tell the step, but is a MAT file",
+        ),
+        (["rig", "init", "new.toml", "--from", "r.mat", "--step", "1"], "r.mat must be a sound MAT file"),
+        (
+            ["rig", "init", "new.toml", "--from", "kind.csv"],
+            "unit of 'displacement [m/s]' must be of a kind with the name, displacement, but tells velocity",
+        ),
         (["rig", "init", "new.toml", "--step", "1"], "step goes with a record"),
         (["rig", "init", "new.toml", "--from", "plain.csv", "--step", "-1"], "step must be a number from 1e-30"),
     ],
@@ -132,6 +141,8 @@ def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch
     Path("record.csv").write_text("u,y\n" + "1,2\n" * 10)
     Path("plain.csv").write_text("u,y\n1,2\n2,3\n")
     Path("uneven.csv").write_text("t,u,y\n0,1,2\n1,1,2\n9,2,3\n")
+    Path("kind.csv").write_text("t,u,displacement [m/s]\n0,1,2\n1,1,2\n2,2,3\n")
+    Path("r.mat").write_bytes(b"none")
     Path("fortnights.csv").write_text("t [fortnight],u,y\n0,1,2\n1,1,2\n2,2,3\n")
     status, told, messages = run(*words)
     assert (status, told) == (2, "")
@@ -149,6 +160,7 @@ def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch
         ("time [ms],drive [V],response [m/s^2]", 1.6384e-3, ("V", "m/s^2"), "acceleration"),
         ("ACC (g),F (N),t (ms)", 1.6384e-3, ("N", "g"), "acceleration"),
         ("time,input,output", 1.6384, ("1", "1"), "displacement"),
+        ("time,input,response [deg]", 1.6384, ("1", "deg"), "displacement"),
     ],
 )
 def test_a_rig_takes_what_a_record_tells(run, tmp_path, monkeypatch, head, step, units, kind):
@@ -169,6 +181,17 @@ def test_a_step_can_be_given(run, tmp_path, monkeypatch):
     Path("r.csv").write_text("1 2\n2 3\n3 4\n")
     assert run("rig", "init", "--from", "r.csv", "--step", "2e-6")[0] == 0
     assert Rig.from_file("rig.toml") == Rig(2e-6)
+
+
+def test_a_mat_file_can_be_the_record(run, tmp_path, monkeypatch):
+    from scipy.io import savemat
+
+    monkeypatch.chdir(tmp_path)
+    savemat("r.mat", {"u": np.arange(9.0), "y": np.arange(9.0) ** 2})
+    status, told, _ = run("rig", "init", "--from", "r.mat", "--step", "2e-3")
+    assert status == 0
+    assert "Next: duffing-env identify rig.toml r.mat" in told
+    assert Rig.from_file("rig.toml") == Rig(2e-3)
 
 
 def test_a_rig_is_asked_for(run, tmp_path, monkeypatch, capsys):
