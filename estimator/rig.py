@@ -22,7 +22,7 @@ from estimator.units import SIZES, Scales
 INTERPOLATIONS = {"zero_order": 0, "linear": 1, "look_ahead": 5, "spline": 5}
 
 #: More samples of delay are a record that was not aligned.
-_LONGEST_DELAY = 1000
+LONGEST_DELAY = 1000
 
 #: No rig file is larger [bytes].
 _LARGEST_FILE = 2**20
@@ -111,7 +111,7 @@ class Rig:
         number("step", self.step, *SIZES, "give the seconds between samples")
         one_of("interpolation", self.interpolation, INTERPOLATIONS)
         least = -1 if self.interpolation == "zero_order" else 0
-        whole(f"delay (for {self.interpolation})", self.delay, _LONGEST_DELAY, least)
+        whole(f"delay (for {self.interpolation})", self.delay, LONGEST_DELAY, least)
         for name, other in (("input", "range"), ("output", "limit")):
             channel = getattr(self, name)
             if isinstance(channel, Mapping):

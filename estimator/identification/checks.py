@@ -15,7 +15,7 @@ from estimator.identification.result import Warning
 from estimator.identification.search import Found
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
-from estimator.rig import INTERPOLATIONS
+from estimator.rig import INTERPOLATIONS, LONGEST_DELAY
 
 #: Nats by which another hypothesis must be better.
 _EVIDENCE = 7.0
@@ -23,8 +23,9 @@ _EVIDENCE = 7.0
 #: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
 _RATIOS = (1.0, 0.1, 0.01)
 
-#: Samples by which the input may be earlier or later than is thought.
-_DELAYS = range(-LATEST, LATEST + 1)
+#: Samples by which the input may be earlier or later than is thought, and many by which it may be later: from the
+#: nearest of these the way leads on, step by step.
+_DELAYS, _LATE = range(-LATEST, LATEST + 1), (5, 8, 12, 16, 20, 25, 30, 40)
 
 #: Steps of a fit of another hypothesis, at most.
 _STEPS = 12
@@ -114,6 +115,8 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
         for later in _DELAYS
         if (way, later) != (rig.interpolation, 0) and rig.delay + later >= (-1 if way == "zero_order" else 0)
     ]
+    others += [replace(found.best, delay=rig.delay + later) for later in _LATE]
+    others = [other for other in others if other.delay <= LONGEST_DELAY]
     gains = own - _energies(found.fitter, others, found, own)
     of_terms = []
     for name in EXTRA:

@@ -24,6 +24,19 @@ def test_faults_are_named(change, name):
     assert name in [warning.name for warning in result.warnings]
 
 
+@pytest.mark.parametrize("late", [4, 12, 24, 45])
+def test_a_large_delay_is_found_step_by_step(late):
+    u, y = simulated(BENCH)
+    delay = 0
+    for _ in range(6):
+        warnings = identify(rig_of(BENCH, delay=delay), (u[late:], y[:-late])).warnings
+        told = [re.search(r"'zero_order' with delay (\d+), by", one.message) for one in warnings if one.name == "delay"]
+        if not told or told[0] is None:
+            break
+        delay = int(told[0][1])
+    assert (delay, warnings) == (late, ())
+
+
 def test_a_channel_that_is_turned_round_and_energy_that_flows_in_are_named():
     u, y = simulated(BENCH)
     for records, guess in (((u, -y), None), ((-u, y), None), ((u, -y), GUESS)):
