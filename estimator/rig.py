@@ -77,11 +77,11 @@ class Rig:
     Attributes:
         step: sampling step [s].
         interpolation: of the input of a differential equation; a difference equation has taps instead. ``zero_order``:
-            u[k] acts from sample k to k + 1, and is first seen in y[k+1]. ``linear``: from u[k-1] to u[k]. Both are
-            causal, and the input before the first was 0. ``look_ahead``: the quintic spline through the last nine
-            inputs and the next one, so that a sample is used when the next input is known. ``spline``: the quintic
-            spline through all inputs, for recorded data that is given at once. Before their first input it was the
-            same.
+            u[k] acts from sample k to k + 1, and is first seen in y[k+1]: an accelerometer, too, shows y[k] just before
+            the input goes to u[k]. ``linear``: from u[k-1] to u[k]. Both are causal, and the input before the first was
+            0. ``look_ahead``: the quintic spline through the last nine inputs and the next one, so that a sample is
+            used when the next input is known. ``spline``: the quintic spline through all inputs, for recorded data that
+            is given at once. Before their first input it was the same.
         delay: samples by which the input acts later than that. A difference equation's newest tap acts on y[k] with
             u[k - delay]: 1 for the paper's in recorded data. -1 is for ``zero_order`` alone, where pairs are those of
             an environment: u[k] acted before y[k].

@@ -27,6 +27,9 @@ _WORDS = {
 }
 _UNITS_OF = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "acceleration": r".+/s(²|\^?2|/s)|m?g"}
 
+_SWITCHES = (
+    "# y[k] is the acceleration just before the input goes from u[k-1] to u[k], where it is held (docs/own_data.md)."
+)
 _UNKNOWN = "not known"
 _UNITS = '  # such as "N", "V", "mm" or "m/s"; "1" is a pure number'
 
@@ -55,6 +58,7 @@ def text_of(rig: Rig, told: str = "") -> str:
         "[output]",
         f"unit = {_quoted(sink.unit)}{_UNITS if sink.unit == '1' else ''}",
         f"kind = {_quoted(sink.kind)}  # displacement, velocity or acceleration",
+        *([_SWITCHES] if sink.kind == "acceleration" else []),
         _known("range", sink.range, "an experiment stops outside of it, in either direction"),
         _known("noise", sink.noise, "standard deviation of the sensor's noise, where you know it"),
         "",

@@ -128,14 +128,14 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
     if gains[best] > _EVIDENCE:
         better = others[best]
         name = "interpolation" if better.interpolation != rig.interpolation else "delay"
-        warnings.append(
-            Warning(
-                name,
-                f"the records speak for interpolation '{better.interpolation}' with delay {better.delay}, by "
-                f"{gains[best]:.0f} nats, and not for '{rig.interpolation}' with delay {rig.delay}; write these into "
-                f"the rig, and identify again",
-            )
+        message = (
+            f"the records speak for interpolation '{better.interpolation}' with delay {better.delay}, by "
+            f"{gains[best]:.0f} nats, and not for '{rig.interpolation}' with delay {rig.delay}; write these into the "
+            f"rig, and identify again"
         )
+        if rig.output.kind == "acceleration" and (rig.interpolation, better.interpolation) == ("zero_order", "linear"):
+            message += "; or make outputs missing where the input switches, if y shows it just after that"
+        warnings.append(Warning(name, message))
         return warnings
     for term, gain in zip(EXTRA, of_terms, strict=True):
         if gain > _EVIDENCE and gain == max(of_terms):

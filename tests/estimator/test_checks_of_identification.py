@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from oscillators import BENCH, SOFT, rig_of, simulated
+from oscillators import BENCH, SOFT, deviations, rig_of, simulated
 
 from estimator import Channel, Rig, identify
 
@@ -35,6 +35,17 @@ def test_a_large_delay_is_found_step_by_step(late):
             break
         delay = int(told[0][1])
     assert (delay, warnings) == (late, ())
+
+
+def test_an_accelerometer_that_is_sampled_after_the_input_switches():
+    u, before = simulated(BENCH, kind="acceleration")
+    after = before + np.diff(u, prepend=0.0) / BENCH[0]["m"]
+    named = {one.name: one.message for one in identify(rig_of(BENCH, "acceleration"), (u, after)).warnings}
+    assert "or make outputs missing where the input switches" in named["interpolation"]
+    after[1:][u[1:] != u[:-1]] = np.nan
+    result = identify(rig_of(BENCH, "acceleration"), (u, after))
+    assert result.warnings == ()
+    assert np.abs(deviations(result, BENCH[0])).max() < 4.5
 
 
 def test_a_channel_that_is_turned_round_and_energy_that_flows_in_are_named():
