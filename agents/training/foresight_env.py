@@ -98,7 +98,9 @@ class ForesightVecEnv(VecEnvWrapper):
 def foresight_of(
     envs: DuffingVectorEnv, env_id: str, options: dict[str, Any], seed: int, *, levels: int = 0
 ) -> Foresight | CommonForesight:
-    """What a policy is trained with: of Eq. (2) its own foresight, which is better there; else that of all oscillators.
+    """What a policy is trained with: the foresight of all oscillators; where the belief forgets, that of Eq. (2) alone.
+
+    There a network with the other swings the oscillator up at once, and does not learn to wait.
 
     Args:
         envs: the environments.
@@ -107,7 +109,7 @@ def foresight_of(
         seed: of the example that `Foresight` needs.
         levels: of the choices; a network that has none, and chooses any number, drives where the energy is limited.
     """
-    if envs.experiment.model.is_continuous:
+    if not envs.experiment.setup.drifts:
         return CommonForesight(envs, own=True, drive=levels == 0)
     return Foresight.of(envs, example_rate(env_id, options, seed))
 

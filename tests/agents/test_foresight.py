@@ -36,8 +36,20 @@ FEATURES = feature_names(difference())
 N_OBSERVATION = len(OBSERVATION)
 COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 PLACE = {name: i for i, name in enumerate(FEATURES)}
-AMPLITUDE, POWER, OUTPUT = (f"duffing_env/{name}-v0" for name in ("Amplitude", "Power", "Output"))
+AMPLITUDE, POWER, OUTPUT, DRIFT = (f"duffing_env/{name}-v0" for name in ("Amplitude", "Power", "Output", "Drift"))
 RATE = np.diag([590.0, 150.0, 680.0, 240.0]) @ (0.5 * np.eye(4) + 0.5) @ np.diag([590.0, 150.0, 680.0, 240.0])
+
+
+class Row:
+    """One row of a batch, as a policy sees an environment."""
+
+    def __init__(self, envs, row):
+        self.experiment, self.unwrapped = envs.experiment, self
+        self._envs, self._row = envs, row
+
+    @property
+    def records(self):
+        return self._envs.records[self._row : self._row + 1]
 
 
 def observations_of(env_id, samples=40, count=24):
@@ -370,24 +382,18 @@ def test_where_its_network_could_not_be_meant_it_stays_as_it_is(trained_in, env_
 
 
 def test_a_policy_keeps_to_the_limit_of_another_track():
-    stays, moves = make_policy("ppo/amplitude"), make_policy("ppo/amplitude", make(OUTPUT, 16))
-    ended = {}
-    for name, policy in (("stays", stays), ("moves", moves)):
-        envs = make(OUTPUT, 16)
-        observations, _ = envs.reset(seed=0)
-        ended[name] = np.zeros(16, dtype=bool)
-        for _ in range(envs.horizon):
-            observations, _, terminated, _, _ = envs.step(policy.predict(observations, deterministic=True)[0])
-            ended[name] |= terminated
-    assert ended["stays"].all()
-    assert not ended["moves"].any()
+    envs = make(OUTPUT, 16)
+    policy = make_policy("ppo/amplitude", envs)
+    observations, _ = envs.reset(seed=0)
+    for _ in range(envs.horizon):
+        observations, _, terminated, _, _ = envs.step(policy.predict(observations, deterministic=True)[0])
+        assert not terminated.any()
 
 
-def test_a_policy_with_foresight_refuses_a_foreign_environment():
-    with pytest.raises(
-        ValueError, match="env must be an environment of duffing_env for a policy with foresight, but is"
-    ):
-        make_policy("ppo/amplitude", gym.make("Pendulum-v1"))
+@pytest.mark.parametrize("name", ["ppo/amplitude", "ppo/drift"])
+def test_a_policy_with_foresight_refuses_a_foreign_environment(name):
+    with pytest.raises(ValueError, match=r"env must be (one|an environment) of duffing_env for .*foresight, but is"):
+        make_policy(name, gym.make("Pendulum-v1"))
 
 
 def test_rewards_differ_from_the_environments_by_a_potential():
@@ -463,17 +469,18 @@ def test_a_policy_that_was_trained_with_it_acts_the_same_from_its_file(tmp_path,
     run = train(TrainConfig(algo, AMPLITUDE, steps=1024, output=tmp_path / "run", hyperparameters=settings))
     envs = make(AMPLITUDE, 5)
     policy, tensors = make_policy(str(run.folder), envs), load_file(run.folder / "policy.safetensors")
+    one = make_policy(str(run.folder), Row(envs, 2))
     observations, _ = envs.reset(seed=1)
     for _ in range(20):
         actions, _ = policy.predict(observations, deterministic=True)
-        alone, _ = policy.predict(observations[2], deterministic=True)
+        alone, _ = one.predict(observations[2], deterministic=True)
         assert actions.shape == (5, 1)
         # A product of matrices rounds by its size: what a choice that differs by so much stands for is between these.
         if algo == "sac" or settings.levels == 0:
-            view = policy._foresight.look(observations[2:3])
-            choice, _ = policy._choose(view.features, None, None, True)
+            view = one._foresight.look(observations[2:3])
+            choice, _ = one._choose(view.features, None, None, True)
             bound, _ = play(tensors, policy.card["network"], view.features)
-            ends = [policy._foresight.act((choice + step)[:, 0], view) for step in (-bound, bound)]
+            ends = [one._foresight.act((choice + step)[:, 0], view) for step in (-bound, bound)]
             assert np.min(ends) - U32 <= alone[0] <= np.max(ends) + U32
             assert np.min(ends) - U32 <= actions[2] <= np.max(ends) + U32
         else:
@@ -501,7 +508,7 @@ def test_entropy_counts_less_and_less(tmp_path):
 def test_a_run_that_was_stopped_goes_on_with_the_same_foresight(tmp_path):
     settings = PPOSettings(foresight=True, levels=3, num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
     config = TrainConfig(
-        env=AMPLITUDE, steps=512, checkpoints=2, eval_every=128, output=tmp_path / "run", hyperparameters=settings
+        env=DRIFT, steps=512, checkpoints=2, eval_every=128, output=tmp_path / "run", hyperparameters=settings
     )
 
     def stop(steps, found):
@@ -518,7 +525,7 @@ def test_a_run_that_was_stopped_goes_on_with_the_same_foresight(tmp_path):
 
 
 def test_a_damaged_foresight_is_refused(tmp_path):
-    shutil.copytree(TRAINED / "ppo" / "short", tmp_path / "copy")
+    shutil.copytree(TRAINED / "ppo" / "drift", tmp_path / "copy")
     file = tmp_path / "copy" / "policy.safetensors"
     tensors = load_file(file)
     save_file(tensors | {"foresight": tensors["foresight"][:-1]}, file)

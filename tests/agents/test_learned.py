@@ -349,7 +349,7 @@ def test_a_memory_of_wrong_shape_is_refused(tmp_path, name):
 
 
 def test_what_is_ahead_of_a_policy_is_checked(tmp_path):
-    shutil.copytree(TRAINED / "ppo" / "short", tmp_path / "policy")
+    shutil.copytree(TRAINED / "ppo" / "drift", tmp_path / "policy")
     tensors, card = load_file(tmp_path / "policy" / WEIGHTS), (tmp_path / "policy" / CARD).read_text()
     for foresight in (tensors["foresight"][:-1], tensors["foresight"] * np.nan, -tensors["foresight"]):
         save_file({**tensors, "foresight": foresight}, tmp_path / "policy" / WEIGHTS)
