@@ -76,7 +76,7 @@ def test_it_is_above_every_input_of_a_tiny_problem(horizon):
     systems = Systems.of(SHORT, 1, {"horizon": horizon})
     inputs = 0.15 * np.array(list(product([-1.0, 0.0, 1.0], repeat=horizon)))
     rng = np.random.default_rng(0)
-    inputs = np.concatenate([inputs, rng.uniform(-0.15, 0.15, (4096, horizon))])
+    inputs = np.concatenate([inputs, rng.uniform(-0.15, 0.15, (1024, horizon))])
     worths, peaks = np.array([[part[0] for part in systems.worth(u[None])] for u in inputs]).T
     allowed = np.where(peaks <= 0.6, worths, -np.inf)
     bound = Certificate(systems, 0).find(inputs[[allowed.argmax()]], rounds=32)
