@@ -87,8 +87,8 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             name; or a function of observations (n, features) that gives actions (n, 1), such as a module of torch.
         env: The environment it is for, single or vector, wrapped or not: it gives the amplitude
             limit, the episode's length and, where it replays a record, the recorded input; to a
-            trained policy with foresight what it imagines. None: the limit is 0.15 V, and a trained
-            policy is in the environment it was trained in.
+            trained policy with foresight what it imagines, without which most of them do not play.
+            None: the limit is 0.15 V.
         seed: The seed of the policy's own randomness; of a trained policy, that of the actions it samples.
         options: Further options of a policy that has some, such as `horizon=8` of `"efe"`; a
             trained policy has none.
