@@ -93,6 +93,10 @@ def check_file(name: str, path: Path | None) -> None:
         raise IsADirectoryError(f"{name} must be a file, but is the folder {path}; name a file in it")
 
 
+#: What the numbers of a result depend on.
+PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy")
+
+
 def versions(*packages: str) -> dict[str, str]:
-    """Of Python, and of these packages."""
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+    """Of Python, of `PACKAGES`, and of these packages."""
+    return {"python": platform.python_version(), **{name: version(name) for name in (*PACKAGES, *packages)}}

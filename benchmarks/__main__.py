@@ -19,7 +19,6 @@ from benchmarks.peer_process import Peers
 from benchmarks.report import Section, print_section, print_verdicts
 
 SectionName = Literal["estimators", "environments", "training", "roofline", "scaling", "startup"]
-_PACKAGES = ("duffing-env", "numpy", "numba", "llvmlite", "scipy", "gymnasium", "stable-baselines3", "torch")
 _SETTINGS = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
 
 
@@ -55,7 +54,7 @@ def main(config: Config) -> None:
         samples = Path(folder) / "samples.npz"
         with Peers(samples, config.peers) as peers:
             machine = describe_machine()
-            used = {"ours": versions(*_PACKAGES), "peers": peers.versions()}
+            used = {"ours": versions("llvmlite", "stable-baselines3", "torch"), "peers": peers.versions()}
             print_head(machine, used, config.repetitions)
             with status:
                 on_row: Callable[[str], None] = status.update

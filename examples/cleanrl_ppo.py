@@ -188,7 +188,7 @@ def main(args: Args) -> Path:
         "steps": steps,
         "config": asdict(args) | {"output": str(folder)},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions("duffing-env", "gymnasium", "numpy", "torch"),
+        "versions": versions("torch"),
     }
     save_policy(folder, agent.actor_mean, card, normalizer=(observe.rms.mean, observe.std, 10.0))
     print(folder)

@@ -63,7 +63,7 @@ def main(args: Args) -> Path:
         "steps": steps,
         "config": asdict(args) | {"output": str(folder)},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions("duffing-env", "gymnasium", "numpy", "ray", "torch"),
+        "versions": versions("ray", "torch"),
     }
     # RLlib normalises no observations by default, and an action of ours, in [-1, 1], is the clipped mean.
     save_policy(folder, mean_network(algorithm.get_module()), card)

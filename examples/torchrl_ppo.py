@@ -103,7 +103,7 @@ def main(args: Args) -> Path:
         "steps": steps,
         "config": asdict(args) | {"output": str(folder)},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions("duffing-env", "gymnasium", "numpy", "torch", "torchrl"),
+        "versions": versions("torch", "torchrl"),
     }
     # The most probable action of a TanhNormal, as TorchRL plays it without exploration, is the tanh of its mean.
     save_policy(folder, nn.Sequential(*mean, nn.Tanh()), card)

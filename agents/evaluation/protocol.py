@@ -50,8 +50,6 @@ SCORE = Metric("score / %", 1, 100, IQM, IQM)
 BESIDE = ("information_gain", "log_posterior_gain", "coverage", "ended_early", "decision_time")
 SHIFTED = ("fisher_gain", "log_posterior_gain", "coverage", "ended_early")
 
-PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy")
-
 
 def shifts_of(track: str) -> dict[str, tuple[str, dict[str, Any]]]:
     """The shifted test sets of a track, by name: the environment and its options. What is believed is not told of them.
@@ -132,7 +130,7 @@ def measure(
         },
         "policies": {member: fingerprint(member) for member in members},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions(*PACKAGES),
+        "versions": versions(),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
     }
 

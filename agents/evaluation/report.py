@@ -15,7 +15,6 @@ from agents.evaluation.figures import (
     figure_of_inputs,
 )
 from agents.evaluation.leaderboard import caption_of, leaderboard, two_way_table
-from agents.evaluation.protocol import PACKAGES
 from agents.evaluation.rollout import Evaluation
 from agents.results import versions
 from estimator.files import write_atomically
@@ -69,7 +68,7 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
     for heading, figure, caption in figures:
         if figure is not None:
             parts.append(f"<h2>{heading}</h2><figure>{svg(figure)}<figcaption>{caption}</figcaption></figure>")
-    used = ", ".join(f"{name} {number}" for name, number in versions(*PACKAGES).items())
+    used = ", ".join(f"{name} {number}" for name, number in versions().items())
     parts += [
         "<h2>How this page was made</h2>",
         f"<pre>{html.escape(' '.join(command))}</pre>",

@@ -40,8 +40,7 @@ class Recording:
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise ValueError(f"out must be a new or empty folder, but {self.folder} holds something; name another one")
         self.folder.mkdir(parents=True, exist_ok=True)
-        packages = versions("duffing-env", "numpy", "scipy", "numba")
-        self._manifest = {**manifest, "versions": packages, "commit": _commit(), "started": _time(), "ended": None}
+        self._manifest = {**manifest, "versions": versions(), "commit": _commit(), "started": _time(), "ended": None}
         self._write_manifest()
         append_atomically(self.samples, ",".join(COLUMNS) + "\n")
 

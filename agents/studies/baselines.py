@@ -58,7 +58,7 @@ def main(config: Config) -> None:
         "steps": model.num_timesteps,
         "config": asdict(config),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions("duffing-env", "gymnasium", "numpy", "stable-baselines3", "sb3-contrib", "torch"),
+        "versions": versions("stable-baselines3", "sb3-contrib", "torch"),
     }
     save_policy(config.folder, model, card)
     print(config.folder)

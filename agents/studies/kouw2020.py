@@ -277,7 +277,7 @@ def summarise(runs: dict[str, dict[str, Run]], record: SilverboxRecord) -> dict[
         "settings": {name: asdict(setting) for name, setting in SETTINGS.items()},
         "seconds": {name: {model: run.seconds for model, run in models.items()} for name, models in runs.items()},
         "samples": {"training": len(record.multisine.u), "validation": len(record.arrow.u)},
-        "versions": versions("duffing-env", "gymnasium", "matplotlib", "numba", "numpy", "scipy"),
+        "versions": versions("matplotlib"),
     }
     return {"published": PUBLISHED, **errors, "meta": meta}
 

@@ -104,7 +104,7 @@ def summarise(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
     }
     meta = {
         "samples": {"training": TRAINING_SAMPLES, "given": GIVEN},
-        "versions": versions("duffing-env", "numba", "numpy", "scipy"),
+        "versions": versions(),
     }
     return {"rows": finite(rows), "meta": meta}
 

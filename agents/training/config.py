@@ -20,8 +20,6 @@ from estimator.files import whole_file
 #: File of a run folder that says what the run was made from.
 CONFIG = "config.json"
 
-_PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy", "stable-baselines3", "torch")
-
 
 @dataclass(frozen=True)
 class Subject:
@@ -120,7 +118,7 @@ def describe(config: TrainConfig) -> dict[str, Any]:
     return {
         "config": resolved,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions(*_PACKAGES, *contrib(config)),
+        "versions": versions("stable-baselines3", "torch", *contrib(config)),
     }
 
 
