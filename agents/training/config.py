@@ -13,9 +13,13 @@ from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
 from agents.training.hyperparameters import read_settings, settings_of
-from estimator.checks import mapping, one_of, whole
+from estimator.checks import is_finite, mapping, one_of, shown, whole
 from estimator.extras import need
 from estimator.files import whole_file
+from estimator.lanes import LANES
+
+#: Rewards that count information.
+IN_NATS = ("information_gain", "log_posterior", "fisher", "expected_free_energy")
 
 #: File of a run folder that says what the run was made from.
 CONFIG = "config.json"
@@ -51,6 +55,8 @@ class TrainConfig(Subject):
     """Seed of systems, noise, weights and exploration; the same seed gives the same policy."""
     options: JsonOptions = field(default_factory=dict)
     """Further options of the environment, as JSON."""
+    vary: JsonOptions = field(default_factory=dict)
+    """Options that are drawn anew for every episode, as JSON: a name, and the lowest and highest value."""
     output: Path | None = None
     """Run folder; runs/ALGO-TRACK-SEED where it is not given, with a number where that exists."""
     begin: Path | None = None
@@ -98,6 +104,8 @@ class TrainConfig(Subject):
                 f"hyperparameters must be {ALGORITHMS[self.algo].__name__} for {self.algo}, "
                 f"but are {type(self.hyperparameters).__name__}"
             )
+        if self.vary:
+            object.__setattr__(self, "vary", _ranges(self))
         if (first := getattr(self.hyperparameters, "learning_starts", 0)) >= self.steps:
             raise ValueError(
                 f"learning_starts must be below steps, but is {first} of {self.steps}: nothing would be learned; "
@@ -109,6 +117,29 @@ class TrainConfig(Subject):
         """Samples that are learned from: ``steps``, up to a whole number of updates."""
         each = self.hyperparameters.samples_per_update
         return -(-self.steps // each) * each
+
+
+def _ranges(config: TrainConfig) -> dict[str, list[float]]:
+    """What is varied, each from the lowest to the highest value."""
+    mapping("vary", config.vary)
+    if config.env == FAMILY or not config.hyperparameters.foresight or config.reward not in IN_NATS:
+        raise ValueError(
+            f"vary needs a track, foresight and a reward that counts information ({', '.join(IN_NATS)}), but env is "
+            f"{config.env}, foresight {config.hyperparameters.foresight}, reward {config.reward}; leave vary out"
+        )
+    if (rows := config.hyperparameters.num_envs) % LANES:
+        raise ValueError(
+            f"num_envs must be a multiple of {LANES} with vary, but is {rows}; take {rows + -rows % LANES}"
+        )
+    if both := sorted(set(config.vary) & set(config.options)):
+        raise ValueError(f"vary must not hold what options hold, but both have {both[0]}; leave it out of one")
+    for name, ends in config.vary.items():
+        ends = list(ends) if isinstance(ends, list | tuple) else [ends]
+        if len(ends) != 2 or not all(is_finite(end) for end in ends) or not 0 < ends[0] <= ends[1]:
+            raise ValueError(
+                f"vary[{name!r}] must be two positive numbers, the lower one first, but is {shown(config.vary[name])}"
+            )
+    return {name: list(ends) for name, ends in config.vary.items()}
 
 
 def describe(config: TrainConfig) -> dict[str, Any]:

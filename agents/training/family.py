@@ -10,8 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agents.cli import RIG_TRACK
+
 #: What is trained on it, in the place of a track.
 FAMILY = "family"
+
+#: Scale of the rewards, to returns of about 1: a critic that errs by more takes all of the clipped gradient.
+SCALE = 0.3
 
 #: Kinds of stiffness, and how often each is drawn.
 KINDS = {"hardening": 0.5, "softening": 0.25, "double-well": 0.25}
@@ -93,6 +98,11 @@ def draw_member(rng: np.random.Generator) -> Member:
     if rng.uniform() < KNOWN:
         options |= {"noise_range": 1.0, "noise_hypotheses": 1}
     return Member(kind, period, damping, drive, options)
+
+
+def draw_rig(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
+    """A rig of the family, as `agents.training.mixed_env.Draw`."""
+    return RIG_TRACK, draw_member(rng).options
 
 
 def _around(value: float, width: float) -> tuple[float, float]:

@@ -20,11 +20,8 @@ from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 from estimator.parameters import FloatArray
 
-#: Rewards are scaled to returns of about 1, where a critic begins.
-_SCALE = 5.0
-
-#: Rewards that count information.
-IN_NATS = ("information_gain", "log_posterior", "fisher", "expected_free_energy")
+#: Rewards on a track are scaled to returns of about 1, where a critic begins.
+SCALE = 5.0
 
 #: Systems whose episodes show how much a sample brings.
 _EXAMPLES = 64
@@ -88,7 +85,7 @@ class ForesightVecEnv(VecEnvWrapper):
                 infos[row] |= {"terminal_observation": features, "TimeLimit.truncated": False}
         features = self._see(observations)
         to_come = np.where(dones, np.float32(0), features[:, self.foresight.to_come])
-        return features, _SCALE * (rewards + self._weight * (to_come - before)), dones, infos
+        return features, SCALE * (rewards + self._weight * (to_come - before)), dones, infos
 
     def _see(self, observations: Any) -> npt.NDArray[np.float32]:
         self._view = self.foresight.look(observations)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from signal import SIGINT
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from agents.policies.learned import CARD
 from agents.policies.saving import save_policy
 from agents.results import write_json
 from agents.running.stopping import Stopped, Stopper
+from agents.training import family
 from agents.training.checkpoints import (
     Progress,
     begin_with,
@@ -27,8 +29,7 @@ from agents.training.checkpoints import (
     restore,
     save_checkpoint,
 )
-from agents.training.config import CONFIG, TrainConfig, contrib, describe, read_config
-from agents.training.family import FAMILY
+from agents.training.config import CONFIG, IN_NATS, TrainConfig, contrib, describe, read_config
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import track_of
 from estimator.extras import need
@@ -95,8 +96,8 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
     """Go on with a run that was stopped, from its latest checkpoint, up to the samples that it was to have.
 
     It is then the run that was never stopped, bit for bit: weights, moments of the optimisers, replay buffer, episodes,
-    streams of random numbers and schedules go on, and the log loses what came after the checkpoint. Of the family the
-    environments begin new episodes, which follow from the run's seed and the samples so far.
+    streams of random numbers and schedules go on, and the log loses what came after the checkpoint. Of the family, and
+    with ``vary``, the environments begin new episodes, which follow from the run's seed and the samples so far.
 
     Args:
         folder: the run folder.
@@ -267,19 +268,29 @@ class _Training:
 
 def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
     """The environments of a run, seen as its hyperparameters say."""
+    from agents.evaluation.batch import make
     from agents.vec_env import DuffingVecEnv
 
     asked = config.hyperparameters
     levels = getattr(asked, "levels", 0)
     options = {"reward": config.reward, **config.options}
-    if config.env == FAMILY:
-        from agents.training.family_env import FamilyVecEnv
+    if config.env == family.FAMILY:
+        from agents.training.mixed_env import MixedVecEnv
 
-        return FamilyVecEnv(asked.num_envs, seed, reward=config.reward, levels=levels)
+        kept: dict[str, Any] = {"reward": config.reward, "levels": levels}
+        return MixedVecEnv(asked.num_envs, seed, family.draw_rig, scale=family.SCALE, **kept)
     if not asked.foresight:
         return DuffingVecEnv(config.env, asked.num_envs, seed=seed, levels=levels, **options)
-    from agents.training.foresight_env import IN_NATS, ForesightVecEnv, foresight_of
+    from agents.training.foresight_env import SCALE, ForesightVecEnv, foresight_of
 
+    if config.vary:
+        from agents.training.mixed_env import MixedVecEnv, draw_options
+
+        for name, end in ((name, end) for name, ends in config.vary.items() for end in ends):
+            make(config.env, 1, options | {name: end}).close()  # which refuses what the option may not be
+        draw = partial(draw_options, env_id=config.env, options=config.options, ranges=config.vary)
+        kept = {"reward": config.reward, "levels": levels, "own": True, "drive": levels == 0}
+        return MixedVecEnv(asked.num_envs, seed, draw, scale=SCALE, **kept)
     envs = DuffingVecEnv(config.env, asked.num_envs, seed=seed, **options)
     foresight = foresight_of(envs.envs, config.env, config.options, config.seed, levels=levels)
     return ForesightVecEnv(envs, foresight, levels, in_nats=config.reward in IN_NATS)

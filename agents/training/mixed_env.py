@@ -1,8 +1,8 @@
-"""The family of oscillators as Stable-Baselines3's `VecEnv`: groups of rows, each on a rig of its own."""
+"""Environments of drawn options as Stable-Baselines3's `VecEnv`: groups of rows, each with options of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from typing import Any
 
@@ -16,60 +16,98 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from agents.evaluation.batch import make
 from agents.policies.foresight import CommonForesight, Sight
 from agents.policies.imagined import BOUND, FEATURES
-from agents.training.family import draw_member
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.lanes import LANES
 
-#: Rewards are scaled to returns of about 1: a critic that errs by more takes the whole of the clipped gradient.
-_SCALE = 0.3
+#: Draws what a group plays next: the id of a track, and the options of its environments.
+Draw = Callable[[np.random.Generator], tuple[str, dict[str, Any]]]
 
 _TO_COME = FEATURES.index("to_come")
 
 
-class _Group:
-    """Rows on one rig, for as long as one of its episodes lasts."""
+def draw_options(
+    rng: np.random.Generator, env_id: str, options: dict[str, Any], ranges: Mapping[str, Sequence[float]]
+) -> tuple[str, dict[str, Any]]:
+    """A track with some of its options drawn, log-uniform: whole numbers between two of them, any between others.
 
-    def __init__(self, rng: np.random.Generator, reward: str) -> None:
-        self.member = draw_member(rng)
-        options = {**self.member.options, "reward": reward, "autoreset_mode": AutoresetMode.SAME_STEP}
-        self.envs: DuffingVectorEnv = make("duffing_env/Rig-v0", LANES, options)
-        self.foresight = CommonForesight(self.envs)
+    Example:
+        >>> import numpy as np
+        >>> from agents.training.mixed_env import draw_options
+        >>> drawn = draw_options(np.random.default_rng(1), "duffing_env/Power-v0", {}, {"horizon": (128, 1024)})
+        >>> drawn
+        ('duffing_env/Power-v0', {'horizon': 371})
+    """
+    drawn = {}
+    for name, (low, high) in ranges.items():
+        value = min(float(np.exp(rng.uniform(np.log(low), np.log(high)))), high)
+        drawn[name] = round(value) if isinstance(low, int) and isinstance(high, int) else value
+    return env_id, options | drawn
+
+
+class _Group:
+    """Rows with the same options, for as long as one of their episodes lasts."""
+
+    def __init__(self, rng: np.random.Generator, draw: Draw, options: dict[str, Any], seen: dict[str, bool]) -> None:
+        env_id, drawn = draw(rng)
+        self.envs: DuffingVectorEnv = make(env_id, LANES, drawn | options)
+        self.foresight = CommonForesight(self.envs, **seen)
         observations, _ = self.envs.reset(seed=int(rng.integers(2**31)))
         self.view: Sight = self.foresight.look(observations)
         self.left = self.envs.horizon
 
 
-class FamilyVecEnv(VecEnv):
-    """Rows in groups of `estimator.lanes.LANES`, each group on a rig of the family, as `CommonForesight` shows them.
+class MixedVecEnv(VecEnv):
+    """Rows in groups of `estimator.lanes.LANES`, each group with options of its own, as `CommonForesight` shows them.
 
-    A group gets its next rig when an episode of its rig has gone by; the rows that began another on the way, because a
-    limit ended theirs, are cut short. As in `agents.training.foresight_env` the increase of what is still to come is
-    added to the reward.
+    A group draws anew when an episode has gone by; the rows that began another on the way, because a limit ended
+    theirs, are cut short. As in `agents.training.foresight_env` the increase of what is still to come is added to the
+    reward.
 
     Args:
         num_envs: rows, a multiple of `LANES`.
-        seed: of rigs, oscillators and noise.
+        seed: of what is drawn, of oscillators and noise.
+        draw: what a group plays next.
         reward: that counts information.
+        scale: of rewards.
         levels: an action is one of so many evenly spaced choices from -1 to 1, by its number; 0: any between.
+        own: as of `CommonForesight`; then all that is drawn has one model.
+        drive: as of `CommonForesight`.
 
     Raises:
         ValueError: for another number of rows.
     """
 
-    def __init__(self, num_envs: int, seed: int, *, reward: str = "information_gain", levels: int = 0) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        seed: int,
+        draw: Draw,
+        *,
+        reward: str = "information_gain",
+        scale: float,
+        levels: int = 0,
+        own: bool = False,
+        drive: bool = False,
+    ) -> None:
         if num_envs % LANES:
-            raise ValueError(f"num_envs must be a multiple of {LANES} for the family, but is {num_envs}")
+            raise ValueError(f"num_envs must be a multiple of {LANES} for drawn options, but is {num_envs}")
         self.render_mode = None
         self._rngs = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(num_envs // LANES)]
-        self._reward = reward
+        self._scale = scale
+        self._draw, self._seen = draw, {"own": own, "drive": drive}
+        self._fixed = {"reward": reward, "autoreset_mode": AutoresetMode.SAME_STEP}
         self._levels = np.linspace(-1.0, 1.0, levels) if levels else None
-        self._groups = [_Group(rng, reward) for rng in self._rngs]
-        space = gym.spaces.Discrete(levels) if levels else gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-        super().__init__(num_envs, gym.spaces.Box(-BOUND, BOUND, (len(FEATURES),), np.float32), space)
+        self._groups = [self._drawn(rng) for rng in self._rngs]
         self.foresight = self._groups[0].foresight
+        space = gym.spaces.Discrete(levels) if levels else gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        seen = gym.spaces.Box(-BOUND, BOUND, (self.foresight.features,), np.float32)
+        super().__init__(num_envs, seen, space)
         self._choices = np.zeros(num_envs)
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64)
         self._started = perf_counter()
+
+    def _drawn(self, rng: np.random.Generator) -> _Group:
+        return _Group(rng, self._draw, self._fixed, self._seen)
 
     def reset(self) -> VecEnvObs:
         """Show what every row sees; the episodes have begun."""
@@ -82,7 +120,7 @@ class FamilyVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all groups."""
-        features = np.empty((self.num_envs, len(FEATURES)), dtype=np.float32)
+        features = np.empty((self.num_envs, self.foresight.features), dtype=np.float32)
         rewards, dones = np.empty(self.num_envs, dtype=np.float32), np.empty(self.num_envs, dtype=np.bool_)
         rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for g, group in enumerate(self._groups):
@@ -94,7 +132,7 @@ class FamilyVecEnv(VecEnv):
             group.view = group.foresight.look(observations)
             group.left -= 1
             after = np.where(ended, np.float32(0), group.view.features[:, _TO_COME])
-            rewards[mine] = _SCALE * (gained + after - before)
+            rewards[mine] = self._scale * (gained + after - before)
             self._returns[mine] += gained
             self._lengths[mine] += 1
             dones[mine] = ended | (group.left == 0)
@@ -108,7 +146,7 @@ class FamilyVecEnv(VecEnv):
                 self._returns[at], self._lengths[at] = 0.0, 0
             if group.left == 0:
                 group.envs.close()
-                group = self._groups[g] = _Group(self._rngs[g], self._reward)
+                group = self._groups[g] = self._drawn(self._rngs[g])
             features[mine] = group.view.features
         return features, rewards, dones, rows
 
