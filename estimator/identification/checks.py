@@ -212,7 +212,7 @@ def _told(problem: Problem, found: Found) -> dict[str, float]:
 
 def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Warning]:
     """Whether what the forecasts left is white and normal."""
-    from scipy.stats import chi2, norm
+    from statistics import NormalDist
 
     left = [
         residuals(explicable(one.y, problem.rig), forecast)[4:]
@@ -222,17 +222,17 @@ def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequen
     n, warnings = len(values), list[Warning]()
     if n < 100:
         return warnings
-    lags = 20
+    lags, most = 20, 52.386  # chi2.isf(_ALARM, lags): SciPy's statistics take longer to import than records to identify
     products = [sum(float(one[k:] @ one[: len(one) - k]) for one in left if len(one) > k) for k in range(lags + 1)]
     statistic = n * sum((products[k] / products[0]) ** 2 for k in range(1, lags + 1))
-    if statistic > chi2.isf(_ALARM, lags):
+    if statistic > most:
         message = (
             "errors of the forecasts can be foreseen: the equation, the way of the input or the noise is not as assumed"
         )
         warnings.append(Warning("residuals_not_white", message))
     centred = (values - values.mean()) / values.std()
     kurtosis = (np.mean(centred**4) - 3) * np.sqrt(n / 24)
-    if abs(kurtosis) > 6.0 or np.abs(centred).max() > norm.isf(_ALARM / n / 2):
+    if abs(kurtosis) > 6.0 or np.abs(centred).max() > -NormalDist().inv_cdf(_ALARM / n / 2):
         message = "errors of the forecasts are not normal: there are outliers, or the noise comes and goes"
         warnings.append(Warning("residuals_not_normal", message))
     return warnings

@@ -166,14 +166,12 @@ def _draw_fit(result: Result, record: Record, forecast: FloatArray) -> Figure:
 
 def _draw_residuals(record: Record, forecast: FloatArray) -> Figure:
     """Histogram and autocorrelation of the standardised innovations."""
-    from scipy.stats import norm
-
     figure, axes = _figure(1, 2, 3.0)
     values = residuals(record.y, forecast)[4:]
     left, right = axes[0]
     bins = np.linspace(-5, 5, 61)
     left.hist(np.clip(values, -5, 5), bins, density=True, color="#06c", alpha=0.5, label="residuals")
-    left.plot(bins, norm.pdf(bins), color="#222", linewidth=1, label="normal")
+    left.plot(bins, np.exp(-(bins**2) / 2) / np.sqrt(2 * np.pi), color="#222", linewidth=1, label="normal")
     left.set_xlabel("residual [standard deviations]")
     left.set_ylabel("density")
     left.legend(fontsize=8)
