@@ -78,7 +78,8 @@ class Against(Written):
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
         results = peers.run(self.rigs, self.seeds, self.against)
-        return {"verdict": peers.show(results), "results": results}
+        whole = peers.scripts(self.rigs) if "dynamax" in self.against else {}
+        return {"verdict": peers.show(results, whole), "results": results}
 
 
 @dataclass(frozen=True)

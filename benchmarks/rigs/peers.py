@@ -5,6 +5,9 @@ from __future__ import annotations
 import ast
 import inspect
 import math
+import statistics
+import subprocess
+import sys
 import tempfile
 import textwrap
 import time
@@ -25,6 +28,7 @@ OURS = "identify"
 RATIO_BARS, TIME_BAR, MOST_STATEMENTS = {"dynamax": 1.1, "scipy": 1.0, "pysindy": 1.0}, 5.0, 5
 
 _STEPS_PER_PERIOD = 64  # of the peers' integration
+_STARTS = 5  # of Python, for the time of a whole script
 
 
 def ours(rig_file: str, data_file: str) -> dict[str, tuple[float, float]]:
@@ -32,6 +36,39 @@ def ours(rig_file: str, data_file: str) -> dict[str, tuple[float, float]]:
     from estimator import Rig, identify
 
     return identify(Rig.from_file(rig_file), [data_file]).parameters
+
+
+def scripts(names: Sequence[str]) -> dict[str, float]:
+    """How many times as long as ours a script of dynamax takes for one record of each rig, from the start of Python.
+
+    In turns, ratios of medians. Before it begins, both have been run once: ours finds its kernels compiled on disk, JAX
+    compiles anew, as both do for whoever runs a script again. Empty where dynamax is not available.
+    """
+    ratios: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        rig, data, problems = (Path(folder) / file for file in ("rig.toml", "data.csv", "problems.npz"))
+        write_problems(problems, names, 1)
+        for name in names:
+            bench = BENCHES[name]
+            made = record(bench, 0)
+            write_rig(rig, bench, guess(bench, 0))
+            write_record(data, made.u, made.y)
+            code = f"{inspect.getsource(ours)}\nours({str(rig)!r}, {str(data)!r})"
+            taken: dict[str, list[float]] = {OURS: [], "dynamax": []}
+            for _ in range(1 + _STARTS):
+                started = time.perf_counter()
+                subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+                taken[OURS].append(time.perf_counter() - started)
+                started = time.perf_counter()
+                try:
+                    with Peers(problems) as peers:
+                        peers.ask(f"rigs dynamax {name}", 0)
+                except NotAvailable:
+                    return {}
+                taken["dynamax"].append(time.perf_counter() - started)
+            mine, theirs = (statistics.median(times[1:]) for times in taken.values())
+            ratios[name] = theirs / mine
+    return ratios
 
 
 def statements(*functions: Callable[..., Any]) -> int:
@@ -126,8 +163,8 @@ def ratio(mine: Any, theirs: Any) -> tuple[float, float]:
     return float(np.exp(known.mean())), float(np.exp(1.96 * known.std() / np.sqrt(max(len(known) - 1, 1))))
 
 
-def show(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Print the table and the verdict; return the verdict for the JSON file."""
+def show(results: dict[str, dict[str, Any]], whole: dict[str, float]) -> dict[str, Any]:
+    """Print the table and the verdict, with what `scripts` found; return the verdict for the JSON file."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -163,6 +200,8 @@ def show(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
         times = np.array([[seconds(methods["dynamax"]), seconds(methods[OURS])] for methods in results.values()])
         whens = ("a rig's first record, dynamax's compilation included", "others")
         slower = dict(zip(whens, np.nanmedian(times[:, 0] / times[:, 1], axis=0).tolist(), strict=True))
+    if whole:
+        slower["a script of one record, from the start of Python"] = statistics.median(whole.values())
     for when, value in slower.items():
         word = "PASS" if value >= TIME_BAR else "MISS"
         console.print(f"{word}: dynamax takes {value:.3g} times as long as ours (at least {TIME_BAR:g}), {when}")
