@@ -31,34 +31,33 @@ def samples() -> tuple[FloatArray, FloatArray, str]:
         return regime.u[:SAMPLES], regime.y[:SAMPLES], f"first {SAMPLES:,} samples of the record's multisine"
     rng = np.random.default_rng(0)
     u = synthesise_multisine(rng, realisations=1)[:SAMPLES]
-    (theta1, theta2, theta3, eta), acting = coefficients_of(difference(), SILVERBOX_TWIN), _delayed(u)
+    theta1, theta2, theta3, eta = coefficients_of(difference(), SILVERBOX_TWIN)
     x = np.zeros(SAMPLES)
     for t in range(2, SAMPLES):
-        x[t] = theta1 * x[t - 1] + theta2 * x[t - 1] ** 3 + theta3 * x[t - 2] + eta * acting[t]
+        x[t] = theta1 * x[t - 1] + theta2 * x[t - 1] ** 3 + theta3 * x[t - 2] + eta * u[t - 1]
         x[t] += 5e-4 * rng.standard_normal()
     y = x + 5e-4 * rng.standard_normal(SAMPLES)
     return u, y, f"{SAMPLES:,} samples of the twin under a synthesised multisine (the record is not on this machine)"
 
 
 def write_samples(path: Path) -> None:
-    """What the peers' estimators get: the same samples, our prior, and its expected noises, which they do not learn."""
+    """What `benchmarks.silverbox_peers` reads: the same samples, our prior, and its expected noises."""
     u, y, _ = samples()
     prior = silverbox_prior()
     gamma_shape, gamma_rate, xi_shape, xi_rate = prior.noises
     np.savez(
         path,
-        acting=_delayed(u),
+        u=u,
         y=y,
-        mean=prior.mean,
-        cov=prior.cov,
-        process_cov=np.diag([gamma_rate / gamma_shape, 0, 0, 0, 0, 0]),
-        measurement_cov=np.array([[xi_rate / xi_shape]]),
+        timed=len(y),
+        lengths=[len(y)],
+        paper_mean=prior.mean,
+        paper_cov=prior.cov,
+        paper_direction=[1.0, 0.0],
+        paper_process_variance=gamma_rate / gamma_shape,
+        paper_measurement_variance=xi_rate / xi_shape,
+        paper_terms=[(1, 0, -1), (3, 0, -1), (0, 1, -1), (0, 0, 1)],
     )
-
-
-def _delayed(u: FloatArray) -> FloatArray:
-    """The inputs (T,) that act on the outputs of the same index."""
-    return np.concatenate(([0.0], u[:-1]))
 
 
 def run(peers: Peers, repetitions: int, on_row: Callable[[str], None]) -> Section:
@@ -70,9 +69,9 @@ def run(peers: Peers, repetitions: int, on_row: Callable[[str], None]) -> Sectio
         for title, factorisation in ((STRUCTURED, "structured"), (MEAN_FIELD, "mean_field"))
     ]
     rows += [Row(title, UNIT, timed(_updates(model, u, y))) for title, (model, _) in ONE_BY_ONE.items()]
-    rows += [peers.row(name, title, UNIT) for name, title in PEERS.items()]
+    rows += [peers.row(f"silverbox {name} paper time", title, UNIT) for name, title in PEERS.items()]
     results = measure(rows, repetitions, on_row)
-    coefficients.update({title: np.array(answer["coefficients"]) for title, answer in peers.answers.items()})
+    coefficients.update({title: np.array(answer["mean"][2:]) for title, answer in peers.answers.items()})
     errors = {title: _errors(values, u, y) for title, values in coefficients.items()}
     claims = [
         Claim(f"time per sample: {other} over {ours}", ratio(results[other], results[ours]))

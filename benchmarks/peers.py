@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import cache, partial
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -114,129 +115,30 @@ def gymnax_pendulum(num_envs: int, scanned: bool) -> Run:
 
 @cache
 def samples() -> dict[str, Any]:
-    """What the estimators get, as `benchmarks.estimators` or `benchmarks.silverbox` wrote it."""
+    """What the estimators get, as our side wrote it."""
     with np.load(sys.argv[1]) as file:
         return {name: file[name] for name in file.files}
-
-
-def estimator(identify: Callable[[], Any]) -> Run:
-    """Time a function that goes through all samples once and returns the coefficients (θ1, θ2, θ3, η)."""
-
-    def run(count: int) -> dict[str, Any]:
-        started = time.perf_counter()
-        for _ in range(count):
-            coefficients = np.asarray(identify(), dtype=np.float64)
-        seconds = time.perf_counter() - started
-        return {"seconds": seconds, "work": count * len(samples()["y"]), "coefficients": coefficients.tolist()}
-
-    return run
-
-
-def filterpy_ukf() -> Run:
-    """The unscented Kalman filter of filterpy, on (x_t, x_{t-1}, θ1, θ2, θ3, η)."""
-    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-
-    given = samples()
-
-    def transition(state: Any, dt: float, u: float) -> Any:
-        x, last, theta1, theta2, theta3, eta = state
-        return np.array([theta1 * x + theta2 * x**3 + theta3 * last + eta * u, x, theta1, theta2, theta3, eta])
-
-    def identify() -> Any:
-        points = MerweScaledSigmaPoints(6, alpha=0.1, beta=2.0, kappa=-3.0)
-        ukf = UnscentedKalmanFilter(6, 1, 1.0, hx=lambda state: state[:1], fx=transition, points=points)
-        ukf.x, ukf.P = given["mean"].copy(), given["cov"].copy()
-        ukf.Q, ukf.R = given["process_cov"], given["measurement_cov"]
-        for u, y in zip(given["acting"].tolist(), given["y"].tolist(), strict=True):
-            ukf.predict(u=u)
-            ukf.update(y)
-        return ukf.x[2:]
-
-    return estimator(identify)
-
-
-def dynamax_ekf() -> Run:
-    """The extended Kalman filter of dynamax, on the same state: one compiled scan over all samples, in float64.
-
-    It conditions first, then predicts with the *next* input, so that the inputs are those that act on each output.
-    """
-    import jax
-    import jax.numpy as jnp
-    from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
-
-    given = samples()
-
-    def transition(state: Any, u: Any) -> Any:
-        x, last, theta1, theta2, theta3, eta = state
-        return jnp.stack(
-            [theta1 * x + theta2 * x**3 + theta3 * last + eta * u[0], x, theta1, theta2, theta3, eta]
-        )  # fmt: skip
-
-    with jax.enable_x64(True):
-        model = {name: jnp.asarray(given[name]) for name in ("mean", "cov", "process_cov", "measurement_cov")}
-        y, acting = jnp.asarray(given["y"])[:, None], jnp.asarray(given["acting"])[:, None]
-
-        @jax.jit
-        def last_mean(y: Any, acting: Any) -> Any:
-            params = ParamsNLGSSM(
-                initial_mean=model["mean"],
-                initial_covariance=model["cov"],
-                dynamics_function=transition,
-                dynamics_covariance=model["process_cov"],
-                emission_function=lambda state, u: state[:1],
-                emission_covariance=model["measurement_cov"],
-            )
-            return extended_kalman_filter(params, y, acting, output_fields=["filtered_means"]).filtered_means[-1]
-
-    def identify() -> Any:
-        with jax.enable_x64(True):
-            return last_mean(y, acting).block_until_ready()[2:]
-
-    return estimator(identify)
-
-
-def padasip_rls() -> Run:
-    """The recursive least squares of padasip, on (y_t, y_t³, y_{t-1}, u_t): no latent state, no noise model."""
-    from padasip.filters import FilterRLS
-
-    given = samples()
-    y = given["y"]
-    regressors = np.column_stack([y[1:-1], y[1:-1] ** 3, y[:-2], given["acting"][2:]])
-
-    def identify() -> Any:
-        rls = FilterRLS(4, mu=1.0, eps=1e-6, w="zeros")
-        rls.run(y[2:], regressors)
-        return rls.w
-
-    return estimator(identify)
 
 
 @cache
 def row(name: str) -> Run:
     """The row of this name, set up.
 
-    ``filterpy``, ``dynamax``, ``padasip``; a name and a number of environments; ``silverbox`` and what
-    `benchmarks.silverbox_peers.row` takes; or ``rigs`` and what `benchmarks.rigs.peer_rows.row` takes.
+    A kind of environment and a number of them; ``silverbox`` and what `benchmarks.silverbox_peers.row` takes; or
+    ``rigs`` and what `benchmarks.rigs.peer_rows.row` takes.
     """
-    estimators = {"filterpy": filterpy_ukf, "dynamax": dynamax_ekf, "padasip": padasip_rls}
-    if name in estimators:
-        return estimators[name]()
+    kind, _, rest = name.partition(" ")
+    modules = {"silverbox": ("silverbox_peers", ""), "rigs": ("peer_rows", "rigs")}
+    if kind in modules:
+        module, folder = modules[kind]
+        sys.path.append(str(Path(__file__).parent / folder))
+        made: Run = import_module(module).row(samples(), *rest.split())
+        return made
     environments: dict[str, Callable[[int], Run]] = {
         "envpool": envpool_pendulum,
         "gymnax": partial(gymnax_pendulum, scanned=False),
         "gymnax-scan": partial(gymnax_pendulum, scanned=True),
     }
-    kind, _, rest = name.partition(" ")
-    if kind == "silverbox":
-        sys.path.append(str(Path(__file__).parent))
-        from silverbox_peers import row as silverbox_row
-
-        return silverbox_row(samples(), *rest.split())
-    if kind == "rigs":
-        sys.path.append(str(Path(__file__).parent / "rigs"))
-        from peer_rows import row as rigs_row
-
-        return rigs_row(samples(), *rest.split())
     return environments[kind](int(rest))
 
 

@@ -1,7 +1,8 @@
-"""The peers' rows of the Silverbox protocol. Runs in the peers' environment (`benchmarks.peers`), imports none of ours.
+"""The peers' estimators. Runs in the peers' environment (`benchmarks.peers`), imports none of ours.
 
-Every online peer goes once through the training section and, where it makes forecasts, on through the multisine test.
-`benchmarks.silverbox` writes what it is given, and judges what it comes to. Models are in the coordinates of
+`benchmarks.estimators` times them with the paper's model. In the Silverbox protocol every online peer goes once through
+the training section and, where it makes forecasts, on through the multisine test; `benchmarks.silverbox` writes what it
+is given, and judges what it comes to. Models are in the coordinates of
 `estimator.models`: the state and the coefficients together are Gaussian, and the coefficients stay.
 """
 
@@ -246,10 +247,11 @@ def row(given: Given, peer: str, name: str, what: str) -> Callable[[int], dict[s
     """A row, set up.
 
     Args:
-        given: what `benchmarks.silverbox` wrote.
+        given: what `benchmarks.silverbox` or `benchmarks.estimators` wrote.
         peer: a key of `ONLINE`, or ``fastcan``.
         name: of the model.
-        what: ``time`` goes through the samples that are timed, ``count`` times; ``protocol`` through all, once.
+        what: ``time`` goes through the samples that are timed, ``count`` times, and says at which mean it ends;
+            ``protocol`` goes through all, once.
     """
     if peer == "fastcan":
         return lambda count: fastcan_narx(given)
@@ -259,8 +261,9 @@ def row(given: Given, peer: str, name: str, what: str) -> Callable[[int], dict[s
     def time_it(count: int) -> dict[str, Any]:
         started = time.perf_counter()
         for _ in range(count):
-            identify(timed, ())
-        return {"seconds": time.perf_counter() - started, "work": count * timed}
+            means, _ = identify(timed, ())
+        seconds = time.perf_counter() - started
+        return {"seconds": seconds, "work": count * timed, "mean": np.asarray(means[-1]).tolist()}
 
     def protocol(count: int) -> dict[str, Any]:
         means, forecasts = identify(len(given["y"]), lengths)

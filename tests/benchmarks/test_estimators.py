@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import estimators
+from benchmarks import estimators, silverbox_peers
 from duffing_env.silverbox import SilverboxRecord
 from estimator import SILVERBOX_TWIN, OnlineEstimator, coefficients_of, difference
 
@@ -25,14 +25,17 @@ def test_without_the_record_the_twin_stands_in(monkeypatch: pytest.MonkeyPatch) 
     assert estimator.belief.coefficients_mean[3] == pytest.approx(eta, rel=0.02)
 
 
-def test_peers_get_the_inputs_that_act_on_each_output(tmp_path: Path) -> None:
+def test_peers_get_the_equation_and_the_inputs_that_act_on_each_output(tmp_path: Path) -> None:
     estimators.write_samples(tmp_path / "samples.npz")
     u, y, _ = estimators.samples()
     with np.load(tmp_path / "samples.npz") as given:
-        np.testing.assert_array_equal(given["acting"][1:], u[:-1])
         np.testing.assert_array_equal(given["y"], y)
-        assert given["cov"].shape == (6, 6)
-        assert np.linalg.eigvalsh(given["cov"])[0] > 0
+        model, taps = silverbox_peers.model(dict(given), "paper"), silverbox_peers.taps_of(given["u"])
+    coefficients = coefficients_of(difference(), SILVERBOX_TWIN)
+    moved = model.move([y[8], y[7], *coefficients], taps[9])
+    assert moved == pytest.approx((coefficients @ [y[8], y[8] ** 3, y[7], u[8]], y[8]))
+    assert model.cov.shape == (6, 6)
+    assert np.linalg.eigvalsh(model.cov)[0] > 0
 
 
 def test_errors_are_in_millivolts() -> None:
