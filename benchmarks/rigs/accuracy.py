@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from agents import results
 from benchmarks.rigs.catalogue import BENCHES, PARAMETERS
-from benchmarks.rigs.judge import POOLED, Cell, Outcome, calibrated, identified, in_processes
+from benchmarks.rigs.judge import POOLED, WIDTH, Cell, Outcome, calibrated, identified, in_processes
 from benchmarks.rigs.records import guess, record
 
 #: With a guess and without; and without one, from so many pieces of the record, of which all but the first begin in
@@ -30,52 +31,46 @@ def trial(task: Task) -> list[Outcome]:
 
 def run(names: Sequence[str], settings: Sequence[str], seeds: int, workers: int) -> list[Cell]:
     """A cell for each rig and setting."""
-    chosen = tuple(settings)
-    tasks = [(name, chosen, seed) for name in names for seed in range(seeds)]
-    outcomes = in_processes(trial, tasks, workers, "Identifying")
+    outcomes = in_processes(trial, [(name, tuple(settings)) for name in names], seeds, workers, "Identifying")
     return [
-        Cell(BENCHES[name], setting, [outcomes[name, chosen, seed][place] for seed in range(seeds)])
-        for name in names
+        Cell(BENCHES[name], setting, [of_seed[place] for of_seed in found])
+        for (name, chosen), found in outcomes.items()
         for place, setting in enumerate(chosen)
     ]
 
 
 def show(cells: Sequence[Cell]) -> dict[str, Any]:
     """Print the table and the verdict; return the verdict for the JSON file."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=170)
-    table = Table("rig", "", "median error of m, c, a, b, %", "bound (1 σ), %", "coverage of 90 %", "verdict",
-                  "s", "warnings and failures", box=box.MARKDOWN)  # fmt: skip
     trials = [len(cell.outcomes) for cell in cells for _ in PARAMETERS]
     hits = [count for cell in cells for count in cell.hits]
-    pooled, meets = calibrated(hits, trials)
+    pooled, meets, is_calibrated = calibrated(hits, trials)
     accurate = [cell.errors <= cell.bars for cell in cells]
+    rows = []
     for place, cell in enumerate(cells):
         number = len(cell.outcomes)
         bad = [f"{p}: error" for p, good in zip(PARAMETERS, accurate[place], strict=True) if not good]
         bad += [
             f"{p}: coverage" for p, good in zip(PARAMETERS, meets[4 * place : 4 * place + 4], strict=True) if not good
         ]
-        table.add_row(
+        rows.append((
             cell.bench.name, cell.setting, percents(cell.errors), percents(cell.bounds),
             ", ".join(f"{count / number:.3g}" for count in cell.hits), "; ".join(bad) or "PASS",
             f"{np.median([outcome.seconds for outcome in cell.outcomes]):.2f}", remarks(cell.outcomes),
-        )  # fmt: skip
-    console.print(table)
-    is_calibrated = POOLED[0] <= pooled <= POOLED[1] and all(meets)
+        ))  # fmt: skip
+    titles = ("rig", "", "median error of m, c, a, b, %", "bound (1 σ), %", "coverage of 90 %", "verdict", "s",
+              "warnings and failures")  # fmt: skip
     verdict = {
         "accurate": bool(np.all(accurate)),
         "calibrated": is_calibrated,
         "pooled coverage": pooled,
         "cells outside": int(np.size(meets) - np.sum(meets)),
     }
-    console.print(
+    results.show(
+        results.table(titles, rows, markdown=True),
         f"{'PASS' if verdict['accurate'] else 'MISS'}: median errors at most 0.3 %, or 1.2 times the median bound\n"
         f"{'PASS' if is_calibrated else 'MISS'}: calibrated; pooled coverage {pooled:.3f} "
-        f"({POOLED[0]} to {POOLED[1]}), {verdict['cells outside']} of {len(meets)} cells outside of 0.85 to 0.95"
+        f"({POOLED[0]} to {POOLED[1]}), {verdict['cells outside']} of {len(meets)} cells outside of 0.85 to 0.95",
+        width=WIDTH,
     )
     return verdict
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.rigs.simulator import FloatArray
+from benchmarks.rigs.simulator import KINDS, FloatArray
 
 PARAMETERS = ("m", "c", "a", "b")
 SAMPLES = 4096
@@ -58,6 +58,11 @@ class Bench:
     quintic: float = 0.0
 
     @property
+    def parameters(self) -> FloatArray:
+        """(5,) m, c, a, b and the quintic stiffness."""
+        return np.array([*self.truth, self.quintic])
+
+    @property
     def rest(self) -> float:
         """Displacement where it rests at the begin: of two wells, the one on the right."""
         _, _, a, b = self.truth
@@ -77,9 +82,7 @@ class Bench:
     @property
     def scale(self) -> FloatArray:
         """(2,) sizes of x and x'."""
-        size = self.output_range / self.angular_frequency ** ("displacement", "velocity", "acceleration").index(
-            self.kind
-        )
+        size = self.output_range / self.angular_frequency ** KINDS.index(self.kind)
         return np.array([size, size * self.angular_frequency])
 
     def excitation(self, rng: np.random.Generator, samples: int = SAMPLES) -> FloatArray:

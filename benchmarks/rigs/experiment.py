@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from benchmarks.rigs.catalogue import BENCHES, PARAMETERS, Bench
-from benchmarks.rigs.judge import LEVEL, binomial_interval, in_processes
-from benchmarks.rigs.loop import ASKED, SAMPLES, BenchPlant
-from benchmarks.rigs.records import guess, record
-from estimator.rig import Channel, Rig
+from agents import results
+from benchmarks.rigs.catalogue import PARAMETERS
+from benchmarks.rigs.judge import LEVEL, WIDTH, binomial_interval, in_processes, judged
+from benchmarks.rigs.loop import ASKED, SAMPLES, BenchPlant, described, held
+from benchmarks.rigs.records import record
 
 #: Seeds of the noises of a second experiment: those of the first, and so much.
 _AGAIN = 1_000_000
@@ -40,24 +40,13 @@ class Trial:
     left: bool
 
 
-def described(bench: Bench, seed: int, noise: bool) -> Rig:
-    """The rig of a bench, its input held, with a guess that is off; with its noises, or without."""
-    return Rig(
-        bench.step,
-        input=Channel(bench.units[0], limit=bench.limit, noise=bench.process_noise if noise else None),
-        output=Channel(bench.units[1], kind=bench.kind, range=bench.output_range,
-                       noise=bench.sensor_noise if noise else None),
-        guess=guess(bench, seed),
-    )  # fmt: skip
-
-
 def trial(task: Task) -> Trial:
     """A record of some samples, or none; the next experiment by a policy; its answer; and both identified."""
     from agents.running.experiment import design
     from estimator import identify
 
     name, policy, samples, seed = task
-    bench = replace(BENCHES[name], decimate=1, interpolation="zero_order")
+    bench = held(name)
     rig, records, prior = described(bench, seed, not samples), [], None
     if samples:
         first = record(bench, seed, samples)
@@ -66,14 +55,12 @@ def trial(task: Task) -> Trial:
     u, y = BenchPlant(bench, _AGAIN + seed).play(found.u)
     result = identify(rig, [*records, (u, y)])
     truth = np.array(bench.truth)
-    mean, std = np.array([result.parameters[p] for p in PARAMETERS]).T
-    low, high = np.array([result.interval(LEVEL)[p] for p in PARAMETERS]).T
+    error, std, inside = judged(result.parameters, result.interval(LEVEL), truth)
     before = np.array([found.before.parameters()[p][1] for p in PARAMETERS])
     expected = np.array([found.after[p] for p in PARAMETERS])
     return Trial(
         *((np.asarray(stds) / np.abs(truth)).tolist() for stds in (before, expected, std)),
-        (mean / truth - 1).tolist(), ((low <= truth) & (truth <= high)).tolist(),
-        bool((np.abs(y) > bench.output_range).any()),
+        error.tolist(), inside.tolist(), bool((np.abs(y) > bench.output_range).any()),
     )  # fmt: skip
 
 
@@ -81,36 +68,31 @@ def run(
     names: Sequence[str], policies: Sequence[str], samples: int, seeds: int, workers: int
 ) -> dict[tuple[str, str], list[Trial]]:
     """Trials by rig and policy."""
-    cells = [(name, policy) for name in names for policy in policies]
-    tasks = [(*cell, samples, seed) for cell in cells for seed in range(seeds)]
-    trials = in_processes(trial, tasks, workers, "Designing")
-    return {cell: [trials[*cell, samples, seed] for seed in range(seeds)] for cell in cells}
+    cells = [(name, policy, samples) for name in names for policy in policies]
+    trials = in_processes(trial, cells, seeds, workers, "Designing")
+    return {(name, policy): of_cell for (name, policy, _), of_cell in trials.items()}
 
 
 def show(found: dict[tuple[str, str], list[Trial]]) -> dict[str, Any]:
     """Print the table and the verdict; return the verdict for the JSON file."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=170)
-    table = Table("rig", "policy", "times narrower, expected", "stated / expected", "RMS error / expected",
-                  "coverage of 90 %", "left its range", box=box.MARKDOWN)  # fmt: skip
 
     def cells(values: Any) -> str:
         return ", ".join(f"{value:.2f}" if value < 9.95 else f"{value:.0f}" for value in values)
 
+    rows = []
     for (name, policy), trials in found.items():
         before, expected, after, error = (
             np.array([getattr(one, part) for one in trials]) for part in ("before", "expected", "after", "error")
         )
-        table.add_row(
+        rows.append((
             name, policy, cells(np.median(before / expected, axis=0)), cells(np.median(after / expected, axis=0)),
             cells(np.sqrt(np.mean((error / expected) ** 2, axis=0))),
             cells(np.mean([one.inside for one in trials], axis=0)),
             f"{sum(one.left for one in trials)} of {len(trials)}",
-        )  # fmt: skip
-    console.print(table)
+        ))  # fmt: skip
+    titles = ("rig", "policy", "times narrower, expected", "stated / expected", "RMS error / expected",
+              "coverage of 90 %", "left its range")  # fmt: skip
+    results.show(results.table(titles, rows, markdown=True), width=WIDTH)
     every = [one for trials in found.values() for one in trials]
     ratios = np.array([one.after for one in every]) / np.array([one.expected for one in every])
     left = sum(one.left for one in every)
@@ -121,5 +103,5 @@ def show(found: dict[tuple[str, str], list[Trial]]) -> dict[str, Any]:
         "of": len(every),
         "at most, with 95 %": binomial_interval(left, len(every), 0.9)[1],
     }
-    console.print(verdict)
+    results.show(verdict, width=170)
     return verdict

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 
+from agents import results
 from benchmarks.rigs.accuracy import remarks
 from benchmarks.rigs.catalogue import A, E
-from benchmarks.rigs.judge import Outcome, identified, in_processes
+from benchmarks.rigs.judge import WIDTH, Outcome, identified, in_processes
 from benchmarks.rigs.records import Record, generator, guess, record
 
 BENCHES = {"a": A, "e": E}
@@ -73,11 +75,7 @@ def trial(task: Task) -> Outcome:
 
 def run(chosen: Sequence[str], seeds: int, workers: int) -> dict[tuple[str, str], list[Outcome]]:
     """(fault, rig) to the outcomes of all seeds."""
-    tasks = [(fault, name, seed) for fault in chosen for name in BENCHES for seed in range(seeds)]
-    outcomes = in_processes(trial, tasks, workers, "Identifying")
-    return {
-        (fault, name): [outcomes[fault, name, seed] for seed in range(seeds)] for fault in chosen for name in BENCHES
-    }
+    return in_processes(trial, list(product(chosen, BENCHES)), seeds, workers, "Identifying")
 
 
 def named(fault: str, outcomes: Sequence[Outcome]) -> float:
@@ -92,19 +90,15 @@ def passes(fault: str, share: float) -> bool:
     return share >= LEAST_NAMED if EXPECTED[fault] else share <= MOST_FALSE
 
 
-def show(results: dict[tuple[str, str], list[Outcome]]) -> dict[str, Any]:
+def show(found: dict[tuple[str, str], list[Outcome]]) -> dict[str, Any]:
     """Print the table; return it for the JSON file."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("fault", "rig", "right name", "share", "verdict", "all warnings and failures", box=box.MARKDOWN)
-    rows = {}
-    for (fault, name), outcomes in results.items():
+    rows, written = [], {}
+    for (fault, name), outcomes in found.items():
         share = named(fault, outcomes)
         verdict = "PASS" if passes(fault, share) else "MISS"
         right = " or ".join(EXPECTED[fault]) or "none"
-        table.add_row(fault, name, right, f"{share:.2f}", verdict, remarks(outcomes))
-        rows[f"{fault}, {name}"] = {"share": share, "verdict": verdict, "outcomes": [vars(o) for o in outcomes]}
-    Console(width=170).print(table)
-    return rows
+        rows.append((fault, name, right, f"{share:.2f}", verdict, remarks(outcomes)))
+        written[f"{fault}, {name}"] = {"share": share, "verdict": verdict, "outcomes": [vars(o) for o in outcomes]}
+    titles = ("fault", "rig", "right name", "share", "verdict", "all warnings and failures")
+    results.show(results.table(titles, rows, markdown=True), width=WIDTH)
+    return written

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -19,6 +19,9 @@ from benchmarks.rigs.simulator import FloatArray
 
 LEVEL, POOLED, CELL = 0.9, (0.87, 0.93), (0.85, 0.95)
 LEAST_BAR, OVER_BOUND = 0.003, 1.2
+
+#: Of the tables: rows are not broken.
+WIDTH = 300
 
 
 @dataclass(frozen=True)
@@ -66,17 +69,24 @@ def identified(made: Record, guess: dict[str, tuple[float, float]] | None, piece
             failed = f"{type(error).__name__}: {error}"
             return Outcome([np.inf] * 4, [np.nan] * 4, [False] * 4, bound.tolist(), failure=failed)
         seconds = time.perf_counter() - started
-    mean, std = np.array([result.parameters[name] for name in PARAMETERS]).T
-    low, high = np.array([result.interval(LEVEL)[name] for name in PARAMETERS]).T
-    finite = np.isfinite(mean) & np.isfinite(std)
+    error, std, inside = judged(result.parameters, result.interval(LEVEL), truth)
     return Outcome(
-        np.where(finite, mean / truth - 1, np.inf).tolist(),
+        np.where(np.isfinite(error) & np.isfinite(std), error, np.inf).tolist(),
         (std / np.abs(truth)).tolist(),
-        ((low <= truth) & (truth <= high)).tolist(),
+        inside.tolist(),
         bound.tolist(),
         {warning.name: warning.message for warning in result.warnings},
         seconds,
     )
+
+
+def judged(
+    parameters: Mapping[str, Sequence[float]], intervals: Mapping[str, tuple[float, float]], truth: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of m, c, a and b: relative errors (4,), standard deviations (4,), and whether the intervals hold the truth."""
+    mean, std = np.array([parameters[name][:2] for name in PARAMETERS]).T
+    low, high = np.array([intervals[name] for name in PARAMETERS]).T
+    return mean / truth - 1, std, (low <= truth) & (truth <= high)
 
 
 @dataclass(frozen=True)
@@ -107,11 +117,6 @@ class Cell:
         """(4,) outcomes whose intervals hold the truth."""
         return np.sum([outcome.inside for outcome in self.outcomes], axis=0).tolist()
 
-    @property
-    def failures(self) -> list[str]:
-        """What was raised."""
-        return [outcome.failure for outcome in self.outcomes if outcome.failure]
-
     def to_dict(self) -> dict[str, Any]:
         """For the JSON file."""
         return {
@@ -124,18 +129,19 @@ class Cell:
         }
 
 
-def calibrated(hits: Sequence[int], trials: Sequence[int]) -> tuple[float, list[bool]]:
-    """Pooled coverage, and whether each cell's 99.9 % binomial interval meets 0.85 to 0.95.
+def calibrated(hits: Sequence[int], trials: Sequence[int]) -> tuple[float, list[bool], bool]:
+    """Pooled coverage, whether each cell's 99.9 % binomial interval meets 0.85 to 0.95, and whether all is well.
 
     Example:
         >>> calibrated([180, 190, 120], [200, 200, 200])
-        (0.8166666666666667, [True, True, False])
+        (0.8166666666666667, [True, True, False], False)
     """
     meets = []
     for count, number in zip(hits, trials, strict=True):
         low, high = binomial_interval(count, number)
         meets.append(bool(low <= CELL[1] and high >= CELL[0]))
-    return sum(hits) / sum(trials), meets
+    pooled = sum(hits) / sum(trials)
+    return pooled, meets, POOLED[0] <= pooled <= POOLED[1] and all(meets)
 
 
 def binomial_interval(count: int, number: int, level: float = 0.999) -> tuple[float, float]:
@@ -146,21 +152,25 @@ def binomial_interval(count: int, number: int, level: float = 0.999) -> tuple[fl
     return float(interval.low), float(interval.high)
 
 
-Task = TypeVar("Task")
+CellName = TypeVar("CellName", bound=tuple[Any, ...])
 Answer = TypeVar("Answer")
 
 
-def in_processes(work: Callable[[Task], Answer], tasks: Iterable[Task], workers: int, title: str) -> dict[Task, Answer]:
-    """Task to answer, in the tasks' order, with a bar on stderr; the first task runs alone, because it compiles."""
+def in_processes(
+    work: Callable[[Any], Answer], cells: Sequence[CellName], seeds: int, workers: int, title: str
+) -> dict[CellName, list[Answer]]:
+    """Cell to the answers of all its seeds, with a bar on stderr; the first task runs alone, because it compiles.
+
+    A task, which ``work`` is given, is what names the cell, and a seed.
+    """
     from rich.console import Console
     from rich.progress import track
 
-    todo = list(tasks)
-    console = Console(stderr=True)
-    answers: dict[Task, Answer] = {}
+    tasks = [(*cell, seed) for cell in cells for seed in range(seeds)]
+    answers: dict[tuple[Any, ...], Answer] = {}
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        answers[todo[0]] = pool.submit(work, todo[0]).result()
-        futures = {pool.submit(work, task): task for task in todo[1:]}
-        for future in track(as_completed(futures), title, len(futures), console=console):
+        answers[tasks[0]] = pool.submit(work, tasks[0]).result()
+        futures = {pool.submit(work, task): task for task in tasks[1:]}
+        for future in track(as_completed(futures), title, len(futures), console=Console(stderr=True)):
             answers[futures[future]] = future.result()
-    return {task: answers[task] for task in todo}
+    return {cell: [answers[*cell, seed] for seed in range(seeds)] for cell in cells}

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from agents import results
 from benchmarks.rigs.accuracy import percents
 from benchmarks.rigs.catalogue import BENCHES, PARAMETERS, Bench
-from benchmarks.rigs.judge import LEVEL, POOLED, binomial_interval, calibrated, in_processes
+from benchmarks.rigs.judge import LEVEL, WIDTH, binomial_interval, calibrated, in_processes, judged
 from benchmarks.rigs.records import generator, guess
 from benchmarks.rigs.simulator import KINDS, FloatArray, simulate
 from estimator.belief import Belief
@@ -44,8 +45,7 @@ class BenchPlant:
     watches = True
 
     def __init__(self, bench: Bench, seed: int) -> None:
-        self._bench, self._parameters = bench, np.array([*bench.truth, bench.quintic])
-        self._rng = generator(bench, seed, "noise")
+        self._bench, self._rng = bench, generator(bench, seed, "noise")
         self.reset()
 
     def reset(self) -> None:
@@ -56,7 +56,7 @@ class BenchPlant:
         """Hold an input for a sample; what the sensor shows at its end."""
         bench = self._bench
         force = np.array([u + bench.process_noise * self._rng.standard_normal()])
-        states, ends = simulate(self._parameters, force, np.zeros(1), self._state, bench.step, bench.scale)
+        states, ends = simulate(bench.parameters, force, np.zeros(1), self._state, bench.step, bench.scale)
         self._state, self._acceleration = states[1], ends[1]
         return self._shown()
 
@@ -100,27 +100,38 @@ class Run:
     refused: bool
 
 
+def held(name: str) -> Bench:
+    """A rig whose input is held, and that does not decimate."""
+    return replace(BENCHES[name], decimate=1, interpolation="zero_order")
+
+
+def described(bench: Bench, seed: int, noise: bool = False) -> Rig:
+    """The rig of a bench whose input is held, with a guess that is off; with its noises, or without."""
+    return Rig(
+        bench.step,
+        input=Channel(bench.units[0], limit=bench.limit, noise=bench.process_noise if noise else None),
+        output=Channel(bench.units[1], kind=bench.kind, range=bench.output_range,
+                       noise=bench.sensor_noise if noise else None),
+        guess=guess(bench, seed),
+    )  # fmt: skip
+
+
 def trial(task: Task) -> Run:
     """Play 256 samples on a rig by a policy."""
     name, policy, way, seed = task
-    bench = replace(BENCHES[name], decimate=1, interpolation="zero_order")
-    rig = Rig(
-        bench.step, input=Channel(bench.units[0], limit=bench.limit),
-        output=Channel(bench.units[1], kind=bench.kind, range=bench.output_range), guess=guess(bench, seed),
-    )  # fmt: skip
+    bench = held(name)
+    rig = described(bench, seed)
     plant = BenchPlant(bench, seed)
     # A signal sample by sample is scaled to stay in the range; blocks, planner and networks find out themselves.
     largest = 1.0 if policy.startswith(("efe", "ppo/")) else bench.amplitude / bench.limit
     play = _samples if way == "samples" else _blocks
     belief, ended = play(rig, plant, policy, seed, largest)
     prior = rig_prior(rig)
-    mean, std = np.array([belief.parameters()[p][:2] for p in PARAMETERS]).T
+    error, std, inside = judged(belief.parameters(), belief.interval(LEVEL), np.array(bench.truth))
     before = np.array([prior.parameters()[p][1] for p in PARAMETERS])
-    low, high = np.array([belief.interval(LEVEL)[p] for p in PARAMETERS]).T
-    truth = np.array(bench.truth)
     return Run(
-        prior.entropy() - belief.entropy(), ((low <= truth) & (truth <= high)).tolist(),
-        (mean / truth - 1).tolist(), (before / std).tolist(), ended == "range", ended == "design",
+        prior.entropy() - belief.entropy(), inside.tolist(), error.tolist(), (before / std).tolist(),
+        ended == "range", ended == "design",
     )  # fmt: skip
 
 
@@ -160,32 +171,26 @@ def run(
     names: Sequence[str], policies: Sequence[str], ways: Sequence[str], seeds: int, workers: int
 ) -> dict[tuple[str, str, str], list[Run]]:
     """Runs by rig, policy and way."""
-    cells = list(product(names, policies, ways))
-    runs = in_processes(trial, [(*cell, seed) for cell in cells for seed in range(seeds)], workers, "Playing")
-    return {cell: [runs[*cell, seed] for seed in range(seeds)] for cell in cells}
+    return in_processes(trial, list(product(names, policies, ways)), seeds, workers, "Playing")
 
 
 def show(runs: dict[tuple[str, str, str], list[Run]]) -> dict[str, Any]:
     """Print the table and the verdicts by way; return these for the JSON file."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=175)
-    table = Table("rig", "played by", "policy", "gained, nats", "median error of m, c, a, b, %", "coverage of 90 %",
-                  "times narrower", "left its range", "refused", box=box.MARKDOWN)  # fmt: skip
+    rows = []
     for (name, policy, way), found in runs.items():
         gains, number = np.array([one.gain for one in found]), len(found)
-        table.add_row(
+        rows.append((
             name, way, policy, f"{gains.mean():.2f} ± {1.96 * gains.std(ddof=1) / np.sqrt(number):.2f}",
             percents(np.median(np.abs([one.error for one in found]), axis=0)),
             ", ".join(f"{share:.2f}" for share in np.mean([one.inside for one in found], axis=0)),
             ", ".join(f"{times:.3g}" for times in np.median([one.narrower for one in found], axis=0)),
             f"{sum(one.left for one in found)} of {number}", f"{sum(one.refused for one in found)} of {number}",
-        )  # fmt: skip
-    console.print(table)
+        ))  # fmt: skip
+    titles = ("rig", "played by", "policy", "gained, nats", "median error of m, c, a, b, %", "coverage of 90 %",
+              "times narrower", "left its range", "refused")  # fmt: skip
+    results.show(results.table(titles, rows, markdown=True), width=WIDTH)
     verdicts = {way: verdict(runs, way) for way in dict.fromkeys(way for *_, way in runs)}
-    console.print(verdicts)
+    results.show(verdicts, width=175)
     return verdicts
 
 
@@ -207,9 +212,9 @@ def verdict(runs: dict[tuple[str, str, str], list[Run]], way: str) -> dict[str, 
             }
             chosen = means.pop("efe")
             ahead.append(all(bool(chosen > gain) for gain in means.values()))
-    pooled, meets = calibrated(hits, trials)
+    pooled, meets, is_calibrated = calibrated(hits, trials)
     return {
-        "calibrated": POOLED[0] <= pooled <= POOLED[1] and all(meets),
+        "calibrated": is_calibrated,
         "pooled coverage": pooled,
         "cells outside": len(meets) - sum(meets),
         "efe ahead on": sum(ahead),

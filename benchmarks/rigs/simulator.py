@@ -114,7 +114,11 @@ def _simulate(p, force, slope, initial, step, scale):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _paths(p, force, slope, states, step, scale):  # type: ignore[no-untyped-def]
+def paths(p, force, slope, states, step, scale):  # type: ignore[no-untyped-def]
+    """(T, 7, 2) derivatives of the state after each interval, from the state before it, in each of `DIRECTIONS`.
+
+    In a parameter: times the parameter, which is a derivative by its logarithm. Arguments are those of `simulate`.
+    """
     moved = np.empty((len(force), 7, 2))
     s = np.empty(16)
     K, new = np.empty((_STAGES + 1, 16)), np.empty(16)
@@ -152,15 +156,6 @@ def simulate(
     if not np.isfinite(states).all():
         raise OverflowError(f"the oscillator escapes at sample {int(np.argmin(np.isfinite(states).all(axis=1)))}")
     return states, ends
-
-
-def paths(parameters: FloatArray, force: FloatArray, slope: FloatArray, states: FloatArray, step: float,
-          scale: FloatArray) -> FloatArray:  # fmt: skip
-    """(T, 7, 2) derivatives of the state after each interval, from the state before it, in each of `DIRECTIONS`.
-
-    In a parameter: times the parameter, which is a derivative by its logarithm.
-    """
-    return np.asarray(_paths(parameters, force, slope, states, step, scale))
 
 
 def sensor(kind: str, parameters: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:

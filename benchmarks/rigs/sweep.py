@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 
+from agents import results
 from benchmarks.rigs.accuracy import percents, remarks
 from benchmarks.rigs.catalogue import PARAMETERS, A, Bench
-from benchmarks.rigs.judge import POOLED, Cell, Outcome, calibrated, identified, in_processes
+from benchmarks.rigs.judge import WIDTH, Cell, Outcome, calibrated, identified, in_processes
 from benchmarks.rigs.records import guess, record
 
 PER_PERIOD = (6, 12, 25, 50, 100, 200, 400, 800)
@@ -53,17 +55,11 @@ def trial(task: Task) -> Outcome:
 
 def run(seeds: int, workers: int) -> list[Cell]:
     """A cell for each sampling and amplitude."""
-    tasks = [(rate, amplitude, seed) for rate in PER_PERIOD for amplitude in AMPLITUDES for seed in range(seeds)]
-    outcomes = in_processes(trial, tasks, workers, "Identifying")
+    found = in_processes(trial, list(product(PER_PERIOD, AMPLITUDES)), seeds, workers, "Identifying")
     return [
-        Cell(
-            bench(rate, amplitude),
-            f"{rate} samples, {amplitude:g}",
-            [outcomes[rate, amplitude, s] for s in range(seeds)],
-        )
-        for rate in PER_PERIOD
-        for amplitude in AMPLITUDES
-    ]  # fmt: skip
+        Cell(bench(rate, amplitude), f"{rate} samples, {amplitude:g}", outcomes)
+        for (rate, amplitude), outcomes in found.items()
+    ]
 
 
 def words(outcomes: Sequence[Outcome]) -> tuple[list[bool], list[bool]]:
@@ -84,37 +80,30 @@ def words(outcomes: Sequence[Outcome]) -> tuple[list[bool], list[bool]]:
 
 def show(cells: Sequence[Cell]) -> dict[str, Any]:
     """Print the table and the verdict; return the verdict for the JSON file."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=210)
-    table = Table("samples per period, share of the limit", "median error of m, c, a, b, %", "bound (1 σ), %",
-                  "coverage of 90 %", "out of reach, said", "within, denied", "s", "warnings and failures",
-                  box=box.MARKDOWN)  # fmt: skip
     hits = [count for cell in cells for count in cell.hits]
-    pooled, meets = calibrated(hits, [len(cell.outcomes) for cell in cells for _ in PARAMETERS])
-    all_said, all_wrong = [], []
+    pooled, meets, is_calibrated = calibrated(hits, [len(cell.outcomes) for cell in cells for _ in PARAMETERS])
+    rows, all_said, all_wrong = [], [], []
     for cell in cells:
         said, wrongly = words(cell.outcomes)
         all_said += said
         all_wrong += wrongly
         shares = (f"{sum(part)} of {len(part)}" if part else "" for part in (said, wrongly))
-        table.add_row(
+        rows.append((
             cell.setting, percents(cell.errors), percents(cell.bounds),
             ", ".join(f"{count / len(cell.outcomes):.3g}" for count in cell.hits), *shares,
             f"{np.median([outcome.seconds for outcome in cell.outcomes]):.2f}", remarks(cell.outcomes),
-        )  # fmt: skip
-    console.print(table)
-    failures = sum(len(cell.failures) for cell in cells)
+        ))  # fmt: skip
+    titles = ("samples per period, share of the limit", "median error of m, c, a, b, %", "bound (1 σ), %",
+              "coverage of 90 %", "out of reach, said", "within, denied", "s", "warnings and failures")  # fmt: skip
+    failures = sum(bool(outcome.failure) for cell in cells for outcome in cell.outcomes)
     lines = {
         f"{failures} records failed": failures == 0,
         f"calibrated; pooled coverage {pooled:.3f}, {len(meets) - sum(meets)} of {len(meets)} cells outside": (
-            POOLED[0] <= pooled <= POOLED[1] and all(meets)
+            is_calibrated
         ),
         f"out of reach, said: {sum(all_said)} of {len(all_said)}": sum(all_said) >= LEAST_SAID * len(all_said),
         f"within reach, denied: {sum(all_wrong)} of {len(all_wrong)}": sum(all_wrong) <= MOST_FALSE * len(all_wrong),
     }
-    for text, good in lines.items():
-        console.print(f"{'PASS' if good else 'MISS'}: {text}")
+    verdicts = (f"{'PASS' if good else 'MISS'}: {text}" for text, good in lines.items())
+    results.show(results.table(titles, rows, markdown=True), *verdicts, width=WIDTH)
     return {text: bool(good) for text, good in lines.items()}
