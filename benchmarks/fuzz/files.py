@@ -77,25 +77,40 @@ def calls() -> st.SearchStrategy[Call]:
     entries = board.SHIPPED.read_text().splitlines()[:2]
     config = json.dumps(describe(TrainConfig()), default=str)
     progress = json.dumps(vars(Progress(steps=5, curve=[(1, 0.5, None)])))
+    fields = ("config", *TrainConfig.__dataclass_fields__, "hyperparameter")
+    #: Kind to the file's name, its content, what reads it, words of clear messages, and JSON to change in places.
+    others: dict[str, tuple[str, bytes, Callable[[Path], Any], tuple[str, ...], str]] = {
+        "rig": ("file", text_of(RIG, "").encode(), Rig.from_file, (), ""),
+        "csv": ("record.csv", _RECORD, lambda path: read(path, 1e-3), (), ""),
+        "mat": ("record.mat", matlab.getvalue(), lambda path: read(path, 1e-3), (), ""),
+        "run": ("config.json", config.encode(), lambda path: read_config(path.parent), fields, config),
+        "checkpoint": (STATE, progress.encode(), lambda path: load_progress(path.parent), ("checkpoint",), progress),
+        "settings": (
+            "file", (FILES / "ppo.toml").read_bytes(), lambda path: read_settings("ppo", "duffing_env/Short-v0", path),
+            ("settings", "hyperparameter"), "",
+        ),
+        "board": (
+            "file", "\n".join(entries).encode(), lambda path: board.tables(board.read(path)), ("board",), entries[0],
+        ),
+    }  # fmt: skip
     counter = iter(range(10**9))
 
     @st.composite
     def call(draw: st.DrawFn) -> Call:
-        others = ("policy", "rig", "csv", "mat", "run", "checkpoint", "settings", "board")
-        kind = draw(st.sampled_from(["estimator"] * 3 + [*others]))
+        kind = draw(st.sampled_from(["estimator"] * 3 + ["policy", *others]))
         number = next(counter) % 4
         if kind == "mat" and draw(st.integers(0, 9)):  # a process each
             kind = "csv"
-        function: Callable[[], Any]
         folder = place / f"{kind}{number}"
         folder.mkdir(exist_ok=True)
-        path = folder / "file"
+        name, whole, reads, words, held = others.get(kind, ("file", b"", None, (), ""))
+        path = folder / name
         names: tuple[str, ...] = ("path", "rig", "record", "policy", str(path))
         if kind == "estimator":
-            whole, arrays = estimators[draw(st.sampled_from(kinds))]
+            known, arrays = estimators[draw(st.sampled_from(kinds))]
             way = draw(st.integers(0, 2))
             if way == 0:
-                content = draw(damaged(whole))
+                content = draw(damaged(known))
             elif way == 1:
                 key = draw(st.sampled_from(sorted(arrays)))
                 content = _archive({**arrays, key: draw(another_array(arrays[key]))})
@@ -122,41 +137,9 @@ def calls() -> st.SearchStrategy[Call]:
                 draw(damaged(json.dumps(card).encode())) if way == 3 else json.dumps(described).encode()
             )
             return Call("load_policy", lambda: _act(folder), names, sound=str)
-        if kind == "rig":
-            text = text_of(RIG, "").encode()
-            path.write_bytes(draw(damaged(text)))
-            function = lambda: Rig.from_file(path)  # noqa: E731
-        elif kind == "csv":
-            path = folder / "record.csv"
-            path.write_bytes(draw(damaged(_RECORD)))
-            function, names = lambda: read(path, 1e-3), (*names, str(path))
-        elif kind == "mat":
-            path = folder / "record.mat"
-            path.write_bytes(draw(damaged(matlab.getvalue())))
-            function, names = lambda: read(path, 1e-3), (*names, str(path))
-        elif kind == "run":
-            described = draw(changed(json.loads(config)))
-            (folder / "config.json").write_bytes(
-                draw(damaged(config.encode())) if draw(st.booleans()) else json.dumps(described).encode()
-            )
-            names = (*names, "config", *TrainConfig.__dataclass_fields__, "hyperparameter")
-            function = lambda: read_config(folder)  # noqa: E731
-        elif kind == "checkpoint":
-            described = draw(changed(json.loads(progress)))
-            (folder / STATE).write_bytes(
-                draw(damaged(progress.encode())) if draw(st.booleans()) else json.dumps(described).encode()
-            )
-            names, function = (*names, "checkpoint"), lambda: load_progress(folder)
-        elif kind == "board":
-            described = draw(changed(json.loads(entries[0])))
-            whole = "\n".join(entries).encode()
-            path.write_bytes(draw(damaged(whole)) if draw(st.booleans()) else json.dumps(described).encode())
-            names, function = (*names, "board"), lambda: board.tables(board.read(path))
-        else:
-            text = (FILES / "ppo.toml").read_bytes()
-            path.write_bytes(draw(damaged(text)))
-            names = (*names, "settings", "hyperparameter")
-            function = lambda: read_settings("ppo", "duffing_env/Short-v0", path)  # noqa: E731
-        return Call(f"read a {kind}", function, names)
+        described = draw(changed(json.loads(held))) if held else None
+        is_damaged = draw(st.booleans()) if held else True
+        path.write_bytes(draw(damaged(whole)) if is_damaged else json.dumps(described).encode())
+        return Call(f"read a {kind}", lambda: reads(path), (*names, *words))
 
     return call()
