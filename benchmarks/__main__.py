@@ -17,6 +17,7 @@ from agents.cli import run_script
 from agents.results import versions, write_json
 from benchmarks.peer_process import Peers
 from benchmarks.report import Section, print_section, print_verdicts
+from benchmarks.timing import CORES
 
 SectionName = Literal["estimators", "environments", "training", "roofline", "scaling", "startup"]
 _SETTINGS = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
@@ -81,11 +82,10 @@ def _run(name: str, config: Config, peers: Peers, samples: Path, on_row: Callabl
 
 def describe_machine() -> dict[str, Any]:
     """Processor, cores, and the settings that a reader needs to repeat a run."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     told = cpuinfo()
     return {
         "processor": f"{told.get('model name', 'unknown processor')} (family {told.get('cpu family', '?')})",
-        "cores": cores,
+        "cores": CORES,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "load_before": _load(),

@@ -7,6 +7,7 @@ are not counted, here or with the peers. Every run covers whole episodes, with t
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,9 +16,9 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 
 import duffing_env  # noqa: F401  registers the tracks
 from benchmarks.peer_process import Peers
-from benchmarks.pieces import SAMPLES, EstimatorOnly, PlantOnly, play
+from benchmarks.pieces import SAMPLES, EstimatorOnly, plant_only, play
 from benchmarks.report import Claim, Section, ratio
-from benchmarks.timing import Row, measure, timed
+from benchmarks.timing import Row, later, measure, timed
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.lanes import LANES
 
@@ -84,15 +85,14 @@ def _single_rows() -> list[Row]:
 
 def _batch_rows(size: int, peers: Peers) -> list[Row]:
     data = play(size)
-    plant = PlantOnly(size, data)
-    rows = [Row(f"{size}: plant only", UNIT, timed(_piece(plant, size)))]
+    rows = [Row(f"{size}: plant only", UNIT, timed(_piece(plant_only(size, data), size)))]
     for rule, iterations in DEFAULT_ITERATIONS.items():
         name = rule.replace("_", " ")
         alone = EstimatorOnly(data, rule, iterations)
-        rows.append(Row(f"{size}: estimator only, {name}", UNIT, timed(_piece(alone, size))))
+        rows.append(Row(f"{size}: estimator only, {name}", UNIT, timed(_piece(alone.step, size))))
         rows += _ours(size, name, TRACK, factorisation=rule)
     rows += _ours(size, "continuous", CONTINUOUS, **KNOWN) + _ours(size, "noises unknown", CONTINUOUS)
-    rows.append(Row(f"{size}: ours, structured, SB3 policy", UNIT, timed(_with_policy(size))))
+    rows.append(Row(f"{size}: ours, structured, SB3 policy", UNIT, timed(later(partial(_policy_loop, size)))))
     if size in SYNC_SIZES:
         sync = SyncVectorEnv([lambda: gym.make("Pendulum-v1")] * size)
         one_by_one = timed(vector_steps(sync, EPISODES["Pendulum-v1"]))
@@ -157,29 +157,17 @@ def vector_steps(envs: VectorEnv[Any, Any, Any], episode: int) -> Callable[[int]
     return action
 
 
-def _piece(piece: PlantOnly | EstimatorOnly, size: int) -> Callable[[int], float]:
+def _piece(step: Callable[[int], None], size: int) -> Callable[[int], float]:
     def action(count: int) -> float:
         for t in range(count * SAMPLES):
-            piece.step(t)
+            step(t)
         return count * SAMPLES * size
 
     return action
 
 
-def _with_policy(size: int) -> Callable[[int], float]:
-    """A policy of Stable-Baselines3 in the loop, set up at the first run, because torch takes its time."""
-    loop: Callable[[int], float] | None = None
-
-    def action(count: int) -> float:
-        nonlocal loop
-        if loop is None:
-            loop = _policy_loop(size)
-        return loop(count)
-
-    return action
-
-
 def _policy_loop(size: int) -> Callable[[int], float]:
+    """A policy of Stable-Baselines3 in the loop."""
     import torch
     from stable_baselines3 import PPO
 

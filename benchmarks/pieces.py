@@ -5,6 +5,7 @@ They are the functions that the environment's kernel calls, over blocks of the s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -123,17 +124,10 @@ def play(num_envs: int) -> Data:
     return Data(inputs, outputs)
 
 
-class PlantOnly:
-    """The plants alone: a vector step is one call."""
-
-    def __init__(self, num_envs: int, data: Data) -> None:
-        self._blocks = plants(num_envs)
-        self._inputs = data.inputs
-        self._move = plant_mover()
-
-    def step(self, t: int) -> None:
-        """Move by the t-th sample."""
-        self._move(self._blocks, self._inputs[t % SAMPLES])
+def plant_only(num_envs: int, data: Data) -> Callable[[int], None]:
+    """The plants alone: ``step(t)`` moves them by the t-th sample, in one call."""
+    blocks, move_all = plants(num_envs), plant_mover()
+    return lambda t: move_all(blocks, data.inputs[t % SAMPLES])
 
 
 class EstimatorOnly:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,12 @@ import gymnasium as gym
 from agents.evaluation.figures import new_figure, save
 from benchmarks.environments import TRACK, vector_steps
 from benchmarks.report import Claim, Section, ratio
-from benchmarks.timing import Result, Row, measure, timed
+from benchmarks.timing import CORES, Result, Row, later, measure, timed
 from estimator.inference import DEFAULT_ITERATIONS
 
 UNIT = "ns/env-step"
 SIZE = 1024
 HORIZON = 256
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 AXES: dict[str, Sequence[int]] = {
     "num_envs": (1, 4, 16, 64, 256, 1024, 4096, 16384),
     "iterations": (1, 2, 3, 5, 10, 20),
@@ -37,7 +36,7 @@ _COLOURS = {"structured": "#0072b2", "mean_field": "#d55e00"}
 def run(repetitions: int, on_row: Callable[[str], None], figure: Path) -> Section:
     """Time whole steps through ``make_vec`` along each axis, others at their defaults, and draw the figure."""
     rows = [
-        Row(_name(axis, value, rule), UNIT, _later(axis, value, rule), at_least=0.1)
+        Row(_name(axis, value, rule), UNIT, later(partial(_steps, axis, value, rule)), at_least=0.1)
         for axis, values in AXES.items()
         for value in values
         for rule in DEFAULT_ITERATIONS
@@ -64,19 +63,10 @@ def _name(axis: str, value: int, rule: str) -> str:
     return f"{LABELS[axis]} {value}, {rule.replace('_', ' ')}"
 
 
-def _later(axis: str, value: int, rule: str) -> Callable[[int], tuple[float, float]]:
-    """A row's run that makes its environments when it is first called."""
-    loop: Callable[[int], tuple[float, float]] | None = None
-
-    def run(count: int) -> tuple[float, float]:
-        nonlocal loop
-        if loop is None:
-            options: dict[str, Any] = {"num_envs": SIZE, "horizon": HORIZON, axis: value}
-            envs = gym.make_vec(TRACK, vectorization_mode="vector_entry_point", factorisation=rule, **options)
-            loop = timed(vector_steps(envs, options["horizon"]))
-        return loop(count)
-
-    return run
+def _steps(axis: str, value: int, rule: str) -> Callable[[int], tuple[float, float]]:
+    options: dict[str, Any] = {"num_envs": SIZE, "horizon": HORIZON, axis: value}
+    envs = gym.make_vec(TRACK, vectorization_mode="vector_entry_point", factorisation=rule, **options)
+    return timed(vector_steps(envs, options["horizon"]))
 
 
 def draw(results: dict[str, Result], path: Path) -> None:

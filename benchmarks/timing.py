@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
+
+#: That this process may use.
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 #: A row's run must last at least this long: the clock and a stray interrupt are then below a percent.
 LONG_ENOUGH = 0.25
@@ -143,3 +148,9 @@ def timed(action: Callable[[int], float]) -> Callable[[int], tuple[float, float]
         return time.perf_counter() - started, work
 
     return run
+
+
+def later(make: Callable[[], Callable[[int], Any]]) -> Callable[[int], Any]:
+    """A row's ``run``, or what `timed` takes, that is set up when it is first called."""
+    made = cache(make)
+    return lambda count: made()(count)

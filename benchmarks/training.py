@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from agents.policies.learned import CARD
 from agents.training import PPOSettings, TrainConfig
 from benchmarks.peer_process import ROOT
 from benchmarks.report import Claim, Section, ratio
-from benchmarks.timing import Row, measure
+from benchmarks.timing import CORES, Row, measure
 
 TRACK = TrainConfig.env
 EXCITATIONS = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")
@@ -32,8 +32,6 @@ CHECKPOINTS = 50
 ENOUGH = 1_500_000
 PATIENCE = 120.0
 TARGET_SECONDS = 60.0
-#: Torch's own number of threads: one for each core.
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 OURS = "ours, PPO's settings without foresight"
 DEFAULTS = {1: "SB3's defaults, DummyVecEnv of 1", 8: "SB3's defaults, DummyVecEnv of 8"}
 USEFUL = "from starting train.py to a useful policy"
@@ -75,15 +73,13 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
 
 def _loop(make: Callable[[], Any], threads: int) -> Callable[[int], tuple[float, float]]:
     """Rounds of roll-out and update of a model that is made at the first call, on as many threads of torch."""
-    model: Any = None
+    made = cache(make)
 
     def run(count: int) -> tuple[float, float]:
         import torch
 
-        nonlocal model
         torch.set_num_threads(threads)
-        if model is None:
-            model = make()
+        model = made()
         before = model.num_timesteps
         started = time.perf_counter()
         model.learn(count * model.n_steps * model.n_envs, reset_num_timesteps=False)
