@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import multivariate_normal
 
 from agents.evaluation.batch import make
 from agents.policies import make_policy
@@ -96,14 +95,12 @@ def identified(track: str, center: tuple[float, float], actions: FloatArray, see
         envs.step(action)
     beliefs = [envs.belief(row) for row in range(systems)]
     model = envs.experiment.model
-    truth = coefficients_of(model, {name: np.asarray(getattr(envs.truth, name)) for name in model.physical},
-                            beliefs[0].scales).T  # fmt: skip
+    physical = {name: np.asarray(getattr(envs.truth, name)) for name in model.physical}
+    truth = coefficients_of(model, physical, beliefs[0].scales)
     std = np.sqrt([np.diag(belief.coefficients_cov) for belief in beliefs])
-    away = (truth.T - [belief.coefficients_mean for belief in beliefs]) / std
-    # In standard deviations, because the scales of coefficients are far apart.
-    units = [b.coefficients_cov / np.outer(s, s) for b, s in zip(beliefs, std, strict=True)]
-    densities = [multivariate_normal.logpdf(d, cov=unit) for d, unit in zip(away, units, strict=True)]
-    return Cell(center, np.abs(away) <= QUANTILE, np.array(densities) - np.log(std).sum(axis=1))
+    away = (truth - [belief.coefficients_mean for belief in beliefs]) / std
+    densities = [belief.log_prob(true) for belief, true in zip(beliefs, truth, strict=True)]
+    return Cell(center, np.abs(away) <= QUANTILE, np.array(densities))
 
 
 def rows(cells: list[Cell], known: Cell) -> list[list[str]]:
