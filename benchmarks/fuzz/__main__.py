@@ -95,7 +95,7 @@ def inside(area: str, inputs: int, seed: int, path: Path | None) -> None:
         judge.judge(call)
 
     attempt()
-    tally = vars(judge.tally) | {"seconds": time.perf_counter() - began}
+    tally = judge.tally | {"seconds": time.perf_counter() - began}
     if path is not None:
         path.write_text(json.dumps(tally))
 

@@ -7,7 +7,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from gymnasium.error import Error as GymnasiumError
@@ -44,53 +44,22 @@ class Call:
     given: Any = None
 
 
-@dataclass
-class Tally:
-    """How many calls ended in which way, and some of the faults, by what they are."""
-
-    counts: Counter[str] = field(default_factory=Counter)
-    faults: Counter[str] = field(default_factory=Counter)
-    examples: dict[str, str] = field(default_factory=dict)
-
-    def add(self, kind: str, fault: str = "", example: str = "") -> None:
-        """Count an outcome; a fault with its first example."""
-        self.counts[kind] += 1
-        if fault:
-            self.faults[f"{kind}: {fault}"] += 1
-            self.examples.setdefault(f"{kind}: {fault}", example[:400])
-
-
-class _Compiling(event.Listener):
-    """Adds up the seconds that Numba compiles."""
-
-    def __init__(self) -> None:
-        self.seconds, self._depth, self._since = 0.0, 0, 0.0
-
-    def on_start(self, event: Any) -> None:
-        """A function begins to be compiled."""
-        if self._depth == 0:
-            self._since = time.perf_counter()
-        self._depth += 1
-
-    def on_end(self, event: Any) -> None:
-        """It has been."""
-        self._depth -= 1
-        if self._depth == 0:
-            self.seconds += time.perf_counter() - self._since
-
-
 class Judge:
-    """Tries calls, and counts."""
+    """Tries calls, and counts.
+
+    Attributes:
+        tally: ``counts`` of calls by the way they ended, ``faults`` by what they are, and their first ``examples``.
+    """
 
     def __init__(self) -> None:
-        self.tally = Tally()
-        self._compiling = _Compiling()
+        self.tally: dict[str, Any] = {"counts": Counter(), "faults": Counter(), "examples": {}}
+        self._compiling = event.TimingListener()
         event.register("numba:compile", self._compiling)
 
     def judge(self, call: Call) -> None:
         """Try a call."""
         before = pickle.dumps(call.state()) if call.state else b""
-        began, compiled = time.perf_counter(), self._compiling.seconds
+        began = time.perf_counter() - self._compiled()
         kind, fault, example = "result", "", ""
         try:
             fault = call.sound(call.function())
@@ -102,9 +71,16 @@ class Judge:
             fault = "" if kind == "clear error" else f"{call.what}: {type(error).__name__}"
             if call.state and pickle.dumps(call.state()) != before:
                 kind, fault = "state changed", f"{call.what}: {type(error).__name__}"
-        if time.perf_counter() - began - (self._compiling.seconds - compiled) > PATIENCE:
+        if time.perf_counter() - self._compiled() - began > PATIENCE:
             kind, fault = "hang", call.what
-        self.tally.add(kind, fault, f"{example} {call.given!r}" if fault else "")
+        self.tally["counts"][kind] += 1
+        if fault:
+            self.tally["faults"][f"{kind}: {fault}"] += 1
+            self.tally["examples"].setdefault(f"{kind}: {fault}", f"{example} {call.given!r}"[:400])
+
+    def _compiled(self) -> float:
+        """Seconds that Numba has compiled so far."""
+        return float(self._compiling.duration) if self._compiling.done else 0.0
 
 
 def _kind_of(error: Exception, names: tuple[str, ...]) -> str:
