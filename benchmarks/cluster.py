@@ -8,9 +8,6 @@ the weights that they have without Ray, bit for bit, and with at most the sample
 Ray: it runs in the environment of ``make compat``.
 """
 
-# Ray is not installed where types are checked.
-# mypy: ignore-errors
-
 from __future__ import annotations
 
 import csv

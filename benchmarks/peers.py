@@ -9,9 +9,6 @@ What is counted as work: env-steps, without the steps of ``NEXT_STEP`` autoreset
 samples. Every row covers whole episodes, its resets included.
 """
 
-# The peers are not installed where types are checked.
-# mypy: disable-error-code="import-not-found"
-
 from __future__ import annotations
 
 import json

@@ -6,9 +6,6 @@ is given, and judges what it comes to. Models are in the coordinates of
 `estimator.models`: the state and the coefficients together are Gaussian, and the coefficients stay.
 """
 
-# The peers are not installed where types are checked.
-# mypy: disable-error-code="import-not-found"
-
 from __future__ import annotations
 
 import time

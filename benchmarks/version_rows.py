@@ -3,9 +3,6 @@
 It is spoken to like `benchmarks.peers`. Versions before the engine (`estimator.engine`) had other names for the update.
 """
 
-# An old version is not there when types are checked.
-# mypy: disable-error-code="import-not-found"
-
 from __future__ import annotations
 
 import json
