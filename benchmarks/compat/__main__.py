@@ -1,8 +1,5 @@
 """`python -m benchmarks.compat`: see the package."""
 
-# The libraries are not installed where types are checked.
-# mypy: ignore-errors
-
 from __future__ import annotations
 
 import json
@@ -14,9 +11,7 @@ import warnings
 from collections.abc import Callable
 from importlib.metadata import version
 
-from benchmarks.compat.collectors import Gymnasium, Tianshou, TorchRL
-from benchmarks.compat.common import CELLS
-from benchmarks.compat.trainers import Minari, RLlib, StableBaselines3
+from benchmarks.compat.libraries import CELLS, Gymnasium, Minari, RLlib, StableBaselines3, Tianshou, TorchRL
 
 LIBRARIES = {kind.__name__: kind for kind in (Gymnasium, TorchRL, Tianshou, StableBaselines3, RLlib, Minari)}
 

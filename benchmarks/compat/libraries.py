@@ -1,13 +1,19 @@
-"""Gymnasium, TorchRL and Tianshou."""
-
-# The libraries are not installed where types are checked.
-# mypy: ignore-errors
+"""The libraries, each with a function for each cell of its row."""
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 
-from benchmarks.compat.common import ID, KEYS, ROWS, made
+ID = "duffing_env:duffing_env/Short-v0"
+KEYS = {"information_gain", "log_posterior_gain", "diverged"}
+ROWS = 4
+CELLS = ("single", "vector", "train", "infos")
+
+
+def made(autoreset_mode="SameStep"):
+    """Ours, as a vector environment of Gymnasium."""
+    return gym.make_vec(ID, num_envs=ROWS, vectorization_mode="vector_entry_point", autoreset_mode=autoreset_mode)
 
 
 class Gymnasium:
@@ -17,7 +23,6 @@ class Gymnasium:
 
     def single(self):
         """Checked, with its time limit and time, and remade from its specification."""
-        import gymnasium as gym
         from gymnasium.utils.env_checker import check_env
 
         check_env(gym.make(ID).unwrapped, skip_render_check=True)
@@ -28,7 +33,6 @@ class Gymnasium:
 
     def vector(self):
         """Ours and its own, in all modes, under wrappers."""
-        import gymnasium as gym
         from gymnasium.vector import AutoresetMode
         from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 
@@ -49,8 +53,6 @@ class Gymnasium:
 
     def infos(self):
         """The same keys at a reset and every step; belief and truth at the end."""
-        import gymnasium as gym
-
         env = gym.make(ID)
         told = [env.reset(seed=0)[1], *(env.step(env.action_space.sample())[4] for _ in range(48))]
         assert all(info.keys() == KEYS for info in told)
@@ -136,13 +138,17 @@ class Tianshou:
 
     package = "tianshou"
 
-    def _envs(self):
-        import gymnasium as gym
+    def _collector(self, rows, size):
+        from tianshou.data import Collector, VectorReplayBuffer
         from tianshou.env import DummyVectorEnv
 
-        return DummyVectorEnv([lambda: gym.make(ID)] * ROWS)
+        envs, buffer = DummyVectorEnv([lambda: gym.make(ID)] * rows), VectorReplayBuffer(size, rows)
+        algorithm = self._algorithm(envs)
+        collector = Collector(algorithm, envs, buffer)
+        collector.reset()
+        return collector, algorithm, buffer
 
-    def _algorithm(self):
+    def _algorithm(self, envs):
         import torch
         from tianshou.algorithm import PPO
         from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
@@ -150,7 +156,6 @@ class Tianshou:
         from tianshou.utils.net.common import Net
         from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
 
-        envs = self._envs()
         space, actions = envs.observation_space[0], envs.action_space[0]
         actor = ContinuousActorProbabilistic(
             preprocess_net=Net(state_shape=space.shape, hidden_sizes=[16]), action_shape=actions.shape, unbounded=True
@@ -164,30 +169,19 @@ class Tianshou:
 
     def single(self):
         """One environment in its collector."""
-        import gymnasium as gym
-        from tianshou.data import Collector, VectorReplayBuffer
-        from tianshou.env import DummyVectorEnv
-
-        collector = Collector(self._algorithm(), DummyVectorEnv([lambda: gym.make(ID)]), VectorReplayBuffer(100, 1))
-        collector.reset()
+        collector, *_ = self._collector(1, 100)
         assert collector.collect(n_episode=1).lens[0] == 48
 
     def vector(self):
         """Several environments in its collector."""
-        from tianshou.data import Collector, VectorReplayBuffer
-
-        collector = Collector(self._algorithm(), self._envs(), VectorReplayBuffer(1000, ROWS))
-        collector.reset()
+        collector, *_ = self._collector(ROWS, 1000)
         assert collector.collect(n_episode=8).n_collected_episodes == 8
 
     def train(self):
         """Three rounds of collecting and updating."""
-        from tianshou.data import Collector, VectorReplayBuffer
         from tianshou.utils.torch_utils import policy_within_training_step
 
-        algorithm, buffer = self._algorithm(), VectorReplayBuffer(400, ROWS)
-        collector = Collector(algorithm, self._envs(), buffer)
-        collector.reset()
+        collector, algorithm, buffer = self._collector(ROWS, 400)
         for _ in range(3):
             with policy_within_training_step(algorithm.policy):
                 collector.collect(n_step=192)
@@ -196,12 +190,120 @@ class Tianshou:
 
     def infos(self):
         """In its replay buffer."""
-        from tianshou.data import Collector, VectorReplayBuffer
-
-        buffer = VectorReplayBuffer(400, ROWS)
-        collector = Collector(self._algorithm(), self._envs(), buffer)
-        collector.reset()
+        collector, _, buffer = self._collector(ROWS, 400)
         collector.collect(n_episode=4)
         told = buffer.sample(0)[0].info
         assert set(told.keys()) >= KEYS
         assert np.count_nonzero(told.information_gain)
+
+
+class StableBaselines3:
+    """Its checker, PPO on one environment and on ours, wrapped."""
+
+    package = "stable-baselines3"
+
+    def _envs(self):
+        from agents.vec_env import DuffingVecEnv
+
+        return DuffingVecEnv(ID, ROWS, seed=0)
+
+    def _ppo(self, envs):
+        from stable_baselines3 import PPO
+
+        return PPO("MlpPolicy", envs, n_steps=48, batch_size=48, policy_kwargs={"net_arch": [16]}, device="cpu")
+
+    def single(self):
+        """Checked, and in its own way to many."""
+        from stable_baselines3.common.env_checker import check_env
+
+        check_env(gym.make(ID))
+        self._ppo(gym.make(ID)).learn(48)
+
+    def vector(self):
+        """Ours, made and wrapped by the user."""
+        from gymnasium.wrappers.vector import TransformReward
+
+        from agents.vec_env import DuffingVecEnv
+
+        envs = DuffingVecEnv(TransformReward(made(), lambda reward: 0.1 * reward))
+        envs.reset()
+        envs.step(np.zeros((ROWS, 1), dtype=np.float32))
+        assert envs.get_attr("truth", 2)[0].m == envs.envs.unwrapped.truth.m[2]
+
+    def train(self):
+        """On ours."""
+        self._ppo(self._envs()).learn(3 * 48 * ROWS)
+
+    def infos(self):
+        """The last step's of each episode."""
+        envs = self._envs()
+        envs.reset()
+        for _ in range(48):
+            _, _, _, infos = envs.step(np.zeros((ROWS, 1), dtype=np.float32))
+        assert all({"belief", "truth", "episode"} | KEYS <= info.keys() for info in infos)
+
+
+class RLlib:
+    """Its PPO, on one environment and on ours."""
+
+    package = "ray"
+
+    def _algorithm(self, many=False):
+        import ray
+        from ray.rllib.algorithms.ppo import PPOConfig
+
+        ray.init(num_cpus=1, include_dashboard=False, object_store_memory=10**8, ignore_reinit_error=True)
+        told = {"num_envs_per_env_runner": ROWS, "gym_env_vectorize_mode": "vector_entry_point"} if many else {}
+        config = PPOConfig().environment(ID).env_runners(num_env_runners=0, **told)
+        return config.training(train_batch_size=192, minibatch_size=96, num_epochs=1).build_algo()
+
+    def single(self):
+        """One environment in its runner."""
+        assert self._algorithm().env_runner.sample(num_episodes=1)[0].is_done
+
+    def vector(self):
+        """Ours in its runner."""
+        algorithm = self._algorithm(many=True)
+        assert len(algorithm.env_runner.sample(num_episodes=ROWS)) >= ROWS
+
+    def train(self):
+        """On ours."""
+        algorithm = self._algorithm(many=True)
+        results = [algorithm.train() for _ in range(3)]
+        assert np.isfinite(results[-1]["env_runners"]["episode_return_mean"])
+
+    def infos(self):
+        """In its episodes."""
+        (episode, *_) = self._algorithm().env_runner.sample(num_episodes=1)
+        assert all(info.keys() >= KEYS for info in episode.get_infos())
+
+
+class Minari:
+    """Its collector; it takes single environments."""
+
+    package = "minari"
+
+    def _dataset(self, infos):
+        import minari
+
+        collector = minari.DataCollector(gym.make(ID), record_infos=infos)
+        for episode in range(3):
+            collector.reset(seed=episode)
+            done = False
+            while not done:
+                _, _, terminated, truncated, _ = collector.step(collector.action_space.sample())
+                done = terminated or truncated
+        told = {"algorithm_name": "random", "code_permalink": "none", "author": "none", "author_email": "none@none"}
+        return collector.create_dataset(dataset_id=f"duffing/short-{infos}/random-v0", **told)
+
+    def single(self):
+        """Episodes into a data set."""
+        assert self._dataset(False).total_steps == 3 * 48
+
+    vector = train = None
+
+    def infos(self):
+        """With ``record_infos``: of the reset and of every step."""
+        for episode in self._dataset(True).iterate_episodes():
+            assert episode.infos.keys() == KEYS
+            assert len(episode.infos["information_gain"]) == 49
