@@ -18,17 +18,12 @@ from estimator.inference import DEFAULT_ITERATIONS
 UNIT = "ns/env-step"
 SIZE = 1024
 HORIZON = 256
-AXES: dict[str, Sequence[int]] = {
-    "num_envs": (1, 4, 16, 64, 256, 1024, 4096, 16384),
-    "iterations": (1, 2, 3, 5, 10, 20),
-    "horizon": (16, 64, 256, 1024),
-    "threads": tuple(range(1, CORES + 1)),
-}
-LABELS = {
-    "num_envs": "environments",
-    "iterations": "iterations",
-    "horizon": "samples of an episode",
-    "threads": "threads",
+#: Option to what it is called, and its values.
+AXES: dict[str, tuple[str, Sequence[int]]] = {
+    "num_envs": ("environments", (1, 4, 16, 64, 256, 1024, 4096, 16384)),
+    "iterations": ("iterations", (1, 2, 3, 5, 10, 20)),
+    "horizon": ("samples of an episode", (16, 64, 256, 1024)),
+    "threads": ("threads", range(1, CORES + 1)),
 }
 _COLOURS = {"structured": "#0072b2", "mean_field": "#d55e00"}
 
@@ -37,7 +32,7 @@ def run(repetitions: int, on_row: Callable[[str], None], figure: Path) -> Sectio
     """Time whole steps through ``make_vec`` along each axis, others at their defaults, and draw the figure."""
     rows = [
         Row(_name(axis, value, rule), UNIT, later(partial(_steps, axis, value, rule)), at_least=0.1)
-        for axis, values in AXES.items()
+        for axis, (_, values) in AXES.items()
         for value in values
         for rule in DEFAULT_ITERATIONS
     ]
@@ -60,7 +55,7 @@ def run(repetitions: int, on_row: Callable[[str], None], figure: Path) -> Sectio
 
 
 def _name(axis: str, value: int, rule: str) -> str:
-    return f"{LABELS[axis]} {value}, {rule.replace('_', ' ')}"
+    return f"{AXES[axis][0]} {value}, {rule.replace('_', ' ')}"
 
 
 def _steps(axis: str, value: int, rule: str) -> Callable[[int], tuple[float, float]]:
@@ -72,7 +67,7 @@ def _steps(axis: str, value: int, rule: str) -> Callable[[int], tuple[float, flo
 def draw(results: dict[str, Result], path: Path) -> None:
     """One panel per axis: median cost, with a band from minimum to maximum."""
     figure = new_figure(10, 6.4)
-    for panel, (axis, values) in zip(figure.subplots(2, 2).flat, AXES.items(), strict=True):
+    for panel, (axis, (label, values)) in zip(figure.subplots(2, 2).flat, AXES.items(), strict=True):
         for rule, colour in _COLOURS.items():
             found = [(value, results[_name(axis, value, rule)]) for value in values]
             found = [(value, result) for value, result in found if result.values]
@@ -91,7 +86,7 @@ def draw(results: dict[str, Result], path: Path) -> None:
             panel.set_yscale("log")
         else:
             panel.set_ylim(0, None)
-        panel.set_xlabel(LABELS[axis])
+        panel.set_xlabel(label)
         panel.set_ylabel("ns per env-step")
         panel.grid(alpha=0.3)
         panel.legend()

@@ -16,10 +16,8 @@ from benchmarks.rigs.records import guess, record
 #: motion.
 SETTINGS, PIECES = ("guess", "no guess", "pieces"), 16
 
-Task = tuple[str, tuple[str, ...], int]
 
-
-def trial(task: Task) -> list[Outcome]:
+def trial(task: tuple[str, tuple[str, ...], int]) -> list[Outcome]:
     """Simulate one record of a rig, of a seed, and identify it in each of some settings."""
     name, settings, seed = task
     bench = BENCHES[name]

@@ -17,8 +17,6 @@ from benchmarks.rigs.records import record
 #: Seeds of the noises of a second experiment: those of the first, and so much.
 _AGAIN = 1_000_000
 
-Task = tuple[str, str, int, int]
-
 
 @dataclass(frozen=True)
 class Trial:
@@ -40,7 +38,7 @@ class Trial:
     left: bool
 
 
-def trial(task: Task) -> Trial:
+def trial(task: tuple[str, str, int, int]) -> Trial:
     """A record of some samples, or none; the next experiment by a policy; its answer; and both identified."""
     from agents.running.experiment import design
     from estimator import identify

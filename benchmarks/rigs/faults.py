@@ -35,8 +35,6 @@ CLIPPED_AT, INPUT_NOISE, QUINTIC = 0.7, 0.05, 0.2
 WEAK = 0.01
 LEAST_NAMED, MOST_FALSE = 0.95, 0.05
 
-Task = tuple[str, str, int]
-
 
 def faulty(fault: str, name: str, seed: int) -> tuple[Record, dict[str, Any]]:
     """A record with a fault, and what is wrong in its rig file."""
@@ -66,7 +64,7 @@ def faulty(fault: str, name: str, seed: int) -> tuple[Record, dict[str, Any]]:
     return good, {}
 
 
-def trial(task: Task) -> Outcome:
+def trial(task: tuple[str, str, int]) -> Outcome:
     """Identify one record with a fault; the rig file has a guess."""
     fault, name, seed = task
     made, changed = faulty(fault, name, seed)

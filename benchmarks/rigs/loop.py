@@ -29,8 +29,6 @@ ASKED = 0.05
 #: Between two blocks an unknown time passes: up to so many samples.
 _PAUSE = 200
 
-Task = tuple[str, str, str, int]
-
 
 class BenchPlant:
     """A bench as a plant: of ``Rig-v0`` by `reset` and `step`, of a run in blocks by the others.
@@ -116,7 +114,7 @@ def described(bench: Bench, seed: int, noise: bool = False) -> Rig:
     )  # fmt: skip
 
 
-def trial(task: Task) -> Run:
+def trial(task: tuple[str, str, str, int]) -> Run:
     """Play 256 samples on a rig by a policy."""
     name, policy, way, seed = task
     bench = held(name)

@@ -26,8 +26,6 @@ NOT_IDENTIFIED = "not_identified"
 #: Share of records that must be told so, and that may be told so wrongly.
 LEAST_SAID, MOST_FALSE = 0.95, 0.05
 
-Task = tuple[int, float, int]
-
 
 def bench(per_period: int, amplitude: float) -> Bench:
     """Rig a, sampled so, with an input of this share of its limit: held for a quarter of a period, at least a sample.
@@ -46,7 +44,7 @@ def bench(per_period: int, amplitude: float) -> Bench:
     )
 
 
-def trial(task: Task) -> Outcome:
+def trial(task: tuple[int, float, int]) -> Outcome:
     """Identify one record, with a guess for even seeds and without for odd ones."""
     per_period, amplitude, seed = task
     chosen = bench(per_period, amplitude)
