@@ -1,7 +1,5 @@
 """Run the benchmarks: `make bench`, or ``python -m benchmarks --help``."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import os

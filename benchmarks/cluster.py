@@ -8,8 +8,6 @@ the weights that they have without Ray, bit for bit, and with at most the sample
 Ray: it runs in the environment of ``make compat``.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import subprocess

@@ -3,8 +3,6 @@
 ``python -m benchmarks.coverage`` prints the tables of docs/coverage.md, docs/continuous.md and docs/estimators.md.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ An env-step is one environment's one step of its plant. The steps of ``NEXT_STEP
 are not counted, here or with the peers. Every run covers whole episodes, with their resets and endings.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

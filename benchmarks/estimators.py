@@ -1,7 +1,5 @@
 """Section 1: the estimator on the Silverbox record, beside the filters that people reach for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@
 the truth. Systems, noises and inputs are the same in every row, and in that of an estimator that is told the noises.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path

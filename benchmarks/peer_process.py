@@ -1,7 +1,5 @@
 """Processes that run rows for the benchmark, and the peers' own environment, in which one of them is."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

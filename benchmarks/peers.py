@@ -9,8 +9,6 @@ What is counted as work: env-steps, without the steps of ``NEXT_STEP`` autoreset
 samples. Every row covers whole episodes, its resets included.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -3,8 +3,6 @@
 They are the functions that the environment's kernel calls, over blocks of the same kind, once per sample from Python.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

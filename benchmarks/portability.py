@@ -5,8 +5,6 @@ for a tanh. So does a setting of the libraries, and it lets one machine compute 
 under one setting and passes under another has a bound that was taken from a machine instead of from the arithmetic.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Sections of the benchmark as they are printed and written: ratios first, then rows, then notes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

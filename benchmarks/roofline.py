@@ -7,8 +7,6 @@ Operations are counted in what `estimator.straight` gives to LLVM, where each st
 still finds an expression or two that are written twice; divisions and roots are as many in the assembly.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable

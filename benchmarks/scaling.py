@@ -1,7 +1,5 @@
 """Section 4b: how the cost of an env-step grows with environments, iterations, horizon and threads; one figure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path

@@ -5,8 +5,6 @@ the training section, and float64. Its coefficients are simulated by our own fre
 noises, so that nothing but the identification differs; fastcan's model is simulated by fastcan.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

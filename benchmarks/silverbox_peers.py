@@ -6,8 +6,6 @@ is given, and judges what it comes to. Models are in the coordinates of
 `estimator.models`: the state and the coefficients together are Gaussian, and the coefficients stay.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

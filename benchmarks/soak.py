@@ -10,8 +10,6 @@ not finite or out of bounds, a covariance not positive semi-definite, or where m
 second half of a run.
 """
 
-from __future__ import annotations
-
 import json
 import resource
 import sys

@@ -1,7 +1,5 @@
 """Section 5: what one waits for before the first step, and how much memory many environments take."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

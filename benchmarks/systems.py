@@ -6,8 +6,6 @@ but its start tells its offsets apart, and is therefore drawn as the prior has i
 prior that is wide beside what a sample tells: Gaussian, under three times the multisine of the Silverbox, from rest.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rows that are timed in turns: all of them once, then all again, so that a busy moment of the machine hits all."""
 
-from __future__ import annotations
-
 import math
 import os
 import statistics

@@ -3,8 +3,6 @@
 Useful: the 95 % interval of its log posterior gain over 256 systems lies above that of every fixed excitation.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

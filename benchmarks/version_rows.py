@@ -3,8 +3,6 @@
 It is spoken to like `benchmarks.peers`. Versions before the engine (`estimator.engine`) had other names for the update.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

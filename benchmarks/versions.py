@@ -3,8 +3,6 @@
 Each version runs from a tree of its own in a process of its own, and both are timed in turns.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

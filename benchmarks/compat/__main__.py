@@ -1,7 +1,5 @@
 """`python -m benchmarks.compat`: see the package."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The libraries, each with a function for each cell of its row."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 

@@ -7,8 +7,6 @@ Each area runs in a process of its own, so that one that dies is counted, and do
 is 1 where there was a fault. The same seed and number give the same inputs.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import subprocess

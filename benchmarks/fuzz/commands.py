@@ -1,7 +1,5 @@
 """Command lines of ``duffing-env``: words of all kinds. Each must end with status 0 or 2, and say why in one line."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

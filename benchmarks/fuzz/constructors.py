@@ -1,7 +1,5 @@
 """Constructors and functions: with one to three arguments that are anything."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import tempfile

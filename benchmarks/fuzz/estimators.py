@@ -1,7 +1,5 @@
 """Online estimators: every method, with series of any scale, and anything in their place."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

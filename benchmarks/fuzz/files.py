@@ -1,7 +1,5 @@
 """Files of every kind: cut, with bits turned over, with other arrays or entries, or of another kind altogether."""
 
-from __future__ import annotations
-
 import io
 import json
 import tempfile

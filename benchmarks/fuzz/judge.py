@@ -1,7 +1,5 @@
 """Calls, and what comes of them: a result, a clear error, or a fault."""
 
-from __future__ import annotations
-
 import pickle
 import re
 import time

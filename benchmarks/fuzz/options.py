@@ -1,7 +1,5 @@
 """Options of every track: one to three of them anything. What can be made is played for five samples."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

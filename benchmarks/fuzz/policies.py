@@ -1,7 +1,5 @@
 """Policies: names, options and observations that are anything."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

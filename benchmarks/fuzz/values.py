@@ -1,7 +1,5 @@
 """What a caller may pass in by mistake: values of all kinds, and files with something changed."""
 
-from __future__ import annotations
-
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Environments: `step` and `reset` with anything, single and vector."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 

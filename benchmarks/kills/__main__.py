@@ -10,8 +10,6 @@ the kill has to be there. Where the same result is promised, it is compared bit 
 something of that failed.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

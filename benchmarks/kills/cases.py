@@ -1,7 +1,5 @@
 """The commands that are killed: how each is started, goes on, and what it had measured."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

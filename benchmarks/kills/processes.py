@@ -1,7 +1,5 @@
 """Processes that run a command line, and that can be killed; the packages are imported once for all of them."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

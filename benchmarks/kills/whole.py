@@ -1,7 +1,5 @@
 """Is a file whole? Each is read as its kind is."""
 
-from __future__ import annotations
-
 import csv
 import json
 import tomllib

@@ -1,7 +1,5 @@
 """Run a part: ``python -m benchmarks.rigs accuracy --seeds 200``; ``--help`` names the others."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import dataclass, field

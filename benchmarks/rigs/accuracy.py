@@ -1,7 +1,5 @@
 """Errors and coverage of `identify` on every rig, from a CSV and a rig file, with a guess, without, and in pieces."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The rigs: truth, what the rig file says, inputs and noises. Numbers are in the units of each rig's channels."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The next experiment, designed, played and identified: what was expected beside what came."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Faults that users meet, put into records of rigs a and e on purpose: are they named, is a good record left alone?"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Verdicts: errors against the Cramér-Rao bound, coverage against its bars, and the trials that give them."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence

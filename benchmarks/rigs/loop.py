@@ -1,7 +1,5 @@
 """The closed loop: 256 samples on the adaptive integrator, by signals and by the planner, one by one and in blocks."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ linearised motion. What the noises' dependence on the parameters would add is le
 shrink.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

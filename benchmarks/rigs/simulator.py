@@ -4,8 +4,6 @@ The coefficients and the control of the step are those of SciPy's ``DOP853``. Th
 samples, so that every sample begins a new integration and no step crosses a jump of the force.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From 6 to 800 samples per period, from the linear range to the limit: no overflow, calibrated, nothing invented."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
