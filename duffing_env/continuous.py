@@ -15,15 +15,7 @@ from estimator.models.model import Model
 
 @dataclass(frozen=True)
 class ContinuousExperiment(SimulatedExperiment):
-    """An experiment on the plant ``sde``, with a new oscillator in every episode.
-
-    The fields of `SimulatedExperiment` are the same, but for ``process_noise``: the standard deviation of what one
-    sample's process noise alone does to x [V]. Oscillators are drawn about `CONTINUOUS_TWIN`.
-
-    Attributes:
-        estimator: ``ode``, the plant's own equation, structured; or ``nlarx``, the paper's difference equation, which
-            no plant of this kind obeys.
-    """
+    """An experiment on the differential equation; `ContinuousEnv` says what its options are."""
 
     estimator: str = "ode"
 
@@ -73,47 +65,18 @@ class ContinuousEnv(DuffingEnv):
 
     ## Action space
 
-    `Box(-1, 1, (1,), float32)`; values outside are clipped.
-
-    | Num | Action | Min | Max | Unit |
-    |-----|--------|-----|-----|------|
-    | 0 | input u_t in parts of ``max_input`` | -1 | 1 | ``max_input`` (0.15 V) |
+    As `DuffingEnv`.
 
     ## Observation space
 
-    `Box(22, float32)`, every entry clipped to its bounds.
-
-    | Num | Observation | Min | Max |
-    |-----|-------------|-----|-----|
-    | 0-3 | posterior means of k, κ, d, g: deviation from the prior's, in its standard deviations | -10 | 10 |
-    | 4-7 | log of their standard deviations, relative to the prior's (0 at the start, falling) | -20 | 5 |
-    | 8-13 | posterior correlations kκ, kd, kg, κd, κg, dg | -1 | 1 |
-    | 14, 15 | log E[γ], log E[ξ] (process and measurement precision), relative to the prior's | -20 | 20 |
-    | 16, 17 | filtered state E[x], E[x'] (x' in V per sample), in parts of ``max_output`` | -2 | 2 |
-    | 18 | last input in parts of ``max_input`` | -1 | 1 |
-    | 19 | last output in parts of ``max_output`` | -2 | 2 |
-    | 20 | time left, in parts of the horizon | 0 | 1 |
-    | 21 | input energy budget left; 1, as this track has none | 0 | 1 |
-
-    With ``estimator="nlarx"`` entries 0 to 13, 16 and 17 are those of `DuffingEnv`: θ1, θ2, θ3, η, x_t and x_{t-1}.
+    As `DuffingEnv`, with k, κ, d, g in place of θ1, θ2, θ3, η (entries 0 to 13), and E[x], E[x'] as the filtered state
+    (16, 17; x' in V per sample). With ``estimator="nlarx"`` all are those of `DuffingEnv`.
 
     ## Reward
 
-    By name (``reward=``), in nats but for the two errors; C is the posterior covariance of (k, κ, d, g), c* their
-    true values. With ``estimator="nlarx"`` they are θ1, θ2, θ3, η, the true ones by Eq. (3), and the estimates of
-    m, c, a, b by Eq. (4).
-
-    | Name | Reward of a step | Range |
-    |------|------------------|-------|
-    | ``information_gain`` (default) | ½ log det C_{t-1} - ½ log det C_t | about 16 over an episode, mostly >= 0 |
-    | ``log_posterior`` | log q_t(c*) - log q_{t-1}(c*) | unbounded below; its mean is at most the information gain |
-    | ``parameter_error`` | e_{t-1} - e_t, e = mean of min(relative error, 1) over m, c, a, b | [-1, 1] |
-    | ``fisher`` | as `DuffingEnv`, with the true noises; not with ``estimator="nlarx"`` | >= 0 |
-    | ``expected_free_energy`` | ½ log det C_{t-1} - ½ log det C'_t, C'_t as expected before the outcome | >= 0 |
-    | ``simulation_error`` | s_{t-1} - s_t, s the relative error of a free run, at most 1 | [-1, 1] |
-    | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
-
-    The ranges are those of an episode's sum; see `DuffingEnv`.
+    As `DuffingEnv`, with C the posterior covariance of (k, κ, d, g) and c* their true values; the information gained
+    over an episode is about 16 nats. ``fisher`` counts with the true noises, and is not for ``estimator="nlarx"``, with
+    which C and c* are those of θ1, θ2, θ3, η, the true ones by Eq. (3), and the estimates of m, c, a, b by Eq. (4).
 
     ## Starting state
 
@@ -135,26 +98,16 @@ class ContinuousEnv(DuffingEnv):
 
     ## Arguments
 
+    As `DuffingEnv`, but for:
+
     | Argument | Default | Meaning |
     |----------|---------|---------|
     | ``estimator`` | ``ode`` | the plant's equation; or ``nlarx``, the paper's |
     | ``factorisation`` | ``structured`` | with ``estimator="nlarx"`` and one hypothesis also ``mean_field`` |
-    | ``iterations`` | 3 or 10 | variational iterations per sample (structured, mean field) |
-    | ``reward`` | ``information_gain`` | see above |
-    | ``max_input`` | 0.15 | input limit [V] |
-    | ``max_output`` | 0.6 | the sensor's limit [V] |
-    | ``horizon`` | 256 | samples of an episode |
-    | ``hold``, ``terminal``, ``terminated_return`` | 1, False, None | as `DuffingEnv` |
     | ``process_noise`` | 5e-4 | standard deviation of what a sample's process noise alone does to x [V]: the middle |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V]: the middle of its range |
-    | ``spread`` | 0.3 | half width of the parameters' range, relative |
     | ``noise_range`` | 10 | largest over smallest of each noise; 1: they are the middle |
-    | ``process_noise_guess``, ``measurement_noise_guess`` | None | as `DuffingEnv` |
-    | ``noise_shape`` | 2 | shape of the Gamma priors of γ and ξ |
     | ``noise_hypotheses`` | 7 | as `DuffingEnv` |
-    | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
-    | ``branch`` | ``train`` | as `DuffingEnv` |
-    | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
 
     >>> import gymnasium as gym
     >>> import duffing_env

@@ -7,6 +7,9 @@ from typing import Any
 
 from estimator.models.pendulum import STEP
 
+#: Limits of the Duffing oscillator's tracks, where they have no others.
+_LIMITS = {"horizon": 256, "max_input": 0.15, "max_output": 0.6}
+
 #: On Eq. (1) the noises are drawn for every episode, over a decade each, and known to nobody.
 _UNKNOWN = {"noise_range": 10.0, "noise_hypotheses": 7}
 
@@ -21,83 +24,58 @@ _PENDULUM = {
     "max_input": 1.0,
 }
 
+
+def _track(entry_point: str, vector_entry_point: str, **kwargs: Any) -> dict[str, Any]:
+    """What a track is registered with."""
+    places = {"entry_point": f"duffing_env.{entry_point}", "vector_entry_point": f"duffing_env.{vector_entry_point}"}
+    return {**places, "kwargs": kwargs}
+
+
+def _duffing(entry_point: str, **changed: Any) -> dict[str, Any]:
+    """A track on the paper's equation, with what differs from Amplitude-v0."""
+    return _track(entry_point, "vector_env:DuffingVectorEnv", **{**_LIMITS, **changed})
+
+
+def _continuous(entry: str, **changed: Any) -> dict[str, Any]:
+    """A track on the differential equation, with what differs from Amplitude-v1."""
+    vector_entry_point = "vector_env:ContinuousVectorEnv"
+    return _track(f"continuous:{entry}", vector_entry_point, **{**_LIMITS, **changed, **_UNKNOWN})
+
+
+def _model(system: str, **kwargs: Any) -> dict[str, Any]:
+    """A track of any model."""
+    return _track("model_env:ModelEnv", "model_env:ModelVectorEnv", system=system, **kwargs)
+
+
 #: Id of a track to what it is registered with. Any change of numbers or spaces is a new version. None registers
 #: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short (`duffing_env.env.Specified`).
 TRACKS: dict[str, dict[str, Any]] = {
-    "duffing_env/Amplitude-v0": {
-        "entry_point": "duffing_env.env:DuffingEnv",
-        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
-        "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6},
-    },
-    "duffing_env/Short-v0": {
-        "entry_point": "duffing_env.limited:ShortEnv",
-        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
-        "kwargs": {"horizon": 48, "max_input": 0.15, "max_output": 0.6},
-    },
-    "duffing_env/Power-v0": {
-        "entry_point": "duffing_env.limited:PowerEnv",
-        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
-        "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6, "max_rms": 0.0222},
-    },
-    "duffing_env/Output-v0": {
-        "entry_point": "duffing_env.limited:OutputEnv",
-        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
-        "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.3},
-    },
-    "duffing_env/Drift-v0": {
-        "entry_point": "duffing_env.limited:DriftEnv",
-        "vector_entry_point": "duffing_env.vector_env:DuffingVectorEnv",
-        "kwargs": {"horizon": 512, "max_input": 0.15, "max_output": 0.6, "jump": 0.3, "drift": 0.01},
-    },
-    **{
-        f"duffing_env/{name}-v1": {
-            "entry_point": f"duffing_env.continuous:{entry}",
-            "vector_entry_point": "duffing_env.vector_env:ContinuousVectorEnv",
-            "kwargs": {"horizon": 256, "max_input": 0.15, "max_output": 0.6, **limits, **_UNKNOWN},
-        }
-        for name, entry, limits in (
-            ("Amplitude", "ContinuousEnv", {}),
-            ("Short", "ContinuousShortEnv", {"horizon": 48}),
-            ("Power", "ContinuousPowerEnv", {"max_rms": 0.0222}),
-            ("Output", "ContinuousOutputEnv", {"max_output": 0.3}),
-        )
-    },
-    **{
-        f"duffing_env/Pendulum-{version}": {
-            "entry_point": "duffing_env.model_env:ModelEnv",
-            "vector_entry_point": "duffing_env.model_env:ModelVectorEnv",
-            "kwargs": {"system": system, **_PENDULUM, "process_noise": process_noise, "max_output": limit},
-        }
-        for version, system, process_noise, limit in (
-            # Diffusion 0.1 of q'', counted as what a sample of it does to q: 0.1 δ^1.5 / √3.
-            ("v0", "pendulum", 6.454972e-4, 6.283185307179586),
-            # By Euler's rule, as published: what a sample does to the velocity in rad per sample, δ √(0.1² δ + 1e-8).
-            ("v1", "pendulum_map", 1.1180452e-3, 4.0),
-        )
-    },
-    "duffing_env/WienerHammerstein-v0": {
-        "entry_point": "duffing_env.model_env:ModelEnv",
-        "vector_entry_point": "duffing_env.model_env:ModelVectorEnv",
-        "kwargs": {
-            "system": "wiener_hammerstein",
-            "mean": {"stiffness": 0.5, "damping": 0.15, "cubic": 1.0, "decay": 0.4},
-            "process_noise": 1e-3,
-            "measurement_noise": 1e-3,
-            "horizon": 256,
-            "max_input": 1.0,
-            "max_output": 20.0,
-        },
-    },
-    "duffing_env/Rig-v0": {
-        "entry_point": "duffing_env.rig_env:RigEnv",
-        "vector_entry_point": "duffing_env.rig_env:RigVectorEnv",
-        "kwargs": {"horizon": 256},
-    },
-    "duffing_env/SilverboxReplay-v0": {
-        "entry_point": "duffing_env.replay:SilverboxReplayEnv",
-        "vector_entry_point": "duffing_env.vector_env:SilverboxReplayVectorEnv",
-        "kwargs": {"regime": "multisine"},
-    },
+    "duffing_env/Amplitude-v0": _duffing("env:DuffingEnv"),
+    "duffing_env/Short-v0": _duffing("limited:ShortEnv", horizon=48),
+    "duffing_env/Power-v0": _duffing("limited:PowerEnv", max_rms=0.0222),
+    "duffing_env/Output-v0": _duffing("limited:OutputEnv", max_output=0.3),
+    "duffing_env/Drift-v0": _duffing("limited:DriftEnv", horizon=512, jump=0.3, drift=0.01),
+    "duffing_env/Amplitude-v1": _continuous("ContinuousEnv"),
+    "duffing_env/Short-v1": _continuous("ContinuousShortEnv", horizon=48),
+    "duffing_env/Power-v1": _continuous("ContinuousPowerEnv", max_rms=0.0222),
+    "duffing_env/Output-v1": _continuous("ContinuousOutputEnv", max_output=0.3),
+    # Diffusion 0.1 of q'', counted as what a sample of it does to q: 0.1 δ^1.5 / √3.
+    "duffing_env/Pendulum-v0": _model("pendulum", **_PENDULUM, process_noise=6.454972e-4, max_output=6.283185307179586),
+    # By Euler's rule, as published: what a sample does to the velocity in rad per sample, δ √(0.1² δ + 1e-8).
+    "duffing_env/Pendulum-v1": _model("pendulum_map", **_PENDULUM, process_noise=1.1180452e-3, max_output=4.0),
+    "duffing_env/WienerHammerstein-v0": _model(
+        "wiener_hammerstein",
+        mean={"stiffness": 0.5, "damping": 0.15, "cubic": 1.0, "decay": 0.4},
+        process_noise=1e-3,
+        measurement_noise=1e-3,
+        horizon=256,
+        max_input=1.0,
+        max_output=20.0,
+    ),
+    "duffing_env/Rig-v0": _track("rig_env:RigEnv", "rig_env:RigVectorEnv", horizon=256),
+    "duffing_env/SilverboxReplay-v0": _track(
+        "replay:SilverboxReplayEnv", "vector_env:SilverboxReplayVectorEnv", regime="multisine"
+    ),
 }
 
 
