@@ -10,13 +10,13 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from duffing_env.panels import GREY, INK, NAMES, RULE, ParameterPanel, SignalPanel, labels
 from estimator.belief import Belief
 from estimator.extras import need
+from estimator.models.duffing import DIMENSIONS
 from estimator.parameters import FloatArray, Parameters
 from estimator.physical import propagate
 from estimator.rig_prior import HALF_WIDTH
-from estimator.units import VOLTS, Scales
+from estimator.units import SUPERSCRIPTS, VOLTS, Scales
 
 Frame = npt.NDArray[np.uint8]
 
@@ -25,6 +25,15 @@ WIDTH, HEIGHT = 960, 540
 
 SPAN = 256
 """Samples on the time axes. Longer episodes scroll: more samples would hide the single periods."""
+
+NAMES = ("m", "c", "a", "b")
+_WORDS = ("mass m", "damping c", "stiffness a", "cubic b")
+
+INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
+SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"
+_TITLE: dict[str, Any] = {"fontsize": 9, "pad": 4}
+# A curve ends in a dot. What is "animated" Matplotlib leaves out of the background.
+_CURVE: dict[str, Any] = {"marker": "o", "markersize": 3.5, "markevery": [-1], "animated": True}
 
 
 class Screen:
@@ -138,25 +147,16 @@ class _Picture:
         self._extent: tuple[int, int] | None = None
 
         left, right = (0.06, 0.41), (0.575, 0.405)
+        u, y = f"input u [{scales.input_unit}]", f"output y [{scales.output_unit}]"
         self._signals = (
-            SignalPanel(
-                self._add_axes(*left, 0.52, 0.34),
-                f"input u [{scales.input_unit}]",
-                scales.input * max_input,
-                "steps-pre",
-            ),
-            SignalPanel(
-                self._add_axes(*left, 0.10, 0.34),
-                f"output y [{scales.output_unit}]",
-                scales.output * max_output,
-                "default",
-            ),
+            _SignalPanel(self._add_axes(*left, 0.52, 0.34), u, scales.input * max_input, "steps-pre"),
+            _SignalPanel(self._add_axes(*left, 0.10, 0.34), y, scales.output * max_output, "default"),
         )
         self._parameters = [
-            ParameterPanel(self._add_axes(*right, 0.10 + 0.205 * row, 0.145), name, unit)
-            for row, (name, unit) in zip((3, 2, 1, 0), labels(scales, believed), strict=True)
+            _ParameterPanel(self._add_axes(*right, 0.10 + 0.205 * row, 0.145), name, unit)
+            for row, (name, unit) in zip((3, 2, 1, 0), _labels(scales, believed), strict=True)
         ]
-        self._panels: tuple[SignalPanel | ParameterPanel, ...] = (*self._signals, *self._parameters)
+        self._panels: tuple[_SignalPanel | _ParameterPanel, ...] = (*self._signals, *self._parameters)
         style: dict[str, Any] = {"color": INK, "verticalalignment": "center_baseline"}
         self._figure.text(0.06, 0.945, "Duffing oscillator", fontsize=12, weight="bold", **style)
         self._status = self._figure.text(0.245, 0.945, "", fontsize=9, animated=True, **style)
@@ -164,14 +164,9 @@ class _Picture:
         self._add_legend()
 
     def draw(
-        self,
-        status: str,
-        extent: tuple[int, int],
-        signals: FloatArray,
-        means: FloatArray,
-        stds: FloatArray,
+        self, status: str, extent: tuple[int, int], signals: FloatArray, means: FloatArray, stds: FloatArray,
         truth: FloatArray,
-    ) -> Frame:
+    ) -> Frame:  # fmt: skip
         """Draw a frame.
 
         Args:
@@ -239,6 +234,73 @@ class _Picture:
             handlelength=1.6,
             columnspacing=1.4,
         )
+
+
+def _labels(scales: Scales, believed: FloatArray) -> list[tuple[str, float]]:
+    """Label of m, c, a and b, and the power of ten that its numbers are in, from what is believed at the start."""
+    named = []
+    for name, word, value in zip(NAMES, _WORDS, believed, strict=True):
+        unit = scales.unit(DIMENSIONS[name])
+        power = int(np.floor(np.log10(abs(value)))) if np.isfinite(value) and value != 0 else 0
+        power = 0 if -1 <= power <= 1 else power
+        words = [f"10{str(power).translate(SUPERSCRIPTS)}"] * (power != 0) + [unit] * (unit != "1")
+        named.append((f"{word} [{' '.join(words)}]" if words else word, 10.0**power))
+    return named
+
+
+class _SignalPanel:
+    """Input or output over time, between its limits. ``moving``: what a frame draws over the background."""
+
+    def __init__(self, axes: Any, name: str, limit: float, drawstyle: str) -> None:
+        self.axes = axes
+        axes.set_title(name, loc="left", color=INK, **_TITLE)
+        self._edge = 1.15 * limit
+        axes.set_ylim(-self._edge, self._edge)
+        axes.set_yticks(limit * np.array([-1, -0.5, 0, 0.5, 1]))
+        axes.yaxis.set_major_formatter("{x:.4g}")
+        for edge in (-limit, limit):
+            self.limit = axes.axhline(edge, color=GREY, linewidth=1, linestyle=(0, (1, 2)))
+        (self._curve,) = axes.plot([], color=SIGNAL, linewidth=1, drawstyle=drawstyle, **_CURVE)
+        self.moving = (self._curve,)
+
+    def update(self, times: FloatArray, values: FloatArray) -> None:
+        """Show values (n,) over times (n,) [ms]."""
+        self._curve.set_data(times, np.clip(values, -self._edge, self._edge))
+
+
+class _ParameterPanel:
+    """Mean and credible band of one parameter as deviations from the truth, and as numbers above."""
+
+    _EDGE = 150.0  # [%]; what is further from the truth is drawn there
+
+    def __init__(self, axes: Any, name: str, unit: float) -> None:
+        self.axes = axes
+        self._unit = unit
+        axes.set_title(name, loc="left", color=INK, **_TITLE)
+        # Linear near the truth and logarithmic away from it: a belief contracts by a factor of a hundred and more.
+        axes.set_yscale("asinh", linear_width=0.3)
+        axes.set_ylim(-self._EDGE, self._EDGE)
+        axes.set_yticks([-100, -10, -1, 0, 1, 10, 100], ["−100", "−10", "−1", "", "1", "10", "100"])
+        axes.yaxis.minorticks_off()
+        self.truth = axes.axhline(0, color=TRUTH, linewidth=1, linestyle=(0, (4, 2)))
+        self.band = axes.fill_between([], [], color=POSTERIOR, alpha=0.22, linewidth=0, animated=True)
+        (self.mean,) = axes.plot([], color=POSTERIOR, linewidth=1.3, **_CURVE)
+        self._true_value = axes.set_title("", loc="center", color=TRUTH, animated=True, **_TITLE)
+        self._estimate = axes.set_title("", loc="right", color=POSTERIOR, animated=True, **_TITLE)
+        self.moving = (self.band, self.mean, self._true_value, self._estimate)
+
+    def update(self, times: FloatArray, mean: FloatArray, half: FloatArray, true: float) -> None:
+        """Show means (n,) with half widths of their bands (n,), beside the true value."""
+        percent = 100 * np.array([mean - half - true, mean - true, mean + half - true]) / abs(true)
+        low, middle, high = np.clip(percent, -self._EDGE, self._EDGE)
+        self.mean.set_data(times, middle)
+        known = np.isfinite(low) & np.isfinite(high)
+        there, back = (times[known], low[known]), (times[known][::-1], high[known][::-1])
+        self.band.set_verts([np.hstack([there, back]).T])
+        self._true_value.set_text(f"true {true / self._unit:.3f}")
+        in_sight = half[-1] < 10 * abs(true)
+        numbers = f"{mean[-1] / self._unit:z.3f} ± {half[-1] / self._unit:.3f}".replace("-", "−")
+        self._estimate.set_text(numbers if in_sight else "not known yet")
 
 
 class _Window:
