@@ -19,8 +19,7 @@ from benchmarks.report import Claim, Section
 from benchmarks.timing import Result, Row, measure, timed
 from duffing_env.batch import Batch
 from duffing_env.experiment import SimulatedExperiment
-from duffing_env.inference import updater
-from duffing_env.kernel import RESET_NEXT_STEP
+from duffing_env.kernel import RESET_NEXT_STEP, updater
 from duffing_env.layout import layout_of
 from duffing_env.sources import parts
 from duffing_env.stages import noise_drawer

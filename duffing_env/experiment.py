@@ -6,20 +6,19 @@ are JSON-able.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from duffing_env.checked import check_mean, check_prior
 from duffing_env.layout import Kind, Setup, parameter_names
 from duffing_env.noise import BRANCHES
 from duffing_env.own import Beliefs, check_observation
 from duffing_env.rewards import check_reward, rewarding
 from estimator.belief import Belief
-from estimator.checks import LARGEST, flag, number, one_of, whole
+from estimator.checks import LARGEST, SMALLEST, flag, number, one_of, shown, whole
 from estimator.ensemble import Hypotheses, first_weights, priors, start
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.difference import difference
@@ -41,25 +40,7 @@ SPREADS = 1e-6, 0.999
 
 @dataclass(frozen=True)
 class Experiment:
-    r"""What all experiments have.
-
-    Attributes:
-        factorisation: of the estimator: ``structured`` or ``mean_field``.
-        iterations: variational iterations per sample; 3 structured and 10 mean field where it is None.
-        reward: its name, see `duffing_env.rewards`; or a function of one's own (`duffing_env.own`).
-        observation: a name of `duffing_env.own.OBSERVATIONS`, or a function of one's own.
-        history: steps that the observation ``history`` shows.
-        max_input: input of the action 1 [V].
-        max_output: displacement limit [V]: the episode ends at \|y\| above it.
-        hold: samples that an action is applied for; a step's reward is the sum of theirs. An episode may end within.
-        terminal: whether the episode's whole reward is paid in its last step, and 0 before.
-        terminated_return: what an episode that is terminated returns, whatever it gained. None keeps what it gained.
-        noise_hypotheses: ratios of the noises that the estimator weighs by their evidence, as
-            `estimator.OnlineEstimator` does; structured and for one sensor. 1: the ratio stays nearly the prior's. Two
-            numbers: values of each noise, in all combinations.
-        branch: of the seeds, a name of `duffing_env.noise.BRANCHES`: the same seed gives other systems and noise in
-            each, so that what is trained in ``train`` with whatever seed never met those of ``test``.
-    """
+    """What all experiments have; `duffing_env.env.DuffingEnv` says what its options are."""
 
     factorisation: str = "structured"
     iterations: int | None = None
@@ -172,85 +153,47 @@ class Experiment:
         return Kind(
             self.model, self.plant, self.degree, self.factorisation,
             self._iterations if self.factorisation == "structured" else 0,
-            str(self.reward) if rewarding(self.reward).hooks is not None else "",
+            str(self.reward) if rewarding(self.reward).module else "",
             self.noise_hypotheses != 1, self.points and self.noise_hypotheses != 1,
         )  # fmt: skip
 
     @property
     def setup(self) -> Setup:
         """The experiment as the kernel is told of it."""
-        prior, model = self.believed, self.model
-        first, noises = prior.record.copy(), np.empty((0, 5))
+        prior, model, names = self.believed, self.model, parameter_names(self.truth_model)
+        first, told = prior.record, dict(self.plant_setup)
         if self.noise_hypotheses != 1:
             members = priors(prior, self.noise_hypotheses)
             weights = first_weights(members, self.balance)
             first = start(members, len(model.names), weights)
-            noises = np.column_stack([members[:, -4:], weights])
+            told["hypotheses"] = np.column_stack([members[:, -4:], weights])
         precisions = first[-2 - 2 * model.n_outputs :]
-        names = parameter_names(self.truth_model)
         values: dict[str, Any] = {
             "max_input": float(self.max_input),
             "max_output": float(self.max_output),
             "horizon": float(self.samples),
-            "hold": 1,
-            "limit": np.inf,
             "iterations": self._iterations,
-            "process_noise": 0.0,
-            "measurement_noise": np.zeros(self.truth_model.n_outputs),
-            "noise_range": 1.0,
             "step": self.step,
             "center": np.array([self.center[name] for name in names]),
             "width": np.zeros(len(names)),
-            "spread": 0.0,
-            "budget": np.inf,
-            "max_slew": np.inf,
-            "input_price": 0.0,
-            "jump": 0.0,
-            "drifts": False,
+            "measurement_noise": np.zeros(self.truth_model.n_outputs),
             "walk": np.zeros(model.n_coefficients),
             "weights": np.array(rewarding(self.reward).weights),
             "terminal": self.terminal,
             "forfeits": self.terminated_return is not None,
             "terminated_return": float(self.terminated_return or 0.0),
-            "as_published": False,
-            "delay": 0,
-            "abreast": 1,
-            "prior": first,
+            "prior": first.copy(),
             "inverse_std": 1.0 / np.sqrt(np.diag(prior.coefficients_cov)),
             "log_precisions": np.log(precisions[::2] / precisions[1::2]),
-            "hypotheses": noises,
-            **self.plant_setup,
         }
-        return Setup(**values)
+        return Setup(**(values | told))
 
 
 @dataclass(frozen=True)
 class SimulatedExperiment(Experiment):
     """An experiment on the plant ``difference``, with a new oscillator in every episode.
 
-    Attributes:
-        horizon: samples of an episode; it is then truncated.
-        process_noise: standard deviation of the process noise w̃, on x [V].
-        measurement_noise: standard deviation of the measurement noise v, on y [V].
-        spread: m, c, a and b are drawn log-uniformly on the twin's value * [1 - spread, 1 + spread]; in (0, 1).
-        noise_range: for every episode each of the two is drawn log-uniformly about these, over a range of this factor:
-            10 is a decade, from 1/√10 to √10 times. They are part of the truth then. 1: they are these.
-        process_noise_guess: standard deviation at which the prior of γ is centred [V]; ``process_noise`` where None.
-        measurement_noise_guess: the same of ξ; ``measurement_noise`` where None.
-        noise_shape: shape of the Gamma priors of γ and ξ; 2 is weak.
-        mean: parameter to the middle of its range, of some or all; the twin's where it is None.
-        prior: the belief that every episode starts from; where it is None, the one that fits plants so drawn, and the
-            noises.
-        plant_spread: as ``spread``, for the plant alone, whose range the prior then does not match: with 0 every
-            oscillator is the twin itself. That of the prior where it is None.
-        max_rms: the input's root mean square over a whole episode [V]: the energy horizon * max_rms² is a budget, and
-            an input that what is left of it cannot pay for is cut to what it can. No budget where it is None.
-        max_slew: largest change of the input from sample to sample [V]; a larger one is cut. None: no limit.
-        input_cost: taken off the reward for every (u / max_input)².
-        jump: the mass jumps once, at a sample that is uniform over the middle half of the episode, by a factor
-            log-uniform on [1 - jump, 1 + jump]; in [0, 1). 0: it stays.
-        drift: how far the estimator lets each coefficient walk in a sample: standard deviation, in parts of the
-            prior's. 0: it takes the coefficients for constant.
+    `duffing_env.env.DuffingEnv` says what its options are.
     """
 
     horizon: int = 256
@@ -348,3 +291,23 @@ def twin_of(model: Model) -> dict[str, float]:
     """The Silverbox circuit as a model of it sees it; of other models the parameters are not known here: all 1."""
     twin = CONTINUOUS_TWIN if model.is_continuous else SILVERBOX_TWIN
     return {name: twin.get(name, 1.0) for name in parameter_names(model)}
+
+
+def check_mean(given: Mapping[str, float] | None, names: Sequence[str]) -> None:
+    """Refuse middles of the parameters' ranges that are not such, of some or all of them."""
+    if given is None:
+        return
+    if not isinstance(given, Mapping) or not set(given) <= set(names):
+        raise ValueError(f"mean must give some of the parameters {list(names)}, but is {shown(given)}")
+    for name, value in given.items():
+        number(f"mean[{name!r}]", value, SMALLEST if name == "m" else -LARGEST)
+
+
+def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None) -> None:
+    """Refuse what is not a belief, or one in other scales, or of another model where that is given."""
+    if not isinstance(prior, Belief):
+        raise ValueError(f"prior must be an estimator.Belief or None, but is {shown(prior)}")
+    if prior.scales != scales:
+        raise ValueError(f"prior must have the scales {scales}, but has {prior.scales}; give it those")
+    if model is not None and prior.model != model:
+        raise ValueError(f"prior must be of the model {model.name!r}, but is of {prior.model.name!r}")

@@ -16,10 +16,11 @@ from numba import prange
 
 from duffing_env import sources, stages
 from duffing_env.hypotheses import NONE, members_of
-from duffing_env.inference import updater
 from duffing_env.layout import OUTCOME, SUMMED, Kind, layout_of, left_out, observation_bounds, parameter_names, unpacker
 from duffing_env.rewards import REWARDS, Hooks, nothing, nothing_in_lane
 from estimator.engine.rows import belief_names
+from estimator.engine.tasks import structured
+from estimator.inference import mean_field
 from estimator.lanes import LANES, kernel, lanewise, part
 
 #: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.
@@ -85,10 +86,9 @@ def compiled(kind: Kind) -> Kernel:
     infer = updater(kind)
     weighs = kind.weighs
     begin_members, learn = members_of(kind) if weighs else NONE
-    make_hooks = REWARDS[kind.work].hooks if kind.work else None
+    is_worked, is_structured = bool(kind.work), kind.factorisation == "structured"
     idle_hooks = Hooks(nothing_in_lane, nothing, nothing, nothing)
-    begin_work, before, expect, after = make_hooks(kind, code) if make_hooks else idle_hooks
-    is_worked, is_structured = make_hooks is not None, kind.factorisation == "structured"
+    begin_work, before, expect, after = REWARDS[kind.work].work.hooks(kind, code) if is_worked else idle_hooks
     settle_truth, appraise, settle, observe = code.settle_truth, code.appraise, code.settle, code.observe
     walk: Any = code.walk
     unpack = unpacker(kind)
@@ -248,6 +248,18 @@ def compiled(kind: Kind) -> Kernel:
             )  # fmt: skip
 
     return Kernel(step, step_parallel)
+
+
+def updater(kind: Kind) -> Any:
+    """Update every lane's belief, with its input and outputs in their rows.
+
+    ``update(W)``, or of mean field ``update(W, iterations, as_published)``.
+    """
+    place = layout_of(kind)
+    if kind.factorisation == "mean_field":
+        return mean_field.updater(place)
+    trace = kind.work == "free_energy"
+    return structured(kind.belief, kind.degree, iterations=kind.iterations, within=place, trace=trace).update
 
 
 def _plant_of(kind: Kind, code: Any, draw_noise: Any) -> Any:

@@ -73,67 +73,66 @@ class Setup(NamedTuple):
         max_input: input of the action 1.
         max_output: limit of the first sensor.
         horizon: samples of an episode.
-        hold: samples of an action.
-        limit: samples after which an episode is cut off from outside, as Gymnasium's ``TimeLimit`` does; inf for none.
         iterations: variational iterations per sample.
-        process_noise: standard deviation of what a sample's process noise does to the first sensor.
-        measurement_noise: (sensors,) standard deviations.
-        noise_range: largest over smallest of what is drawn for an episode about each of them; 1 leaves them.
         step: sampling step [s].
         center: (p,) parameters in the middle of the range, or their means.
         width: (p,) standard deviations of those that are drawn from a Gaussian; minus that of the logarithm of those
             that are log-normal; 0 for those that are log-uniform.
-        spread: relative half width of the range.
-        budget: of the energy Σ u²; inf for none.
-        max_slew: largest change of the input; inf for none.
-        input_price: square root of what an input of 1 costs.
-        jump: of the first parameter, in parts of it; 0 for none.
-        drifts: whether the coefficients are believed to walk.
-        walk: (K,) variances of their walk in a sample.
+        measurement_noise: (sensors,) standard deviations.
+        walk: (K,) variances of the coefficients' walk in a sample.
         weights: (4,) of the reward (`duffing_env.rewards.Reward`).
         terminal: whether a reward is paid at the end.
         forfeits: whether an episode that is terminated returns ``terminated_return``.
         terminated_return: see there.
-        as_published: whether mean field departs from the paper as its published run did.
-        delay: samples between a recorded input and the output it acts on.
-        abreast: environments of a block whose members lie beside each other (`duffing_env.hypotheses`).
         prior: (size,) record that episodes start from.
         inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
         log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
-        hypotheses: (members, 5) shape and rate of γ and of ξ that each of several beliefs starts from, and its weight;
-            (0, 5) for one.
+        hold: samples of an action.
+        limit: samples after which an episode is cut off from outside, as Gymnasium's ``TimeLimit`` does.
+        process_noise: standard deviation of what a sample's process noise does to the first sensor.
+        noise_range: largest over smallest of what is drawn for an episode about each of the noises; 1 leaves them.
+        spread: relative half width of the range.
+        budget: of the energy Σ u².
+        max_slew: largest change of the input.
+        input_price: square root of what an input of 1 costs.
+        jump: of the first parameter, in parts of it.
+        drifts: whether the coefficients are believed to walk.
+        as_published: whether mean field departs from the paper as its published run did.
+        delay: samples between a recorded input and the output it acts on.
+        abreast: environments of a block whose members lie beside each other (`duffing_env.hypotheses`).
+        hypotheses: (members, 5) shape and rate of γ and of ξ that each of several beliefs starts from, and its weight.
     """
 
     max_input: float
     max_output: float
     horizon: float
-    hold: int
-    limit: float
     iterations: int
-    process_noise: float
-    measurement_noise: npt.NDArray[np.float64]
-    noise_range: float
     step: float
     center: npt.NDArray[np.float64]
     width: npt.NDArray[np.float64]
-    spread: float
-    budget: float
-    max_slew: float
-    input_price: float
-    jump: float
-    drifts: bool
+    measurement_noise: npt.NDArray[np.float64]
     walk: npt.NDArray[np.float64]
     weights: npt.NDArray[np.float64]
     terminal: bool
     forfeits: bool
     terminated_return: float
-    as_published: bool
-    delay: int
-    abreast: int
     prior: npt.NDArray[np.float64]
     inverse_std: npt.NDArray[np.float64]
     log_precisions: npt.NDArray[np.float64]
-    hypotheses: npt.NDArray[np.float64]
+    hold: int = 1
+    limit: float = np.inf
+    process_noise: float = 0.0
+    noise_range: float = 1.0
+    spread: float = 0.0
+    budget: float = np.inf
+    max_slew: float = np.inf
+    input_price: float = 0.0
+    jump: float = 0.0
+    drifts: bool = False
+    as_published: bool = False
+    delay: int = 0
+    abreast: int = 1
+    hypotheses: npt.NDArray[np.float64] = np.empty((0, 5))
 
 
 def pack(setup: Setup) -> npt.NDArray[np.float64]:

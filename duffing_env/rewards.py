@@ -57,9 +57,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, NamedTuple
 
-from duffing_env.layout import Kind
 from estimator.lanes import jit
 
 
@@ -97,27 +97,21 @@ class Reward:
         weights: of what a sample gave: the decrease of entropy, the increase of the log posterior at the truth [nats],
             the decrease of the parameters' error, and the ``WORK`` of its hooks.
         needs_truth: whether it compares with the true plant.
-        source: generates the functions that its hooks use, from a kind and `duffing_env.sources`' loop.
-        hooks: makes the hooks, from a kind and the compiled functions.
+        module: that makes its hooks, if it has any: ``hooks(kind, code)``, of the compiled functions of a kind; among
+            these are what ``source(kind, loop)`` generates with the loop of `duffing_env.sources`.
     """
 
     weights: tuple[float, float, float, float]
     needs_truth: bool = False
-    source: Callable[[Kind, Any], str] | None = None
-    hooks: Callable[[Kind, Any], Hooks] | None = None
+    module: str = ""
+
+    @property
+    def work(self) -> Any:
+        """The module, which is imported only where the reward is used."""
+        return import_module(self.module)
 
 
 _WORK = (0.0, 0.0, 0.0, 1.0)
-
-
-def _lazily(module: str) -> tuple[Callable[[Kind, Any], str], Callable[[Kind, Any], Hooks]]:
-    """Source and hooks of a module, which is imported only where its reward is used."""
-    from importlib import import_module
-
-    return (
-        lambda kind, loop: import_module(module).source(kind, loop),
-        lambda kind, code: import_module(module).hooks(kind, code),
-    )
 
 
 #: The rewards by name.
@@ -125,10 +119,10 @@ REWARDS = {
     "information_gain": Reward((1.0, 0.0, 0.0, 0.0)),
     "log_posterior": Reward((0.0, 1.0, 0.0, 0.0), needs_truth=True),
     "parameter_error": Reward((0.0, 0.0, 1.0, 0.0), needs_truth=True),
-    "free_energy": Reward(_WORK, False, *_lazily("duffing_env.free_energy")),
-    "fisher": Reward(_WORK, True, *_lazily("duffing_env.fisher")),
-    "expected_free_energy": Reward(_WORK, False, *_lazily("duffing_env.expectation")),
-    "simulation_error": Reward(_WORK, True, *_lazily("duffing_env.simulation")),
+    "free_energy": Reward(_WORK, False, "duffing_env.free_energy"),
+    "fisher": Reward(_WORK, True, "duffing_env.fisher"),
+    "expected_free_energy": Reward(_WORK, False, "duffing_env.expectation"),
+    "simulation_error": Reward(_WORK, True, "duffing_env.simulation"),
 }
 
 

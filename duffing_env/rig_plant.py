@@ -14,10 +14,9 @@ import numpy.typing as npt
 from gymnasium import logger
 from gymnasium.error import ResetNeeded
 
-from duffing_env.checked import check_prior
 from duffing_env.contract import checked_options
 from duffing_env.env import DuffingEnv, Observation
-from duffing_env.experiment import MOST_SAMPLES, Experiment
+from duffing_env.experiment import MOST_SAMPLES, Experiment, check_prior
 from duffing_env.rewards import rewarding
 from estimator.belief import Belief
 from estimator.checks import shown, whole
@@ -74,13 +73,7 @@ def checked_rig(rig: AnyRig | None, needs_guess: bool = True) -> Rig:
 
 
 class RigNumbers:
-    """What experiments on a rig share.
-
-    Attributes:
-        rig: a `Rig`, a dictionary, or the name of a rig file; with limit, range and guess.
-        max_input: input of the action 1, in parts of the input's limit; at most 1.
-        max_output: largest output, in parts of the output's range; at most 1.
-    """
+    """What experiments on a rig share."""
 
     rig: AnyRig | None
     max_input: float
@@ -117,13 +110,11 @@ class RigNumbers:
 class RigPlantExperiment(RigNumbers, Experiment):
     """An experiment on a rig's plant itself, whose parameters nobody knows.
 
+    `duffing_env.rig_env.RigEnv` says what its options are. Seven values of each noise reach over three decades.
+
     Attributes:
-        rig: see `RigNumbers`; it needs no guess where there is a prior.
-        max_input: see `RigNumbers`.
-        max_output: see `RigNumbers`.
-        horizon: samples of an episode; it is then truncated.
         prior: the belief that every episode starts from, in the rig's scales; what the guess says where it is None.
-        noise_hypotheses: of the estimator; seven values of each noise reach over three decades.
+            With one the rig needs no guess.
     """
 
     rig: AnyRig | None = None

@@ -56,8 +56,7 @@ def _source(kind: Kind) -> str:
     if kind.plant is not None:
         source += _plant(kind.plant, kind.degree, plant_loop)
     source += _walk(kind.belief, loop)
-    own = REWARDS[kind.work].source if kind.work else None
-    return source + ("" if own is None else own(kind, loop))
+    return source + (REWARDS[kind.work].work.source(kind, loop) if kind.work else "")
 
 
 def _walk(model: Model, loop: Any) -> str:
