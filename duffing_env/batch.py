@@ -14,7 +14,7 @@ from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, noise_rows, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
 from duffing_env.recycling import Recycled
-from duffing_env.threads import use_threads
+from duffing_env.turns import use_threads
 from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, Parameters

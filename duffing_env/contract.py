@@ -11,8 +11,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
+from duffing_env.batch import Batch
 from duffing_env.experiment import Experiment
-from duffing_env.own import bounds_of
+from duffing_env.own import Own, bounds_of
+from estimator.parameters import FloatArray
 
 
 def observation_space(experiment: Experiment) -> spaces.Box:
@@ -44,7 +46,23 @@ class Specified:
     """
 
     experiment: Experiment
+    _batch: Batch
+    _own: Own | None
     _spec: EnvSpec | None = None
+
+    @property
+    def records(self) -> FloatArray:
+        """(environments, size) the posteriors now, as the flat records of `estimator.Belief`; a copy."""
+        return self._batch.records()
+
+    def mixture(self, index: int = 0) -> tuple[FloatArray, FloatArray]:
+        """Records (m, size) and weights (m,) of the beliefs that one weighs: one, or one for each hypothesis."""
+        return self._batch.mixture(index)
+
+    @property
+    def _seen(self) -> Batch | Own:
+        """What has the observations."""
+        return self._batch if self._own is None else self._own
 
     @property
     def max_input(self) -> float:

@@ -19,7 +19,7 @@ from duffing_env.own import Own
 from duffing_env.turns import in_turn
 from estimator.belief import Belief
 from estimator.checks import numbers, one_of, shown
-from estimator.parameters import FloatArray, Parameters
+from estimator.parameters import Parameters
 
 if TYPE_CHECKING:
     from duffing_env.rendering import Screen
@@ -138,13 +138,13 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     | ``terminated_return`` | None | return of an episode that is terminated, whatever it gained; None keeps that |
     | ``process_noise`` | 5e-4 | standard deviation of w̃ [V] |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
-    | ``spread`` | 0.3 | half width of the parameters' range, relative |
+    | ``spread`` | 0.3 | half width of the parameters' range, relative, in (0, 1) |
     | ``noise_range`` | 1 | both noises are drawn for every episode; see below |
     | ``process_noise_guess`` | None | where the prior of γ is centred [V]; None: at ``process_noise`` |
     | ``measurement_noise_guess`` | None | where that of ξ is centred [V]; None: at ``measurement_noise`` |
-    | ``noise_shape`` | 2 | shape of these Gamma priors |
+    | ``noise_shape`` | 2 | shape of these Gamma priors; 2 is weak |
     | ``noise_hypotheses`` | 1 | ratios of the noises to weigh by their evidence; see below |
-    | ``plant_spread`` | ``spread`` | the same for the plant alone; 0: every oscillator is the twin |
+    | ``plant_spread`` | ``spread`` | the same for the plant alone, not for its prior; 0: all are the twin |
     | ``mean`` | None | parameter to the middle of its range, of some or all; the twin's where None |
     | ``prior`` | None | a `estimator.Belief` to start from; None: the one that fits plants and noises |
     | ``max_rms`` | None | largest RMS input over a whole episode [V]; see `PowerEnv` |
@@ -205,15 +205,6 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         return self._batch.belief(0)
 
     @property
-    def records(self) -> FloatArray:
-        """(1, size) the posterior now as the flat record of `estimator.Belief`, as the vector environment's."""
-        return self._batch.records()
-
-    def mixture(self, index: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Records (m, size) and weights (m,) of the beliefs that it weighs: one, or one for each hypothesis."""
-        return self._batch.mixture(0)
-
-    @property
     def truth(self) -> Parameters:
         """The oscillator that is to be identified."""
         return self._batch.true_of(0)
@@ -270,7 +261,7 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         return self._observation(), outcome["reward"], terminated, truncated, self._info(outcome)
 
     def _observation(self) -> Observation:
-        seen: Observation = (self._batch if self._own is None else self._own).observations[0].copy()
+        seen: Observation = self._seen.observations[0].copy()
         return seen
 
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")

@@ -118,9 +118,9 @@ class DriftEnv(DuffingEnv):
     ## Description
 
     As `DuffingEnv` over 512 samples, but at a sample that is uniform over the middle half of the episode the mass is
-    multiplied by a factor that is log-uniform on [0.7, 1.3]. The estimator expects change: before every sample each
-    coefficient's standard deviation is widened as by a random walk, ``drift`` (0.01) of that of the prior, so it
-    forgets in some hundred samples. Its intervals are those of a walk; a jump is a large step of it.
+    multiplied by a factor that is log-uniform on 1 ± ``jump`` (0.3, and below 1). The estimator expects change: before
+    every sample each coefficient's standard deviation is widened as by a random walk, ``drift`` (0.01) of that of the
+    prior, so it forgets in some hundred samples. Its intervals are those of a walk; a jump is a large step of it.
 
     ## Action space, observation space, information
 

@@ -22,17 +22,7 @@ from estimator.priors import gaussian_moments, weak_prior
 
 @dataclass(frozen=True)
 class ModelExperiment(SimulatedExperiment):
-    """An experiment on any model, which is believed as it is.
-
-    Attributes:
-        system: the model: a name of `estimator.models.MODELS`, a `Model`, or a dict of its fields.
-        mean: parameter to its mean, or with ``std`` left out to the middle of its range.
-        std: parameter to its standard deviation: plants are then drawn from a Gaussian. Without it each parameter is
-            log-uniform on mean * [1 - spread, 1 + spread].
-        sampling_step: seconds between two samples.
-        interpolation: of the input of a differential equation between samples: ``zero_order`` or ``linear``.
-        sensor_noise: standard deviation of each further sensor; that of the first, where it is None.
-    """
+    """An experiment on any model, which is believed as it is; `ModelEnv` says what its options are."""
 
     system: str | Model | Mapping[str, Any] = "difference"
     mean: Mapping[str, float] | None = None
@@ -167,11 +157,11 @@ class ModelEnv(DuffingEnv):
     | Argument | Default | Meaning |
     |----------|---------|---------|
     | ``system`` | | a name of `estimator.models.MODELS`, a `Model`, or a dict of its fields |
-    | ``mean`` | | parameter to its mean, or the middle of its range |
+    | ``mean`` | | parameter to its mean, or without ``std`` to the middle of its range |
     | ``std`` | None | parameter to its standard deviation: Gaussian; None: log-uniform within ``spread`` |
     | ``sampling_step`` | 1 | seconds between two samples |
-    | ``interpolation`` | ``zero_order`` | or ``linear``: the input between samples |
-    | ``sensor_noise`` | None | standard deviations of the further sensors |
+    | ``interpolation`` | ``zero_order`` | or ``linear``: the input of a differential equation between samples |
+    | ``sensor_noise`` | None | standard deviations of the further sensors; None: that of the first |
 
     >>> import gymnasium as gym
     >>> import duffing_env

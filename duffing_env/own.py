@@ -76,7 +76,7 @@ class Beliefs:
 
 
 def check_observation(chosen: Any, history: int) -> None:
-    """Refuse what is neither an observation's name nor a function, and a history that is not a number of steps."""
+    """Refuse what is no observation, or no number of steps."""
     if not callable(chosen) and not (isinstance(chosen, str) and chosen in OBSERVATIONS):
         raise ValueError(f"observation must be one of {list(OBSERVATIONS)} or a function, but is {shown(chosen)}")
     whole("history", history, MOST_STEPS)
@@ -141,9 +141,6 @@ def _looped(function: Any, parameters: tuple[str, ...]) -> Any:
 
 class Own:
     """What a batch shows and pays by functions.
-
-    Args:
-        batch: what it shows and pays for.
 
     Attributes:
         observations: (n, entries) float32, after `begin` and `observe`.

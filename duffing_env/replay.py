@@ -30,16 +30,7 @@ _PRIORS: dict[str, Callable[[Model], Belief]] = {
 
 @dataclass(frozen=True)
 class ReplayExperiment(Experiment):
-    """The recorded Silverbox experiment. A record can only answer the input that was applied.
-
-    Attributes:
-        regime: part of the record: ``multisine`` (the paper's training part) or ``arrow`` (its validation part).
-        prior: name of the prior: ``silverbox_twin``, ``published_run`` or ``paper_text``.
-        input_delay: samples between a recorded input and the output it acts on: 1 as Eq. (2) says, 0 as published.
-        nonlinear: whether the estimator's model has the cubic term.
-        as_published: mean field with the two departures of the published run.
-        data: file or folder of the record; searched for where it is None (`duffing_env.silverbox.load_record`).
-    """
+    """The recorded Silverbox experiment; `SilverboxReplayEnv` says what its options are."""
 
     regime: str = "multisine"
     prior: str = "silverbox_twin"
@@ -141,7 +132,7 @@ class SilverboxReplayEnv(DuffingEnv):
     |----------|---------|---------|
     | ``regime`` | ``multisine`` | the paper's training part, or ``arrow``, its validation part |
     | ``prior`` | ``silverbox_twin`` | or ``published_run``, ``paper_text`` |
-    | ``input_delay`` | 1 | samples between an input and the output it acts on; the published run had 0 |
+    | ``input_delay`` | 1 | samples between an input and the output it acts on: as Eq. (2) says; 0 as published |
     | ``nonlinear`` | True | whether the estimator's model has the cubic term |
     | ``as_published`` | False | mean field with the two departures of the published run |
     | ``data`` | None | file or folder of the record; searched for where None |

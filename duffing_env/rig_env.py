@@ -23,18 +23,8 @@ from estimator.rig_prior import HALF_WIDTH, NOISE, OFFSET, rig_prior
 class RigExperiment(RigNumbers, SimulatedExperiment):
     """An experiment on oscillators that are drawn from a rig's guess. All numbers are in parts of its limit and range.
 
-    The fields of `SimulatedExperiment` are the same, but for these; ``spread``, ``plant_spread`` and ``jump`` are not
-    used, because the guess says what may be.
-
-    Attributes:
-        rig: a `Rig`, a dictionary, or the name of a rig file; with limit, range and guess.
-        max_input: input of the action 1, in parts of the input's limit; at most 1.
-        max_output: largest output, in parts of the output's range; at most 1.
-        process_noise: disturbance of the force, as a standard deviation per sample, in parts of the input's limit; the
-            rig's, or 0.1 % where it has none.
-        measurement_noise: of the sensor, in parts of the output's range; the rig's, or 0.1 % where it has none.
-        noise_range: both are drawn for every episode, over a range of this factor.
-        noise_hypotheses: of the estimator.
+    `RigEnv` says what its options are; ``spread``, ``plant_spread`` and ``jump`` are not used, because the guess says
+    what may be.
     """
 
     rig: AnyRig | None = None
@@ -87,9 +77,7 @@ class RigExperiment(RigNumbers, SimulatedExperiment):
         """Parameter to middle and standard deviation, inside; of m, which is log-normal, minus its logarithm's."""
         rig, model, scales = self.described, self.plant, self.scales
         assert rig.guess is not None
-        drawn = {}
-        for name, (low, high) in rig.guess.items():
-            drawn[name] = (low + high) / 2, (high - low) / 2 / HALF_WIDTH
+        drawn = {name: ((low + high) / 2, (high - low) / 2 / HALF_WIDTH) for name, (low, high) in rig.guess.items()}
         low, high = rig.guess["m"]
         drawn |= {"u0": (rig.input.offset, OFFSET * scales.input), "y0": (rig.output.offset, OFFSET * scales.output)}
         inside = {}
@@ -103,7 +91,10 @@ class RigExperiment(RigNumbers, SimulatedExperiment):
     @cached_property
     def believed(self) -> Belief:
         """The prior that the guess makes, with the noises where they are guessed to be."""
-        return self._with_noises(rig_prior(self.described))
+        prior, (process, sensor) = rig_prior(self.described), self.noise_guesses
+        moved, shape = _moved(process, prior.coefficients()["gain"][0]), float(self.noise_shape)
+        gamma, xi = ((shape, shape * std**2) for std in (moved, sensor))
+        return Belief.of(prior.model, prior.mean, prior.cov, gamma, xi, scales=prior.scales)
 
     def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
         """The prior of the rig's model; there is no other that knows its offsets.
@@ -115,26 +106,12 @@ class RigExperiment(RigNumbers, SimulatedExperiment):
             raise ValueError(f"model must be the rig's, but is {model.name!r}")
         return self.believed.factorised(factorisation)
 
-    def _with_noises(self, prior: Belief) -> Belief:
-        process, sensor = self.noise_guesses
-        gain = prior.coefficients()["gain"][0]
-        shape = float(self.noise_shape)
-        gamma, xi = ((shape, shape * std**2) for std in (_moved(process, gain), sensor))
-        return Belief.of(prior.model, prior.mean, prior.cov, gamma, xi, scales=prior.scales)
-
-    @property
-    def noise_levels(self) -> tuple[float, float]:
-        """The disturbance of the force and the sensor's noise, in parts of limit and range."""
-        assert self.process_noise is not None
-        assert self.measurement_noise is not None
-        return float(self.process_noise), float(self.measurement_noise)
-
     @property
     def plant_setup(self) -> dict[str, Any]:
         """The noises and the range of the plants, inside."""
-        gain = self.believed.coefficients()["gain"][0]
+        told, gain = super().plant_setup, self.believed.coefficients()["gain"][0]
         width: FloatArray = np.array([std for _, std in self._drawn.values()])
-        return {**super().plant_setup, "process_noise": _moved(self.noise_levels[0], gain), "width": width}
+        return {**told, "process_noise": _moved(told["process_noise"], gain), "width": width}
 
 
 def _moved(disturbance: float, gain: float) -> float:
@@ -194,9 +171,9 @@ class RigEnv(DuffingEnv):
     |----------|---------|---------|
     | ``rig`` | | a `Rig`, a dictionary (which is JSON-able), or the name of a rig file; with limit, range and guess |
     | ``plant`` | None | the plant itself: an object with ``reset()`` and ``step(u)``, in the rig's units |
-    | ``max_input`` | 1 | input of the action 1, in parts of the rig's limit |
-    | ``max_output`` | 1 | largest output, in parts of the rig's range |
-    | ``process_noise`` | the rig's, or 0.001 | disturbance of the force, in parts of the input's limit |
+    | ``max_input`` | 1 | input of the action 1, in parts of the rig's limit; at most 1 |
+    | ``max_output`` | 1 | largest output, in parts of the rig's range; at most 1 |
+    | ``process_noise`` | the rig's, or 0.001 | disturbance of the force in a sample, in parts of the input's limit |
     | ``measurement_noise`` | the rig's, or 0.001 | noise of the sensor, in parts of the output's range |
     | ``noise_range`` | 10 | both are drawn for every episode, over a range of this factor |
     | ``noise_hypotheses`` | (5, 5), or (7, 7) with ``plant`` | values of each noise that the estimator weighs |

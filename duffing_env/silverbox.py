@@ -102,7 +102,7 @@ class SilverboxRecord:
 
 
 def load_record(path: str | Path | None = None) -> SilverboxRecord:
-    """Loads the Silverbox record from this machine.
+    """Loads the Silverbox record from this machine; a file is read once per process.
 
     Searched in this order; a folder is searched for `SNLS80mV.csv`, then `SNLS80mV.mat`:
 
@@ -116,12 +116,6 @@ def load_record(path: str | Path | None = None) -> SilverboxRecord:
 
     Both files give the identical record: the CSV holds the values of the .mat rounded to five
     significant digits, so the values of the .mat are rounded likewise.
-
-    Args:
-        path: The file or the folder; None to search the other places.
-
-    Returns:
-        The record. A file is read once per process; later calls return the same arrays.
 
     Raises:
         RecordNotFound: The record is not in the place that was named, or not in any place.
@@ -138,10 +132,7 @@ def load_record(path: str | Path | None = None) -> SilverboxRecord:
 
 
 def record_available() -> bool:
-    """Says whether `load_record()` finds a file.
-
-    A damaged file counts as found, so that `load_record` reports it instead of it being passed
-    over in silence.
+    """Whether `load_record()` finds a file; a damaged one counts, so that `load_record` reports it.
 
     Raises:
         RecordNotFound: `SILVERBOX_DATA` is set, but the record is not there.
@@ -223,16 +214,15 @@ def _read_only(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def regime_input(name: str, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Gives the input of a regime: the record's where it is present, else a synthesised one.
+    """Gives the input of a regime: the record's where it is present, else one that `rng` draws.
 
     Args:
         name: `"multisine"` or `"arrow"`.
-        rng: Draws the synthesised input; not used where the record is present.
+        rng: See `synthesise_multisine` and `synthesise_arrow`.
 
     Returns:
         Input in volts, shape `(samples,)`, not to be written to. The record's is as measured, with
-        its mean of 6.2 mV; the synthesised one is as described at `synthesise_multisine` or
-        `synthesise_arrow`.
+        its mean of 6.2 mV.
 
     Raises:
         ValueError: There is no regime of this name.
@@ -254,10 +244,6 @@ def synthesise_multisine(rng: np.random.Generator, realisations: int = 10) -> ND
     with φ_l independent and uniform on [0, 2π). It lasts 400 samples of transient and one period
     of 8192, of which the transient is the periodic continuation. A gap of 100 zeros stands
     before each realisation and after the last.
-
-    Args:
-        rng: Draws the phases.
-        realisations: Number of realisations, at least 1.
 
     Returns:
         Input in volts, shape `(8692 · realisations + 100,)`, of mean zero; the RMS of every period
@@ -282,11 +268,7 @@ def synthesise_arrow(rng: np.random.Generator, samples: int = ARROW_SAMPLES) -> 
     """Makes the arrow part of the record from its published description.
 
     White Gaussian noise passes a discrete Butterworth low-pass of order 9 and cut-off 200 Hz; its
-    amplitude then grows linearly from zero.
-
-    Args:
-        rng: Draws the noise.
-        samples: Length, at least 1; the growth is spread over it.
+    amplitude then grows linearly from zero, over all samples.
 
     Returns:
         Input in volts, shape `(samples,)`, of mean zero; the standard deviation of the last sample

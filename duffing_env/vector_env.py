@@ -138,15 +138,6 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         return self._autoreset_mode
 
     @property
-    def records(self) -> FloatArray:
-        """(num_envs, size) the posteriors now, as the flat records of `estimator.Belief`; a copy."""
-        return self._batch.records()
-
-    def mixture(self, index: int) -> tuple[FloatArray, FloatArray]:
-        """Records (m, size) and weights (m,) of the beliefs that one weighs: one, or one for each hypothesis."""
-        return self._batch.mixture(index)
-
-    @property
     def truth(self) -> Parameters:
         """The oscillators that are to be identified, a batch of ``num_envs``."""
         return self._batch.truth()
@@ -239,11 +230,6 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         """
         return self._batch.memory | ({} if self._own is None else self._own.memory)
 
-    @property
-    def _seen(self) -> Batch | Own:
-        """What has the observations."""
-        return self._batch if self._own is None else self._own
-
     def _reset_mask(self, options: dict[str, Any]) -> Flags:
         if "reset_mask" not in options:
             return self._everywhere
@@ -262,10 +248,8 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
             whole("seed", seed, MOST_SEED, 0)
             seeds = spawn_seeds(int(seed), self.num_envs)
         elif seed is not None:
-            if isinstance(seed, np.ndarray):
-                seeds = list(seed) if seed.ndim else []
-            else:
-                seeds = list(seed) if isinstance(seed, Sequence) and not isinstance(seed, str | bytes) else []
+            is_list = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes)
+            seeds = list(seed) if is_list and getattr(seed, "ndim", 1) else []
             if len(seeds) != self.num_envs:
                 raise ValueError(
                     f"seed must be a whole number or {self.num_envs} of them, one for each row, but is {shown(seed)}"
