@@ -16,7 +16,7 @@ from agents.planner.motion import View
 from agents.planner.policy import Planner
 from agents.policies import make_policy
 from agents.policies.signals import SignalPolicy
-from agents.running.designs import Block, SignalDesign
+from agents.running.blocks import Block, SignalDesign
 from agents.running.observed import Observed
 from estimator.belief import Belief, covariance_places
 from estimator.checks import SMALLEST, number, whole

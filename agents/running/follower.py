@@ -165,7 +165,11 @@ class Follower:
 
     def ahead(self, u: float) -> Belief:
         """When the next input begins to act, if the one in force is u; nothing changes."""
-        return self._after(u, 1 + self.delay).belief
+        later = copy.copy(self.estimator)  # `run` leaves what it shares as it is
+        inputs = np.zeros(1 + self.delay)
+        inputs[0] = u
+        later.run(inputs, np.full(len(inputs), np.nan), missing=True)
+        return later.belief
 
     def pause(self, u: float) -> None:
         """A pause of unknown length without input begins, after a last sample with u. What is known of the state fades.
@@ -196,14 +200,6 @@ class Follower:
         self._put_state(kept.mean(axis=0), np.cov(kept.T))
         self._rung = systems, noises
         self._starts = _parts(kept)
-
-    def _after(self, u: float, samples: int) -> OnlineEstimator:
-        """A copy that has followed so many samples without outputs: one with u, the others with none."""
-        later = copy.copy(self.estimator)  # `run` leaves what it shares as it is
-        inputs = np.zeros(samples)
-        inputs[0] = u
-        later.run(inputs, np.full(samples, np.nan), missing=True)
-        return later
 
     def _put_state(self, mean: FloatArray, cov: FloatArray) -> None:
         arrays, model = self.estimator.arrays(), self.estimator.model

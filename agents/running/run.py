@@ -14,15 +14,14 @@ import numpy as np
 from agents.planner.futures import Futures
 from agents.policies import make_policy
 from agents.policies.signals import SignalPolicy
-from agents.running.blocks import Blocks
+from agents.running.blocks import Blocks, Design, design_of, designed
 from agents.running.clock import Clock, RealClock
-from agents.running.designs import Design, design_of, designed
 from agents.running.follower import Follower
 from agents.running.observed import Observed
 from agents.running.plan import Plan
 from agents.running.plant import Plant, check_plant
 from agents.running.recording import Recording
-from agents.running.samples import Chooser, PolicyChooser, Series, Ticker
+from agents.running.samples import Chooser, Ticker, asking, playing
 from agents.running.session import Session, Tripped, check_session
 from agents.running.stopping import Stopped
 from estimator.belief import Belief
@@ -120,13 +119,12 @@ def run(
     """
     rig, plan, clock = Rig.of(rig), plan or Plan(), clock or RealClock()
     plant, told = check_plant(plant), told or (lambda samples: None)
-    follower = Follower(rig, prior)
-    check_session(rig, plant, plan.silence(rig.step))
+    follower, silence = Follower(rig, prior), plan.silence(rig.step)
+    check_session(rig, plant, silence)
     observed = Observed(rig, follower.belief, plan.samples)
     policy = make_policy(plan.policy, observed, seed=plan.seed)  # type: ignore[arg-type]
     design = design_of(policy, observed) if plan.block or isinstance(policy, SignalPolicy) else None
-    chooser: Chooser | None = None if design else PolicyChooser(policy, observed, follower)
-    silence = plan.silence(rig.step)
+    choose: Chooser | None = None if design else asking(policy, observed, follower)
     _warm_up(follower, observed, design, policy, plan)
     described = {"command": sys.argv, "rig": rig.to_dict(), "plan": asdict(plan), "watchdog": silence}
     recording = Recording(out, {**described, "plant": repr(plant)[:200]})
@@ -144,11 +142,11 @@ def run(
                 try:
                     ticker.listen(plan.listen)
                     if design is not None:
-                        told_of = recording.note
-                        chooser = Series(designed(design, follower, observed, plan.samples, plan.bound, rng, told_of))
-                    assert chooser is not None
+                        note = recording.note
+                        choose = playing(designed(design, follower, observed, plan.samples, plan.bound, rng, note))
+                    assert choose is not None
                     session.arm()
-                    ticker.play(chooser, plan.samples, told)
+                    ticker.play(choose, plan.samples, told)
                     message = ticker.warning
                 finally:
                     late = ticker.late

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,39 +25,28 @@ _MANY = 0.1
 _REMEDY = "play blocks (--block 64), or take a longer step"
 
 
-class Chooser(Protocol):
-    """What chooses the next input."""
-
-    def next(self, k: int, u: float, y: float) -> float:
-        """The input of tick k, in the rig's unit, after an input u in force and the output y."""
-        ...
+#: ``choose(k, u, y)``: the input of tick k, in the rig's unit, after an input u in force and the output y.
+Chooser = Callable[[int, float, float], float]
 
 
-class PolicyChooser:
-    """Asks a policy, which sees the belief that its input will meet."""
+def asking(policy: Policy, observed: Observed, follower: Follower) -> Chooser:
+    """Asks a policy, which sees the belief that its input will meet, one tick ahead."""
+    state: Any = None
 
-    def __init__(self, policy: Policy, observed: Observed, follower: Follower) -> None:
-        self._policy, self._observed, self._follower = policy, observed, follower
-        self._state: Any = None
+    def choose(k: int, u: float, y: float) -> float:
+        nonlocal state
+        scales = follower.estimator.scales
+        observed.belief = follower.ahead(u)
+        seen = observed.observation(u / scales.input, y / scales.output, k)
+        action, state = policy.predict(seen, state, deterministic=True)
+        return float(action[0]) * observed.max_input * scales.input
 
-    def next(self, k: int, u: float, y: float) -> float:
-        """The policy's action on the belief one tick ahead."""
-        scales = self._follower.estimator.scales
-        self._observed.belief = self._follower.ahead(u)
-        seen = self._observed.observation(u / scales.input, y / scales.output, k)
-        action, self._state = self._policy.predict(seen, self._state, deterministic=True)
-        return float(action[0]) * self._observed.max_input * scales.input
+    return choose
 
 
-class Series:
+def playing(inputs: FloatArray) -> Chooser:
     """Plays inputs (T,) that were designed before, in the rig's unit."""
-
-    def __init__(self, u: FloatArray) -> None:
-        self._u = u
-
-    def next(self, k: int, u: float, y: float) -> float:
-        """The k-th of them."""
-        return float(self._u[k])
+    return lambda k, u, y: float(inputs[k])
 
 
 class Ticker:
@@ -67,13 +56,6 @@ class Ticker:
     tick the estimator is told, and the next input decided. A tick that passes meanwhile is missed: the input stays, the
     output is not read, the row is marked late, and the estimator is told just that. An output that came late is kept
     beside the others, and not used. Where an input came to act late, its sample has the mean of what was applied.
-
-    Args:
-        session: of the plant.
-        follower: of the estimator.
-        recording: of the rows.
-        clock: of the ticks.
-        step: between them [s].
 
     Attributes:
         tick: the next one.
@@ -108,15 +90,12 @@ class Ticker:
         while self._miss(late=False):  # the estimator, too, takes its time to hear of it
             pass
 
-    def play(self, chooser: Chooser, samples: int, told: Callable[[int], None]) -> None:
-        """Play so many ticks; then the input is zero, and its last response is read.
+    def play(self, choose: Chooser, samples: int, told: Callable[[int], None]) -> None:
+        """Play so many ticks, missed ones included; then the input is zero, and its last response is read.
 
-        Args:
-            chooser: of the inputs.
-            samples: ticks, missed ones included.
-            told: is called with the number of ticks after each.
+        ``told`` is called with the number of ticks after each.
         """
-        asked = chooser.next(0, self._in_force, self._last)
+        asked = choose(0, self._in_force, self._last)
         self.skip()
         start = self.tick
         while (k := self.tick - start) <= samples:
@@ -128,7 +107,7 @@ class Ticker:
             self._sample(asked if k < samples else 0.0)
             told(min(self.tick - start, samples))
             if self.tick - start < samples:
-                asked = chooser.next(self.tick - start, self._last_mean, self._last)
+                asked = choose(self.tick - start, self._last_mean, self._last)
 
     @property
     def warning(self) -> str:

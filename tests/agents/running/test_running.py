@@ -338,7 +338,7 @@ def test_a_belief_that_cannot_be_safe_is_not_played(tmp_path):
 @pytest.mark.parametrize("policy", ["prbs", "efe"])
 def test_blocks_leave_the_range_as_rarely_as_asked(policy):
     """Of 200 systems drawn from the guess, at the first and boldest design: more than 19 for 5 % are a 1 in 1000."""
-    from agents.running.designs import design_of
+    from agents.running.blocks import design_of
 
     rig = replace(RIG, input=replace(RIG.input, limit=40.0))
     left, promised, rng = 0, [], np.random.default_rng(5)
