@@ -189,16 +189,10 @@ class Planner:
         episode_start: npt.ArrayLike | None = None,
         deterministic: bool = False,
     ) -> tuple[npt.NDArray[np.float32], PlannerState]:
-        """Plan, and give the first input of each environment's plan.
+        """Plan, and give the first input of each environment's plan, as `agents.policies.Policy`.
 
-        Args:
-            observation: (n, features) what the environment showed last, or (features,) of a single one.
-            state: what the last call returned; None begins new plans and streams.
-            episode_start: (n,) which environments begin an episode, and so a new plan.
-            deterministic: without effect: the search is reproducible by its seed.
-
-        Returns:
-            The actions in [-1, 1], float32 (n, 1), or (1,) for a single observation; and the next state.
+        An episode begins with a new plan, and where the state is None all plans and streams are new. ``deterministic``
+        is without effect: the search is reproducible by its seed.
 
         Raises:
             ValueError: as `asked`.
@@ -207,7 +201,8 @@ class Planner:
         records, n = self._env.records, len(rows)
         k, terms = self.view.model.n_coefficients, self.terms
         if state is None:
-            words = np.array([_stream(child) for child in np.random.SeedSequence(self.seed).spawn(n)])
+            streams = map(np.random.SFC64, np.random.SeedSequence(self.seed).spawn(n))
+            words = np.array([stream.state["state"]["state"] for stream in streams])
             plans, rates, held = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n, dtype=np.int64)
             state = PlannerState(plans, rates, words, np.zeros(n), np.zeros(n), held)
         plans, rates, words = state.plans.copy(), state.rates.copy(), state.words.copy()
@@ -220,10 +215,8 @@ class Planner:
         inputs = np.empty(len(due))
         searched = plans[due], rates[due], words[due]
         if self._energy is not None:
-            energies, rule = (
-                rows[:, at.budget_left] * self._energy,
-                Rule(terms.amplitude, terms.limit, terms.margin, terms.shaken),
-            )
+            energies = rows[:, at.budget_left] * self._energy
+            rule = Rule(terms.amplitude, terms.limit, terms.margin, terms.shaken)
             self._pursue(records, left, energies, rule, last, *searched[::2], inputs)
         else:
             lasts = np.stack([last, before], axis=1)[due]
@@ -261,9 +254,3 @@ class Planner:
                 raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
             check_rows("state", len(state[0]), n)
         return observed.reshape(n, -1), starts(episode_start, n)
-
-
-def _stream(seed: np.random.SeedSequence) -> npt.NDArray[np.uint64]:
-    """The four words of a fresh stream."""
-    state: npt.NDArray[np.uint64] = np.random.SFC64(seed).state["state"]["state"]
-    return state

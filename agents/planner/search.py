@@ -272,6 +272,16 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             refresh(W, task, best, rate)
         return pace
 
+    @inner
+    def go_on(W, record, u, lasts, terms):
+        """Let the record follow an input over a sample; the input becomes the newest of the last ones."""
+        begin(W, record, lasts)
+        for j in range(LANES):
+            W[U + j] = u
+        advance(W, record, terms)
+        collect(W, record)
+        lasts[1], lasts[0] = lasts[0], u
+
     @entry
     def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, held):
         kept_memory = memory(horizon, _LATE_CELLS)
@@ -292,24 +302,14 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                     held = improve(kept_memory, record, len(u) - t, rounds, terms, lasts, best, rate, words)
                 u[t] = best[0]
                 held -= 1
-            begin(W, record, lasts)
-            for j in range(LANES):
-                W[U + j] = u[t]
-            advance(W, record, terms)
-            collect(W, record)
-            lasts[1], lasts[0] = lasts[0], u[t]
+            go_on(W, record, u[t], lasts, terms)
 
     @entry
     def through(record, first, cells, terms, rate, words, u):
         M, W, lasts = np.zeros((k, k)), np.empty(size), np.zeros(2)
         factorise(rate, M)
         for t in range(first):
-            begin(W, record, lasts)
-            for j in range(LANES):
-                W[U + j] = u[t]
-            advance(W, record, terms)
-            collect(W, record)
-            lasts[1], lasts[0] = lasts[0], u[t]
+            go_on(W, record, u[t], lasts, terms)
         left = len(u) - first
         find_way(memory(left, cells), Task(record, left, left, 1, terms, lasts, M, cells, cells), u[first:], words)
 
