@@ -37,10 +37,7 @@ def draw_regime(name: str) -> Draw:
     """A stretch of a regime of the Silverbox record, or of its synthesised stand-in.
 
     The stretch is contiguous and starts anywhere it fits, gaps and quiet beginning included. One
-    longer than the regime starts at its first sample and repeats it.
-
-    Args:
-        name: `"multisine"` or `"arrow"`; see `duffing_env.silverbox.regime_input`.
+    longer than the regime starts at its first sample and repeats it. See `duffing_env.silverbox.regime_input`.
     """
 
     def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
@@ -67,27 +64,15 @@ def draw_gaussian(max_input: float) -> Draw:
 
 
 def draw_prbs(max_input: float, hold: int = 1) -> Draw:
-    """A random binary signal: +`max_input` or -`max_input` volts with even odds.
+    """A random binary signal: +`max_input` or -`max_input` volts with even odds; see `draw_levels`.
 
     A coin rather than a shift register: of a maximum length sequence every draw would be the same one, shifted.
-
-    Args:
-        max_input: The amplitude, in volts.
-        hold: For how many samples each value is kept, at least 1.
-
-    Raises:
-        ValueError: `hold` is no whole number of at least 1.
     """
     return draw_levels(max_input, hold, levels=(-1.0, 1.0))
 
 
 def draw_levels(max_input: float, hold: int, levels: tuple[float, ...] = LEVELS) -> Draw:
-    """A random signal of a few levels with even odds.
-
-    Args:
-        max_input: The limit, in volts.
-        hold: For how many samples each value is kept, at least 1.
-        levels: The values, in parts of `max_input`.
+    """A random signal of a few levels, in parts of `max_input` volts, with even odds, each held for so many samples.
 
     Raises:
         ValueError: `hold` is no whole number of at least 1.
@@ -158,10 +143,7 @@ def draw_chirp(max_input: float, method: str) -> Draw:
     """A sine of amplitude `max_input` that rises through `BAND` once in a draw, its first phase random.
 
     It rises because a hardening oscillator follows a rising frequency to larger displacements than a falling one.
-
-    Args:
-        max_input: The amplitude, in volts.
-        method: `"linear"` or `"logarithmic"` in time; see `scipy.signal.chirp`.
+    `method` is `"linear"` or `"logarithmic"` in time; see `scipy.signal.chirp`.
     """
 
     def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
@@ -197,11 +179,8 @@ def resonance(theta1: FloatArray | np.float64, theta3: FloatArray | np.float64) 
     """Frequency at which the linear part of Eq. (2) rings [Hz], within `BAND`.
 
     The poles are those of z² - θ1 z - θ3, of the angle arccos(θ1 / (2 sqrt(-θ3))). It is 68.1 Hz for the twin;
-    sqrt(a / m) / 2π, without damping and samples, is 67.9 Hz.
-
-    Args:
-        theta1: Any shape.
-        theta3: The same shape. Where it is not negative, no oscillator is described, and the lower edge is given.
+    sqrt(a / m) / 2π, without damping and samples, is 67.9 Hz. Where θ3 is not negative, no oscillator is described, and
+    the lower edge is given. Both are of one shape, whatever it is.
     """
     modulus = np.sqrt(np.maximum(-np.asarray(theta3), 1e-12))
     angle = np.arccos(np.clip(np.asarray(theta1) / (2.0 * modulus), -1.0, 1.0))

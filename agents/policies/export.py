@@ -62,16 +62,13 @@ def export_signal(name: str, path: str | Path, **limits: Any) -> NDArray[np.floa
 
     Numbers have all their digits, so that reading them gives the very signal.
 
-    Args:
-        name: As `draw_signal`.
-        path: The file. Its folder is made where it is missing; a file of this name is replaced.
-        limits: Further arguments of `draw_signal`.
+    The folder is made where it is missing; a file of this name is replaced.
 
     Returns:
         The input in volts, shape `(samples,)`.
 
     Raises:
-        ValueError: As `draw_signal`; nothing is written then.
+        ValueError: As `draw_signal`, whose arguments the others are; nothing is written then.
         OSError: The file cannot be written.
     """
     volts = draw_signal(name, **limits)

@@ -96,14 +96,7 @@ class FeedbackPolicy:
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """Gives the next input of each environment, as `agents.policies.Policy`; there is nothing random about it.
 
-        Args:
-            observation: Shape `(n, features)` for n environments, or `(features,)` for one.
-            state: What the last call returned: the phases, shape `(n,)`, in periods. None: all begin at 0.
-            episode_start: Shape `(n,)`: which environments begin an episode, and so at phase 0. None: none does.
-            deterministic: Without effect.
-
-        Returns:
-            Actions, float32 of shape `(n, 1)`, or `(1,)` for one environment; and the state for the next call.
+        The state is the phases, shape `(n,)`, in periods; an episode begins at 0, and all do where it is None.
 
         Raises:
             ValueError: `observation` is not one of duffing_env, or `state` or `episode_start` is for another number

@@ -91,10 +91,12 @@ class SignalPolicy:
     Attributes:
         name: The name of the excitation.
         limits: What every signal is fitted to.
-        samples: The length of one draw. A signal that runs out before its episode ends is
-            continued by the next draw.
+        samples: The length of one draw. A signal that runs out before its episode ends is continued by the next draw.
         actions: The number of actions that play it: fewer, where an action is held for several samples.
         seed: The seed that `reset` starts from.
+
+    Raises:
+        ValueError: `max_input` or `max_rms` is not positive and finite, or `samples` or `seed` is not a whole number.
     """
 
     def __init__(
@@ -108,22 +110,6 @@ class SignalPolicy:
         hold: int = 1,
         seed: int = 0,
     ) -> None:
-        """Fits an excitation to the limits of an environment.
-
-        Args:
-            name: The name of the excitation.
-            draw: Gives one excitation in volts, shape `(samples,)`, from a generator and a number
-                of samples.
-            max_input: The input at action 1, in volts, positive; the signal is clipped there.
-            max_rms: The largest root mean square of a draw, in volts; see `Limits.fit`. None: no limit.
-            samples: The length of one draw, 1 to `MOST_SAMPLES`.
-            hold: Samples that an action is applied for; see `Limits.fit`.
-            seed: The seed of all the signals.
-
-        Raises:
-            ValueError: `max_input` or `max_rms` is not positive and finite, or `samples` or `seed` is not a whole
-                number.
-        """
         whole("samples", samples, MOST_SAMPLES)
         whole("seed", seed, 2**128, 0)
         self.name = name
@@ -140,11 +126,7 @@ class SignalPolicy:
         return self.limits.max_input
 
     def reset(self, seed: int | None = None) -> None:
-        """Starts over: the next signal of each environment is its first one again.
-
-        Args:
-            seed: Replaces the seed; None keeps it.
-        """
+        """Starts over, with another seed where there is one: the next signal of each environment is its first one."""
         if seed is not None:
             self.seed = seed
         self._seeds = np.random.SeedSequence(self.seed)
@@ -159,16 +141,9 @@ class SignalPolicy:
     ) -> tuple[NDArray[np.float32], SignalState]:
         """Gives the next input of each environment, as `agents.policies.Policy`.
 
-        Args:
-            observation: Shape `(n, features)` for n environments, or `(features,)` for one; it is not looked at.
-            state: What the last call returned, which stays as it is; None draws a new signal for every environment. A
-                caller who always passes None gets first samples only.
-            episode_start: Shape `(n,)`: which environments begin an episode, and so a new signal. None: none does.
-            deterministic: Without effect: a signal is random by its draw, and reproducible by its seed.
-
-        Returns:
-            The actions, u / max_input fitted to the limits, as float32 of shape `(n, 1)`, or `(1,)` for one
-            environment; and the state for the next call.
+        The observation is not looked at. An episode begins with a new signal, and so does every environment where the
+        state is None: a caller who always passes None gets first samples only. `deterministic` is without effect: a
+        signal is random by its draw, and reproducible by its seed.
 
         Raises:
             ValueError: `observation` has neither one nor two dimensions, or `state` or `episode_start` is for another
@@ -213,11 +188,6 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
 
     Signals are made for the Silverbox. On a rig each of their values is held for as many samples as the rig's
     resonance, as its prior believes it, is slower, and they reach as far as its limit.
-
-    Args:
-        name: A name in `EXCITATIONS`.
-        env: The unwrapped environment, or None.
-        seed: The seed of the signals.
 
     Raises:
         ValueError: `env` is not one of duffing_env.
