@@ -137,20 +137,8 @@ class ContinuousShortEnv(ContinuousEnv):
 
     ## Description
 
-    As `ContinuousEnv`, but ``horizon`` is 48: every sample counts, and the posterior is still wide, and the noises
-    hardly known, when the best inputs must be chosen.
-
-    ## Action space, observation space, reward, starting state, information
-
-    As `ContinuousEnv`.
-
-    ## Episode end
-
-    As `ContinuousEnv`, truncated after 48 samples.
-
-    ## Arguments
-
-    As `ContinuousEnv`, with ``horizon`` 48.
+    As `ContinuousEnv` in all, but ``horizon`` is 48, after which an episode is truncated: every sample counts, and the
+    posterior is still wide, and the noises hardly known, when the best inputs must be chosen.
 
     ## Version history
 
@@ -163,20 +151,9 @@ class ContinuousPowerEnv(ContinuousEnv):
 
     ## Description
 
-    As `ContinuousEnv`, with the budget of `PowerEnv`: over an episode Σ u² is at most ``horizon * max_rms**2``, and an
-    input that what is left cannot pay for is cut to what it can.
-
-    ## Action space, observation space
-
-    As `PowerEnv`; the belief's entries as `ContinuousEnv`.
-
-    ## Reward, starting state, episode end, information
-
-    As `ContinuousEnv`.
-
-    ## Arguments
-
-    As `ContinuousEnv`, with ``max_rms`` 0.0222.
+    As `ContinuousEnv` in all, with the budget of `PowerEnv`: over an episode Σ u² is at most ``horizon * max_rms**2``,
+    with ``max_rms`` 0.0222, and an input that what is left cannot pay for is cut to what it can. Observations 18 and 21
+    are as there.
 
     ## Version history
 
@@ -189,19 +166,8 @@ class ContinuousOutputEnv(ContinuousEnv):
 
     ## Description
 
-    As `ContinuousEnv`, but the episode ends at half the displacement, so the input must feel its way.
-
-    ## Action space, observation space, reward, starting state, information
-
-    As `ContinuousEnv`; the states and the output are observed in parts of 0.3 V.
-
-    ## Episode end
-
-    As `ContinuousEnv`, terminated at \|y\| > 0.3 V.
-
-    ## Arguments
-
-    As `ContinuousEnv`, with ``max_output`` 0.3.
+    As `ContinuousEnv` in all, but ``max_output`` is 0.3: the episode is terminated at half the displacement, in parts
+    of which the states and the output are observed. So the input must feel its way.
 
     ## Version history
 

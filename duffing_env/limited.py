@@ -10,24 +10,9 @@ class ShortEnv(DuffingEnv):
 
     ## Description
 
-    As `DuffingEnv`, but ``horizon`` is 48: every sample counts, and the posterior is still wide when the best inputs
-    must be chosen.
-
-    ## Action space, observation space, reward, information
-
-    As `DuffingEnv`; the information gained over an episode is about 16 nats.
-
-    ## Starting state
-
-    As `DuffingEnv`.
-
-    ## Episode end
-
-    As `DuffingEnv`, truncated after 48 samples.
-
-    ## Arguments
-
-    As `DuffingEnv`, with ``horizon`` 48.
+    As `DuffingEnv` in all, but ``horizon`` is 48, after which an episode is truncated: every sample counts, and the
+    posterior is still wide when the best inputs must be chosen. The information gained over an episode is about 16
+    nats.
 
     >>> import gymnasium as gym
     >>> env = gym.make("duffing_env/Short-v0")
@@ -46,27 +31,13 @@ class PowerEnv(DuffingEnv):
 
     ## Description
 
-    As `DuffingEnv`, but the input has a budget: over an episode its root mean square is at most ``max_rms``, so its
-    energy Σ u² is at most ``horizon * max_rms**2``. An input that what is left of the budget cannot pay for is cut to
-    what it can: |u_t| ≤ sqrt(budget - spent), so the budget is never exceeded, and an input of zero follows when
+    As `DuffingEnv` in all, but the input has a budget: over an episode its root mean square is at most ``max_rms``, so
+    its energy Σ u² is at most ``horizon * max_rms**2``. An input that what is left of the budget cannot pay for is cut
+    to what it can: |u_t| ≤ sqrt(budget - spent), so the budget is never exceeded, and an input of zero follows when
     nothing is left. Spent all at once at 0.15 V it lasts for 5 samples; when to spend it is the question.
 
-    ## Action space
-
-    As `DuffingEnv`: the input that is asked for, in parts of ``max_input`` (0.15 V). Observation 18 is the input that
-    was given.
-
-    ## Observation space
-
-    As `DuffingEnv`; observation 21 is the part of the energy that is left.
-
-    ## Reward, starting state, episode end, information
-
-    As `DuffingEnv`; the information gained over an episode is 9 to 16 nats.
-
-    ## Arguments
-
-    As `DuffingEnv`, with ``max_rms`` 0.0222.
+    The action is the input that is asked for; observation 18 is the input that was given, observation 21 the part of
+    the energy that is left. ``max_rms`` is 0.0222. The information gained over an episode is 9 to 16 nats.
 
     >>> import gymnasium as gym
     >>> env = gym.make("duffing_env/Power-v0")
@@ -87,24 +58,9 @@ class OutputEnv(DuffingEnv):
 
     ## Description
 
-    As `DuffingEnv`, but the episode ends at half the displacement: driven at its resonance by the largest input, the
-    oscillator gets there within a period and a half, so the input must feel its way.
-
-    ## Action space, observation space, reward, information
-
-    As `DuffingEnv`; the state and the output are observed in parts of 0.3 V.
-
-    ## Starting state
-
-    As `DuffingEnv`.
-
-    ## Episode end
-
-    As `DuffingEnv`, terminated at \|y\| > 0.3 V.
-
-    ## Arguments
-
-    As `DuffingEnv`, with ``max_output`` 0.3.
+    As `DuffingEnv` in all, but ``max_output`` is 0.3: the episode is terminated at half the displacement, in parts of
+    which the state and the output are observed. Driven at its resonance by the largest input, the oscillator gets there
+    within a period and a half, so the input must feel its way.
 
     ## Version history
 
@@ -117,31 +73,23 @@ class DriftEnv(DuffingEnv):
 
     ## Description
 
-    As `DuffingEnv` over 512 samples, but at a sample that is uniform over the middle half of the episode the mass is
-    multiplied by a factor that is log-uniform on 1 ± ``jump`` (0.3, and below 1). The estimator expects change: before
-    every sample each coefficient's standard deviation is widened as by a random walk, ``drift`` (0.01) of that of the
-    prior, so it forgets in some hundred samples. Its intervals are those of a walk; a jump is a large step of it.
+    As `DuffingEnv`, but over a ``horizon`` of 512 samples, and at a sample that is uniform over the middle half of the
+    episode the mass is multiplied by a factor that is log-uniform on 1 ± ``jump`` (0.3; below 1). The estimator
+    expects change: before every sample each coefficient's standard deviation is widened as by a random walk, ``drift``
+    (0.01) of that of the prior, so it forgets in some hundred samples. Its intervals are those of a walk; a jump is a
+    large step of it.
 
-    ## Action space, observation space, information
-
-    As `DuffingEnv`. The agent is not told of the jump; it shows in the outputs.
+    The agent is not told of the jump; it shows in the outputs. At the end ``env.unwrapped.truth`` is the oscillator
+    after it. All that is not said here is as in `DuffingEnv`.
 
     ## Reward
 
-    As `DuffingEnv`. The posterior widens between samples, so the ``information_gain`` of a step can be negative;
+    The posterior widens between samples, so the ``information_gain`` of a step can be negative;
     ``log_posterior`` and ``parameter_error`` are those of the oscillator as it is at that sample, and what the jump
     itself does to them is not counted: they are set anew with the new mass. So they pay again for what was believed
     and has to be unlearned, the more the surer it was, and are no rewards to train with here. Of ``information_gain``
     only what is known at the end is left over an episode; with ``terminated_return=0`` nothing is gained by ending it
     before the jump.
-
-    ## Starting state, episode end
-
-    As `DuffingEnv`, truncated after 512 samples. ``env.unwrapped.truth`` is then the oscillator after the jump.
-
-    ## Arguments
-
-    As `DuffingEnv`, with ``horizon`` 512, ``jump`` 0.3 and ``drift`` 0.01.
 
     ## Version history
 
