@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -14,12 +17,16 @@ from duffing_env.kernel import RESET_NOW, compiled
 from duffing_env.layout import OUTCOME, layout_of, noise_rows, observation_bounds, pack, parameter_names
 from duffing_env.noise import stream_words
 from duffing_env.recycling import Recycled
-from duffing_env.turns import use_threads
 from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, Parameters
 
 _OUTCOME = tuple(name.lower() for name in OUTCOME)
+
+#: The process whose threads have stepped: they do not live on in its children.
+_process: int | None = None
+
+_turn = threading.Lock()
 
 
 class Batch:
@@ -287,3 +294,20 @@ def spawn_seeds(seed: int | None, count: int) -> list[int]:
     """
     children = np.random.SeedSequence(seed).spawn(count)
     return [int(child.generate_state(1, np.uint64)[0]) for child in children]
+
+
+def use_threads(number: int) -> AbstractContextManager[object] | None:
+    """The context in which Numba may step with so many threads; None where it may not.
+
+    It may not in the child of a process that has: one thread then does it all, with the same results. One of Numba's
+    threading layers can be entered by one Python thread at a time, and ends the process where two do: there they wait
+    for each other.
+    """
+    import numba
+
+    global _process
+    _process = _process or os.getpid()
+    if _process != os.getpid():
+        return None
+    numba.set_num_threads(number)
+    return _turn if numba.threading_layer() == "workqueue" else nullcontext()

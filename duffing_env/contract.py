@@ -1,11 +1,13 @@
-"""What single and vector environments share of Gymnasium's contract: spaces, options, specification."""
+"""What single and vector environments share: spaces, options, specification, and that one call goes at a time."""
 
 from __future__ import annotations
 
 import copy
 import difflib
+from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
+from functools import wraps
+from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -15,6 +17,8 @@ from duffing_env.batch import Batch
 from duffing_env.experiment import Experiment
 from duffing_env.own import Own, bounds_of
 from estimator.parameters import FloatArray
+
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 def observation_space(experiment: Experiment) -> spaces.Box:
@@ -106,3 +110,30 @@ def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experime
                 f"got an unexpected keyword argument {name!r}: the options of this environment are {known}{hint}"
             )
     return kind(**options)
+
+
+def in_turn(method: Method) -> Method:
+    """Refuse a call of a method while another call that is in turn has not returned; nothing has changed then.
+
+    Two threads that step at once would mix two steps into one. The object has a list ``_turn`` of one entry, which a
+    call takes out and puts back: a lock that can be copied.
+
+    Raises:
+        RuntimeError: for the second call.
+    """
+
+    @wraps(method)
+    def called(self: Any, *args: Any, **kwargs: Any) -> Any:
+        try:
+            token = self._turn.pop()
+        except IndexError:
+            raise RuntimeError(
+                f"{method.__name__} must wait until the last call of this environment has returned, but another thread "
+                "called it meanwhile; give each thread an environment of its own"
+            ) from None
+        try:
+            return method(self, *args, **kwargs)
+        finally:
+            self._turn.append(token)
+
+    return called  # type: ignore[return-value]

@@ -11,12 +11,11 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from duffing_env.batch import Batch
-from duffing_env.contract import Specified, action_space, checked_options, make_experiment, observation_space
+from duffing_env.contract import Specified, action_space, checked_options, in_turn, make_experiment, observation_space
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND
 from duffing_env.layout import SUMMED
 from duffing_env.own import Own
-from duffing_env.turns import in_turn
 from estimator.belief import Belief
 from estimator.checks import numbers, one_of, shown
 from estimator.parameters import Parameters

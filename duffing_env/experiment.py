@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -55,6 +55,11 @@ class Experiment:
     noise_hypotheses: Hypotheses = 1
     branch: str = "train"
 
+    #: Whether there is a true plant to compare with.
+    knows_truth: ClassVar[bool] = True
+    #: Whether hypotheses about the noises are moved by sigma points: where they start from a wide belief.
+    points: ClassVar[bool] = False
+
     def __post_init__(self) -> None:
         one_of("branch", self.branch, BRANCHES)
         one_of("factorisation", self.factorisation, DEFAULT_ITERATIONS)
@@ -94,11 +99,6 @@ class Experiment:
         return self.plant or self.model
 
     @property
-    def knows_truth(self) -> bool:
-        """Whether there is a true plant to compare with."""
-        return True
-
-    @property
     def degree(self) -> int:
         """Of the input over a sample of a differential equation: 0 held, 1 linear from the last input to this one."""
         return 0
@@ -107,11 +107,6 @@ class Experiment:
     def step(self) -> float:
         """Sampling step [s]."""
         return SAMPLING_STEP
-
-    @property
-    def points(self) -> bool:
-        """Whether hypotheses about the noises are moved by sigma points: where they start from a wide belief."""
-        return False
 
     @property
     def scales(self) -> Scales:

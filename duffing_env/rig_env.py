@@ -63,11 +63,6 @@ class RigExperiment(RigNumbers, SimulatedExperiment):
         return self.plant
 
     @property
-    def step(self) -> float:
-        """The rig's."""
-        return float(self.described.step)
-
-    @property
     def center(self) -> dict[str, float]:
         """The guess's middle, inside."""
         return {name: mean for name, (mean, _) in self._drawn.items()}

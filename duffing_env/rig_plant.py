@@ -79,6 +79,9 @@ class RigNumbers:
     max_input: float
     max_output: float
 
+    #: A guess is wide.
+    points: ClassVar[bool] = True
+
     def _check_parts(self) -> None:
         for name in ("max_input", "max_output"):
             if getattr(self, name) > 1:
@@ -96,9 +99,9 @@ class RigNumbers:
         return int(self.described.interpolation != "zero_order")
 
     @property
-    def points(self) -> bool:
-        """A guess is wide."""
-        return True
+    def step(self) -> float:
+        """The rig's."""
+        return float(self.described.step)
 
     @property
     def scales(self) -> Scales:
@@ -123,6 +126,8 @@ class RigPlantExperiment(RigNumbers, Experiment):
     horizon: int = 256
     prior: Belief | None = None
     noise_hypotheses: Hypotheses = (7, 7)
+
+    knows_truth: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rig", checked_rig(self.rig, self.prior is None))
@@ -156,19 +161,9 @@ class RigPlantExperiment(RigNumbers, Experiment):
         return balance(self.believed) if isinstance(self.noise_hypotheses, tuple) else None
 
     @property
-    def knows_truth(self) -> bool:
-        """Nobody does."""
-        return False
-
-    @property
     def model(self) -> Model:
         """That of the prior."""
         return self.believed.model
-
-    @property
-    def step(self) -> float:
-        """The rig's."""
-        return float(self.described.step)
 
     @property
     def center(self) -> dict[str, float]:

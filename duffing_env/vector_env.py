@@ -16,14 +16,13 @@ from gymnasium.vector.utils import batch_space
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.continuous import ContinuousEnv
-from duffing_env.contract import Specified, action_space, checked_options, make_experiment, observation_space
+from duffing_env.contract import Specified, action_space, checked_options, in_turn, make_experiment, observation_space
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import MOST_SAMPLES, Experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.layout import OUTCOME
 from duffing_env.own import Own
 from duffing_env.replay import SilverboxReplayEnv
-from duffing_env.turns import in_turn
 from estimator.belief import Belief
 from estimator.checks import numbers, shown, whole
 from estimator.parameters import FloatArray, Parameters
@@ -249,7 +248,7 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
             seeds = spawn_seeds(int(seed), self.num_envs)
         elif seed is not None:
             is_list = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes)
-            seeds = list(seed) if is_list and getattr(seed, "ndim", 1) else []
+            seeds = list(seed) if is_list and getattr(seed, "shape", None) != () else []
             if len(seeds) != self.num_envs:
                 raise ValueError(
                     f"seed must be a whole number or {self.num_envs} of them, one for each row, but is {shown(seed)}"
