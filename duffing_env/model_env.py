@@ -14,7 +14,7 @@ from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
-from estimator.checks import LARGEST, SMALLEST, number, one_of, shown
+from estimator.checks import number, one_of, shown
 from estimator.models import MODELS
 from estimator.models.model import Model
 from estimator.priors import gaussian_moments, weak_prior
@@ -34,13 +34,11 @@ class ModelExperiment(SimulatedExperiment):
     def __post_init__(self) -> None:
         super().__post_init__()
         names = parameter_names(self.plant)
-        for name, given in (("mean", self.mean), ("std", self.std)):
-            if given is None and name == "std":
-                continue
+        for name, given in (("mean", self.mean), ("std", self.mean if self.std is None else self.std)):
             if not isinstance(given, Mapping) or set(given) != set(names):
                 raise ValueError(f"{name} must give the parameters {list(names)}, but is {given!r}")
-            for parameter, value in given.items():
-                number(f"{name} of {parameter}", value, -LARGEST if name == "mean" else SMALLEST)
+        for parameter, value in (self.std or {}).items():
+            number(f"std of {parameter}", value)
         number("sampling_step", self.sampling_step)
         one_of("interpolation", self.interpolation, ("zero_order", "linear"))
         if self.factorisation != "structured":

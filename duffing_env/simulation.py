@@ -19,6 +19,7 @@ import numpy as np
 
 from duffing_env.layout import Kind, layout_of
 from duffing_env.rewards import Hooks, nothing
+from estimator.arrays import copy_lanes
 from estimator.engine.feeding import feeder
 from estimator.engine.rows import input_rows
 from estimator.lanes import LANES, part
@@ -80,8 +81,7 @@ def hooks(kind: Kind, code: Any) -> Hooks:
         """The misfits of a block's beliefs."""
         kept = np.empty(len(inputs) * LANES)
         for k in range(len(inputs)):
-            for j in range(LANES):
-                kept[k * LANES + j] = W[inputs[k] + j]
+            copy_lanes(kept, k * LANES, W, inputs[k], LANES)
         for i in range(first, last):
             W[i] = 0.0
         for t in range(SAMPLES):
@@ -100,20 +100,18 @@ def hooks(kind: Kind, code: Any) -> Hooks:
             compare(W)
         conclude(W)
         for k in range(len(inputs)):
-            for j in range(LANES):
-                W[inputs[k] + j] = kept[k * LANES + j]
+            copy_lanes(W, inputs[k], kept, k * LANES, LANES)
 
     @part(kind.name)
     def begin(W, j, setup):
         """Of lane j alone: the other lanes keep what they had."""
         works, misfits = np.empty(LANES), np.empty(LANES)
-        for k in range(LANES):
-            works[k], misfits[k] = W[work + k], W[misfit + k]
+        copy_lanes(works, 0, W, work, LANES)
+        copy_lanes(misfits, 0, W, misfit, LANES)
         run(W, setup.max_input)
-        for k in range(LANES):
-            W[work + k] = works[k]
-            if k != j:
-                W[misfit + k] = misfits[k]
+        misfits[j] = W[misfit + j]
+        copy_lanes(W, work, works, 0, LANES)
+        copy_lanes(W, misfit, misfits, 0, LANES)
 
     @part(kind.name)
     def after(W, setup):
