@@ -115,11 +115,8 @@ class ModelEnv(DuffingEnv):
     ## Description
 
     As `DuffingEnv`, but the plant is a `estimator.models.model.Model`: the environment steps it with its noises, and
-    the estimator that is made of the same declaration keeps the posterior that is observed.
-
-    ## Action space
-
-    `Box(-1, 1, (1,), float32)`, the input in parts of ``max_input``.
+    the estimator that is made of the same declaration keeps the posterior that is observed. Actions, rewards and all
+    that is not said here are as there.
 
     ## Observation space
 
@@ -128,10 +125,6 @@ class ModelEnv(DuffingEnv):
     of their standard deviations relative to the prior's, their correlations, log E[γ] and log E[ξ] of each sensor
     relative to the prior's, the states and last outputs in parts of ``max_output``, the last input, the time and the
     energy that are left, in the order of `duffing_env.layout.observation_bounds`.
-
-    ## Reward
-
-    As `DuffingEnv`.
 
     ## Starting state
 
@@ -144,8 +137,7 @@ class ModelEnv(DuffingEnv):
 
     ## Information
 
-    As `DuffingEnv`; ``truth`` is a `estimator.Parameters`. Where noises are drawn (``noise_range``), of several sensors
-    it has ``measurement_noise_<sensor>``.
+    Where noises are drawn (``noise_range``), of several sensors ``truth`` has ``measurement_noise_<sensor>``.
 
     ## Arguments
 

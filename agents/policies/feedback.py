@@ -38,6 +38,9 @@ the largest displacement was 0.78 of the limit on Amplitude-v0, 0.93 on Output-v
 #: Cycles per sample between which a resonance is looked for.
 _BAND = (BAND[0] * SAMPLING_STEP, BAND[1] * SAMPLING_STEP)
 
+#: The signs `(n,)` of inputs that need not brake, of velocities and phases of a wave of the believed resonance.
+Signs = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+
 
 class FeedbackPolicy:
     """What the policies have in common: the limits, the prior that an observation is relative to, and the brake.
@@ -46,9 +49,9 @@ class FeedbackPolicy:
         limits: What the input keeps to.
     """
 
-    def __init__(self, limits: Limits, experiment: Experiment) -> None:
+    def __init__(self, signs: Signs, limits: Limits, experiment: Experiment) -> None:
         """Takes from the experiment what an observed mean, in the prior's standard deviations, stands for."""
-        self.limits = limits
+        self._signs, self.limits = signs, limits
         self._model, self._step = experiment.model, experiment.step
         self._places = places(experiment.model)
         self._limit = float(experiment.max_output)
@@ -115,10 +118,6 @@ class FeedbackPolicy:
         actions = (size * signs).astype(np.float32).reshape(*np.shape(observation)[:-1], 1)
         return actions, (phase + self.limits.hold * seen[2]) % 1.0
 
-    def _signs(self, velocities: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The signs `(n,)` of inputs that need not brake, at phases of a wave of the believed resonance."""
-        raise NotImplementedError
-
     def _rows(self, observation: ArrayLike) -> NDArray[np.float64]:
         """The observations as a batch `(n, features)`."""
         observed = numbers("observation", observation)
@@ -131,39 +130,35 @@ class FeedbackPolicy:
         return np.atleast_2d(observed)
 
 
-class VelocitySign(FeedbackPolicy):
+def velocity_sign(velocities: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pushes in the direction in which the oscillator is believed to move, and so pumps energy in.
 
     It needs no frequency: whatever the oscillator's resonance is at its present amplitude, the input is in phase with
     the velocity there, but for half a sample. Only the brake looks at the model.
     """
-
-    def _signs(self, velocities: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.where(velocities < 0.0, -1.0, 1.0)
+    return np.where(velocities < 0.0, -1.0, 1.0)
 
 
-class SquareBelieved(FeedbackPolicy):
+def square_believed(velocities: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
     """A square wave whose frequency is the linear resonance that the posterior's mean has, sample by sample.
 
     The phase goes on as the frequency changes; an episode begins with a positive half-wave.
     """
-
-    def _signs(self, velocities: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.where(phases < 0.5, 1.0, -1.0)
+    return np.where(phases < 0.5, 1.0, -1.0)
 
 
-def make_feedback(kind: type[FeedbackPolicy], env: Any, seed: int) -> FeedbackPolicy:
+def make_feedback(signs: Signs, env: Any, seed: int) -> FeedbackPolicy:
     """A policy with feedback for an unwrapped environment (or None: the defaults); the seed has no effect.
 
     Raises:
         ValueError: `env` is not one of duffing_env.
     """
     limits, _ = limits_of(env)
-    return kind(limits, SimulatedExperiment() if env is None else env.experiment)
+    return FeedbackPolicy(signs, limits, SimulatedExperiment() if env is None else env.experiment)
 
 
 FEEDBACK: dict[str, Callable[[Any, int], FeedbackPolicy]] = {
-    "square-believed": partial(make_feedback, SquareBelieved),
-    "velocity-sign": partial(make_feedback, VelocitySign),
+    "square-believed": partial(make_feedback, square_believed),
+    "velocity-sign": partial(make_feedback, velocity_sign),
 }
 """Name of a policy with feedback to what makes it from the unwrapped environment and the seed."""

@@ -167,17 +167,12 @@ class SignalPolicy:
         if due.any():
             position = np.where(due, 0, position)
             signals = signals.copy()
+            missing = rows - len(self._generators)
+            self._generators += map(np.random.default_rng, self._seeds.spawn(max(0, missing)))
             for row in np.flatnonzero(due).tolist():
-                signals[row] = self._next_signal(row)
+                signals[row] = self.limits.fit(self._draw(self._generators[row], self.samples))
         actions = signals[np.arange(rows), position][:, np.newaxis]
         return actions.reshape(*observed[:-1], 1), (position + 1, signals)
-
-    def _next_signal(self, row: int) -> NDArray[np.float64]:
-        """The actions, shape `(self.actions,)`, of the next draw for environment `row`."""
-        missing = row + 1 - len(self._generators)
-        if missing > 0:
-            self._generators += map(np.random.default_rng, self._seeds.spawn(missing))
-        return self.limits.fit(self._draw(self._generators[row], self.samples))
 
 
 def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
