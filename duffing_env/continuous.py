@@ -63,11 +63,7 @@ class ContinuousEnv(DuffingEnv):
     ``estimator="nlarx"`` puts the paper's difference equation in its place, which this plant does not obey: a
     foil that shows what misspecification does (docs/continuous.md).
 
-    ## Action space
-
-    As `DuffingEnv`.
-
-    ## Observation space
+    ## Action space, observation space
 
     As `DuffingEnv`, with k, κ, d, g in place of θ1, θ2, θ3, η (entries 0 to 13), and E[x], E[x'] as the filtered state
     (16, 17; x' in V per sample). With ``estimator="nlarx"`` all are those of `DuffingEnv`.
@@ -75,8 +71,8 @@ class ContinuousEnv(DuffingEnv):
     ## Reward
 
     As `DuffingEnv`, with C the posterior covariance of (k, κ, d, g) and c* their true values; the information gained
-    over an episode is about 16 nats. ``fisher`` counts with the true noises, and is not for ``estimator="nlarx"``, with
-    which C and c* are those of θ1, θ2, θ3, η, the true ones by Eq. (3), and the estimates of m, c, a, b by Eq. (4).
+    over an episode is about 16 nats. ``fisher`` counts with the true noises. With ``estimator="nlarx"`` there is no
+    ``fisher``, and C and c* are of θ1, θ2, θ3, η: the true ones by Eq. (3), the estimates of m, c, a, b by Eq. (4).
 
     ## Starting state
 
