@@ -7,12 +7,11 @@ import numba
 import numpy as np
 import pytest
 from checkers import assert_checkers_are_content
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 from rounding import U32
 from test_rig_plant import Difference, around
-from test_vector_env import assert_same, random_actions, roll_out, without_endings
+from test_vector_env import assert_same, play_beside_singles, random_actions, roll_out
 
-from duffing_env.batch import spawn_seeds
 from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
 from duffing_env.replay import ReplayExperiment
@@ -77,19 +76,8 @@ def test_a_held_action_is_the_same_action_at_every_sample(kind, options):
 @pytest.mark.parametrize(("kind", "options"), KINDS)
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_rows_are_single_environments(mode, kind, options):
-    options = {**BOTH_ENDS, **options}
     vector = ContinuousVectorEnv if kind is ContinuousEnv else DuffingVectorEnv
-    envs = vector(5, autoreset_mode=mode, **options)
-    singles = SyncVectorEnv([lambda: kind(**options)] * 5, autoreset_mode=mode)
-    actions = random_actions(60, 5)
-    ours, theirs = roll_out(envs, actions, seed=7), roll_out(singles, actions, seed=spawn_seeds(7, 5))
-    for told, expected in zip(ours, theirs, strict=True):
-        assert_same(told[:-1], expected[:-1])
-        told, expected = without_endings(told[-1]), expected[-1]
-        assert told.keys() == expected.keys()
-        for name in (*GAINS, "diverged"):
-            assert_same(told.get(name), expected.get(name))
-    steps = [told for told in ours if len(told) == 5]
+    steps = play_beside_singles(5, 60, vector=vector, mode=mode, **{**BOTH_ENDS, **options})
     assert np.sum([step[2] for step in steps]) > 3
 
 

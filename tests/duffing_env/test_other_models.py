@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from test_vector_env import assert_same, random_actions, roll_out, without_endings
+from gymnasium.vector import AutoresetMode
+from test_vector_env import play_beside_singles, random_actions
 
-from duffing_env.batch import spawn_seeds
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.vector_env import DuffingVectorEnv
@@ -52,14 +51,7 @@ class PendulumVectorEnv(DuffingVectorEnv):
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_rows_are_single_environments(mode):
-    envs = PendulumVectorEnv(5, autoreset_mode=mode, **BOTH_ENDS)
-    singles = SyncVectorEnv([lambda: PendulumEnv(**BOTH_ENDS)] * 5, autoreset_mode=mode)
-    actions = random_actions(120, 5)
-    ours, theirs = roll_out(envs, actions, seed=7), roll_out(singles, actions, seed=spawn_seeds(7, 5))
-    for told, expected in zip(ours, theirs, strict=True):
-        assert_same(told[:-1], expected[:-1])
-        assert without_endings(told[-1]).keys() == expected[-1].keys()
-    steps = [told for told in ours if len(told) == 5]
+    steps = play_beside_singles(5, 120, vector=PendulumVectorEnv, mode=mode, **BOTH_ENDS)
     assert np.sum([step[2] for step in steps]) > 3
     assert np.sum([step[3] for step in steps]) > 3
 

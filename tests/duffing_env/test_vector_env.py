@@ -77,10 +77,10 @@ def without_endings(infos):
     return told
 
 
-def play_beside_singles(rows, steps, *, mode=AutoresetMode.NEXT_STEP, **options):
+def play_beside_singles(rows, steps, *, vector=DuffingVectorEnv, mode=AutoresetMode.NEXT_STEP, **options):
     """Check every step against `SyncVectorEnv`; gives the steps."""
-    envs = DuffingVectorEnv(rows, autoreset_mode=mode, **options)
-    singles = SyncVectorEnv([lambda: DuffingEnv(**options)] * rows, autoreset_mode=mode)
+    envs = vector(rows, autoreset_mode=mode, **options)
+    singles = SyncVectorEnv([lambda: vector.single(**options)] * rows, autoreset_mode=mode)
     for space in ("single_observation_space", "observation_space", "single_action_space", "action_space"):
         assert getattr(envs, space) == getattr(singles, space)
     actions = random_actions(steps, rows)
