@@ -43,7 +43,7 @@ from scipy.special import ndtri, stdtrit
 from agents.asked import check_rows, starts
 from agents.planner.imagination import TAILS, Terms
 from agents.planner.motion import View, places, seen, swing_of
-from agents.planner.pursuit import Rule, pursuit
+from agents.planner.pursuit import pursuit
 from agents.planner.search import search
 from estimator.checks import LARGEST, SMALLEST, number, numbers, shown, whole
 from estimator.parameters import FloatArray
@@ -216,8 +216,7 @@ class Planner:
         searched = plans[due], rates[due], words[due]
         if self._energy is not None:
             energies = rows[:, at.budget_left] * self._energy
-            rule = Rule(terms.amplitude, terms.limit, terms.margin, terms.shaken)
-            self._pursue(records, left, energies, rule, last, *searched[::2], inputs)
+            self._pursue(records, left, energies, terms, last, *searched[::2], inputs)
         else:
             lasts = np.stack([last, before], axis=1)[due]
             moved = np.empty_like(due)

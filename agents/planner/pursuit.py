@@ -44,12 +44,12 @@ class Pursuit(NamedTuple):
     """Compiled functions of one model and interpolation of the input.
 
     Attributes:
-        pursue: ``pursue(records, left, energies, rule, last, plans, words, actions)``: improve the plans of n
+        pursue: ``pursue(records, left, energies, terms, last, plans, words, actions)``: improve the plans of n
             environments by some gradient steps.
 
             - ``records`` (n, size): their beliefs, as `estimator.Belief` keeps them.
             - ``left`` (n,) samples, and ``energies`` (n,) energy, left in their episodes.
-            - ``rule``: a `Rule`.
+            - ``terms``: `agents.planner.imagination.Terms`; the margin is of the first sample's predictive deviations.
             - ``last`` (n,): the inputs applied last.
             - ``plans`` (n, T): the last plans, begun one sample ago; all zeros where there is none. Overwritten.
             - ``words`` (n, 4): streams of random numbers; overwritten.
@@ -63,22 +63,6 @@ class Pursuit(NamedTuple):
     pursue: Any
     begin: Any
     swings: Any
-
-
-class Rule(NamedTuple):
-    """What plans must keep.
-
-    Attributes:
-        amplitude: largest input.
-        limit: of the first sensor's signal.
-        margin: its predictive standard deviations, those of the first sample, that a plan keeps from the limit.
-        shaken: see `agents.planner.imagination.Terms`.
-    """
-
-    amplitude: float
-    limit: float
-    margin: float
-    shaken: float = 0.0
 
 
 @cache
@@ -127,7 +111,7 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
                 x = 0.0
 
     @kernel(kind=kind)
-    def pursue(records, left, energies, rule, last, plans, words, actions):
+    def pursue(records, left, energies, terms, last, plans, words, actions):
         T = plans.shape[1]
         start, precision, coefficients = np.zeros(start_size), np.empty((k, k)), np.empty(k)
         mean, cov, variances = np.empty(n + k), np.empty((n + k, n + k)), np.empty(sensors + 1)
@@ -146,18 +130,18 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
                 variances[a] = records[i, noise + 2 * a + 1] / records[i, noise + 2 * a]
             known = Known(coefficients, precision, as_noises(variances))
             _, _, spread = rest(known, start, last[i], memory.tape)
-            margin = rule.margin * np.sqrt(spread + rule.shaken * variances[0])
-            aim = rule.limit - min(margin, MOST_MARGIN * rule.limit)
+            margin = terms.margin * np.sqrt(spread + terms.shaken * variances[0])
+            aim = terms.limit - min(margin, MOST_MARGIN * terms.limit)
             u, other = plans[i, :steps], challenger[:steps]
             fresh = plans[i, 0] == 0.0
             for t in range(T - 1):
                 fresh = fresh and plans[i, t + 1] == 0.0
                 plans[i, t] = plans[i, t + 1]
             plans[i, T - 1] = 0.0
-            limits = Limits(np.inf, aim, rule.amplitude, energies[i])
-            project(u, rule.amplitude, energies[i])
-            swing(known, start, rule.limit, energies[i], fresh, other, words[i], memory.tape)
-            project(other, rule.amplitude, energies[i])
+            limits = Limits(np.inf, aim, terms.amplitude, energies[i])
+            project(u, terms.amplitude, energies[i])
+            swing(known, start, terms.limit, energies[i], fresh, other, words[i], memory.tape)
+            project(other, terms.amplitude, energies[i])
             score = ascend(known, limits, _RATE, _STEPS, start, u, best[:steps], memory)
             if fresh or ascend(known, limits, _RATE, _TRIAL, start, other, best[:steps], memory) > score:
                 copy(u, 0, other, steps)
@@ -165,7 +149,7 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
             # The gradient may not have come down from where it began.
             for _ in range(_SOFTER):
                 _, peak = worth(known, aim, 0.0, start, u, memory)
-                if peak <= rule.limit:
+                if peak <= terms.limit:
                     break
                 for t in range(steps):
                     u[t] *= 0.5
