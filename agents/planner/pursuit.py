@@ -54,8 +54,8 @@ class Pursuit(NamedTuple):
             - ``plans`` (n, T): the last plans, begun one sample ago; all zeros where there is none. Overwritten.
             - ``words`` (n, 4): streams of random numbers; overwritten.
             - ``actions`` (n,) receives the first input of each plan.
-        begin: ``begin(mean, cov, precision, start)``: from the moments of states and coefficients the inverse (K, K) of
-            the coefficients' covariance, and what a path starts with (`agents.planner.design`).
+        begin: ``begin(record, precision, start)``: of a belief the inverse (K, K) of the coefficients' covariance, and
+            what a path starts with (`agents.planner.design`).
         swings: ``swings(known, limit, energy, inputs, words)``: fill inputs (k, T) with bursts from rest, which push as
             the system moves.
     """
@@ -73,8 +73,33 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
     begin_path, coefficients_of, lay, step = found.code.begin, found.code.coefficients, found.code.lay, found.code.step
     n, k, sensors = model.n_states, model.n_coefficients, model.n_outputs
     kind = f"{model.name}_{model.digest}_{degree}"
-    begin = part(kind)(_beginning(n, k))
+    first = n + n * (n + 1) // 2  # of the sensitivities in a start
     as_noises, covariance, noise = found.code.noises, covariance_places(model), belief_names(model).index("GAMMA_SHAPE")
+
+    @part(kind)
+    def begin(record, precision, start):
+        work = np.empty((k, k))
+        for a in range(k):
+            for b in range(k):
+                work[a, b] = record[covariance[n + a, n + b]]
+        half_log_det(work)
+        invert(work, precision)
+        copy(start, 0, record, n)
+        # State = Z (coefficients' error) + what is left of it, with Z = P_xc Λ.
+        for a in range(n):
+            for b in range(k):
+                total = 0.0
+                for c in range(k):
+                    total += record[covariance[a, n + c]] * precision[c, b]
+                start[first + k * a + b] = total
+        place = n
+        for a in range(n):
+            for b in range(a, n):
+                value = record[covariance[a, b]]
+                for c in range(k):
+                    value -= start[first + k * a + c] * record[covariance[b, n + c]]
+                start[place] = max(0.0, value) if a == b else value
+                place += 1
 
     @part(kind)
     def rest(known, start, last, tape):
@@ -114,18 +139,13 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
     def pursue(records, left, energies, terms, last, plans, words, actions):
         T = plans.shape[1]
         start, precision, coefficients = np.zeros(start_size), np.empty((k, k)), np.empty(k)
-        mean, cov, variances = np.empty(n + k), np.empty((n + k, n + k)), np.empty(sensors + 1)
-        memory, challenger, best = memory_for(T), np.empty(T), np.empty(T)
+        variances, memory, challenger, best = np.empty(sensors + 1), memory_for(T), np.empty(T), np.empty(T)
         for i in range(len(records)):
             steps = max(1, min(T, left[i]))
-            for a in range(n + k):
-                mean[a] = records[i, a]
-                for b in range(n + k):
-                    cov[a, b] = records[i, covariance[a, b]]
-            begin(mean, cov, precision, start)
+            begin(records[i], precision, start)
             if start_size > n_path:
                 start[n_path] = last[i]
-            copy(coefficients, 0, mean[n:], k)
+            copy(coefficients, 0, records[i, n:], k)
             for a in range(sensors + 1):
                 variances[a] = records[i, noise + 2 * a + 1] / records[i, noise + 2 * a]
             known = Known(coefficients, precision, as_noises(variances))
@@ -162,35 +182,3 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
             swing(known, start, limit, energy, False, inputs[i], words, tape)
 
     return Pursuit(pursue, begin, swings)
-
-
-def _beginning(n: int, k: int) -> Any:
-    """See `Pursuit.begin`, for n states and k coefficients."""
-    spreads = n * (n + 1) // 2
-
-    def begin(mean, cov, precision, start):
-        work = np.empty((k, k))
-        for a in range(k):
-            for b in range(k):
-                work[a, b] = cov[n + a, n + b]
-        half_log_det(work)
-        invert(work, precision)
-        copy(start, 0, mean, n)
-        # State = Z (coefficients' error) + what is left of it, with Z = P_xc Λ.
-        first = n + spreads
-        for a in range(n):
-            for b in range(k):
-                total = 0.0
-                for c in range(k):
-                    total += cov[a, n + c] * precision[c, b]
-                start[first + k * a + b] = total
-        place = n
-        for a in range(n):
-            for b in range(a, n):
-                value = cov[a, b]
-                for c in range(k):
-                    value -= start[first + k * a + c] * cov[b, n + c]
-                start[place] = max(0.0, value) if a == b else value
-                place += 1
-
-    return begin

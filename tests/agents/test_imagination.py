@@ -185,7 +185,7 @@ def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
     belief = random_belief(model, np.random.default_rng(2))
     found = designer(model)
     precision, start = np.empty((4, 4)), np.empty(found.start_size)
-    pursuit(model).begin(belief.mean, belief.cov, precision, start)
+    pursuit(model).begin(belief.record.copy(), precision, start)
     known = Known(belief.coefficients_mean, precision, (0.01**2, 0.02**2))
     u = np.random.default_rng(3).normal(0.0, 0.05, 8)
     value, _ = found.worth(known, 1e3, 0.0, start, u, found.memory(8))
