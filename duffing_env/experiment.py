@@ -120,8 +120,9 @@ class Experiment:
 
     @property
     def center(self) -> dict[str, float]:
-        """The plant in the middle of the range."""
-        return twin_of(self.truth_model)
+        """The plant in the middle of the range: the Silverbox circuit's as a model of it sees it, 1 of other models."""
+        twin = CONTINUOUS_TWIN if self.truth_model.is_continuous else SILVERBOX_TWIN
+        return {name: twin.get(name, 1.0) for name in parameter_names(self.truth_model)}
 
     @property
     def recorded(self) -> tuple[FloatArray, FloatArray]:
@@ -280,12 +281,6 @@ class SimulatedExperiment(Experiment):
             "drifts": self.drift > 0,
             "walk": self.drift**2 * np.diag(self.believed.coefficients_cov),
         }
-
-
-def twin_of(model: Model) -> dict[str, float]:
-    """The Silverbox circuit as a model of it sees it; of other models the parameters are not known here: all 1."""
-    twin = CONTINUOUS_TWIN if model.is_continuous else SILVERBOX_TWIN
-    return {name: twin.get(name, 1.0) for name in parameter_names(model)}
 
 
 def check_mean(given: Mapping[str, float] | None, names: Sequence[str]) -> None:

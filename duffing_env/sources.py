@@ -209,7 +209,8 @@ def _judgement(kind: Kind, loop: Any) -> str:
     kept = {name: f"NEW_{name}" for name in ("LOG_DET", "LOG_DENSITY", "ERROR")}
     source = loop("appraise", "Measure lane j's belief beside its truth.", lines, kept, "step", one=True)
     select, check, is_finite = (sp.Function(name) for name in ("select", "positive", "finite"))
-    every = [name for name in belief_names(model) if not name.startswith("P_") or name[2:] in _doubled(model)]
+    variances = {f"P_{name}_{name}" for name in model.names}
+    every = [name for name in belief_names(model) if not name.startswith("P_") or name in variances]
     every += [f"X_{x}" for x in kind.truth.states] + [f"Y_{y}" for y in model.outputs]
     total = sum((symbol(name) for name in every), symbol("NEW_LOG_DENSITY") + symbol("NEW_ERROR") + symbol("WORK"))
     spreads = [symbol(f"P_{x}_{x}") for x in model.states] if kind.factorisation == "structured" else []
@@ -240,10 +241,6 @@ def _judgement(kind: Kind, loop: Any) -> str:
     uniform = ("step", "max_output", "horizon", "input_price", *weighed)
     doc = "What a sample gave, and whether it ends the episode; a belief that is broken gives nothing and ends it."
     return source + loop("settle", doc, lines, results, *uniform)
-
-
-def _doubled(model: Model) -> set[str]:
-    return {f"{name}_{name}" for name in model.names}
 
 
 def _observation(kind: Kind) -> str:

@@ -207,15 +207,12 @@ class LearnedPolicy:
 def _tensor(tensors: Mapping[str, FloatArray], name: str, *shape: int | None) -> FloatArray:
     """A tensor that a network can calculate with; None stands for any length of a side."""
     found = tensors[name]
-    fits = found.ndim == len(shape) and all(map(_fits, found.shape, shape))
+    sides = zip(found.shape, shape, strict=False)
+    fits = found.ndim == len(shape) and all(length > 0 and wish in (None, length) for length, wish in sides)
     if not fits or found.dtype != np.float32 or not np.isfinite(found).all():
         wishes = tuple("any" if wish is None else wish for wish in shape)
         raise ValueError(f"{name} must be finite float32 of shape {wishes}, but is {found.dtype} of {found.shape}")
     return found
-
-
-def _fits(length: int, wish: int | None) -> bool:
-    return length > 0 and wish in (None, length)
 
 
 class _Memory:
