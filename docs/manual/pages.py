@@ -27,6 +27,7 @@ REFERENCE = {
     "duffing_env": [
         "duffing_env.vector_env.DuffingVectorEnv",
         "duffing_env.vector_env.SilverboxReplayVectorEnv",
+        "duffing_env.contract.Specified",
         "duffing_env.own.Beliefs",
         "duffing_env.rig_plant.Plant",
         "duffing_env.silverbox.load_record",
