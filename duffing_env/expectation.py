@@ -16,6 +16,7 @@ from typing import Any
 
 from duffing_env.layout import Kind
 from duffing_env.rewards import Hooks, nothing, nothing_in_lane
+from estimator.engine.rows import carried_names
 from estimator.lanes import part
 
 
@@ -50,7 +51,7 @@ def imagined_sample(
     model, text, body = kind.belief, "", ""
     lines, motion = derive.moved(model)
     if model.is_continuous:
-        carried = derive.carried(model)
+        carried = carried_names(model)
         start = [(f"V_{row}", value) for row, value in derive.carried_at_start(model).items()]
         text += loop(
             f"{name}_begin", "The point that moves.", derive.renamed(start, at), {row: f"V_{row}" for row in carried}

@@ -45,12 +45,12 @@ def _source(kind: Kind) -> str:
     place = layout_of(kind)
 
     def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str, one: bool = False) -> str:
-        return "@straight\n" + lane_loop(name, lines, results, place, LANES, uniform, doc=doc, one=one)
+        return lane_loop(name, lines, results, place, LANES, uniform, doc=doc, one=one)
 
     def plant_loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
         noises = {name: place[row] for name, row in noise_rows(kind.truth).items()}
         within = {**place, **inputs_of(kind, kind.truth, place), **noises}
-        return "@straight\n" + lane_loop(name, lines, results, within, LANES, uniform, doc=doc)
+        return lane_loop(name, lines, results, within, LANES, uniform, doc=doc)
 
     source = _truth(kind, loop) + _judgement(kind, loop) + _observation(kind)
     if kind.plant is not None:
@@ -281,7 +281,7 @@ def _observation(kind: Kind) -> str:
     uniform += ["LOG_gamma", *(f"LOG_xi_{y}" for y in model.outputs)]
     scales = ["per_output", "per_input", "horizon", "per_horizon", "budget"]
     rows = {f"OBS_{name}": row for row, name in enumerate(values)}
-    source = "@straight\n" + lane_loop(
+    source = lane_loop(
         "observe_lanes", lines, {f"OBS_{name}": f"V_{name}" for name in values}, layout_of(kind), LANES,
         (*uniform, *scales), doc="The observation, in rows.", beside=rows,
     )  # fmt: skip

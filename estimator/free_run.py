@@ -55,21 +55,17 @@ def free_run(
 @cache
 def _compiled(model: Model, degree: int) -> Any:
     """``run(start, u, y)`` of a model; ``start`` holds states and coefficients."""
-    place = rows(" ".join([*model.names, *input_rows(model, degree), "SHOWN"]))
+    place = rows(*model.names, *input_rows(model, degree), "SHOWN")
 
     def make() -> str:
         from estimator.engine import derive, emit
 
         lines, results = derive.state_step(model, degree, {name: name for name in model.names})
         uniform = ("T",) if model.is_continuous else ()
-        source = "@straight\n" + emit.lane_loop("move", lines, results, place, 1, uniform, doc="The state moves.")
+        source = emit.lane_loop("move", lines, results, place, 1, uniform, doc="The state moves.")
         end = derive.input_at_end(model, degree)
         shown = derive.renamed([("", derive.calculus(model).outputs[0])], {"u": end})[0][1]
-        return (
-            source
-            + "@straight\n"
-            + emit.lane_loop("sense", [("S", shown)], {"SHOWN": "S"}, place, 1, doc="The sensor.")
-        )
+        return source + emit.lane_loop("sense", [("S", shown)], {"SHOWN": "S"}, place, 1, doc="The sensor.")
 
     code = stored.load(model.name, "free-run", repr((model.digest, degree)), make, NAMES)
     move, sense, size, steps, n = code.move, code.sense, len(place), model.substeps, len(model.names)

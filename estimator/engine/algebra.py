@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import sympy as sp
 
-from estimator.engine.derive import Assignments, Moved, calculus, input_at_end, pair, symbol
+from estimator.engine.derive import Assignments, Lines, Moved, calculus, input_at_end, pair, symbol
 from estimator.engine.emit import text_of
 from estimator.models.model import Model
 
@@ -52,7 +52,8 @@ class Gaussian:
     def __init__(self, model: Model, moved: Moved) -> None:
         self.model, self.moved = model, moved
         self.names, self.states = list(model.names), list(model.states)
-        self.lines: Assignments = []
+        self.lines = Lines()
+        self.put = self.lines.put
         if model.is_continuous and not model.held:
             self.moved = replace(moved, noise=self._sound(moved.noise))
         self.mean: dict[str, sp.Expr] = {
@@ -65,13 +66,6 @@ class Gaussian:
     def __getitem__(self, key: tuple[str, str]) -> sp.Expr:
         i, j = key
         return self.cov[(i, j) if self.names.index(i) <= self.names.index(j) else (j, i)]
-
-    def put(self, name: str, expression: sp.Expr) -> sp.Expr:
-        """Assign, where the expression is more than a name or a number; what stands for it from now on."""
-        if expression.is_Number or expression.is_Symbol:
-            return expression
-        self.lines.append((name, expression))
-        return symbol(name)
 
     def _sound(self, noise: Sequence[Sequence[sp.Expr]]) -> tuple[tuple[sp.Expr, ...], ...]:
         """N where it is positive semi-definite; else its variances, with covariances cut to what they allow.

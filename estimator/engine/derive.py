@@ -18,13 +18,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations_with_replacement
 
 import sympy as sp
 
+from estimator.engine.rows import carried_names
 from estimator.models.model import Model
 
 Assignments = list[tuple[str, sp.Expr]]
+
+
+class Lines(Assignments):
+    """Assignments that grow."""
+
+    def put(self, name: str, expression: sp.Expr) -> sp.Expr:
+        """Assign, where the expression is more than a name or a number; what stands for it from now on."""
+        if expression.is_Number or expression.is_Symbol:
+            return expression
+        self.append((name, expression))
+        return symbol(name)
+
 
 _FUNCTIONS = {name: getattr(sp, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")}
 
@@ -39,11 +51,6 @@ def pair(letter: str, first: str, second: str, order: Sequence[str]) -> sp.Symbo
     if order.index(first) > order.index(second):
         first, second = second, first
     return symbol(f"{letter}_{first}_{second}")
-
-
-def pairs(letter: str, names: Sequence[str]) -> list[str]:
-    """Names of a symmetric matrix's entries: its upper triangle, row by row."""
-    return [f"{letter}_{i}_{j}" for i, j in combinations_with_replacement(names, 2)]
 
 
 @dataclass(frozen=True)
@@ -156,16 +163,9 @@ def difference_step(model: Model) -> tuple[Assignments, Moved]:
     return lines, Moved(tuple(value(f"M_{i}") for i in model.states), by, noise)
 
 
-def carried(model: Model) -> list[str]:
-    """Names that a differential equation carries over its Runge-Kutta steps: M, S and N, or D where noise is held."""
-    names = [f"M_{i}" for i in model.states]
-    names += [f"S_{i}_{j}" for i in model.states for j in model.movers]
-    return names + ([f"D_{i}" for i in model.states] if model.held else pairs("N", list(model.states)))
-
-
 def carried_at_start(model: Model) -> dict[str, sp.Expr]:
     """What is carried, at the begin of a sample."""
-    start: dict[str, sp.Expr] = dict.fromkeys(carried(model), sp.S.Zero)
+    start: dict[str, sp.Expr] = dict.fromkeys(carried_names(model), sp.S.Zero)
     for i in model.states:
         start |= {f"M_{i}": symbol(i), f"S_{i}_{i}": sp.S.One}
     return start
@@ -238,17 +238,12 @@ def input_over_step(degree: int, substeps: int) -> Assignments:
     return lines
 
 
-def plain_stage(model: Model) -> Assignments:
-    """The time derivative of the state alone."""
-    c = calculus(model)
-    at = {symbol(i): symbol(f"M_{i}") for i in model.states}
-    return shared({f"K_M_{i}": move.xreplace(at) for i, move in zip(model.states, c.moves, strict=True)}, "W")
-
-
 def plain_step(model: Model, degree: int) -> Assignments:
     """One Runge-Kutta step of the state alone."""
-    names = [f"M_{i}" for i in model.states]
-    return input_over_step(degree, model.substeps) + runge_kutta(names, plain_stage(model), model.substeps)
+    at = {symbol(i): symbol(f"M_{i}") for i in model.states}
+    rates = {f"K_M_{i}": move.xreplace(at) for i, move in zip(model.states, calculus(model).moves, strict=True)}
+    moved = runge_kutta([f"M_{i}" for i in model.states], shared(rates, "W"), model.substeps)
+    return input_over_step(degree, model.substeps) + moved
 
 
 def state_step(model: Model, degree: int, names: Mapping[str, str]) -> tuple[Assignments, dict[str, str]]:

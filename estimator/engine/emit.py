@@ -12,6 +12,7 @@ import sympy as sp
 from sympy.printing.pycode import PythonCodePrinter
 
 from estimator.engine.derive import Assignments
+from estimator.models.model import Model
 
 #: Functions that are written out: a call is compiled on its own, and costs more than what it does. Arguments that stand
 #: there twice must be names.
@@ -79,7 +80,7 @@ def lane_loop(
     one: bool = False,
     beside: Mapping[str, int] | None = None,
 ) -> str:
-    """Source of ``name(W, *uniform)``, which executes assignments in every lane of a block.
+    """Source of a straight ``name(W, *uniform)``, which executes assignments in every lane of a block.
 
     Args:
         name: of the function.
@@ -96,15 +97,11 @@ def lane_loop(
     Raises:
         ValueError: for a name that is neither assigned, nor a row, nor uniform.
     """
-    kept = _needed(lines, {str(v) for v in results.values()})
-    assigned = {target for target, _ in kept}
-    taken = sorted(assigned & set(layout))
+    kept, used = _needed(lines, set(results.values()))
+    taken = sorted({target for target, _ in kept} & set(layout))
     if taken:
         raise ValueError(f"{name} assigns {taken}, which are rows; give the results other names first")
-    used = {str(s) for _, e in kept for s in e.free_symbols} | {
-        str(v) for v in results.values() if not is_number(str(v))
-    }
-    read = sorted((used - assigned) - set(uniform), key=lambda row: (str(layout.get(row.removeprefix("G_"))), row))
+    read = sorted(used - set(uniform), key=lambda row: (str(layout.get(row.removeprefix("G_"))), row))
     adjoint = any(row not in layout and row.removeprefix("G_") in layout for row in (*read, *results))
 
     def place(row: str) -> str:
@@ -122,27 +119,33 @@ def lane_loop(
     body += [f"{target} = {text_of(e)}" for target, e in kept]
     body += [f"{place(row)} = {value}" for row, value in results.items()]
     blocks = ["W", *(["A"] if adjoint else []), *(["B"] if beside else []), *(["LANE"] if one else [])]
-    source = [f"def {name}({', '.join([*blocks, *uniform])}):", f'    """{doc}"""']
+    source = ["@straight", f"def {name}({', '.join([*blocks, *uniform])}):", f'    """{doc}"""']
     if lanes > 1 and not one:
         source.append(f"    for LANE in range({lanes}):")
     indent = "        " if lanes > 1 and not one else "    "
     return "\n".join(source + [indent + line for line in body]) + "\n"
 
 
-def _needed(lines: Assignments, wanted: set[str]) -> Assignments:
-    """The assignments that what is wanted depends on."""
+def sample(head: str, model: Model, end: str, move: str = "move", told: str = "") -> str:
+    """Source of a straight function over a sample: ``begin(W)``, all steps ``move(W, T, told)``, and the ``end``.
+
+    Of a difference equation the end is all.
+    """
+    steps = model.substeps
+    body = ["begin(W)", f"for s in range({steps}):", f"    {move}(W, s / {steps}{told and ', '}{told})"]
+    body = [*(body if model.is_continuous else []), end]
+    return f"@straight\ndef {head}:\n" + "".join(f"    {line}\n" for line in body)
+
+
+def _needed(lines: Assignments, wanted: set[str]) -> tuple[Assignments, set[str]]:
+    """The assignments that what is wanted depends on, and the names that these and it need from elsewhere."""
     kept: Assignments = []
     needed = set(wanted)
     for name, expression in reversed(lines):
         if name in needed:
             kept.append((name, expression))
             needed |= {str(s) for s in expression.free_symbols}
-    return kept[::-1]
-
-
-def number(text: str) -> sp.Expr:
-    """The number that a text is."""
-    return sp.Float(float(text))
+    return kept[::-1], {name for name in needed - {target for target, _ in kept} if not is_number(name)}
 
 
 def is_number(text: str) -> bool:
@@ -162,7 +165,7 @@ def scalar_function(
     uniform: Sequence[str] = (),
     doc: str = "",
 ) -> str:
-    """Source of ``name(*arguments, *uniform)`` of tuples of scalars, which stay in registers from call to call.
+    """Source of a straight ``name(*arguments, *uniform)`` of tuples of scalars, which stay in registers.
 
     Args:
         name: of the function.
@@ -175,15 +178,12 @@ def scalar_function(
     Raises:
         ValueError: for a name that is neither assigned nor an argument.
     """
-    wanted = {str(value) for group in results for value in group}
-    kept = _needed(lines, wanted)
-    used = {str(s) for _, e in kept for s in e.free_symbols} | {v for v in wanted if not is_number(v)}
+    kept, used = _needed(lines, {value for group in results for value in group})
     given = {held for group in arguments.values() for held in group} | set(uniform)
-    unknown = sorted(used - given - {target for target, _ in kept})
-    if unknown:
+    if unknown := sorted(used - given):
         raise ValueError(f"{name} uses {unknown}, which no line assigns and no argument brings")
     body = [f"({', '.join(held)},) = {group}" for group, held in arguments.items() if used & set(held)]
     body += [f"{target} = {text_of(e)}" for target, e in kept]
     gathered = [f"({', '.join(group)},)" for group in results]
-    source = [f"def {name}({', '.join([*arguments, *uniform])}):", f'    """{doc}"""']
+    source = ["@straight", f"def {name}({', '.join([*arguments, *uniform])}):", f'    """{doc}"""']
     return "\n".join([*source, *(f"    {line}" for line in body), f"    return {', '.join(gathered)}"]) + "\n"

@@ -12,7 +12,7 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 from estimator.engine import cache as stored
-from estimator.engine.rows import input_rows, path_names, path_results
+from estimator.engine.rows import carried_names, input_rows, path_names, path_results
 from estimator.engine.tasks import NAMES
 from estimator.models.model import Model
 
@@ -55,15 +55,12 @@ def _source(model: Model, degree: int) -> str:
     from estimator.engine import derive, emit
     from estimator.engine.path import path_sample
 
-    coefficients, carried = list(model.coefficients), derive.carried(model) if model.is_continuous else []
+    coefficients, carried = list(model.coefficients), carried_names(model)
     path_rows, inputs = path_names(model), input_rows(model, degree)
     information = [row for row in path_results(model) if row.startswith("F_")]
     noises = ["Q", *(f"R_{y}" for y in model.outputs)]
     shown = f"SHOWN_{next(iter(model.outputs))}"
-    if model.is_continuous:
-        before, moved = derive.Assignments(), derive.carried_at_end(model)
-    else:
-        before, moved = derive.difference_step(model)
+    before, moved = derive.moved(model)
     live = {derive.symbol("LIVE"): derive.sp.S.One}
     more, results = path_sample(model, moved, degree, observed=False)
     lines = [(name, e.xreplace(live)) for name, e in [*before, *more]]
@@ -71,7 +68,7 @@ def _source(model: Model, degree: int) -> str:
     held: dict[str, Sequence[str]] = {"P": path_rows, "F": information, **({"M": carried} if carried else {})}
     held |= {"C": coefficients, "U": inputs, "N": noises}
     after = [path_after, [results.get(row, row) for row in information], [results[shown], results["SPREAD"]]]
-    source = "@straight\n" + emit.scalar_function("finish", lines, after, held, doc="Predict and see.")
+    source = emit.scalar_function("finish", lines, after, held, doc="Predict and see.")
     followed = {row: results[row] for row in (*path_rows, *information, shown) if row in results}
     adjoints = {"G": [f"G_{row}" for row in path_rows], "H": [f"G_{row}" for row in information]}
     held = {**{name: names for name, names in held.items() if name != "F"}, **adjoints, "S": [f"G_{shown}"]}
@@ -89,19 +86,15 @@ def _motion(model: Model, degree: int, carried: list[str], path_rows: list[str])
     held = {"M": carried, "C": list(model.coefficients), "U": input_rows(model, degree)}
     start = [emit.text_of(value) for value in derive.carried_at_start(model).values()]
     step, moves = sensitivity.motion_step(model, degree), {name: f"{name}_E" for name in carried}
-    source = "@straight\n" + emit.scalar_function("start", [], [start], {"P": path_rows}, doc="The point that moves.")
-    source += "@straight\n" + emit.scalar_function(
-        "move", step, [list(moves.values())], held, ("T",), "A Runge-Kutta step."
-    )
+    source = emit.scalar_function("start", [], [start], {"P": path_rows}, doc="The point that moves.")
+    source += emit.scalar_function("move", step, [list(moves.values())], held, ("T",), "A Runge-Kutta step.")
     adjoints = {"GM": [f"G_{name}" for name in carried], "GU": [f"G_{name}" for name in held["U"]]}
     source += _reverse("move_back", step, moves, [carried, held["U"]], {**held, **adjoints}, ("T",), held["U"])
     # The point begins at the path's states, with slopes and noise that are constants.
     states = list(model.states)
     results = [f"G_M_{i}" for i in states] + [f"G_{row}" for row in path_rows[len(states) :]]
     arguments = {"G": [f"G_{row}" for row in path_rows], "GM": adjoints["GM"]}
-    return (
-        source + "@straight\n" + emit.scalar_function("start_back", [], [results], arguments, doc="Reverse of start.")
-    )
+    return source + emit.scalar_function("start_back", [], [results], arguments, doc="Reverse of start.")
 
 
 def _reverse(
@@ -134,7 +127,8 @@ def _reverse(
         if value in assigned and value not in seeds:
             seeds[value] = f"G_{row}"
         else:
-            forward.append((f"{row}_copy", derive.symbol(value) if not emit.is_number(value) else emit.number(value)))
+            copied = derive.sp.Float(float(value)) if emit.is_number(value) else derive.symbol(value)
+            forward.append((f"{row}_copy", copied))
             seeds[f"{row}_copy"] = f"G_{row}"
     wanted = [row for group in groups for row in group]
     back = derive.reverse(forward, wanted, seeds)
@@ -145,9 +139,8 @@ def _reverse(
         for target, e in back[split:]
     ]
     outcome = [[before[f"G_{row}"] for row in group] for group in groups]
-    return "@straight\n" + emit.scalar_function(
-        name, [*forward, *back[:split], *ends], outcome, held, uniform, "The reverse derivative."
-    )  # fmt: skip
+    lines = [*forward, *back[:split], *ends]
+    return emit.scalar_function(name, lines, outcome, held, uniform, "The reverse derivative.")
 
 
 def _frame(model: Model, degree: int, carried: list[str], path_rows: list[str], information: list[str]) -> str:

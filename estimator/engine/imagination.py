@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations_with_replacement, pairwise
+from itertools import pairwise
 from typing import Any
 
 from estimator.engine import cache as stored
-from estimator.engine.rows import carried_names
+from estimator.engine.rows import carried_names, pairs
 from estimator.engine.tasks import NAMES
 from estimator.lanes import LANES, rows
 from estimator.models.model import Model
@@ -71,9 +71,8 @@ def imagination(model: Model, degree: int = 0, lag: int = 0) -> Imagination:
     if degree not in (0, 1) or lag not in (0, 1) or (model.is_continuous and lag):
         raise ValueError(f"degree and lag must be 0 or 1, and lag 0 for a differential equation: {degree}, {lag}")
     coarse, inputs = coarsened(model), inputs_of(model, degree, lag)
-    covariances = [f"P_{i}_{j}" for i, j in combinations_with_replacement(model.names, 2)]
-    kept = [*model.states, *covariances, *inputs, "COST"]
-    place = rows(" ".join([*kept, "SHOWN", "SPREAD", "KNOWN", "SCORE", *carried_names(model)]))
+    kept = [*model.states, *pairs("P", model.names), *inputs, "COST"]
+    place = rows(*kept, "SHOWN", "SPREAD", "KNOWN", "SCORE", *carried_names(model))
     key = repr((coarse.digest, degree, lag))
     code = stored.load(model.name, "imagination", key, lambda: _source(coarse, degree, lag, inputs, place), NAMES)
     return Imagination(code.advance, code.judge, place, len(kept))
@@ -115,35 +114,16 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
     results = {**walked, **results, **{older: newer for newer, older in pairwise(inputs)}}
     noises = ["Q", *(f"R_{y}" for y in model.outputs)]
     uniform = [*coefficients, *noises, *(f"WALK_{c}" for c in coefficients)]
-    source = ""
-    if model.is_continuous:
-        start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
-        source += "@straight\n" + emit.lane_loop(
-            "begin", [], start, place, LANES, doc="The point that moves, at the mean."
-        )
-        step = derive.renamed(sensitivity.motion_step(model, degree), given)
-        moves = {name: f"{name}_E" for name in derive.carried(model)}
-        source += "@straight\n" + emit.lane_loop(
-            "move", step, moves, place, LANES, ("T", *coefficients), doc="One step."
-        )
-    source += "@straight\n" + emit.lane_loop(
-        "expect", lines, results, place, LANES, uniform, doc="One expected sample."
-    )
-    return source + _composed(model) + _judgement(model, place)
-
-
-def _composed(model: Model) -> str:
-    """Source of ``advance``, which tells the loops what they want of a record."""
+    source = sensitivity.motion_source(model, degree, place, LANES, coefficients, given)
+    source += emit.lane_loop("expect", lines, results, place, LANES, uniform, doc="One expected sample.")
+    # What the loops want of a record.
     n, k = model.n_states, model.n_coefficients
     first = (n + k) + (n + k) * (n + k + 1) // 2
     means = ", ".join(f"record[{n + c}]" for c in range(k))
     told = [f"record[{first + 2 * i + 1}] / record[{first + 2 * i}]" for i in range(1 + model.n_outputs)]
     told += [f"walk[{c}]" for c in range(k)]
-    body = [f"expect(W, {means}, {', '.join(told)})"]
-    if model.is_continuous:
-        steps = model.substeps
-        body = ["begin(W)", f"for s in range({steps}):", f"    move(W, s / {steps}, {means})", *body]
-    return "@straight\ndef advance(W, record, walk):\n" + "".join(f"    {line}\n" for line in body)
+    source += emit.sample("advance(W, record, walk)", model, f"expect(W, {means}, {', '.join(told)})", told=means)
+    return source + _judgement(model, place)
 
 
 def _judgement(model: Model, place: Mapping[str, int]) -> str:
@@ -178,8 +158,6 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
     known = choose(symbol("NOW"), choose(ratio - 1e-300, known, sp.Float(LOST)), sp.Float(LOST))
     lines.append(("NATS", known))
     uniform = [str(factor[i][j]) for i in range(k) for j in range(i + 1)]
-    source = "@straight\n" + emit.lane_loop(
-        "judge_lanes", lines, {"KNOWN": "NATS"}, place, LANES, uniform, doc="What will be known."
-    )  # fmt: skip
+    source = emit.lane_loop("judge_lanes", lines, {"KNOWN": "NATS"}, place, LANES, uniform, doc="What will be known.")
     told_entries = ", ".join(f"scale * M[{i}, {j}]" for i in range(k) for j in range(i + 1))
     return source + f"@jit\ndef judge(W, M, scale):\n    judge_lanes(W, {told_entries})\n"

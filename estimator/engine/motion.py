@@ -60,24 +60,25 @@ def motion(model: Model, degree: int = 0, lag: int = 0) -> Motion:
     names = [*model.names, "INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN"]
     names += [f"{letter}_{c}" for letter in ("PHI", "E") for c in model.coefficients]
     names += [f"A_{i}_{j}" for i in model.states for j in model.states]
-    place = rows(" ".join([*names, *carried_names(model)]))
+    place = rows(*names, *carried_names(model))
     key = repr((coarse.digest, degree, lag))
     code = stored.load(model.name, "motion", key, lambda: _source(coarse, degree, lag, place), NAMES)
     return Motion(code.sense, code.glance, code.step, code.regress, code.linearise, place, code.IS_ODD)
 
 
 def _source(model: Model, degree: int, lag: int, place: Mapping[str, int]) -> str:
-    from estimator.engine import derive, emit
+    from estimator.engine import derive, emit, sensitivity
 
     found, symbol = derive.calculus(model), derive.symbol
     given = fed(model, degree, lag)
 
     def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
-        return "@straight\n" + emit.lane_loop(name, derive.renamed(lines, given), results, place, 1, uniform, doc=doc)
+        return emit.lane_loop(name, derive.renamed(lines, given), results, place, 1, uniform, doc=doc)
 
     shown, velocity, gain = _sensor(model)
     values = {"NOW_e": shown, "VELOCITY_e": velocity, "GAIN_e": gain}
     source = loop("sense", "The sensor now.", derive.shared(values, "W"), {n.removesuffix("_e"): n for n in values})
+    source += sensitivity.motion_source(model, degree, place, 1, given=given)
     source += _step_source(model, degree, lag, loop)
     still = {symbol("u1"): symbol("u"), symbol("u2"): symbol("u")}
     summed = {f"R_{c}": sum(m.diff(symbol(c)) for m in found.moves).xreplace(still) for c in model.coefficients}
@@ -98,18 +99,14 @@ def _source(model: Model, degree: int, lag: int, place: Mapping[str, int]) -> st
 
 def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     """``glance`` and ``step``."""
-    from estimator.engine import derive, emit, sensitivity
+    from estimator.engine import derive, emit
 
     found, symbol, states = derive.calculus(model), derive.symbol, list(model.states)
     inputs = inputs_of(model, degree, lag)
     source, (lines, moved) = "", derive.moved(model)
     if model.is_continuous:
-        start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
-        source += loop("begin", "The point that moves.", [], start)
-        carried = {name: f"{name}_E" for name in derive.carried(model)}
-        source += loop("move", "One Runge-Kutta step.", sensitivity.motion_step(model, degree), carried, "T")
         point = {f"M_{x}": f"M_{x}_E" for x in states}
-        source += loop("move_plainly", "The same of the state alone.", derive.plain_step(model, degree), point, "T")
+        source += loop("move_plainly", "As move, of the state alone.", derive.plain_step(model, degree), point, "T")
     at = dict(zip(map(symbol, states), moved.state, strict=True)) | {symbol("u"): derive.input_at_end(model, degree)}
     shown = found.outputs[0].xreplace(at)
     readout = [slope.xreplace(at) for slope in found.readouts[0]]
@@ -125,9 +122,7 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     results |= {older: newer for newer, older in pairwise(inputs)}
     source += loop("finish", "What the sensor shows, by the coefficients too.", [*lines, *more], results)
     for name, move, end in (("glance", "move_plainly", "see"), ("step", "move", "finish")):
-        steps = model.substeps
-        body = ["begin(W)", f"for s in range({steps}):", f"    {move}(W, s / {steps})"] if model.is_continuous else []
-        source += f"@straight\ndef {name}(W):\n" + "".join(f"    {line}\n" for line in [*body, f"{end}(W)"])
+        source += emit.sample(f"{name}(W)", model, f"{end}(W)", move)
     return source
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sympy as sp
 
 from estimator.engine.algebra import HALF, ZERO
-from estimator.engine.derive import Assignments, Moved, calculus, input_at_end, pair, symbol
+from estimator.engine.derive import Assignments, Lines, Moved, calculus, input_at_end, pair, symbol
 from estimator.engine.emit import text_of
 from estimator.engine.rows import path_results
 from estimator.models.model import Model
@@ -29,14 +29,8 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
             leaves what the sensors show in ``SHOWN_<sensor>``, and the first one's predictive variance in ``SPREAD``.
     """
     states, coefficients = list(model.states), list(model.coefficients)
-    n, lines = len(states), []
-
-    def put(name: str, expression: sp.Expr) -> sp.Expr:
-        if expression.is_Number or expression.is_Symbol:
-            return expression
-        lines.append((name, expression))
-        return symbol(name)
-
+    n, lines = len(states), Lines()
+    put = lines.put
     mean = dict(zip(states, moved.state, strict=True))
     cov: dict[tuple[str, str], sp.Expr] = {}
     for a, i in enumerate(states):

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import combinations_with_replacement
 
 from estimator.lanes import rows
 from estimator.models.model import Model
+
+
+def pairs(letter: str, names: Iterable[str]) -> list[str]:
+    """Names of a symmetric matrix's entries: its upper triangle, row by row."""
+    return [f"{letter}_{i}_{j}" for i, j in combinations_with_replacement(names, 2)]
 
 
 def noise_names(model: Model) -> list[str]:
@@ -15,8 +21,7 @@ def noise_names(model: Model) -> list[str]:
 
 def belief_names(model: Model) -> list[str]:
     """The flat record of a belief: means, upper triangle of the covariance, shapes and rates of the noises."""
-    covariances = [f"P_{i}_{j}" for i, j in combinations_with_replacement(model.names, 2)]
-    return [*model.names, *covariances, *noise_names(model)]
+    return [*model.names, *pairs("P", model.names), *noise_names(model)]
 
 
 def input_rows(model: Model, degree: int) -> list[str]:
@@ -25,20 +30,20 @@ def input_rows(model: Model, degree: int) -> list[str]:
 
 
 def carried_names(model: Model) -> list[str]:
-    """What a differential equation carries over a sample; nothing for a difference equation."""
+    """What a differential equation carries over its Runge-Kutta steps: M, S and N, or D where noise is held.
+
+    Nothing for a difference equation.
+    """
     if not model.is_continuous:
         return []
-    names = [f"M_{i}" for i in model.states]
-    names += [f"S_{i}_{j}" for i in model.states for j in model.movers]
-    if model.held:
-        return [*names, *(f"D_{i}" for i in model.states)]
-    return [*names, *(f"N_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2))]
+    names = [f"M_{i}" for i in model.states] + [f"S_{i}_{j}" for i in model.states for j in model.movers]
+    return names + ([f"D_{i}" for i in model.states] if model.held else pairs("N", model.states))
 
 
 def layout(model: Model, degree: int) -> dict[str, int]:
     """Rows of an estimator's block: the belief, the sample, and what is carried over it."""
     outputs = [f"Y_{y}" for y in model.outputs]
-    return rows(" ".join([*belief_names(model), *input_rows(model, degree), *outputs, *carried_names(model)]))
+    return rows(*belief_names(model), *input_rows(model, degree), *outputs, *carried_names(model))
 
 
 def point_names(model: Model) -> list[str]:
@@ -62,18 +67,17 @@ def trace_names(model: Model, iterations: int) -> list[str]:
 
 def path_names(model: Model) -> list[str]:
     """Where a path is: the filter's state, its covariance V, and its sensitivities Z to the coefficients."""
-    covariances = [f"V_{i}_{k}" for i, k in combinations_with_replacement(model.states, 2)]
-    return [*model.states, *covariances, *(f"Z_{i}_{c}" for i in model.states for c in model.coefficients)]
+    sensitivities = [f"Z_{i}_{c}" for i in model.states for c in model.coefficients]
+    return [*model.states, *pairs("V", model.states), *sensitivities]
 
 
 def path_results(model: Model) -> list[str]:
     """What a path adds up: minus the log likelihood, its slope, the information (upper triangle), and Σ ν²/S."""
-    information = [f"F_{c}_{d}" for c, d in combinations_with_replacement(model.coefficients, 2)]
-    return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *information, "MISFIT"]
+    return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *pairs("F", model.coefficients), "MISFIT"]
 
 
 def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
     """Rows of a path's block."""
     shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
     given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE", "Q", *(f"R_{y}" for y in model.outputs)]
-    return rows(" ".join([*path_names(model), *path_results(model), *given, *carried_names(model)]))
+    return rows(*path_names(model), *path_results(model), *given, *carried_names(model))

@@ -1,4 +1,4 @@
-"""One Runge-Kutta step of a differential equation, with its sensitivities and its process noise.
+"""A differential equation over a sample, by Runge-Kutta steps, with its sensitivities and its process noise.
 
 The sensitivities S are moved by exactly the derivative of the step's arithmetic, which is linear in them. With J the
 slopes of the rates at a stage, by the states and by the coefficients, and H the derivative of where the step ends by
@@ -12,9 +12,25 @@ To take every column of S through the stages on its own is twice the work, and m
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import sympy as sp
 
-from estimator.engine.derive import Assignments, calculus, input_over_step, pair, pairs, runge_kutta, shared, symbol
+from estimator.engine import emit
+from estimator.engine.derive import (
+    Assignments,
+    Lines,
+    calculus,
+    carried_at_start,
+    input_over_step,
+    pair,
+    renamed,
+    runge_kutta,
+    shared,
+    symbol,
+)  # fmt: skip
+from estimator.engine.rows import carried_names, pairs
 from estimator.models.model import Model
 
 #: Of each stage, in parts of a step: what its rates count at the end, and how far they move the next stage.
@@ -27,20 +43,39 @@ _HELD = "HELD"
 _Slopes = dict[tuple[str, str], sp.Expr]
 
 
+def motion_source(
+    model: Model,
+    degree: int,
+    place: Mapping[str, int],
+    lanes: int,
+    uniform: Sequence[str] = (),
+    given: Mapping[str, Any] | None = None,
+) -> str:
+    """Source of ``begin(W)`` and ``move(W, T, *uniform)``, which carry a state over a sample.
+
+    Args:
+        model: whose state; of a difference equation the source is empty.
+        degree: of the input's polynomial.
+        place: rows of the block.
+        lanes: systems in it.
+        uniform: names that are the same in all lanes.
+        given: the input ``U_k`` in other rows.
+    """
+    if not model.is_continuous:
+        return ""
+    start = {name: emit.text_of(value) for name, value in carried_at_start(model).items()}
+    moved = {name: f"{name}_E" for name in carried_names(model)}
+    step, doc = renamed(motion_step(model, degree), given or {}), "One Runge-Kutta step, from T in [0, 1) of a sample."
+    source = emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
+    return source + emit.lane_loop("move", step, moved, place, lanes, ("T", *uniform), doc)
+
+
 def motion_step(model: Model, degree: int) -> Assignments:
-    """One step of all that is carried (`estimator.engine.derive.carried`), from ``<name>`` to ``<name>_E``."""
+    """One step of all that is carried (`estimator.engine.rows.carried_names`), from ``<name>`` to ``<name>_E``."""
     states, h = list(model.states), sp.Rational(1, model.substeps)
     stage, slopes = _stage(model)
     moving = [f"M_{i}" for i in states] + ([] if model.held else pairs("N", states))
-    lines = input_over_step(degree, model.substeps) + runge_kutta(moving, stage, model.substeps)
-
-    def put(name: str, expression: sp.Expr) -> sp.Expr:
-        """Assign, where the expression is more than a name or a number; what stands for it from now on."""
-        if expression.is_Number or expression.is_Symbol:
-            return expression
-        lines.append((name, expression))
-        return symbol(name)
-
+    lines = Lines(input_over_step(degree, model.substeps) + runge_kutta(moving, stage, model.substeps))
     total: _Slopes = dict.fromkeys(slopes, sp.S.Zero)
     through: _Slopes = {}
     for tag in "DCBA":
@@ -49,16 +84,16 @@ def motion_step(model: Model, degree: int) -> Assignments:
         for i in states:
             for k in states:
                 value = (counts * h if i == k else sp.S.Zero) + reach * h * through.get((i, k), sp.S.Zero)
-                weight[i, k] = put(f"H_{i}_{k}_{tag}", value)
+                weight[i, k] = lines.put(f"H_{i}_{k}_{tag}", value)
         assigned = {name for name, _ in stage}
         for i, j in slopes:
             at = [symbol(f"J_{k}_{j}_{tag}") if f"J_{k}_{j}" in assigned else slopes[k, j] for k in states]
             product = sum((weight[i, k] * slope for k, slope in zip(states, at, strict=True)), sp.S.Zero)
-            through[i, j] = put(f"HJ_{i}_{j}_{tag}", product) if j in states else product
+            through[i, j] = lines.put(f"HJ_{i}_{j}_{tag}", product) if j in states else product
             total[i, j] += through[i, j]
     for i in states:
         for k in states:
-            total[i, k] = put(f"WHOLE_{i}_{k}", total[i, k] + (1 if i == k else 0))
+            total[i, k] = lines.put(f"WHOLE_{i}_{k}", total[i, k] + (1 if i == k else 0))
     for i, j in slopes:
         columns = {k: symbol(f"D_{k}" if j == _HELD else f"S_{k}_{j}") for k in states}
         moved = sum((total[i, k] * columns[k] for k in states), sp.S.Zero)

@@ -6,7 +6,7 @@ of ``lanes`` systems is what `layout` lists; whoever needs more rows adds them b
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 
 from estimator import elementary
 from estimator.engine import cache as stored
-from estimator.engine.rows import layout, path_layout, point_names, trace_names
+from estimator.engine.rows import carried_names, layout, path_layout, point_names, trace_names
 from estimator.lanes import LANES, rows
 from estimator.models.model import Model
 from estimator.straight import straight
@@ -41,16 +41,12 @@ class Update:
     Attributes:
         update: ``update(W)``: every lane's belief, with its rows ``U_k`` and ``Y_<sensor>``.
         layout: rows of the block.
-        lanes: systems in it.
-        traced: rows that hold, per iteration and sensor, what `estimator.engine.free_energy` needs.
         check: with sigma points, ``check(W)``: counts in the row ``UNSOUND`` whether a lane's covariance is not
             positive semi-definite. The update does so with the belief that it is given.
     """
 
     update: Any
     layout: Mapping[str, int]
-    lanes: int
-    traced: Sequence[str] = ()
     check: Any = None
 
 
@@ -81,23 +77,13 @@ def structured(
     Raises:
         ValueError: for iterations out of range, or other expectations.
     """
-    return _structured(model, degree, iterations, lanes, _frozen(within), trace, missing, expectations)
-
-
-def _frozen(within: Mapping[str, int] | None) -> tuple[tuple[str, int], ...] | None:
-    return None if within is None else tuple(within.items())
+    frozen = None if within is None else tuple(within.items())
+    return _structured(model, degree, iterations, lanes, frozen, trace, missing, expectations)
 
 
 @cache
 def _structured(
-    model: Model,
-    degree: int,
-    iterations: int,
-    lanes: int,
-    within: Any,
-    trace: bool,
-    missing: bool,
-    expectations: str = "first_order",
+    model: Model, degree: int, iterations: int, lanes: int, within: Any, trace: bool, missing: bool, expectations: str
 ) -> Update:
     if not 1 <= iterations <= 100:
         raise ValueError(f"iterations must be from 1 to 100, but is {iterations}; 3 are enough")
@@ -105,32 +91,32 @@ def _structured(
         raise ValueError(f"expectations must be 'first_order' or 'sigma_points', but is {expectations!r}")
     points = expectations == "sigma_points"
     place = dict(within) if within is not None else layout(model, degree)
-    traced = trace_names(model, iterations) if trace else []
-    more_rows = [*traced, *(point_names(model) if points else ())]
-    place |= rows(" ".join(t for t in more_rows if t not in place), start=max(place.values()) + 1)
+    more_rows = [*(trace_names(model, iterations) if trace else ()), *(point_names(model) if points else ())]
+    place |= rows(*(row for row in more_rows if row not in place), start=max(place.values()) + 1)
 
     def make() -> str:
-        from estimator.engine import algebra, derive, emit
+        from estimator.engine import algebra, derive, emit, sensitivity
+        from estimator.engine.points import moments
 
-        lines, moved = derive.moved(model)
-        if points:
-            from estimator.engine.points import moments
-
-            lines, moved = moments(model)
+        lines, moved = moments(model) if points else derive.moved(model)
         more, results = algebra.update(model, moved, degree, iterations, trace, missing)
         # Every layer of functions is compiled: what a difference equation finishes is all of its update.
         whole = not (points or model.is_continuous)
         name = "update" if whole else "finish"
-        finish = "@straight\n" + emit.lane_loop(name, lines + more, results, place, lanes, doc="Predict and condition.")
+        finish = emit.lane_loop(name, lines + more, results, place, lanes, doc="Predict and condition.")
         if whole:
             return finish
         if points:
             return finish + _points_source(model, degree, place, lanes)
-        return _motion_source(model, degree, place, lanes) + finish + _composed("update", model)
+        return (
+            sensitivity.motion_source(model, degree, place, lanes)
+            + finish
+            + emit.sample("update(W)", model, "finish(W)")
+        )
 
     key = repr((model.digest, degree, iterations, lanes, sorted(place.items()), trace, missing, expectations))
     code = stored.load(model.name, "update", key, make, NAMES)
-    return Update(code.update, place, lanes, tuple(traced), code.spread if points else None)
+    return Update(code.update, place, code.spread if points else None)
 
 
 def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
@@ -144,14 +130,14 @@ def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
     by_point |= {f"I_P_{i}": f"{first} + P*{model.n_states} + {k}" for k, i in enumerate(model.states)}
 
     def loop(name: str, lines: Any, results: Any, uniform: tuple[str, ...], doc: str) -> str:
-        return "@straight\n" + emit.lane_loop(name, lines, results, by_point, lanes, uniform, doc)
+        return emit.lane_loop(name, lines, results, by_point, lanes, uniform, doc)
 
     source = loop("spread", *points.spread(model), (), "Columns of the covariance's factor, and their weights.")
     if not model.is_continuous:
         sample = points.point_sample(model)
         source += loop("carry", *sample, ("C", "SIGN", "P"), "One point over the sample.")
         return source + _looped(model, "", "        carry(W, P // 2, 1.0 - 2.0 * (P % 2), P)\n")
-    noise = [name for name in derive.carried(model) if name[0] != "S"]
+    noise = [name for name in carried_names(model) if name[0] != "S"]
     start = {i: emit.text_of(value) for i, value in derive.carried_at_start(model).items() if i in noise}
     source += loop("begin", [], start, (), "The mean, and its process noise.")
     step = sensitivity.motion_step(model, degree)
@@ -171,31 +157,6 @@ def _looped(model: Model, before: str, body: str) -> str:
     """Source of ``update(W)`` over all sigma points."""
     head = f"@straight\ndef update(W):\n    spread(W)\n{before}    for P in range({2 * len(model.movers)}):\n"
     return head + body + "    finish(W)\n"
-
-
-def _motion_source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
-    """Source of ``begin(W)`` and ``move(W, T)``, which carry a state over a sample; empty for a difference equation."""
-    from estimator.engine import derive, emit, sensitivity
-
-    if not model.is_continuous:
-        return ""
-    start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
-    moved = {name: f"{name}_E" for name in derive.carried(model)}
-    source = "@straight\n" + emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
-    step = sensitivity.motion_step(model, degree)
-    return source + "@straight\n" + emit.lane_loop(
-        "move", step, moved, place, lanes, ("T",), doc="One Runge-Kutta step, from T in [0, 1) of a sample on."
-    )  # fmt: skip
-
-
-def _composed(name: str, model: Model) -> str:
-    """Source of the whole sample: begin, all steps, finish."""
-    if not model.is_continuous:
-        return f"@straight\ndef {name}(W):\n    finish(W)\n"
-    return (
-        f"@straight\ndef {name}(W):\n    begin(W)\n    for s in range({model.substeps}):\n"
-        f"        move(W, s / {model.substeps})\n    finish(W)\n"
-    )
 
 
 @dataclass(frozen=True)
@@ -227,15 +188,14 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -
     place = path_layout(model, degree, observed)
 
     def make() -> str:
-        from estimator.engine import derive, emit
+        from estimator.engine import derive, emit, sensitivity
         from estimator.engine.path import path_sample
 
         lines, moved = derive.moved(model)
         more, results = path_sample(model, moved, degree, observed)
-        lines += more
-        source = _motion_source(model, degree, place, lanes)
-        source += "@straight\n" + emit.lane_loop("finish", lines, results, place, lanes, doc="Predict and see.")
-        return source + _composed("sample", model)
+        source = sensitivity.motion_source(model, degree, place, lanes)
+        source += emit.lane_loop("finish", lines + more, results, place, lanes, doc="Predict and see.")
+        return source + emit.sample("sample(W)", model, "finish(W)")
 
     key = repr((model.digest, degree, observed, lanes))
     return Path(stored.load(model.name, "path", key, make, NAMES).sample, place, lanes)
