@@ -143,10 +143,7 @@ def weak_prior(
     Model.checked(model)
     number("process_noise", process_noise, *_STDS)
     number("noise_shape", noise_shape, *_STDS)
-    for name, value in (
-        ("measurement_noise", measurement_noise),
-        ("state_std", state_std),
-    ):
+    for name, value in (("measurement_noise", measurement_noise), ("state_std", state_std)):
         for one in np.ravel(np.asarray(value, dtype=object)):
             number(name, one, *_STDS)
     n, k = model.n_states, model.n_coefficients

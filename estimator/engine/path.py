@@ -43,8 +43,7 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
             cov[i, states[b]] = put(f"W_{i}_{states[b]}", total)
     sense = {
         (i, c): put(
-            f"X_{i}_{c}",
-            sum((moved.by[a][m] * symbol(f"Z_{states[m]}_{c}") for m in range(n)), moved.by[a][n + b]),
+            f"X_{i}_{c}", sum((moved.by[a][m] * symbol(f"Z_{states[m]}_{c}") for m in range(n)), moved.by[a][n + b])
         )
         for a, i in enumerate(states)
         for b, c in enumerate(coefficients)

@@ -88,9 +88,7 @@ def _scales(rig: Rig, records: list[Record]) -> Scales:
     widest = max(float(np.nanmax(np.abs(one.y))) for one in records)
     scales = rig.scales
     return replace(
-        scales,
-        input=scales.input if rig.input.limit else largest,
-        output=scales.output if rig.output.range else widest,
+        scales, input=scales.input if rig.input.limit else largest, output=scales.output if rig.output.range else widest
     )
 
 

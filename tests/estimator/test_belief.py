@@ -19,11 +19,7 @@ MODEL = Model(
     outputs={"y": "x"},
     rates=("v", "u - damping*v - stiffness*x - cubic*x**3"),
 )
-FIELDS = {
-    "mean": np.array([0.1, -2.0, 1.8e5, 42.0, 7e5]),
-    "gamma": (2.0, 2e-6),
-    "xi": (3.0, 12e-8),
-}
+FIELDS = {"mean": np.array([0.1, -2.0, 1.8e5, 42.0, 7e5]), "gamma": (2.0, 2e-6), "xi": (3.0, 12e-8)}
 
 
 def covariance(seed=0):

@@ -409,10 +409,7 @@ def test_unchanged_after_a_run_that_raised(samples, change, message):
         (lambda: OnlineEstimator(ODE, factorisation="mean_field"), "factorisation must be 'structured' for duffing"),
         (lambda: OnlineEstimator(iterations=0), "iterations must be a whole number from 1 to 100, but is 0"),
         (lambda: OnlineEstimator(iterations=2.0), "iterations must be a whole number from 1 to 100, but is 2.0"),
-        (
-            lambda: OnlineEstimator(iterations=2**31),
-            "from 1 to 100, but is 2147483648",
-        ),
+        (lambda: OnlineEstimator(iterations=2**31), "from 1 to 100, but is 2147483648"),
         (lambda: OnlineEstimator(drift=None), "drift must be a number from 0 to 1, but is None"),
         (lambda: OnlineEstimator(drift=np.inf), "drift must be a number from 0 to 1, but is inf"),
         (lambda: OnlineEstimator(drift=0.1, factorisation="mean_field"), "drift must be 0 in mean field"),
@@ -425,10 +422,7 @@ def test_unchanged_after_a_run_that_raised(samples, change, message):
             lambda: OnlineEstimator(factorisation="mean_field").run([0.0], [0.0], missing=True),
             "missing must be False in mean field",
         ),
-        (
-            lambda: OnlineEstimator(noise_hypotheses=0),
-            "noise_hypotheses must be a whole number from 1 to 1000",
-        ),
+        (lambda: OnlineEstimator(noise_hypotheses=0), "noise_hypotheses must be a whole number from 1 to 1000"),
         (
             lambda: OnlineEstimator(factorisation="mean_field", noise_hypotheses=9),
             "noise_hypotheses must be 1 for factorisation='mean_field', but is 9",
@@ -457,10 +451,7 @@ def test_errors_name_the_argument_and_its_value(call, message):
 
 @pytest.mark.parametrize(
     ("nonlinear", "prediction", "simulation"),
-    [
-        (False, 5.9446129987526364e-05, 1.0204335589997665e-03),
-        (True, 5.8304968780121563e-05, 9.256401174690808e-04),
-    ],
+    [(False, 5.9446129987526364e-05, 1.0204335589997665e-03), (True, 5.8304968780121563e-05, 9.256401174690808e-04)],
     ids=["FEM-LARX", "FEM-NLARX"],
 )
 def test_published_numbers(record, nonlinear, prediction, simulation):

@@ -117,10 +117,7 @@ def test_silverbox_prior_matches_the_oscillators_it_is_drawn_from(model, twin):
 
 @pytest.mark.parametrize(
     ("prior", "eta", "precision", "noises"),
-    [
-        (published_run_prior, 2.0, 1e2, [1e8, 1e3, 1e8, 1e1]),
-        (paper_text_prior, 1.0, 0.1, [1e3, 1e1, 1e8, 1e3]),
-    ],
+    [(published_run_prior, 2.0, 1e2, [1e8, 1e3, 1e8, 1e1]), (paper_text_prior, 1.0, 0.1, [1e3, 1e1, 1e8, 1e3])],
     ids=["published run", "paper's text"],
 )
 def test_the_papers_priors(prior, eta, precision, noises):
@@ -170,25 +167,13 @@ def test_mean_field_begins_without_correlations_of_states_theta_and_eta():
         (lambda: silverbox_prior(spread=0.0), "spread must be a number from 1e-09 to 0.999999999, but is 0.0"),
         (lambda: silverbox_prior(PENDULUM), "model must have the parameters m, c, a and b, but pendulum has"),
         (lambda: silverbox_prior(duffing(offsets=True)), "model must have the parameters m, c, a and b, but duffing"),
-        (
-            lambda: log_uniform_moments(PAPER, OSCILLATOR, 1.0),
-            "from 0 to 0.999999999, but is 1.0",
-        ),
+        (lambda: log_uniform_moments(PAPER, OSCILLATOR, 1.0), "from 0 to 0.999999999, but is 1.0"),
         (lambda: log_uniform_moments(PAPER, OSCILLATOR, np.nan), "but is nan; log-uniform intervals do not reach 0"),
-        (
-            lambda: silverbox_prior(process_noise=1e300),
-            "process_noise must be a number from 1e-60",
-        ),
-        (
-            lambda: silverbox_prior(process_noise=1e-300),
-            "process_noise must be a number from 1e-60",
-        ),
+        (lambda: silverbox_prior(process_noise=1e300), "process_noise must be a number from 1e-60"),
+        (lambda: silverbox_prior(process_noise=1e-300), "process_noise must be a number from 1e-60"),
         (lambda: weak_prior(PAPER, "abc", np.eye(4)), "mean must be numbers, but is 'abc'"),
         (lambda: weak_prior(PAPER, np.ones(3), np.eye(4)), "mean and cov must have shapes (4,) and (4, 4)"),
-        (
-            lambda: weak_prior(PAPER, np.ones(4), np.eye(4), state_std=[1.0, 2.0, 3.0]),
-            "state_std must be one number",
-        ),
+        (lambda: weak_prior(PAPER, np.ones(4), np.eye(4), state_std=[1.0, 2.0, 3.0]), "state_std must be one number"),
         (lambda: log_uniform_moments(PAPER, {**OSCILLATOR, "b": 0.0}, 0.1), "center must have a finite b other than 0"),
         (lambda: log_uniform_moments(PAPER, {"m": 1.0}, 0.1), "center must have a finite c other than 0"),
     ],

@@ -65,10 +65,7 @@ def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
         ({"output": 3}, "output must be a Channel, but is 3"),
         ({"guess": {"m": [1, 2]}}, "guess must have intervals of ['m', 'c', 'a', 'b'], but is of ['m']"),
         ({"guess": {**GUESS, "a": [2, 1]}}, "guess of a must be two numbers, low < high, but is [2, 1]"),
-        (
-            {"guess": {**GUESS, "m": [-1, 1]}},
-            "from 1e-30 to 1e+30, but is -1; a mass is above 0",
-        ),
+        ({"guess": {**GUESS, "m": [-1, 1]}}, "from 1e-30 to 1e+30, but is -1; a mass is above 0"),
     ],
 )
 def test_errors_name_the_key_and_the_remedy(change, message):
