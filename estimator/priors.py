@@ -65,12 +65,9 @@ def _log_uniform_moments(
     nodes, weights = np.polynomial.legendre.leggauss(nodes_per_axis)
     # log(1 ± spread) = log(1 - spread²) / 2 ± artanh(spread)
     factors = np.sqrt(1 - spread**2) * np.exp(np.arctanh(spread) * nodes)
-    grid = np.stack(np.meshgrid(*[factors] * len(names), indexing="ij")).reshape(len(names), -1)
-    probabilities = np.ones(1)
-    for _ in names:
-        probabilities = np.outer(probabilities, weights / 2).ravel()  # the weights sum to 2, the length of [-1, 1]
-    points = coefficients_of(model, {name: c * row for name, c, row in zip(names, center, grid, strict=True)}, scales)
-    return moments(points, probabilities)
+    # The weights sum to 2, the length of [-1, 1].
+    axes = {name: (middle * factors, weights / 2) for name, middle in zip(names, center, strict=True)}
+    return moments(model, axes, scales)
 
 
 def gaussian_moments(
@@ -94,20 +91,33 @@ def gaussian_moments(
         mapping(name, given)
         for parameter in names if name == "mean" else given:
             number(f"{name} of {parameter}", given.get(parameter), 0 if name == "std" else -_STDS[1], _STDS[1])
-    nodes, weights = np.polynomial.hermite_e.hermegauss(max(2, min(7, int(_POINTS ** (1 / len(names))))))
-    grid = np.stack(np.meshgrid(*[nodes] * len(names), indexing="ij")).reshape(len(names), -1)
-    probabilities = np.ones(1)
-    for _ in names:
-        probabilities = np.outer(probabilities, weights / weights.sum()).ravel()
-    drawn = {name: mean[name] + std.get(name, 0.0) * row for name, row in zip(names, grid, strict=True)}
-    return moments(coefficients_of(model, drawn, scales), probabilities)
+    nodes = max(2, min(7, int(_POINTS ** (1 / len(names)))))
+    return moments(model, {name: gaussian(mean[name], std.get(name, 0.0), nodes) for name in names}, scales)
 
 
-def moments(points: FloatArray, probabilities: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of weighed points (N, K).
+def gaussian(mean: float, std: float, nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Points and weights (nodes,) of the quadrature over a Gaussian."""
+    points, weights = np.polynomial.hermite_e.hermegauss(nodes)
+    return mean + std * points, weights / weights.sum()
+
+
+def moments(
+    model: Model, axes: Mapping[str, tuple[FloatArray, FloatArray]], scales: Scales
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (K,) and covariance (K, K) of the coefficients of a plant whose parameters are independent.
 
     Plain sums, because the last digits of a BLAS product depend on its number of threads.
+
+    Args:
+        model: whose coefficients.
+        axes: parameter to the points and weights of a quadrature along it.
+        scales: what one inside is worth.
     """
+    grid = np.meshgrid(*(points for points, _ in axes.values()), indexing="ij")
+    probabilities = np.ones(1)
+    for _, weights in axes.values():
+        probabilities = np.outer(probabilities, weights).ravel()
+    points = coefficients_of(model, dict(zip(axes, map(np.ravel, grid), strict=True)), scales)
     mean = np.array([(probabilities * column).sum() for column in points.T])
     deviations = points - mean
     cov = np.array([[(probabilities * (one * other)).sum() for one in deviations.T] for other in deviations.T])
@@ -143,18 +153,17 @@ def weak_prior(
     Model.checked(model)
     number("process_noise", process_noise, *_STDS)
     number("noise_shape", noise_shape, *_STDS)
-    for name, value in (("measurement_noise", measurement_noise), ("state_std", state_std)):
+    n, k = model.n_states, model.n_coefficients
+    for name, value, size in (("measurement_noise", measurement_noise, model.n_outputs), ("state_std", state_std, n)):
         for one in np.ravel(np.asarray(value, dtype=object)):
             number(name, one, *_STDS)
-    n, k = model.n_states, model.n_coefficients
+        if np.shape(value) not in ((), (size,)):
+            raise ValueError(f"{name} must be one number or {size}, but has shape {np.shape(value)}")
     joint_mean, joint = np.zeros(n + k), np.zeros((n + k, n + k))
     given = numbers("mean", mean), numbers("cov", cov)
     if given[0].shape != (k,) or given[1].shape != (k, k):
         raise ValueError(f"mean and cov must have shapes {(k,)} and {(k, k)}, but have {[one.shape for one in given]}")
     joint_mean[n:], joint[n:, n:] = given
-    for name, value, size in (("state_std", state_std, n), ("measurement_noise", measurement_noise, model.n_outputs)):
-        if np.shape(value) not in ((), (size,)):
-            raise ValueError(f"{name} must be one number or {size}, but has shape {np.shape(value)}")
     joint[:n, :n] = np.diag(np.broadcast_to(np.asarray(state_std, dtype=np.float64) ** 2, n))
     sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
     xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
@@ -201,7 +210,7 @@ def published_run_prior(nonlinear: bool = True, model: Model | None = None) -> B
         nonlinear: else θ2 is known to be 0: the paper's FEM-LARX.
         model: `difference("linear")`, which has no θ2; the paper's where it is None.
     """
-    return _paper_prior(nonlinear, model, 2.0, 1e-2, (1e8, 1e3), (1e8, 1e1))
+    return _paper_prior(nonlinear, model, (2.0, 1e-2), (1e8, 1e3), (1e8, 1e1))
 
 
 def paper_text_prior(nonlinear: bool = True, model: Model | None = None) -> Belief:
@@ -209,22 +218,17 @@ def paper_text_prior(nonlinear: bool = True, model: Model | None = None) -> Beli
 
     Arguments as `published_run_prior`.
     """
-    return _paper_prior(nonlinear, model, 1.0, 10.0, (1e3, 1e1), (1e8, 1e3))
+    return _paper_prior(nonlinear, model, (1.0, 10.0), (1e3, 1e1), (1e8, 1e3))
 
 
 def _paper_prior(
-    nonlinear: bool,
-    model: Model | None,
-    eta_mean: float,
-    eta_var: float,
-    gamma: tuple[float, float],
-    xi: tuple[float, float],
+    nonlinear: bool, model: Model | None, eta: tuple[float, float], gamma: tuple[float, float], xi: tuple[float, float]
 ) -> Belief:
     """Means of 1 (of the states 0) and variances of 10, but for η."""
     model = difference() if model is None else Model.checked(model)
     flag("nonlinear", nonlinear)
     mean, variance = np.ones(len(model.names)), np.full(len(model.names), 10.0)
-    mean[: model.n_states], mean[-1], variance[-1] = 0.0, eta_mean, eta_var
+    mean[: model.n_states], (mean[-1], variance[-1]) = 0.0, eta
     if not nonlinear:
         place = model.names.index("theta2")
         mean[place] = variance[place] = 0.0
@@ -254,23 +258,23 @@ def recorded_prior(
         ValueError: for another model, or a value out of its range.
     """
     number("spread", spread, 0)
-    for name, value in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
-        number(name, value, *_STDS)
-    number("noise_shape", noise_shape, *_STDS)
     if Model.checked(model).name not in _TWINS:
         raise ValueError(f"model must be a duffing or difference equation, but is {model.name}; use weak_prior")
     moments = _recorded_duffing(model, spread) if model.name == "duffing" else _recorded_difference(model, spread)
-    mean, cov = moments
-    n = model.n_states
-    joint_mean = np.concatenate([np.zeros(n), mean])
-    joint = np.zeros((len(joint_mean), len(joint_mean)))
-    joint[:n, :n], joint[n:, n:] = 0.1**2 * np.eye(n), cov
-    if "output_offset" in model.coefficients:  # the state is the displacement with its offset
-        place = n + list(model.coefficients).index("output_offset")
-        joint[0, :] += joint[place, :]
-        joint[:, 0] += joint[:, place]
-    noises = (noise_shape, noise_shape * process_noise**2), (noise_shape, noise_shape * measurement_noise**2)
-    return Belief.of(model, joint_mean, joint, *noises)
+    prior = weak_prior(model, *moments, process_noise, measurement_noise, noise_shape, 0.1)
+    if "output_offset" not in model.coefficients:
+        return prior
+    mean, cov = prior.mean, prior.cov
+    add_offset(model, mean, cov)
+    return Belief.of(model, mean, cov, tuple(prior.noises[:2]), tuple(prior.noises[2:]))
+
+
+def add_offset(model: Model, mean: FloatArray, cov: FloatArray) -> None:
+    """Let the first state be the displacement with its offset: of moments (d,) and (d, d), in place."""
+    place = model.names.index("output_offset")
+    mean[0] += mean[place]
+    cov[0, :] += cov[place, :]
+    cov[:, 0] += cov[:, place]
 
 
 def _recorded_duffing(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:

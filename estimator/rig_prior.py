@@ -9,8 +9,7 @@ import numpy as np
 from estimator.belief import Belief
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
-from estimator.physical import coefficients_of
-from estimator.priors import moments
+from estimator.priors import add_offset, gaussian, moments
 from estimator.rig import Rig
 from estimator.units import Scales
 
@@ -45,18 +44,10 @@ def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
     if rig.guess is None:
         raise ValueError("rig must have a guess of m, c, a and b, but has none; add one, or use identify on a record")
     scales = rig.scales if scales is None else scales
-    model = rig.model
-    names = list(model.physical)
     axes = {name: _axis(name, *rig.guess[name]) for name in rig.guess}
-    axes["u0"] = _gaussian(rig.input.offset, OFFSET * scales.input, _OFFSET_NODES)
-    axes["y0"] = _gaussian(rig.output.offset, OFFSET * scales.output, _OFFSET_NODES)
-    grid = np.meshgrid(*(axes[name][0] for name in names), indexing="ij")
-    probabilities = np.ones(1)
-    for name in names:
-        probabilities = np.outer(probabilities, axes[name][1]).ravel()
-    points = {name: column.ravel() for name, column in zip(names, grid, strict=True)}
-    mean, cov = moments(coefficients_of(model, points, scales), probabilities)
-    return about(rig, scales, mean, cov)
+    axes["u0"] = gaussian(rig.input.offset, OFFSET * scales.input, _OFFSET_NODES)
+    axes["y0"] = gaussian(rig.output.offset, OFFSET * scales.output, _OFFSET_NODES)
+    return about(rig, scales, *moments(rig.model, axes, scales))
 
 
 def about(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief:
@@ -68,11 +59,8 @@ def about(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief
     joint_mean, joint = np.concatenate([np.zeros(n), mean]), np.zeros((d, d))
     joint[:n, :n] = np.diag([displacement**2, (displacement * frequency) ** 2])
     joint[n:, n:] = cov
-    if KINDS[rig.output.kind] == 0:  # the state is the displacement with its offset
-        place = n + list(model.coefficients).index("output_offset")
-        joint_mean[0] = joint_mean[place]
-        joint[0, :] += joint[place, :]
-        joint[:, 0] += joint[:, place]
+    if KINDS[rig.output.kind] == 0:
+        add_offset(model, joint_mean, joint)
     force = (rig.input.noise or NOISE * scales.input) / scales.input
     noises = known["gain"] * force / np.sqrt(3), (rig.output.noise or NOISE * scales.output) / scales.output
     gamma, xi = ((2.0, 2.0 * float(noise) ** 2) for noise in noises)
@@ -98,11 +86,6 @@ def _frequency(known: Mapping[str, float]) -> float:
 def _axis(name: str, low: float, high: float) -> tuple[FloatArray, FloatArray]:
     """Points and weights of a parameter."""
     if name != "m":
-        return _gaussian((low + high) / 2, (high - low) / 2 / HALF_WIDTH, _NODES)
-    points, weights = _gaussian(np.log(low * high) / 2, np.log(high / low) / 2 / HALF_WIDTH, _NODES)
+        return gaussian((low + high) / 2, (high - low) / 2 / HALF_WIDTH, _NODES)
+    points, weights = gaussian(np.log(low * high) / 2, np.log(high / low) / 2 / HALF_WIDTH, _NODES)
     return np.exp(points), weights
-
-
-def _gaussian(mean: float, std: float, nodes: int) -> tuple[FloatArray, FloatArray]:
-    points, weights = np.polynomial.hermite_e.hermegauss(nodes)
-    return mean + std * points, weights / weights.sum()
