@@ -12,8 +12,7 @@ from llvmlite import binding, ir
 from numba.core import cgutils, types
 from numba.core.extending import _Intrinsic
 
-from estimator.straight.source import Source
-from estimator.straight.translation import EXTERNAL, Kinds, Translated, Translation, leaves
+from estimator.straight.translation import EXTERNAL, Kinds, Source, Translated, Translation, leaves
 
 _TYPES = {"double": types.float64, "i1": types.boolean, "i64": types.int64, "word": types.uint64}
 _LLVM = {"double": ir.DoubleType(), "i1": ir.IntType(1), "i64": ir.IntType(64), "word": ir.IntType(64)}
