@@ -69,36 +69,30 @@ def _duffing(offsets: bool, cubic_damping: bool, quintic: bool, feedthrough: boo
     physical = {"m": "step**2/gain", "c": "step*damping/gain", "a": "stiffness/gain", "b": "cubic/gain"}
     dimensions = dict(DIMENSIONS)
     inverse = {"stiffness": "a*step**2/m", "cubic": "b*step**2/m", "damping": "c*step/m", "gain": "step**2/m"}
-    per_step = ("", "/step", "/step**2")[order]
+    per_step, by_step = (("", ""), ("/step", "*step**1"), ("/step**2", "*step**2"))[order]
+
+    def add(name: str, unit: str, parameter: str, text: str, dimension: tuple[int, int, int], back: str) -> None:
+        """A coefficient, and the parameter that goes with it: its expression, its dimension, and the way back."""
+        coefficients[name], inverse[name] = unit, back
+        physical[parameter], dimensions[parameter] = text, dimension
+
     if offsets:
-        coefficients |= {"force": "V", "output_offset": "V"}
         acceleration += " + force"
-        static = "stiffness*output_offset - force" if order == 0 else "-force"
-        physical |= {"u0": f"({static})/gain", "y0": f"output_offset{per_step}"}
-        dimensions |= {"u0": (1, 0, 0), "y0": (0, 1, -order)}
-        inverse |= {"force": f"({'a*y0 - u0' if order == 0 else '-u0'})*step**2/m"}
-        inverse |= {"output_offset": f"y0*step**{order}" if order else "y0"}
+        static, force = ("-force", "-u0") if order else ("stiffness*output_offset - force", "a*y0 - u0")
+        add("force", "V", "u0", f"({static})/gain", (1, 0, 0), f"({force})*step**2/m")
+        add("output_offset", "V", "y0", f"output_offset{per_step}", (0, 1, -order), f"y0{by_step}")
     if cubic_damping:
-        coefficients |= {"cubic_damping": "V⁻²"}
         acceleration += " - cubic_damping*v**3"
-        physical |= {"e": "step**3*cubic_damping/gain"}
-        dimensions |= {"e": (1, -3, 3)}
-        inverse |= {"cubic_damping": "e/(m*step)"}
+        add("cubic_damping", "V⁻²", "e", "step**3*cubic_damping/gain", (1, -3, 3), "e/(m*step)")
     if quintic:
-        coefficients |= {"quintic": "V⁻⁴"}
         acceleration += f" - quintic*{x}**5"
-        physical |= {"q": "quintic/gain"}
-        dimensions |= {"q": (1, -5, 0)}
-        inverse |= {"quintic": "q*step**2/m"}
+        add("quintic", "V⁻⁴", "q", "quintic/gain", (1, -5, 0), "q*step**2/m")
     output = ("x", "v", acceleration)[order]
     if offsets and order:
         output += " + output_offset"
     if feedthrough:
-        coefficients |= {"feedthrough": "1"}
         output += " + feedthrough*u"
-        physical |= {"d": f"feedthrough{per_step}"}
-        dimensions |= {"d": (-1, 1, -order)}
-        inverse |= {"feedthrough": f"d*step**{order}" if order else "d"}
+        add("feedthrough", "1", "d", f"feedthrough{per_step}", (-1, 1, -order), f"d{by_step}")
     return Model(
         name="duffing",
         states={"x": "V", "v": "V"},
