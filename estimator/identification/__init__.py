@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from estimator.belief import Belief
-from estimator.identification.beliefs import posterior
+from estimator.identification.beliefs import contraction, posterior
 from estimator.identification.checks import examine
-from estimator.identification.contraction import contraction
 from estimator.identification.problem import LATEST, Problem, explicable
 from estimator.identification.records import Record, records_of
 from estimator.identification.result import Result
@@ -103,22 +103,13 @@ def _forecast(belief: Belief, rig: Rig, record: Record, motion: FloatArray) -> F
     return estimator.forecast(record.u, explicable(record.y, rig))
 
 
-class _teller:
+@contextmanager
+def _teller(progress: bool) -> Iterator[Callable[[str], None]]:
     """Tells what is being done, where that is wanted."""
+    if not progress:
+        yield lambda text: None
+        return
+    from rich.console import Console
 
-    def __init__(self, progress: bool) -> None:
-        self._status: Any = None
-        if progress:
-            from rich.console import Console
-
-            self._status = Console(stderr=True).status("Identifying")
-
-    def __enter__(self) -> Callable[[str], None]:
-        if self._status is None:
-            return lambda text: None
-        self._status.__enter__()
-        return lambda text: self._status.update(text.capitalize())
-
-    def __exit__(self, *reason: object) -> None:
-        if self._status is not None:
-            self._status.__exit__(*reason)
+    with Console(stderr=True).status("Identifying") as status:
+        yield lambda text: status.update(text.capitalize())

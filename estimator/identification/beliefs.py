@@ -1,4 +1,4 @@
-"""Beliefs of what a search left: the rig's own posterior, and that of all records at once, from a belief near it."""
+"""Beliefs of what a search left: the rig's own posterior, how it contracts, and that from a belief near it."""
 
 from __future__ import annotations
 
@@ -24,6 +24,12 @@ _SUBSTEPS = 16
 
 #: Factor of the ratio of the noises, either way, within which a search from a belief begins.
 _NEAR = 3.0
+
+#: For its history the records are halved so often, and shorter ones are left out; and steps of a fit at most.
+_HALVINGS, _SHORTEST, _STEPS = 7, 50, 12
+
+#: Outputs that were used, with the mean and standard deviation of each parameter that they leave.
+History = tuple[tuple[int, dict[str, tuple[float, float]]], ...]
 
 
 def posterior(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[float, float]]]:
@@ -56,6 +62,26 @@ def _with_start(belief: Belief, problem: Problem) -> FloatArray:
 def _spread(weights: FloatArray, values: FloatArray, shapes: FloatArray) -> float:
     mean = weights @ values
     return float(np.sqrt(weights @ ((values - mean) ** 2 + values**2 / (4 * shapes))))
+
+
+def contraction(problem: Problem, found: Found, parameters: dict[str, tuple[float, float]]) -> History:
+    """The parameters that the first half of every record leaves, the first quarter, and so on; shortest first.
+
+    Each is a fit of its own from what all samples say, with the noises in the best ratio. One that runs away is left
+    out. Last come the ``parameters`` that all leave.
+    """
+    longest, history = max(len(u) for u in problem.u), []
+    for halvings in range(_HALVINGS, 0, -1):
+        count = longest >> halvings
+        if count < _SHORTEST:
+            continue
+        short = problem.shortened(count)
+        fits = found.fitter.on(short).fit([found.best], found.mean, found.level, _STEPS)
+        if fits.free_energy[0] < float("inf"):
+            belief = about(problem.rig, problem.scales, fits.mean[0], fits.cov[0])
+            told = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
+            history.append((short.samples, told))
+    return (*history, (problem.samples, parameters))
 
 
 def refit(

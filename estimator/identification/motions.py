@@ -41,10 +41,6 @@ _PARTS = np.array([1.0, 0.3, 0.1, 0.01])
 _AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]], dtype=np.float64)
 
 
-#: Candidates (C, records, 2) and σ_v to losses (C, records).
-Judge = Callable[[FloatArray, float], FloatArray]
-
-
 def motions(problem: Problem, hypothesis: Hypothesis, point: FloatArray, level: float) -> FloatArray:
     """The most probable displacement and velocity a sample before each record.
 
@@ -98,8 +94,10 @@ def _newton(around: FloatArray) -> FloatArray:
     return np.asarray(step * np.minimum(1.0, _FARTHEST / np.maximum(length, 1e-300)))
 
 
-def _judge(problem: Problem, hypothesis: Hypothesis, point: FloatArray, cov: FloatArray) -> Judge:
-    """What gives minus the log likelihoods of records that begin about candidates, with a covariance (2, 2)."""
+def _judge(
+    problem: Problem, hypothesis: Hypothesis, point: FloatArray, cov: FloatArray
+) -> Callable[[FloatArray, float], FloatArray]:
+    """Candidates (C, records, 2) and σ_v to minus the log likelihoods (C, records) of what begins there, within cov."""
     inputs, ratio = problem.inputs(hypothesis.interpolation, hypothesis.delay), hypothesis.ratio
 
     def losses(candidates: FloatArray, sensor: float) -> FloatArray:

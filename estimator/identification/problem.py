@@ -63,14 +63,14 @@ class Problem:
     @cached_property
     def outputs(self) -> FloatArray:
         """(records, T, 1) outputs; a shorter record ends with NaN."""
-        return _stacked([y[:, None] for y in self.y])
+        return _stacked([y[:, None] for y in self.y], 1)
 
     def inputs(self, interpolation: str, delay: int) -> FloatArray:
         """(records, T, rows) what acts over each sample, if the input went so; a shorter record ends with NaN."""
         rows = 1 + INTERPOLATIONS["spline" if INTERPOLATIONS[self.rig.interpolation] > 1 else "linear"]
         # A record's first output comes before its first input acts, however the input goes.
         rig = replace(self.rig, interpolation=interpolation, delay=delay)
-        return _stacked([_widened(driven(self.model, rig, u), rows) for u in self.u])
+        return _stacked([driven(self.model, rig, u) for u in self.u], rows)
 
     def shortened(self, samples: int) -> Problem:
         """The same with the first samples of each record only."""
@@ -155,13 +155,10 @@ def driven(model: Model, rig: Rig, u: FloatArray) -> FloatArray:
     return np.asarray(acting @ way.stencil.T)
 
 
-def _widened(inputs: FloatArray, rows: int) -> FloatArray:
-    return np.concatenate([inputs, np.zeros((len(inputs), rows - inputs.shape[1]))], axis=1)
-
-
-def _stacked(series: list[FloatArray]) -> FloatArray:
-    longest = max(len(one) for one in series)
-    stacked = np.full((len(series), longest, series[0].shape[1]), np.nan)
+def _stacked(series: list[FloatArray], columns: int) -> FloatArray:
+    """(n, T, columns) of n series: columns that one lacks are 0, and a shorter one ends with NaN."""
+    stacked = np.full((len(series), max(map(len, series)), columns), np.nan)
     for row, one in zip(stacked, series, strict=True):
-        row[: len(one)] = one
+        row[: len(one)] = 0.0
+        row[: len(one), : one.shape[1]] = one
     return stacked

@@ -76,15 +76,8 @@ def _parameters(result: Result) -> str:
     intervals, rows = result.interval(0.9), []
     for name, (mean, std) in result.parameters.items():
         low, high = intervals[name]
-        rows.append(
-            [
-                f"{name}, {_MEANINGS[name]}",
-                f"{mean:.6g}",
-                f"{std:.2g}",
-                f"{low:.6g} to {high:.6g}",
-                escape(result.units[name]),
-            ]
-        )
+        label, interval = f"{name}, {_MEANINGS[name]}", f"{low:.6g} to {high:.6g}"
+        rows.append([label, f"{mean:.6g}", f"{std:.2g}", interval, escape(result.units[name])])
     for name, what in (("input", "disturbance of the force"), ("output", "noise of the sensor")):
         mean, std = result.noises[name]
         interval = f"{max(mean - 1.645 * std, 0):.3g} to {mean + 1.645 * std:.3g}"

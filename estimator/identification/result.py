@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.identification.contraction import History
+from estimator.identification.beliefs import History
 from estimator.identification.records import Record
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
@@ -78,7 +78,7 @@ class Result:
     def history(self) -> History:
         """What the first samples left: how many outputs, and the mean and standard deviation of each parameter.
 
-        From few samples to all, for the same oscillator in the same noise: `estimator.identification.contraction`.
+        From few samples to all, for the same oscillator in the same noise (`estimator.identification.beliefs`).
         """
         return self.contraction()
 

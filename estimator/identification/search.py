@@ -146,13 +146,15 @@ def _look(fitter: Fitter) -> tuple[Fits, float]:
     short = fitter.on(problem.shortened(int(np.clip(_PERIODS * period, _SHORTEST, _LONGEST))))
     candidates = starts(problem.shortened(_LONGEST))
     if problem.rig.guess is not None:
-        candidates.append(_middle(problem))
+        middle = {name: (low + high) / 2 for name, (low, high) in problem.rig.guess.items()}
+        none = dict.fromkeys(problem.model.physical, 0.0)
+        candidates.append(coefficients_of(problem.model, none | middle, problem.scales))
     if not candidates:
         raise ValueError(
             f"records must be longer than a few periods to find a start, but have {problem.samples} outputs; add "
             f"samples, or a guess to the rig"
         )
-    ratios = _RATIOS * problem.frequency ** (2 - _order(problem))
+    ratios = _RATIOS * problem.frequency ** (2 - problem.scales.order)
     base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]))
     level = np.array(0.1 * problem.size)
     moving = [replace(base, motions=motions(short.problem, base, point, float(level))) for point in candidates]
@@ -201,7 +203,7 @@ def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: flo
         level: σ_v to begin with.
         reach: factor of the ratio, either way, that the first grid spans.
     """
-    unit = fitter.problem.frequency ** (2 - _order(fitter.problem))
+    unit = fitter.problem.frequency ** (2 - fitter.problem.scales.order)
     bounds = np.log([_LOWEST * unit, _HIGHEST * unit])
     width, middle = np.log(reach), np.log(hypothesis.ratio)
     for _ in range(12):
@@ -240,15 +242,3 @@ def _vertex(places: FloatArray, energies: FloatArray, best: int) -> tuple[float,
         return float(places[best]), np.inf
     slope = (before * right + after * left) / (left + right)
     return float(places[best] - slope / curvature), float(1 / np.sqrt(curvature))
-
-
-def _middle(problem: Problem) -> FloatArray:
-    """The coefficients of the guess's middle."""
-    assert problem.rig.guess is not None
-    model = problem.model
-    told = {name: (low + high) / 2 for name, (low, high) in problem.rig.guess.items()}
-    return coefficients_of(model, {name: told.get(name, 0.0) for name in model.physical}, problem.scales)
-
-
-def _order(problem: Problem) -> int:
-    return problem.scales.order

@@ -52,12 +52,11 @@ def starts(problem: Problem) -> list[FloatArray]:
         unit = equations / scale
         solution = np.linalg.lstsq(unit[:, 1:], unit[:, 0], rcond=1e-8)[0] * scale[0] / scale[1:]
         gain, damping, stiffness, cubic, force, square = solution
-        values = dict.fromkeys(names, 0.0) | {"gain": gain, "damping": damping, "cubic": cubic}
+        values = dict.fromkeys(names, 0.0) | {"gain": gain, "damping": damping, "cubic": cubic, "force": force}
         # An integrated signal may be displaced: stiffness x + square x² + cubic x³ is a cubic about another middle.
         middle = square / (3 * cubic) if abs(cubic) > 0 else 0.0
         inside = abs(middle) < 3 * problem.displacement and integrates
         values["stiffness"] = stiffness - (3 * cubic * middle**2 if inside else 0.0)
-        values["force"] = force
         if np.isfinite(list(values.values())).all() and gain != 0:
             found.append(np.array([values[name] for name in names]))
     return found
@@ -90,16 +89,8 @@ def _equations(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, p
         (over(bump, shown), -over(first, x)),
     )[order]
     square = over(bump, x**2) if order else np.zeros(count - 2 * half)
-    ones = np.ones(count)
-    columns = (
-        acceleration,
-        over(bump, acting),
-        -velocity,
-        -over(bump, x),
-        -over(bump, x**3),
-        over(bump, ones),
-        -square,
-    )
+    forces = -over(bump, x), -over(bump, x**3), over(bump, np.ones(count)), -square
+    columns = (acceleration, over(bump, acting), -velocity, *forces)
     clean = over(np.ones(2 * half + 1), missing.astype(float)) < 0.5
     clean &= np.arange(len(clean)) >= min(2 * np.pi * periods / problem.frequency, count / 4)
     stride = max(1, half // 4)
