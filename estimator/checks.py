@@ -55,9 +55,13 @@ def flag(name: str, value: object) -> None:
 def one_of(name: str, value: object, known: Collection[str]) -> None:
     """Refuse what is not a name among those that are known."""
     if not isinstance(value, str) or value not in known:
-        near = difflib.get_close_matches(value, known, 1) if isinstance(value, str) else []
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"{name} must be one of {list(known)}, but is {shown(value)}{hint}")
+        raise ValueError(f"{name} must be one of {list(known)}, but is {shown(value)}{hint(value, known)}")
+
+
+def hint(value: object, known: Collection[str]) -> str:
+    """The end of a message: what name may have been meant, where one is near."""
+    near = difflib.get_close_matches(value, known, 1) if isinstance(value, str) else []
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def mapping(name: str, value: object, kind: type = object) -> None:

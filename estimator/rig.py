@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from estimator.checks import number, one_of, printable, shown, whole
+from estimator.checks import hint, number, one_of, printable, shown, whole
 from estimator.files import whole_file
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
@@ -243,9 +242,7 @@ def _built(kind: Any, described: object, where: str) -> Any:
     known = [one.name for one in fields(kind)]
     for key in described:
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, 1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"{where} must have keys of {known}, but has {key!r:.60}{hint}")
+            raise ValueError(f"{where} must have keys of {known}, but has {key!r:.60}{hint(key, known)}")
     if kind is Rig and "step" not in described:
         raise ValueError("rig must have a step, but has none; give the seconds between samples")
     return kind(**described)
