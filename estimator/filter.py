@@ -153,7 +153,7 @@ class Filter:
 
     @property
     def belief(self) -> Belief:
-        """The belief now, of the mixture where there are several."""
+        """The belief now, with the mixture's moments where there are several."""
         return self.prior.with_records(self._mixture()[None])[0]
 
     @property
@@ -218,8 +218,7 @@ class Filter:
         settings = replace(self.settings, drift=0.0, noise_hypotheses=1)
         if settings.factorisation == "mean_field":
             settings = Settings()
-        known = Filter(self.prior.with_records(record[None])[0], self.rig, settings)
-        return known
+        return Filter(self.prior.with_records(record[None])[0], self.rig, settings)
 
     def follow(self, u: FloatArray, y: FloatArray) -> FloatArray:
         """(T, sensors, 2) mean and variance of each output before it is seen; the end may wait for an input in vain."""

@@ -139,8 +139,7 @@ class OnlineEstimator:
 
         (T, sensors, 2) for several sensors, each given those before it of the same sample.
         """
-        told = self._forecasts * np.array([self.scales.output, self.scales.output**2])
-        return told[:, 0] if self.model.n_outputs == 1 else told
+        return self._shown(self._forecasts, self.scales.output, self.scales.output**2)
 
     @property
     def noise_ratio(self) -> NoiseRatio:
@@ -254,7 +253,7 @@ class OnlineEstimator:
             the last two outputs as measured, as the paper does, and the first two repeat y.
         """
         u, outputs = self._record(u, y, False, least=2)
-        return self._shown(self._filter.predict(u, outputs))
+        return self._shown(self._filter.predict(u, outputs), self.scales.output)
 
     def forecast(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Mean and variance of each output before it is seen, with the coefficients and noises fixed at their means.
@@ -267,8 +266,7 @@ class OnlineEstimator:
             (T, 2) or (T, sensors, 2).
         """
         u, outputs = self._record(u, y, True)
-        told = self._filter.known().follow(u, outputs) * np.array([self.scales.output, self.scales.output**2])
-        return told[:, 0] if self.model.n_outputs == 1 else told
+        return self._shown(self._filter.known().follow(u, outputs), self.scales.output, self.scales.output**2)
 
     def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:
         """Free run with the coefficients fixed at their means, over all of u.
@@ -285,7 +283,7 @@ class OnlineEstimator:
         outputs = self._outputs("y_init", y_init, False)
         if not 2 <= len(outputs) <= len(u):
             raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(outputs)}")
-        return self._shown(self._filter.simulate(u, outputs))
+        return self._shown(self._filter.simulate(u, outputs), self.scales.output)
 
     def _record(
         self, u: npt.ArrayLike, y: npt.ArrayLike, missing: bool, least: int = 0
@@ -309,8 +307,9 @@ class OnlineEstimator:
         flat = np.ma.reshape(y, -1) if isinstance(y, np.ma.MaskedArray) else np.reshape(y, -1)
         return series(name, flat, missing).reshape(shape) / self.scales.output
 
-    def _shown(self, outputs: FloatArray) -> FloatArray:
-        return outputs[:, 0] * self.scales.output if self.model.n_outputs == 1 else outputs * self.scales.output
+    def _shown(self, told: FloatArray, *scales: float) -> FloatArray:
+        """What the filter tells (T, sensors, ...), in the rig's units; (T, ...) of one sensor."""
+        return (told[:, 0] if self.model.n_outputs == 1 else told) * np.array(scales)
 
     def _chunks(self, samples: int, progress: bool) -> Iterator[tuple[int, int]]:
         """Ranges that cover all samples; one range without progress, else many with a bar that counts them."""

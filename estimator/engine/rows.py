@@ -14,14 +14,10 @@ def pairs(letter: str, names: Iterable[str]) -> list[str]:
     return [f"{letter}_{i}_{j}" for i, j in combinations_with_replacement(names, 2)]
 
 
-def noise_names(model: Model) -> list[str]:
-    """Names of the noises' Gamma beliefs: γ first, then ξ of each sensor."""
-    return ["GAMMA_SHAPE", "GAMMA_RATE", *(f"XI_{part}_{y}" for y in model.outputs for part in ("SHAPE", "RATE"))]
-
-
 def belief_names(model: Model) -> list[str]:
-    """The flat record of a belief: means, upper triangle of the covariance, shapes and rates of the noises."""
-    return [*model.names, *pairs("P", model.names), *noise_names(model)]
+    """The flat record of a belief: means, upper triangle of the covariance, shape and rate of γ and of each ξ."""
+    sensors = [f"XI_{part}_{y}" for y in model.outputs for part in ("SHAPE", "RATE")]
+    return [*model.names, *pairs("P", model.names), "GAMMA_SHAPE", "GAMMA_RATE", *sensors]
 
 
 def input_rows(model: Model, degree: int) -> list[str]:

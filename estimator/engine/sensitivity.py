@@ -29,7 +29,7 @@ from estimator.engine.derive import (
     runge_kutta,
     shared,
     symbol,
-)  # fmt: skip
+)
 from estimator.engine.rows import carried_names, pairs
 from estimator.models.model import Model
 

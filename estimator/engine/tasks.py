@@ -28,10 +28,7 @@ def sqrt(value):
 
 
 #: What generated code may use.
-NAMES = {
-    "sqrt": sqrt, "log": elementary.log,
-    **{name: getattr(elementary, name) for name in ("sin", "cos", "exp", "tanh")},
-}  # fmt: skip
+NAMES = {"sqrt": sqrt} | {name: getattr(elementary, name) for name in ("log", "sin", "cos", "exp", "tanh")}
 
 
 @dataclass(frozen=True)

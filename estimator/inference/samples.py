@@ -72,19 +72,6 @@ def structured(model: Model, degree: int, iterations: int, expectations: str = "
         update(W)
         energies_of(W, before)
 
-    look = forecaster(kind, model, iterations, lanes, place)
-
-    @part(kind)
-    def judge(W, j, before, values, forecasts):
-        for i in range(iterations):
-            values[i] = np.nan if unsound >= 0 and W[unsound + j] > 0.0 else before[i * lanes + j]
-        look(W, j, forecasts)
-
-    return Loop(_loop(kind, model, place, lanes, iterations * lanes, take, judge), place, lanes)
-
-
-def forecaster(kind: str, model: Model, iterations: int, lanes: int, place: Mapping[str, int]) -> Any:
-    """``look(W, j, forecasts)``: mean and variance (sensors, 2) of lane j's outputs before they were seen."""
     sensors = model.n_outputs
     means = tuple(place[f"TRACE_{k}_mean"] * lanes for k in range(sensors))
     parts = tuple(
@@ -93,12 +80,14 @@ def forecaster(kind: str, model: Model, iterations: int, lanes: int, place: Mapp
     )
 
     @part(kind)
-    def look(W, j, forecasts):
+    def judge(W, j, before, values, forecasts):
+        for i in range(iterations):
+            values[i] = np.nan if unsound >= 0 and W[unsound + j] > 0.0 else before[i * lanes + j]
         for k in range(sensors):
             forecasts[k, 0] = W[means[k] + j]
             forecasts[k, 1] = W[parts[k][0] + j] + W[parts[k][1] + j] + W[parts[k][2] + j]
 
-    return look
+    return Loop(_loop(kind, model, place, lanes, iterations * lanes, take, judge), place, lanes)
 
 
 @cache
