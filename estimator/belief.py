@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,6 @@ from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
 from estimator.units import VOLTS, Scales
-
-Self = TypeVar("Self", bound="Belief")
 
 
 @cache
@@ -107,7 +105,7 @@ class Belief:
 
     @classmethod
     def of(
-        cls: type[Self],
+        cls,
         model: Model,
         mean: npt.ArrayLike,
         cov: npt.ArrayLike,
@@ -164,7 +162,7 @@ class Belief:
     def _kind(self) -> tuple[Any, ...]:
         return (self.model.digest, self.scales, self.factorisation)
 
-    def with_records(self: Self, records: FloatArray) -> list[Self]:
+    def with_records(self, records: FloatArray) -> list[Self]:
         """Beliefs of the same kind with other records (n, size), which must not be written to any more."""
         beliefs = []
         for record in records:
@@ -175,7 +173,7 @@ class Belief:
             beliefs.append(belief)
         return beliefs
 
-    def factorised(self: Self, factorisation: str) -> Self:
+    def factorised(self, factorisation: str) -> Self:
         """This belief as an inference of another factorisation begins with it.
 
         In ``mean_field``, the paper's, states, θ and η are independent: their cross-covariances are left out.

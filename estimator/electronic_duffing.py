@@ -42,9 +42,6 @@ def electronic_duffing(
     if kind not in ("displacement", "velocity"):
         raise ValueError(f"kind must be displacement or velocity, but is {kind!r}; the board shows these")
     centers = {"m": 1e-4, "c": 1e-3 * p1, "a": (10 if wells == 1 else -10) * p2, "b": p3}
-    guess = {}
-    for name, center in centers.items():
-        low, high = sorted((center * (1 - _SPREADS[name]), center * (1 + _SPREADS[name])))
-        guess[name] = (low, high)
+    ends = {name: (center * (1 - _SPREADS[name]), center * (1 + _SPREADS[name])) for name, center in centers.items()}
     base = Rig.shipped("electronic-duffing" if kind == "displacement" else "electronic-duffing-velocity")
-    return replace(base, guess=guess)
+    return replace(base, guess={name: (min(pair), max(pair)) for name, pair in ends.items()})

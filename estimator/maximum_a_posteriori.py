@@ -60,18 +60,17 @@ def maximum_a_posteriori(
 ) -> Fit:
     """Fit a model's coefficients to whole records, each from rest.
 
+    Model, noises and interpolation are as `estimator.information.fisher_information` takes them.
+
     Args:
         model: the equation.
-        u: (n, T) inputs; the t-th acts over the sample that ends with the t-th output. A record ends before its first
-            NaN, so that episodes of different lengths fit into one array.
+        u: (n, T) inputs, likewise.
         y: (n, T) the outputs that followed them, or (n, T, p) those of p sensors.
         prior: of the coefficients, in the model's order, and of the state about rest. Its belief in the noises is not
             used. A coefficient of variance 0 is known.
-        process_noise: what the process noise of one sample alone does to the first sensor: standard deviation, 0 or
-            more; (n,) of each record.
-        measurement_noise: the sensors' standard deviations, positive: one number, or one for each; (n, p) of each
-            record.
-        interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
+        process_noise: standard deviation; (n,) of each record.
+        measurement_noise: the sensors' standard deviations; (n, p) of each record.
+        interpolation: of the input between samples.
         starts: (n, K) coefficients each, from which the records are fitted besides the prior's mean; of each record the
             fit with the smallest L is kept.
 

@@ -84,14 +84,11 @@ class PEMNARX:
         whole("input_delay (the published run had 0)", self.input_delay, 1, 0)
 
     def fit(self, u: npt.ArrayLike, y: npt.ArrayLike) -> PEMNARX:
-        """Fits the network to one record. An earlier fit is replaced.
+        """Fits the network to one record, and gives this model. An earlier fit is replaced.
 
         Args:
             u: (T,) inputs [V].
             y: (T,) outputs [V], paired with u by index; T - 2 must exceed the number of parameters 4 + 5K.
-
-        Returns:
-            This model.
 
         Raises:
             ValueError: If u or y is not a finite series, they differ in length, are too short, or do not vary.
@@ -136,14 +133,11 @@ class PEMNARX:
         return self
 
     def predict(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """One-step predictions: each output from the two measured before it.
+        """One-step predictions (T,) [V]: each output from the two measured before it; the first two repeat y.
 
         Args:
             u: (T,) inputs [V].
             y: (T,) outputs [V], paired with u by index; T >= 2.
-
-        Returns:
-            Predictions (T,) [V]; the first two entries repeat y.
 
         Raises:
             ValueError: If u or y is not a finite series, they differ in length, or T < 2.

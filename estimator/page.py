@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.extras import need
-
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -73,7 +71,6 @@ def plain(text: str) -> str:
 
 def svg(figure: Figure) -> str:
     """A figure as an element of the page."""
-    need("matplotlib")
     from matplotlib import rc_context
 
     buffer = io.StringIO()

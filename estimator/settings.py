@@ -24,16 +24,7 @@ _MOST_HYPOTHESES, _MOST_VALUES = 1000, 99
 
 @dataclass(frozen=True)
 class Settings:
-    """How a filter learns.
-
-    Attributes:
-        factorisation: ``structured`` or ``mean_field``.
-        iterations: per sample.
-        as_published: with the departures of the published run.
-        expectations: ``first_order`` or ``sigma_points``.
-        drift: standard deviation of a coefficient's step per sample, in parts of that of its prior.
-        noise_hypotheses: ratios of the noises, or values of each (`estimator.ensemble.grid`).
-    """
+    """How a filter learns: `estimator.OnlineEstimator` says what each option means."""
 
     factorisation: str = "structured"
     iterations: int = 3
