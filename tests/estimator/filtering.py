@@ -86,6 +86,19 @@ def filtered(model, interpolation, c, u, y, q, r, state_variance=0.0, state=0.0)
     return innovations, variances, expected
 
 
+def of_paper(theta, u, y, q, r, cov):
+    """The same of the paper's model, from rest with a covariance (2, 2), in less time: both of (T,)."""
+    mean, innovations, variances = np.zeros(2), np.empty(len(u)), np.empty(len(u))
+    for t in range(len(u)):
+        A = np.array([[theta[0] + 3 * theta[1] * mean[0] ** 2, theta[2]], [1.0, 0.0]])
+        mean = np.array([theta @ np.array([mean[0], mean[0] ** 3, mean[1], u[t]]), mean[0]])
+        cov = A @ cov @ A.T + np.diag([q, 0.0])
+        innovations[t], variances[t] = y[t] - mean[0], cov[0, 0] + r
+        gain = cov[:, 0] / variances[t]
+        mean, cov = mean + gain * innovations[t], cov - np.outer(gain, cov[0])
+    return innovations, variances
+
+
 def information(model, interpolation, c, u, q, r, state_variance=0.0):
     """F along the response without noise, by central differences of the filter's innovations."""
     c = np.array(c, dtype=np.float64)

@@ -1,18 +1,13 @@
 """Fisher information: against a plain twin, the curvature of the likelihood, the estimator's posterior, and bounds."""
 
-import sys
-from pathlib import Path
-
+import filtering
 import numpy as np
 import pytest
+from filtering import CASES, of_paper
 
 from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior
 from estimator.information import cramer_rao, fisher_information, follow, relative_covariance, sampled
 from estimator.physical import coefficients_of
-
-sys.path.append(str(Path(__file__).parent))
-import filtering
-from filtering import CASES
 
 Q, R = 5e-4, 3e-4
 PAPER = difference()
@@ -37,19 +32,8 @@ def simulate(theta, u, rng=None):
 
 
 def filtered(theta, u, y, state_std=0.0):
-    """Innovations (T,) and their variances (T,) of the extended Kalman filter, with matrices."""
-    m, P, H = np.zeros(2), state_std**2 * np.eye(2), np.array([[1.0, 0.0]])
-    innovations, variances = np.empty(len(u)), np.empty(len(u))
-    for t in range(len(u)):
-        A = np.array([[theta[0] + 3 * theta[1] * m[0] ** 2, theta[2]], [1.0, 0.0]])
-        m = np.array([theta @ np.array([m[0], m[0] ** 3, m[1], u[t]]), m[0]])
-        P = A @ P @ A.T + np.diag([Q**2, 0.0])
-        S = H @ P @ H.T + R**2
-        K = P @ H.T / S
-        innovations[t], variances[t] = y[t] - m[0], S[0, 0]
-        m = m + K[:, 0] * innovations[t]
-        P = (np.eye(2) - K @ H) @ P
-    return innovations, variances
+    """Innovations (T,) and their variances (T,)."""
+    return of_paper(theta, u, y, Q**2, R**2, state_std**2 * np.eye(2))
 
 
 def differentiated(theta, u, y, state_std=0.0):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from filtering import of_paper
 from scipy.optimize import minimize
 
 from estimator import SILVERBOX_TWIN, difference, silverbox_prior, weak_prior
@@ -30,17 +31,9 @@ def simulate(systems, samples, rng, process=NOISES[0]):
 
 def objective(psi, u, y):
     """L(ψ) of the module's docstring, with matrices."""
-    q, r = NOISES[0] ** 2, NOISES[1] ** 2
-    mean, cov, loss = np.zeros(2), np.array(PRIOR.state_cov), 0.0
-    for u_t, y_t in zip(u, y, strict=True):
-        transition = np.array([[psi[0] + 3 * psi[1] * mean[0] ** 2, psi[2]], [1.0, 0.0]])
-        mean = np.array([psi[0] * mean[0] + psi[1] * mean[0] ** 3 + psi[2] * mean[1] + psi[3] * u_t, mean[0]])
-        cov = transition @ cov @ transition.T + np.diag([q, 0.0])
-        variance, innovation = cov[0, 0] + r, y_t - mean[0]
-        loss += 0.5 * (innovation**2 / variance + np.log(variance))
-        gain = cov[:, 0] / variance
-        mean, cov = mean + gain * innovation, cov - np.outer(gain, cov[0])
+    innovations, variances = of_paper(psi, u, y, NOISES[0] ** 2, NOISES[1] ** 2, PRIOR.state_cov)
     pull = psi - PRIOR.coefficients_mean
+    loss = 0.5 * (innovations**2 / variances + np.log(variances)).sum()
     return loss + 0.5 * pull @ np.linalg.solve(PRIOR.coefficients_cov, pull)
 
 

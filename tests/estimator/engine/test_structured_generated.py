@@ -4,17 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from engine_cases import (
-    CASES,
-    Case,
-    assert_agrees,
-    block,
-    get_belief,
-    put,
-    put_belief,
-    random_belief,
-    random_inputs,
-)  # fmt: skip
+from engine_cases import CASES, Case, assert_agrees, block, get_belief, put, put_belief, random_belief, random_inputs
 from engine_reference import EPS, Plant, update
 
 from estimator.engine import tasks
