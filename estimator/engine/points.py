@@ -19,18 +19,9 @@ from __future__ import annotations
 
 import sympy as sp
 
+from estimator.engine import derive
 from estimator.engine.algebra import HALF, ONE, ZERO
-from estimator.engine.derive import (
-    Assignments,
-    Moved,
-    calculus,
-    carried_at_end,
-    difference_step,
-    pair,
-    plain_step,
-    renamed,
-    symbol,
-)  # fmt: skip
+from estimator.engine.derive import Assignments, Moved, calculus, pair, renamed, symbol
 from estimator.models.model import Model
 
 #: What rounding leaves of the variance of a dimension that depends on those before it, as a part of that variance.
@@ -105,7 +96,7 @@ def point(model: Model) -> tuple[Assignments, dict[str, str]]:
 def point_step(model: Model, degree: int) -> Assignments:
     """One Runge-Kutta step of a point."""
     coefficients = {i: to for i, to in at_point(model).items() if i not in model.states}
-    return renamed(plain_step(model, degree), coefficients)
+    return renamed(derive.plain_step(model, degree), coefficients)
 
 
 def point_sample(model: Model) -> tuple[Assignments, dict[str, str]]:
@@ -137,5 +128,5 @@ def moments(model: Model) -> tuple[Assignments, Moved]:
         for j in model.coefficients:
             total = sum((symbol(f"LEAN_{c}_{i}") * symbol(f"L_{c}_{j}") for c in range(m)), ZERO)
             lines.append((f"Q_{i}_{j}", total))
-    moved = carried_at_end(model) if model.is_continuous else difference_step(model)[1]
-    return lines, Moved(tuple(symbol(f"MIDDLE_{i}") for i in states), (), moved.noise)
+    noise = derive.moved(model)[1].noise
+    return lines, Moved(tuple(symbol(f"MIDDLE_{i}") for i in states), (), noise)

@@ -17,19 +17,8 @@ from typing import Any
 
 import sympy as sp
 
-from estimator.engine import emit
-from estimator.engine.derive import (
-    Assignments,
-    Lines,
-    calculus,
-    carried_at_start,
-    input_over_step,
-    pair,
-    renamed,
-    runge_kutta,
-    shared,
-    symbol,
-)
+from estimator.engine import derive, emit
+from estimator.engine.derive import Assignments, Lines, calculus, input_over_step, pair, runge_kutta, shared, symbol
 from estimator.engine.rows import carried_names, pairs
 from estimator.models.model import Model
 
@@ -63,11 +52,12 @@ def motion_source(
     """
     if not model.is_continuous:
         return ""
-    start = {name: emit.text_of(value) for name, value in carried_at_start(model).items()}
+    start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
     moved = {name: f"{name}_E" for name in carried_names(model)}
-    step, doc = renamed(motion_step(model, degree), given or {}), "One Runge-Kutta step, from T in [0, 1) of a sample."
+    step = derive.renamed(motion_step(model, degree), given or {})
     source = emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
-    return source + emit.lane_loop("move", step, moved, place, lanes, ("T", *uniform), doc)
+    told = "One Runge-Kutta step, from T in [0, 1) of a sample on."
+    return source + emit.lane_loop("move", step, moved, place, lanes, ("T", *uniform), told)
 
 
 def motion_step(model: Model, degree: int) -> Assignments:

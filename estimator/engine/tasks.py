@@ -105,11 +105,8 @@ def _structured(
             return finish
         if points:
             return finish + _points_source(model, degree, place, lanes)
-        return (
-            sensitivity.motion_source(model, degree, place, lanes)
-            + finish
-            + emit.sample("update(W)", model, "finish(W)")
-        )
+        motion = sensitivity.motion_source(model, degree, place, lanes)
+        return motion + finish + emit.sample("update(W)", model, "finish(W)")
 
     key = repr((model.digest, degree, iterations, lanes, sorted(place.items()), trace, missing, expectations))
     code = stored.load(model.name, "update", key, make, NAMES)
