@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.leaderboard import METRICS, Metric
+from agents.evaluation.leaderboard import METRICS, Metric, center_of
+from agents.evaluation.oracle import FOLDER
 from agents.evaluation.protocol import SCORE, TRACKS, VERSION, digest
-from agents.evaluation.systems import FOLDER
 from agents.results import finite
 from estimator.checks import printable
 from estimator.files import append_atomically, whole_file, write_atomically
@@ -84,7 +84,7 @@ def cells(entry: dict[str, Any]) -> list[str]:
     shifted = [entry["shifted"].get(shift, {}).get("fisher_gain") for shift in _SHIFTS]
     return [
         printable(str(entry["name"])),
-        _with_interval(SCORE, entry["score"]),
+        f"{_center(SCORE, entry['score'])} [{', '.join(SCORE.text(entry['score'][end]) for end in ('low', 'high'))}]",
         str(entry["seeds"]),
         str(entry["budget"]),
         *(_center(METRICS[name], told[name]) for name in ("information_gain", "coverage", "ended_early")),
@@ -113,12 +113,5 @@ CAPTION = (
 
 
 def _center(metric: Metric, entry: dict[str, Any] | None) -> str:
-    if entry is None:
-        return "-"
-    center = next(value for key, value in entry.items() if key in ("mean", "iqm", "median"))
-    return "-" if center is None else f"{metric.scale * center:.{metric.digits}f}"
-
-
-def _with_interval(metric: Metric, entry: dict[str, Any]) -> str:
-    low, high = (f"{metric.scale * entry[end]:.{metric.digits}f}" for end in ("low", "high"))
-    return f"{_center(metric, entry)} [{low}, {high}]"
+    center = None if entry is None else center_of(entry)
+    return "-" if center is None else metric.text(center)

@@ -17,7 +17,6 @@ from estimator.parameters import FloatArray
 
 _RESAMPLES = 2000
 
-
 Statistic = tuple[str, Callable[..., Any]]
 
 MEAN: Statistic = ("mean", np.mean)
@@ -141,6 +140,16 @@ def center_and_interval(values: FloatArray, metric: Metric, seed: int = 0) -> di
     return entry
 
 
+def in_line(metric: Metric, values: FloatArray) -> str:
+    """The centre of values (systems,), with its interval, on one line."""
+    return cell_of(metric, center_and_interval(values[None], metric)).replace("\n", " ")
+
+
+def center_of(entry: dict[str, Any]) -> Any:
+    """The centre in what `center_and_interval` made, whatever it is called."""
+    return next(value for key, value in entry.items() if key in ("mean", "median", "iqm"))
+
+
 def write_evaluations(path: Path, evaluations: list[Evaluation], settings: dict[str, Any]) -> None:
     """Write summaries and the settings that they were made with."""
     results = {
@@ -225,8 +234,6 @@ def cell_of(metric: Metric, entry: dict[str, Any] | None) -> str:
     """
     if entry is None:
         return "-"
-
     text = metric.text
-    center = next(value for key, value in entry.items() if key in ("mean", "median", "iqm"))
-    cell = f"{text(center)}\n[{text(entry['low'])}, {text(entry['high'])}]"
+    cell = f"{text(center_of(entry))}\n[{text(entry['low'])}, {text(entry['high'])}]"
     return f"{cell}\nmedian seed {text(entry['median_of_seeds'])}" if "seeds" in entry else cell

@@ -23,7 +23,7 @@ import numpy as np
 
 from agents.cli import run_script
 from agents.evaluation.batch import TESTED, make
-from agents.evaluation.leaderboard import METRICS, cell_of, center_and_interval
+from agents.evaluation.leaderboard import METRICS, in_line
 from agents.policies import make_policy
 from agents.results import show, table
 from estimator.parameters import FloatArray
@@ -72,10 +72,7 @@ def main(config: Config) -> None:
     rows, metric = [], METRICS["information_gain"]
     for name in config.policies:
         found, early = gains(name, config.systems, config.seed)
-        then, last = (
-            cell_of(metric, center_and_interval(values[None], metric)).replace("\n", " ")
-            for values in (found[SAMPLE - 1], found[-1])
-        )
+        then, last = in_line(metric, found[SAMPLE - 1]), in_line(metric, found[-1])
         rows.append([name, then, f"{found[SAMPLE - 1].std():.2f}", last, str(early)])
     rows += [[f"published: {name}", f"{mean:.2f}", f"{std:.2f}", "", ""] for name, (mean, std) in PUBLISHED.items()]
     titles = "policy", f"gain of {SAMPLE} samples / nat", "std over systems", "gain of 50 / nat", "ended early"
