@@ -40,8 +40,7 @@ class Silverbox(Config):
 def main(config: Config) -> None:
     """Repeat the experiment, run the protocol, or compare its settings."""
     from agents.studies.kouw2020 import reproduce
-    from agents.studies.silverbox_results import run_protocol
-    from agents.studies.silverbox_selection import select
+    from agents.studies.silverbox_results import run_protocol, select
 
     if not isinstance(config, Silverbox):
         reproduce(config.data, config.json, config.figures)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from signal import SIGINT
@@ -46,7 +46,7 @@ JsonOptions = Annotated[
 ]
 
 Config = TypeVar("Config")
-
+Task = TypeVar("Task")
 
 #: The track of a rig.
 RIG_TRACK = "duffing_env/Rig-v0"
@@ -71,6 +71,17 @@ def progress_bar() -> Progress:
     columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
     console = Console(stderr=True)
     return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
+def followed(tasks: Iterable[tuple[str, Task]]) -> Iterator[Task]:
+    """Tasks, one after the other, behind a `progress_bar` that names the one at hand."""
+    tasks = list(tasks)
+    with progress_bar() as bar:
+        shown = bar.add_task("", total=len(tasks))
+        for name, task in tasks:
+            bar.update(shown, description=name)
+            yield task
+            bar.advance(shown)
 
 
 def check_track(env_id: str) -> None:
@@ -145,11 +156,7 @@ def told_in_one_line(name: str) -> Iterator[None]:
         sys.exit(2)
 
 
-def run_script(
-    main: Callable[[Config], None],
-    config: type[Config],
-    description: str | None = None,
-) -> None:
+def run_script(main: Callable[[Config], object], config: type[Config], description: str | None = None) -> None:
     """Parse the command line into ``config`` and call ``main`` with it, `told_in_one_line` where that fails.
 
     Args:

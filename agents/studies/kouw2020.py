@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from agents.cli import progress_bar
+from agents.cli import followed
 from agents.evaluation.figures import new_figure, save
 from agents.policies import make_policy
-from agents.results import check_file, show, table, versions, write_json
+from agents.results import check_file, show, spinner, table, versions, write_json
 from duffing_env.silverbox import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
@@ -115,8 +115,7 @@ def reproduce(
         mean squared errors [V²]; and under ``meta`` the settings, seconds of training, sample counts and versions.
 
     Raises:
-        RecordNotFound: The record is not on this machine; the message says where to get it.
-        RecordDamaged: The file found is not the record.
+        RecordNotFound, RecordDamaged: As `load_record`.
         OSError: A result cannot be written; found out before the work begins, where it can be.
     """
     record = load_record(data)
@@ -136,17 +135,12 @@ def reproduce(
 
 def run_all(record: SilverboxRecord, data: Path | None) -> dict[str, dict[str, Run]]:
     """Trains and validates each model of each setting, behind a progress bar on stderr."""
-    runs: dict[str, dict[str, Run]] = {}
-    with progress_bar() as progress:
-        task = progress.add_task("compiling", total=sum(len(setting.models) for setting in SETTINGS.values()))
+    with spinner("compiling"):
         compile_kernels(record, data)
-        for name, setting in SETTINGS.items():
-            runs[name] = {}
-            for model in setting.models:
-                progress.update(task, description=f"{name}, {model}")
-                runs[name][model] = run(setting, model, record, data)
-                progress.advance(task)
-        progress.update(task, description="done")
+    runs: dict[str, dict[str, Run]] = {name: {} for name in SETTINGS}
+    tasks = [(f"{name}, {model}", (name, model)) for name, setting in SETTINGS.items() for model in setting.models]
+    for name, model in followed(tasks):
+        runs[name][model] = run(SETTINGS[name], model, record, data)
     return runs
 
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from agents.cli import progress_bar, run_script
+from agents.cli import followed, run_script
 from agents.evaluation.batch import TESTED
-from agents.evaluation.leaderboard import METRICS, cell_of, center_and_interval
+from agents.evaluation.leaderboard import METRICS, in_line
 from agents.evaluation.metrics import information
 from agents.evaluation.rollout import roll_out
 from agents.results import show, table, write_json
@@ -78,31 +78,24 @@ def judge(track: str, options: dict[str, Any], policies: tuple[str, ...], system
 def main(config: Config) -> None:
     """Play, and print the table."""
     rows, results = [], []
-    metrics = replace(METRICS["efficiency"], digits=3, scale=1.0), METRICS["fisher_gain"]
-    with progress_bar() as bar:
-        task = bar.add_task("", total=len(config.versions) * len(config.cases))
-        for version in config.versions:
-            for title, name, options in (CASES[case - 1] for case in config.cases):
-                track = f"{name}-v{version}"
-                bar.update(task, description=f"{track}, {title}")
-                policies = own(name, version), UNIVERSAL
-                for found in judge(f"duffing_env/{track}", options, policies, config.systems):
-                    cells = [
-                        cell_of(metric, center_and_interval(found[key][None], metric)).replace("\n", " ")
-                        for key, metric in zip(("efficiency", "fisher_gain"), metrics, strict=True)
-                    ]
-                    early = f"{int(found['ended_early'].sum())} of {config.systems}"
-                    rows.append([track, title, found["policy"], *cells, early])
-                    results.append({"track": track, "case": title, **{k: _plain(v) for k, v in found.items()}})
-                bar.advance(task)
+    metrics = {
+        "efficiency": replace(METRICS["efficiency"], digits=3, scale=1.0),
+        "fisher_gain": METRICS["fisher_gain"],
+    }
+    tasks = [(version, *CASES[case - 1]) for version in config.versions for case in config.cases]
+    for task in followed((f"{task[2]}-v{task[0]}, {task[1]}", task) for task in tasks):
+        version, title, name, options = task
+        track, policies = f"{name}-v{version}", (own(name, version), UNIVERSAL)
+        for found in judge(f"duffing_env/{track}", options, policies, config.systems):
+            cells = [in_line(metrics[key], found[key]) for key in metrics]
+            early = f"{int(found['ended_early'].sum())} of {config.systems}"
+            rows.append([track, title, found["policy"], *cells, early])
+            plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in found.items()}
+            results.append({"track": track, "case": title, **plain})
     heads = ("track", "options", "policy", "D-efficiency beside efe", "Fisher information / nat", "ended early")
     show(table(heads, rows, markdown=True), width=150)
     if config.output is not None:
         write_json(config.output, results)
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 if __name__ == "__main__":

@@ -125,10 +125,5 @@ def _recipe(runs: tuple[Path, ...], cards: list[dict[str, Any]]) -> tuple[str, d
     return recipes[0]["env"], recipes[0]["options"], seeds
 
 
-def main(config: Config) -> None:
-    """Ship it."""
-    ship(config)
-
-
 if __name__ == "__main__":
-    run_script(main, Config, __doc__ or "")
+    run_script(ship, Config, __doc__)

@@ -3,8 +3,8 @@
 As `nonlinear_benchmarks` defines it: a model is identified on the first 75 % of the multisine section. From the inputs
 and the first 50 outputs of three test signals (the rest of the multisine; the arrow; the arrow without the part whose
 amplitude exceeds the training's) it simulates the other outputs, and the root mean square of the errors counts. Nothing
-may be decided on test data: `agents.studies.silverbox_selection` chooses settings on the last quarter of the training
-section.
+may be decided on test data: `agents.studies.silverbox_results.select` compares settings on the last quarter of the
+training section.
 
 ``docs/silverbox.md`` discusses the outcome.
 """
@@ -40,8 +40,6 @@ LENGTHS = (50, 100, 200, 300, 500, 1_000, 2_000, 5_000, 20_000, TRAINING_SAMPLES
 
 CLOSE = 1e-3
 """Simulation error on the arrow [V] that the learning curve is timed by."""
-
-"""Half width of a central 90 % interval in standard deviations."""
 
 TIMINGS = 3
 

@@ -18,18 +18,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from agents.cli import progress_bar, run_script
+from agents.cli import followed, run_script
 from agents.evaluation.batch import TESTED, make
 from agents.policies import TRAINED, make_policy
 from agents.policies.learned import CARD
-from agents.results import write_json
+from agents.results import show, table, write_json
 from agents.studies.ship import card_of, put
-from agents.training.family import Member, draw_member
+from agents.training.family import FAMILY, Member, draw_member
 
 PLANNER, SHIPPED = "efe", "ppo/universal"
 
@@ -107,52 +106,35 @@ def classes(members: Sequence[Member]) -> Iterator[tuple[str, npt.NDArray[np.boo
 
 def main(config: Config) -> None:
     """Play, and print the table."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
     members = unseen(config.systems, config.seed)
     names = (PLANNER, *config.policies)
     gains, ended, covered = np.empty((3, len(names), len(members)))
-    with progress_bar() as bar:
-        task = bar.add_task("", total=len(names) * len(members))
-        for p, name in enumerate(names):
-            for i, member in enumerate(members):
-                bar.update(task, advance=1, description=f"{name}, {member.kind}")
-                gains[p, i], ended[p, i], covered[p, i] = play(member, name, config.seed + i)
-    console = Console(width=150)
+    tasks = [(f"{name}, {member.kind}", (p, i)) for p, name in enumerate(names) for i, member in enumerate(members)]
+    for p, i in followed(tasks):
+        gains[p, i], ended[p, i], covered[p, i] = play(members[i], names[p], config.seed + i)
     groups = [(name, mask) for name, mask in classes(members) if mask.any()]
     n_coefficients = 6
     efficiency = np.exp(2.0 * (gains - gains[0]) / n_coefficients)
-    table = Table("oscillators", "number", *names, box=box.MARKDOWN)
+    rows = []
     for name, mask in groups:
         cells = [f"{np.median(e[mask]):.2f} / {np.quantile(e[mask], 0.1):.2f}" for e in efficiency]
-        table.add_row(name, str(int(mask.sum())), *cells)
-    table.add_row("ended early", "", *(f"{100 * e.mean():.1f} %" for e in ended))
-    table.add_row("90 % intervals that cover", "", *(f"{c.mean():.3f}" for c in covered))
-    table.add_row("information / nat", "", *(f"{g.mean():.2f}" for g in gains))
-    console.print("D-efficiency beside efe: median / 10 % quantile")
-    console.print(table)
+        rows.append([name, str(int(mask.sum())), *cells])
+    rows.append(["ended early", "", *(f"{100 * e.mean():.1f} %" for e in ended)])
+    rows.append(["90 % intervals that cover", "", *(f"{c.mean():.3f}" for c in covered)])
+    rows.append(["information / nat", "", *(f"{g.mean():.2f}" for g in gains)])
+    heading = "D-efficiency beside efe: median / 10 % quantile"
+    show(heading, table(("oscillators", "number", *names), rows, markdown=True), width=150)
     if config.output is not None:
         config.output.mkdir(parents=True, exist_ok=True)
-        results: dict[str, Any] = {
-            "policies": names,
-            "gains": gains.tolist(),
-            "ended": ended.tolist(),
-            "covered": covered.tolist(),
-        }
-        write_json(config.output / "universal.json", results)
+        told = {"gains": gains.tolist(), "ended": ended.tolist(), "covered": covered.tolist()}
+        write_json(config.output / "universal.json", {"policies": names, **told})
     if config.ship:
-        scores = {name: [float(np.median(efficiency[1][mask])), float(np.quantile(efficiency[1][mask], 0.1))]
-                  for name, mask in groups}  # fmt: skip
-        print(_ship(Path(config.policies[0]), {"systems": config.systems, "seed": config.seed, "efficiency": scores}))
-
-
-def _ship(run: Path, scores: dict[str, Any]) -> Path:
-    """Write a run's policy into the package."""
-    folder = TRAINED / SHIPPED
-    put(folder, run, card_of(run) | {"track": "family", "version": version("duffing-env"), "scores": scores})
-    return folder
+        own = efficiency[1]
+        first = {name: [float(np.median(own[mask])), float(np.quantile(own[mask], 0.1))] for name, mask in groups}
+        scores = {"systems": config.systems, "seed": config.seed, "efficiency": first}
+        run, folder = Path(config.policies[0]), TRAINED / SHIPPED
+        put(folder, run, card_of(run) | {"track": FAMILY, "version": version("duffing-env"), "scores": scores})
+        print(folder)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ def _command(folder: Path, words: list[str]) -> None:
 
         policies.TRAINED = folder  # not into the package
         sys.argv = words
-        return run_script(ship.main, ship.Config)
+        return run_script(ship.ship, ship.Config)
     from agents.commands import main as command
 
     command()

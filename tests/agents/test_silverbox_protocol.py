@@ -13,7 +13,6 @@ import pytest
 
 from agents.studies import silverbox_protocol as module
 from agents.studies import silverbox_results as reporting
-from agents.studies import silverbox_selection as selection
 from agents.studies.silverbox_protocol import GIVEN, SETTINGS, TESTS, Outcome
 from duffing_env.silverbox import Regime, SilverboxRecord, synthesise_multisine
 
@@ -147,13 +146,13 @@ def test_selection_uses_the_training_section_only(record, monkeypatch, capsys):
     u, y = (np.full(131_072, np.nan) for _ in range(2))
     training = slice(40_650, 40_650 + 65_062)
     u[training], y[training] = record.u[training], record.y[training]
-    monkeypatch.setattr(selection, "load_record", lambda data: SilverboxRecord(u, y))
+    monkeypatch.setattr(reporting, "load_record", lambda data: SilverboxRecord(u, y))
     monkeypatch.setattr(
-        selection, "SETTINGS", {"ODE linear": SETTINGS["ODE linear"], "paper": SETTINGS["NLARX offset"]}
+        reporting, "SETTINGS", {"ODE linear": SETTINGS["ODE linear"], "paper": SETTINGS["NLARX offset"]}
     )
-    monkeypatch.setattr(selection, "PROCESS_NOISES", (1e-4,))
-    monkeypatch.setattr(selection, "SUBSTEPS", (2,))
-    scores = selection.select()
+    monkeypatch.setattr(reporting, "PROCESS_NOISES", (1e-4,))
+    monkeypatch.setattr(reporting, "SUBSTEPS", (2,))
+    scores = reporting.select()
     assert {model: list(row) for model, row in scores.items()} == {"ODE linear": ["default", "100 µV", "2 steps"]}
     (default, covers), (noisy, too_wide), (coarse, _) = scores["ODE linear"].values()
     assert default < 0.36e-3 < noisy

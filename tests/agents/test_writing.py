@@ -142,7 +142,7 @@ def command(words, monkeypatch, capsys, folder):
     try:
         if name == "ship":
             monkeypatch.setattr(sys, "argv", ["ship.py", *rest])
-            run_script(ship.main, ship.Config)
+            run_script(ship.ship, ship.Config)
         else:
             main()
     except SystemExit as stop:
