@@ -43,8 +43,7 @@ def figure_of_learning(curve: list[tuple[int, float, float]], reward: str) -> Fi
     axes = figure.add_subplot()
     steps, seconds, returns = np.array(curve, dtype=float).reshape(-1, 3).T
     axes.plot(steps / 1e6, returns, color=_COLOURS[0])
-    axes.set_xlabel("samples / 10⁶")
-    axes.set_ylabel(f"mean return: {reward.replace('_', ' ')}")
+    axes.set(xlabel="samples / 10⁶", ylabel=f"mean return: {reward.replace('_', ' ')}")
     axes.grid(alpha=0.3)
     if len(steps) > 1:
         axes.set_xlim(steps[0] / 1e6, steps[-1] / 1e6)
@@ -71,11 +70,8 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
         samples = np.arange(len(median))
         axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
         axes.plot(samples, median, stroke, color=colour, label=plain(evaluation.title))
-    axes.set_xlabel("samples")
-    axes.set_ylabel("log posterior gain of the truth / nat")
-    axes.set_title(title)
-    axes.set_xlim(0, None)
-    axes.set_ylim(lowest, None)
+    axes.set(xlabel="samples", ylabel="log posterior gain of the truth / nat", title=title)
+    axes.set(xlim=(0, None), ylim=(lowest, None))
     axes.grid(alpha=0.3)
     if len(evaluations) > len(_COLOURS):  # so many names would cover the curves
         figure.set_figwidth(10)
@@ -125,8 +121,7 @@ def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
             evaluation.metrics["fisher_gain"], 100 * errors, ".", color=colour, alpha=0.5, markersize=4,
             label=plain(evaluation.title),
         )  # fmt: skip
-    axes.set_xlabel("Fisher information / nat")
-    axes.set_ylabel("mean error of the parameters / %")
+    axes.set(xlabel="Fisher information / nat", ylabel="mean error of the parameters / %")
     axes.grid(alpha=0.3)
     axes.legend()
     return figure

@@ -53,11 +53,8 @@ def _arrow(outcomes: Mapping[str, Outcome]) -> Figure:
         middle = np.arange(len(mean_square)) + _WINDOW / 2
         axes.plot(middle, np.sqrt(mean_square), color=_COLOURS[name], linewidth=1.2, label=name)
     axes.axvline(WITHOUT_EXTRAPOLATION, color="black", linestyle=":", linewidth=1)
-    axes.set_yscale("log")
-    axes.set_ylim(3e-3, 300)
-    axes.set_xlim(0, len(error))
+    axes.set(yscale="log", ylim=(3e-3, 300), ylabel="simulation error / mV", xlim=(0, len(error)))
     axes.set_xlabel("sample of the arrow; right of the dotted line its amplitude exceeds the training's")
-    axes.set_ylabel("simulation error / mV")
     axes.set_title(f"points: every sample; lines: root mean square of {_WINDOW}", fontsize=9, loc="left")
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", ncols=3, fontsize=9)
@@ -72,8 +69,7 @@ def _learning(outcomes: Mapping[str, Outcome]) -> Figure:
         samples, errors = np.array(list(outcome.learning.items())).T
         axes.loglog(samples, 1e3 * errors, "o-", markersize=3, color=_COLOURS[name], label=name)
     axes.axhline(1.0, color="black", linestyle=":", linewidth=1)
-    axes.set_xlabel("training samples")
-    axes.set_ylabel("simulation error on the arrow / mV")
+    axes.set(xlabel="training samples", ylabel="simulation error on the arrow / mV")
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.27), fontsize=9)
     return figure
@@ -98,8 +94,7 @@ def _parameters(outcomes: Mapping[str, Outcome]) -> Figure:
             limits[parameter] += [low[samples >= _SHOWN_FROM].min(), high[samples >= _SHOWN_FROM].max()]
     for place, ((parameter, axes), unit) in enumerate(zip(panels.items(), units.values(), strict=True)):
         low, high = min(limits[parameter], default=0.0), max(limits[parameter], default=1.0)
-        axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
-        axes.set_xscale("log")
+        axes.set(xscale="log", ylim=(low - 0.1 * (high - low), high + 0.1 * (high - low)))
         axes.set_title(f"{parameter} / {unit}", fontsize=9)
         axes.grid(alpha=0.3)
         if place >= 4:
