@@ -1,7 +1,8 @@
 """Checkpoints: the policy on the way, and in the latest one the state of the training, from which it goes on.
 
-The state is ``training.safetensors`` (weights, moments of the optimisers, the replay buffer where there is one, and
-`agents.training.moments`) and ``training.json`` (the counts).
+The state is ``training.safetensors`` (weights, moments of the optimisers, the replay buffer where there is one, and the
+moment that the training is in: episodes, streams of random numbers, and the last returns) and ``training.json`` (the
+counts). With it a training that goes on from a checkpoint is the one that was never stopped, bit for bit.
 """
 
 from __future__ import annotations
@@ -10,26 +11,31 @@ import json
 import os
 import shutil
 import tempfile
+from collections import deque
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from agents.policies.learned import WEIGHTS
 from agents.policies.saving import save_policy
-from agents.training.moments import Tensors, go_on, moment_of
 from estimator.files import whole_file, write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
+Tensors = dict[str, npt.NDArray[Any]]
+
 FOLDER = "checkpoints"
 STATE = "training.json"
 TENSORS = "training.safetensors"
 _HALF_WRITTEN = ".checkpoint-"
+_ENTROPY = "log_ent_coef"  # the log weight of the entropy, of an algorithm that learns it
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_ENDED = ("r", "l", "t")
 
 
 @dataclass
@@ -130,13 +136,13 @@ def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
         tensors = {name: tensor.copy() for name, tensor in load_file(checkpoint / TENSORS).items()}
         for name in model.get_parameters():
             part = attrgetter(name)(model)
-            own = {key.removeprefix(f"{name}/"): torch.from_numpy(t) for key, t in tensors.items() if _of(name, key)}
+            own = {key: torch.from_numpy(tensor) for key, tensor in part_of(tensors, name).items()}
             part.load_state_dict(_moments(own, part) if isinstance(part, torch.optim.Optimizer) else own)
-        if (entropy := _entropy(model)) is not None:
-            entropy.data.copy_(torch.from_numpy(tensors["log_ent_coef"]))
-        if (buffer := _buffer(model)) is not None:
-            _refill(buffer, tensors)
-        go_on(model, {key.removeprefix("moment/"): t for key, t in tensors.items() if _of("moment", key)})
+        if (entropy := getattr(model, _ENTROPY, None)) is not None:
+            entropy.data.copy_(torch.from_numpy(tensors[_ENTROPY]))
+        if (buffer := getattr(model, "replay_buffer", None)) is not None:
+            _refill(buffer, part_of(tensors, "buffer"))
+        go_on(model, part_of(tensors, "moment"))
     except (KeyError, RuntimeError, ValueError, OSError, SafetensorError) as error:
         raise ValueError(f"checkpoint must hold this algorithm's state, but {checkpoint} does not: {error}") from error
 
@@ -159,9 +165,9 @@ def _save_state(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
         if isinstance(attrgetter(name)(model), torch.optim.Optimizer):
             part = {f"{i}/{key}": value for i, moments in part["state"].items() for key, value in moments.items()}
         tensors |= {f"{name}/{key}": value.detach().cpu().numpy() for key, value in part.items()}
-    if (entropy := _entropy(model)) is not None:
-        tensors["log_ent_coef"] = entropy.detach().cpu().numpy()
-    if (buffer := _buffer(model)) is not None:
+    if (entropy := getattr(model, _ENTROPY, None)) is not None:
+        tensors[_ENTROPY] = entropy.detach().cpu().numpy()
+    if (buffer := getattr(model, "replay_buffer", None)) is not None:
         tensors |= {f"buffer/{name}": getattr(buffer, name)[: buffer.size()] for name in _BUFFER}
         tensors["buffer/position"] = np.array(buffer.pos)
     tensors |= {f"moment/{name}": array for name, array in moment_of(model).items()}
@@ -170,21 +176,6 @@ def _save_state(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
     except SafetensorError as error:  # of a full disk
         raise OSError(f"{folder / TENSORS} cannot be written: {error}; make room, then resume") from error
     write_atomically(folder / STATE, json.dumps(asdict(progress)))
-
-
-def _entropy(model: BaseAlgorithm) -> Any:
-    """The log weight of the entropy, of an algorithm that learns it."""
-    return getattr(model, "log_ent_coef", None)
-
-
-def _buffer(model: BaseAlgorithm) -> Any:
-    """The replay buffer, of an algorithm that has one."""
-    return getattr(model, "replay_buffer", None)
-
-
-def _of(name: str, key: str) -> bool:
-    """Whether a tensor's key belongs to the part of this name."""
-    return key.startswith(f"{name}/")
 
 
 def _moments(own: dict[str, Any], optimizer: Any) -> dict[str, Any]:
@@ -197,8 +188,66 @@ def _moments(own: dict[str, Any], optimizer: Any) -> dict[str, Any]:
 
 
 def _refill(buffer: Any, tensors: Tensors) -> None:
-    filled = len(tensors["buffer/rewards"])
+    filled = len(tensors["rewards"])
     for name in _BUFFER:
-        getattr(buffer, name)[:filled] = tensors[f"buffer/{name}"]
-    buffer.pos = int(tensors["buffer/position"])
+        getattr(buffer, name)[:filled] = tensors[name]
+    buffer.pos = int(tensors["position"])
     buffer.full = filled == buffer.buffer_size
+
+
+def moment_of(model: BaseAlgorithm) -> Tensors:
+    """The moment between an update and the next roll-out; nothing where the environments cannot be gone on with."""
+    import torch
+
+    envs: Any = model.get_env()
+    if not hasattr(envs, "recall"):
+        return {}
+    numpys = np.random.get_state(legacy=False)  # noqa: NPY002  Stable-Baselines3 draws from it
+    numpys["state"]["key"] = numpys["state"]["key"].tolist()
+    streams = {"numpy": numpys, "actions": model.action_space.np_random.bit_generator.state}
+    ended = [[episode[name] for name in _ENDED] for episode in model.ep_info_buffer or ()]
+    return {
+        "streams": np.frombuffer(json.dumps(streams).encode(), np.uint8),
+        "torch": torch.get_rng_state().numpy(),
+        "starts": np.asarray(model._last_episode_starts),
+        "ended": np.array(ended, dtype=np.float64).reshape(-1, len(_ENDED)),
+        "left": np.array(model._current_progress_remaining),
+        **{f"lstm/{place}": value.numpy() for place, value in enumerate(_recurrent(model))},
+        **{f"envs/{name}": array for name, array in envs.memory.items()},
+    }
+
+
+def go_on(model: BaseAlgorithm, moment: Tensors) -> None:
+    """Put a model with new environments into the moment that another was in.
+
+    Raises:
+        KeyError, ValueError: where it is that of a model with other environments.
+    """
+    import torch
+
+    if not moment:
+        return
+    envs: Any = model.get_env()
+    model._last_obs = envs.recall(part_of(moment, "envs"))
+    model._last_episode_starts = moment["starts"]
+    model._current_progress_remaining = float(moment["left"])
+    for place, value in enumerate(_recurrent(model)):
+        value.copy_(torch.from_numpy(moment[f"lstm/{place}"]))
+    ended = [dict(zip(_ENDED, row, strict=True)) for row in moment["ended"].tolist()]
+    model.ep_info_buffer = deque(ended, maxlen=model._stats_window_size)
+    model.ep_success_buffer = deque(maxlen=model._stats_window_size)
+    streams = json.loads(moment["streams"].tobytes())
+    np.random.set_state(streams["numpy"])  # noqa: NPY002
+    model.action_space.np_random.bit_generator.state = streams["actions"]
+    torch.set_rng_state(torch.from_numpy(moment["torch"]))
+
+
+def part_of(tensors: Tensors, name: str) -> Tensors:
+    """What is called "NAME/KEY", by its key."""
+    return {key.removeprefix(f"{name}/"): array for key, array in tensors.items() if key.startswith(f"{name}/")}
+
+
+def _recurrent(model: Any) -> list[Any]:
+    """The memories (layers, n, units) of actor and critic, of a model that has one."""
+    states = getattr(model, "_last_lstm_states", None)
+    return [] if states is None else [value for part in states for value in part]
