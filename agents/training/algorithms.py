@@ -75,15 +75,16 @@ class AlgorithmSettings(ABC):
         suggest = {int: trial.suggest_int, float: trial.suggest_float}
         return {f.name: suggest[type(f.default)](f.name, **f.metadata) for f in varied}
 
-    def _common(self, envs: VecEnv, seed: int) -> dict[str, Any]:
-        """Arguments that every model takes."""
+    def _arguments(self, envs: VecEnv, seed: int, *names: str) -> dict[str, Any]:
+        """Arguments that every model takes, and those of the hyperparameters that are named."""
         start = self.learning_rate
-        return {
+        return {name: getattr(self, name) for name in names} | {
             "env": envs,
             "batch_size": self.batch_size,
             "learning_rate": lambda left: start * left,
             "gamma": self.gamma,
             "stats_window_size": self.num_envs,
+            "policy_kwargs": {"net_arch": list(self.hidden)},
             "seed": seed,
             "device": "cpu",
         }
@@ -124,13 +125,10 @@ class OnPolicySettings(AlgorithmSettings):
         return 1
 
     def _on_policy(self, envs: VecEnv, seed: int) -> dict[str, Any]:
-        return self._common(envs, seed) | {
-            "n_steps": self.n_steps,
-            "n_epochs": self.n_epochs,
-            "gae_lambda": self.gae_lambda,
-            "policy_kwargs": {"net_arch": list(self.hidden)}
-            | ({} if self.levels else {"log_std_init": self.log_std_init}),
-        }
+        arguments = self._arguments(envs, seed, "n_steps", "n_epochs", "gae_lambda")
+        if not self.levels:
+            arguments["policy_kwargs"]["log_std_init"] = self.log_std_init
+        return arguments
 
 
 @dataclass(frozen=True)
@@ -195,10 +193,7 @@ class OffPolicySettings(AlgorithmSettings):
 
     def _off_policy(self, envs: VecEnv, seed: int) -> dict[str, Any]:
         names = ("buffer_size", "learning_starts", "train_freq", "gradient_steps", "tau")
-        return self._common(envs, seed) | {
-            **{name: getattr(self, name) for name in names},
-            "policy_kwargs": {"net_arch": list(self.hidden)},
-        }
+        return self._arguments(envs, seed, *names)
 
 
 @dataclass(frozen=True)
