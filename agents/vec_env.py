@@ -24,7 +24,37 @@ from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402
 )
 
 
-class DuffingVecEnv(VecEnv):
+class BatchVecEnv(VecEnv):
+    """A `VecEnv` that is one batch: what an attribute or a method of the batch gives stands for every row."""
+
+    @property
+    def _batch(self) -> Any:
+        """What has the attributes and methods."""
+        return self
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute, once for every row asked for."""
+        return [getattr(self._batch, attr_name)] * len(self._rows(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute; it is one for all rows."""
+        setattr(self._batch, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Call a method once; its result stands for every row asked for."""
+        return [getattr(self._batch, method_name)(*args, **kwargs)] * len(self._rows(indices))
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """No row is wrapped; their episodes are monitored here."""
+        from stable_baselines3.common.monitor import Monitor
+
+        return [wrapper_class is Monitor] * len(self._rows(indices))
+
+    def _rows(self, indices: VecEnvIndices) -> list[int]:
+        return list(self._get_indices(indices))
+
+
+class DuffingVecEnv(BatchVecEnv):
     """Stable-Baselines3's view of a `DuffingVectorEnv` in mode ``SAME_STEP``.
 
     A finished row's info holds what the environment tells of its last step, the ``belief`` and the ``truth`` it ended
@@ -98,7 +128,7 @@ class DuffingVecEnv(VecEnv):
     @property
     def memory(self) -> dict[str, npt.NDArray[Any]]:
         """As `DuffingVectorEnv.memory`."""
-        return self.envs.unwrapped.memory | {"returns": self._returns, "lengths": self._lengths}
+        return self._batch.memory | {"returns": self._returns, "lengths": self._lengths}
 
     def recall(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
         """Go on with the episodes that a copy of `memory` is of, and see what was seen then."""
@@ -136,32 +166,19 @@ class DuffingVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of every row asked for: its part of what the batch has for each row, or what all have alike."""
-        envs: DuffingVectorEnv = self.envs.unwrapped
         rows = self._rows(indices)
         if attr_name == "belief":
-            return [envs.belief(row) for row in rows]
-        value = getattr(self.envs if hasattr(self.envs, attr_name) else envs, attr_name)
+            return [self._batch.belief(row) for row in rows]
+        value = getattr(self.envs if hasattr(self.envs, attr_name) else self._batch, attr_name)
         if isinstance(value, Parameters):
             return [Parameters({name: numbers[row].item() for name, numbers in value.items()}) for row in rows]
         each = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
         return [value[row] if each else value for row in rows]
 
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the batch; it is one for all rows."""
-        setattr(self.envs.unwrapped, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call a method of the batch once; its result stands for every row asked for."""
-        return [getattr(self.envs.unwrapped, method_name)(*args, **kwargs)] * len(self._rows(indices))
-
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """No row is wrapped; their episodes are monitored here."""
-        from stable_baselines3.common.monitor import Monitor
-
-        return [wrapper_class is Monitor] * len(self._rows(indices))
-
-    def _rows(self, indices: VecEnvIndices) -> list[int]:
-        return list(self._get_indices(indices))
+    @property
+    def _batch(self) -> DuffingVectorEnv:
+        batch: DuffingVectorEnv = self.envs.unwrapped
+        return batch
 
 
 def told_of(infos: dict[str, Any], row: int) -> dict[str, Any]:

@@ -10,12 +10,12 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from agents.evaluation.batch import make
 from agents.policies.foresight import CommonForesight, Sight
 from agents.policies.imagined import BOUND, FEATURES
+from agents.vec_env import BatchVecEnv
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.lanes import LANES
 
@@ -56,7 +56,7 @@ class _Group:
         self.left = self.envs.horizon
 
 
-class MixedVecEnv(VecEnv):
+class MixedVecEnv(BatchVecEnv):
     """Rows in groups of `estimator.lanes.LANES`, each group with options of its own, as `CommonForesight` shows them.
 
     A group draws anew when an episode has gone by; the rows that began another on the way, because a limit ended
@@ -154,22 +154,6 @@ class MixedVecEnv(VecEnv):
         """Close the environments."""
         for group in self._groups:
             group.envs.close()
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute, once for every row asked for."""
-        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute; it is one for all rows."""
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call a method once; its result stands for every row asked for."""
-        return [getattr(self, method_name)(*args, **kwargs)] * len(list(self._get_indices(indices)))
-
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """No row is wrapped; their episodes are monitored here."""
-        return [False] * len(list(self._get_indices(indices)))
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Nothing: the seed is that of the constructor."""
