@@ -80,7 +80,8 @@ def draw_member(rng: np.random.Generator) -> Member:
     m = small / omega**2
     c = 2.0 * damping * np.sqrt(small * m)
     width = log_uniform(*GUESS)
-    guess = {name: _around(value, width) for name, value in (("m", m), ("c", c), ("a", a), ("b", b))}
+    centers = {"m": m, "c": c, "a": a, "b": b}
+    guess = {name: tuple(sorted((x * (1.0 - width), x * (1.0 + width)))) for name, x in centers.items()}
     sensor = log_uniform(*SENSOR_NOISE)
     samples = int(log_uniform(*SAMPLES))
     # What white noise alone shakes the oscillator to, by the end or in balance with damping.
@@ -103,9 +104,3 @@ def draw_member(rng: np.random.Generator) -> Member:
 def draw_rig(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
     """A rig of the family, as `agents.training.mixed_env.Draw`."""
     return RIG_TRACK, draw_member(rng).options
-
-
-def _around(value: float, width: float) -> tuple[float, float]:
-    """A guess about a value, the lower end first."""
-    low, high = sorted((value * (1.0 - width), value * (1.0 + width)))
-    return low, high

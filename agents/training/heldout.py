@@ -84,9 +84,6 @@ class HeldOut:
         write_atomically(self._folder / FILE, table.getvalue())
         if found[SCORE] > self._best:
             self._best = found[SCORE]
-            save_policy(
-                self._folder / BEST,
-                model,
-                {**card, "evaluation": {"seed": _SEED, "systems": _SYSTEMS, **found}},
-            )
+            judged = card | {"evaluation": {"seed": _SEED, "systems": _SYSTEMS, **found}}
+            save_policy(self._folder / BEST, model, judged)
         return found

@@ -6,7 +6,7 @@ import difflib
 import json
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +18,10 @@ from estimator.files import whole_file, write_atomically
 #: Folder of the files that come with the package, ``ALGORITHM.toml``.
 FILES = Path(__file__).parents[1] / "hyperparameters"
 DEFAULT = "default"
+
+_KINDS: dict[type, str] = {
+    int: "a whole number", float: "a number", tuple: "a list of whole numbers", str: "a name", bool: "true or false"
+}  # fmt: skip
 
 Settings = TypeVar("Settings")
 
@@ -71,18 +75,8 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
             value = float(value)
         if wanted is tuple and isinstance(value, list) and all(type(units) is int for units in value):
             value = tuple(value)
-        if is_dataclass(wanted) and isinstance(value, dict):
-            value = settings_of(wanted, value)
         if type(value) is not wanted:
-            kinds = {
-                int: "a whole number",
-                float: "a number",
-                tuple: "a list of whole numbers",
-                str: "a name",
-                bool: "true or false",
-            }
-            kinds.setdefault(wanted, "a table")
-            raise ValueError(f"{name} must be {kinds[wanted]}, but is {value!r}")
+            raise ValueError(f"{name} must be {_KINDS[wanted]}, but is {value!r}")
         values[name] = value
     return kind(**values)
 
@@ -90,9 +84,7 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
 def write_settings(path: Path, env_id: str, settings: AlgorithmSettings, comment: str) -> None:
     """Write a file that `read_settings` reads, with these hyperparameters for this track."""
     lines = [f"# {printable(comment)}", f"[{table_of(env_id)}]"]
-    for name, value in as_written(settings).items():
-        entries = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
-        lines += [f"{key} = {json.dumps(each)}" for key, each in entries.items()]
+    lines += [f"{name} = {json.dumps(value)}" for name, value in as_written(settings).items()]
     write_atomically(path, "\n".join(lines) + "\n")
 
 

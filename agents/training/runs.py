@@ -274,11 +274,11 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
     asked = config.hyperparameters
     levels = getattr(asked, "levels", 0)
     options = {"reward": config.reward, **config.options}
+    mixed: dict[str, Any] = {"reward": config.reward, "levels": levels}
     if config.env == family.FAMILY:
         from agents.training.mixed_env import MixedVecEnv
 
-        kept: dict[str, Any] = {"reward": config.reward, "levels": levels}
-        return MixedVecEnv(asked.num_envs, seed, family.draw_rig, scale=family.SCALE, **kept)
+        return MixedVecEnv(asked.num_envs, seed, family.draw_rig, scale=family.SCALE, **mixed)
     if not asked.foresight:
         return DuffingVecEnv(config.env, asked.num_envs, seed=seed, levels=levels, **options)
     from agents.training.foresight_env import SCALE, ForesightVecEnv, foresight_of
@@ -289,8 +289,7 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
         for name, end in ((name, end) for name, ends in config.vary.items() for end in ends):
             make(config.env, 1, options | {name: end}).close()  # which refuses what the option may not be
         draw = partial(draw_options, env_id=config.env, options=config.options, ranges=config.vary)
-        kept = {"reward": config.reward, "levels": levels, "own": True, "drive": levels == 0}
-        return MixedVecEnv(asked.num_envs, seed, draw, scale=SCALE, **kept)
+        return MixedVecEnv(asked.num_envs, seed, draw, scale=SCALE, own=True, drive=levels == 0, **mixed)
     envs = DuffingVecEnv(config.env, asked.num_envs, seed=seed, **options)
     foresight = foresight_of(envs.envs, config.env, config.options, config.seed, levels=levels)
     return ForesightVecEnv(envs, foresight, levels, in_nats=config.reward in IN_NATS)

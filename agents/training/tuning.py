@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -51,7 +51,10 @@ def tune(config: TrainConfig, trials: int, *, on_ray: bool = False) -> Path:
         ModuleNotFoundError: without Optuna, or Ray where that is asked for.
         ValueError: where the folder holds another search.
     """
-    optuna = _optuna()
+    need("optuna")
+    import optuna
+    import optuna.storages.journal
+
     if on_ray:
         need("ray")
     folder = config.output or Path("runs") / f"tune-{config.algo}-{track_of(config.env).lower()}-{config.seed}"
@@ -69,12 +72,12 @@ def tune(config: TrainConfig, trials: int, *, on_ray: bool = False) -> Path:
     if not begun:
         study.enqueue_trial({k: v for k, v in as_written(config.hyperparameters).items() if k != "hidden"})
     state = optuna.trial.TrialState
-    for trial in begun:
-        if trial.state == state.RUNNING:  # the one that the search was stopped in; it is made again
+    for earlier in begun:
+        if earlier.state == state.RUNNING:  # the one that the search was stopped in; it is made again
             # It may have been told a part of its hyperparameters by then.
-            study.enqueue_trial(trial.system_attrs.get("fixed_params", {}) | trial.params)
-            study.tell(trial.number, state=state.FAIL)
-    finished = sum(trial.state in (state.COMPLETE, state.PRUNED) for trial in begun)
+            study.enqueue_trial(earlier.system_attrs.get("fixed_params", {}) | earlier.params)
+            study.tell(earlier.number, state=state.FAIL)
+    finished = sum(earlier.state in (state.COMPLETE, state.PRUNED) for earlier in begun)
 
     def objective(trial: Trial) -> float | None:
         """The score; None for a trial that was given up."""
@@ -127,11 +130,3 @@ def _print_table(study: Study) -> None:
         rows.append((str(trial.number), f"{trial.value:.3f}", *values))
     show(f"Log posterior gain: {len(complete)} trials to the end, {pruned} given up")
     show(table(("trial", "nat", *best[0].params), rows))
-
-
-def _optuna() -> Any:
-    need("optuna")
-    import optuna
-    import optuna.storages.journal
-
-    return optuna
