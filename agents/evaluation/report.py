@@ -55,12 +55,13 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
             "line, an over-confident one below it.",
         ),
     ]
+    heads, rows = leaderboard(evaluations)
     parts = [
         f"<h1>{html.escape(settings['env'])}</h1>",
         f"<p>{settings['systems']} systems, seed {settings['seed']}, the same for every policy; "
         f"options <code>{html.escape(json.dumps(settings['options']))}</code>.</p>",
         "<h2>Leaderboard</h2>",
-        _leaderboard(evaluations),
+        table(heads, [[title, *map(_with_interval, cells)] for title, *cells in rows]),
         f"<p><small>{caption_of(evaluations).capitalize()}. An episode that a limit ends counts with what was known by "
         "then.</small></p>",
         _estimators(evaluations),
@@ -78,14 +79,8 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
     write_atomically(path, page(title, parts))
 
 
-def _leaderboard(evaluations: list[Evaluation]) -> str:
-    """The table of all metrics, a column for each policy, the best first; intervals below the centres, and smaller."""
-    heads, rows = leaderboard(evaluations)
-    cells = [[title, *map(_with_interval, cells)] for title, *cells in rows]
-    return table(heads, cells)
-
-
 def _with_interval(cell: str) -> str:
+    """A cell of the leaderboard, whose interval stands smaller below the centre."""
     center, _, below = cell.partition("\n")
     return f"{center}<br><small>{below.replace(chr(10), '<br>')}</small>"
 

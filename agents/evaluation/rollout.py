@@ -25,7 +25,6 @@ from estimator.checks import printable, whole
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
-from estimator.models.model import Model
 from estimator.parameters import FloatArray, Parameters
 from estimator.physical import coefficients_of
 from estimator.posteriors import posteriors
@@ -305,7 +304,9 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
     if plant == difference():
         hands = {name: (experiment.prior_of(plant, name), u) for name in FACTORISATIONS}
     else:
-        hands[_own_hand(plant, experiment)] = own_prior, u
+        name = "ode" if plant.is_continuous else "structured"
+        # The environment's own estimator, without the hypotheses that it may weigh.
+        hands[f"{name}_alone" if experiment.noise_hypotheses != 1 else name] = own_prior, u
         if set(parameter_names(plant)) == set(parameter_names(difference())):
             earlier = u if not experiment.degree else np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
             hands |= {f"nlarx_{name}": (experiment.prior_of(difference(), name), earlier) for name in FACTORISATIONS}
@@ -319,9 +320,3 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
     fit = maximum_a_posteriori(plant, u, y, own_prior, process_noise, sensor_noises, interpolation, starts)
     found[AUDITOR] = metrics.estimate_metrics(fit.mean, fit.cov, truth, plant, experiment.scales)
     return found
-
-
-def _own_hand(plant: Model, experiment: SimulatedExperiment) -> str:
-    """Name of the environment's own estimator, without the hypotheses that it may weigh."""
-    name = "ode" if plant.is_continuous else "structured"
-    return f"{name}_alone" if experiment.noise_hypotheses != 1 else name
