@@ -36,9 +36,8 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from agents.cli import JsonOptions, run_script
-from agents.evaluation.oracle import Oracle
+from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.state_grid import StateGrid
-from agents.evaluation.systems import Systems
 from estimator.free_run import free_run
 from estimator.models.difference import difference
 from estimator.parameters import FloatArray

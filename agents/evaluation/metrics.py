@@ -92,8 +92,7 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> dict[st
 
     The latter, ``certified``, is at least so much of what is possible. Without an oracle there is neither.
     """
-    from agents.evaluation.oracle import Oracle
-    from agents.evaluation.systems import Systems
+    from agents.evaluation.oracle import Oracle, Systems
 
     try:
         oracle = Oracle.of(Systems.of(env_id, evaluation.inputs.shape[1], options))

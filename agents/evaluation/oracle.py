@@ -1,4 +1,4 @@
-"""The oracle: D-optimal inputs at the true parameters, stored, and the D-efficiency of other inputs against them.
+"""The systems of a track that input is designed for, and their oracle: D-optimal inputs at the true parameters, stored.
 
 `agents.evaluation.oracle_search` finds them. The worth of inputs has many summits, and the best one found is only a
 lower bound of the highest. So whoever finds a better input puts it in its place.
@@ -6,17 +6,147 @@ lower bound of the highest. So whoever finds a better input puts it in its place
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from agents.evaluation.systems import Systems
+from agents.evaluation.batch import TESTED, make
+from agents.planner.ascent import Limits, climber
+from agents.planner.design import Known
+from agents.planner.plants import Plant, plant_of
+from duffing_env.experiment import SimulatedExperiment
+from estimator.engine.feeding import input_degree
 from estimator.files import write_atomically
+from estimator.information import fisher_information, variances
+from estimator.models.difference import difference
 from estimator.parameters import FloatArray
+
+FOLDER = Path(__file__).parents[1] / "oracles"
+
+#: Inputs are stored as whole numbers, of which this one stands for the largest.
+LEVELS = 32767
+
+
+@dataclass(frozen=True)
+class Systems:
+    """The first systems of a track, by row.
+
+    Attributes:
+        experiment: what they are drawn for.
+        theta: (n, K) their coefficients.
+        precision: (K, K) Λ0.
+        variances: (n, 1 + p) of the process noise and of each sensor's.
+    """
+
+    experiment: SimulatedExperiment
+    theta: FloatArray
+    precision: FloatArray
+    variances: FloatArray
+
+    @classmethod
+    def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None) -> Systems:
+        """The first systems of a track, as they are evaluated with seed 0: of the branch ``test``, if not told another.
+
+        Raises:
+            ValueError: where its plant is not simulated, or changes.
+        """
+        envs = make(env_id, count, TESTED | (options or {}))
+        envs.reset(seed=0)
+        e = envs.experiment
+        if not isinstance(e, SimulatedExperiment) or e.jump or e.max_slew is not None:
+            raise ValueError(f"env must simulate a plant without jump and slew limit, but is {e}; choose another track")
+        plant = plant_of(e, envs.truth)
+        precision = np.linalg.inv(plant.prior.coefficients_cov).astype(np.float64)
+        strengths = variances(plant.model, plant.process_noise, plant.sensor_noises)
+        strengths = np.broadcast_to(strengths, (count, strengths.shape[-1])).copy()
+        return cls(e, plant.coefficients_of(envs.truth), precision, strengths)
+
+    def rows(self, first: int, stop: int) -> Systems:
+        """Some of them."""
+        chosen = slice(first, stop)
+        return replace(self, theta=self.theta[chosen], variances=self.variances[chosen])
+
+    @property
+    def plant(self) -> Plant:
+        """What they obey."""
+        return plant_of(self.experiment)
+
+    @property
+    def samples(self) -> int:
+        """Of an episode."""
+        return self.experiment.samples
+
+    @property
+    def limits(self) -> Limits:
+        """What inputs must keep, over an episode."""
+        e = self.experiment
+        energy = np.inf if e.max_rms is None else e.max_rms**2 * e.samples
+        return Limits(e.max_output, e.max_output, e.max_input, energy)
+
+    @property
+    def degree(self) -> int:
+        """Of the input's polynomial over a sample."""
+        return input_degree(self.plant.model, self.plant.interpolation)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Everything that the worth of an input, and which inputs are allowed, depend on.
+
+        The paper's equation goes without saying, as it does in what was stored first.
+        """
+        e, plant = self.experiment, self.plant
+        names = ("max_input", "max_output", "samples", "process_noise", "measurement_noise", "spread")
+        told = {name: getattr(e, name) for name in names}
+        told |= {"plant_spread": e.spread if e.plant_spread is None else e.plant_spread, "max_rms": e.max_rms}
+        told["branch"] = e.branch
+        if e.noise_range != 1:
+            told["noise_range"] = e.noise_range
+        if plant.model == difference():
+            return told
+        return told | {"model": plant.model.digest, "interpolation": plant.interpolation}
+
+    @property
+    def path(self) -> Path:
+        """The file in the package that holds their oracle."""
+        digest = hashlib.sha256(json.dumps(self.description).encode()).hexdigest()[:12]
+        return FOLDER / f"{self.samples}-samples-{digest}.npz"
+
+    def known(self, row: int) -> Known:
+        """What the worth of an input to one system is taken at."""
+        return Known(self.theta[row].copy(), self.precision, tuple(self.variances[row]))
+
+    def worth(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Worth ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
+
+        Each (n,). Inputs that are not finite, as after the end of an episode, tell nothing from there on.
+        """
+        u = np.array(inputs, dtype=np.float64)
+        if u.ndim != 2 or len(u) > len(self.theta):
+            raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.theta)}, but have {u.shape}")
+        values, peaks = np.empty((2, len(u)))
+        appraise = climber(self.plant.model, self.degree).appraise
+        for row in range(len(u)):
+            one = slice(row, row + 1)
+            noises = tuple(self.variances[row])
+            appraise(self.theta[one], self.precision, noises, self.limits.output, u[one], values[one], peaks[one])
+        return values, peaks
+
+    def information(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike | None = None) -> FloatArray:
+        """(n, K, K) F of inputs (n, samples) [V], along the outputs that followed, or the response without noise.
+
+        Raises:
+            ValueError: as `estimator.fisher_information`.
+        """
+        n, plant, stds = len(np.asarray(inputs)), self.plant, np.sqrt(self.variances)
+        return fisher_information(
+            plant.model, self.theta[:n], inputs, stds[:n, 0], stds[:n, 1:], y=outputs, interpolation=plant.interpolation
+        )
 
 
 @dataclass(frozen=True)
@@ -110,10 +240,6 @@ class Oracle:
             np.exp(2 * (values - top[: len(u)]) / information.shape[-1]) for top in (self.values, self.bounds)
         )
         return best, least
-
-
-#: Inputs are stored as whole numbers, of which this one stands for the largest.
-LEVELS = 32767
 
 
 def as_stored(scaled: FloatArray) -> FloatArray:

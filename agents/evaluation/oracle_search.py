@@ -23,8 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from agents.cli import JsonOptions, run_script
-from agents.evaluation.oracle import LEVELS, Oracle, as_stored
-from agents.evaluation.systems import Systems
+from agents.evaluation.oracle import LEVELS, Oracle, Systems, as_stored
 from agents.planner import search as planning
 from agents.planner.ascent import Limits, climber
 from agents.planner.imagination import Terms

@@ -19,9 +19,8 @@ import numpy as np
 from agents.evaluation.batch import TESTED
 from agents.evaluation.leaderboard import IQM, METRICS, Metric, center_and_interval
 from agents.evaluation.metrics import information
-from agents.evaluation.oracle import Oracle
+from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.rollout import Evaluation, members_of, roll_out
-from agents.evaluation.systems import Systems
 from agents.loading import load_object
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import CARD, WEIGHTS

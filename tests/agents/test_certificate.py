@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from agents.evaluation.certificate import Certificate, Multipliers
-from agents.evaluation.oracle import Oracle
+from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.state_grid import StateGrid
-from agents.evaluation.systems import Systems
 from estimator.free_run import free_run
 from estimator.models.difference import difference
 

@@ -16,8 +16,8 @@ import agents.evaluation.rollout
 from agents import make_policy
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.comparison import compare
+from agents.evaluation.oracle import Systems
 from agents.evaluation.rollout import evaluate
-from agents.evaluation.systems import Systems
 from agents.policies.learned import WEIGHTS, load_policy
 from agents.policies.saving import save_policy
 from agents.vec_env import DuffingVecEnv

@@ -451,8 +451,7 @@ def test_rewards_that_count_no_information_stay_as_they_are():
 
 def test_the_example_brings_about_as_much_as_the_oracle():
     """In the volume of what a sample tells, within a factor of two."""
-    from agents.evaluation.oracle import Oracle
-    from agents.evaluation.systems import Systems
+    from agents.evaluation.oracle import Oracle, Systems
     from estimator import fisher_information
 
     systems = Systems.of(AMPLITUDE, 24)

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
+from agents.evaluation import oracle as module_of_oracle
 from agents.evaluation import oracle_search
-from agents.evaluation import systems as module_of_systems
-from agents.evaluation.oracle import Oracle, as_stored
+from agents.evaluation.oracle import Oracle, Systems, as_stored
 from agents.evaluation.oracle_search import Config, main, search
-from agents.evaluation.systems import Systems
 from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
 
@@ -17,7 +16,7 @@ STORED = [f"duffing_env/{name}-v{version}" for name in ("Amplitude", "Short", "P
 
 @pytest.fixture
 def empty_folder(monkeypatch, tmp_path):
-    monkeypatch.setattr(module_of_systems, "FOLDER", tmp_path)
+    monkeypatch.setattr(module_of_oracle, "FOLDER", tmp_path)
     return tmp_path
 
 

@@ -10,8 +10,7 @@ import pytest
 
 from agents.commands import main
 from agents.evaluation import board, protocol
-from agents.evaluation.oracle import Oracle
-from agents.evaluation.systems import Systems
+from agents.evaluation.oracle import Oracle, Systems
 
 SHORT = "duffing_env/Short-v0"
 

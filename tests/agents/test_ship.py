@@ -7,8 +7,8 @@ import pytest
 from stable_baselines3 import PPO
 
 from agents import make_policy, policies
+from agents.evaluation.oracle import Systems
 from agents.evaluation.rollout import evaluate
-from agents.evaluation.systems import Systems
 from agents.policies.learned import CARD, load_policy
 from agents.policies.saving import save_policy
 from agents.studies.ship import Config, card_of, median_index, ship
