@@ -298,6 +298,9 @@ def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be an estimator.Belief or None, but is {shown(prior)}")
     if prior.scales != scales:
-        raise ValueError(f"prior must have the scales {scales}, but has {prior.scales}; give it those")
+        raise ValueError(
+            f"prior must have the scales {scales}, but has {prior.scales}; a posterior of a rig has those of its limit "
+            f"and range: identify once more with the rig as it is now"
+        )
     if model is not None and prior.model != model:
         raise ValueError(f"prior must be of the model {model.name!r}, but is of {prior.model.name!r}")

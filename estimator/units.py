@@ -104,3 +104,16 @@ def written(powers: Mapping[str, int]) -> str:
 
 def _power(power: int) -> str:
     return "" if power == 1 else str(power).translate(SUPERSCRIPTS)
+
+
+def digits_of(low: float, high: float, least: int) -> int:
+    """Significant digits, a ``least`` number or more, that show that the ends of an interval differ.
+
+    Example:
+        >>> digits_of(0.0023, 0.0023000001, 5), digits_of(1.0, 2.0, 5)
+        (9, 5)
+    """
+    for digits in range(least, 16):
+        if f"{low:.{digits}g}" != f"{high:.{digits}g}":
+            return digits if digits == least else digits + 1
+    return least

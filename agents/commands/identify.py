@@ -90,13 +90,15 @@ def show(result: Result) -> None:
     from rich.table import Table
 
     from estimator.checks import printable
+    from estimator.units import digits_of
 
     console = Console()
     units, intervals = result.units, result.interval(0.9)
     table = Table("", "mean", "90 % interval", "unit", box=box.SIMPLE_HEAD)
     for name, (mean, _) in result.parameters.items():
         low, high = intervals[name]
-        table.add_row(name, f"{mean:.5g}", f"{low:.5g} to {high:.5g}", escape(units[name]))
+        digits = digits_of(low, high, 5)
+        table.add_row(name, f"{mean:.{digits}g}", f"{low:.{digits}g} to {high:.{digits}g}", escape(units[name]))
     console.print("m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0", highlight=False)
     console.print(table)
     for warning in result.warnings:

@@ -4,28 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from estimator.checks import printable
 from estimator.identification.records import read
-from estimator.identification.tables import Table, read_table
+from estimator.identification.tables import read_table
 from estimator.models.duffing import KINDS
 from estimator.rig import INTERPOLATIONS, Channel, Rig
 
 _EQUATION = "#   m x'' + c x' + a x + b x³ = u - u0 + w,   seen: {seen} + y0 + noise"
 _SEEN = {"displacement": "x", "velocity": "x'", "acceleration": "x''"}
 _INTERPOLATION = '# Of the input between samples: "zero_order": held, as by a converter; "linear"; "spline": smooth.'
-
-#: Kind of an output to the words that name it, and the units that only it has.
-_WORDS = {
-    "displacement": ("displacement", "disp", "position", "pos"),
-    "velocity": ("velocity", "vel", "v"),
-    "acceleration": ("acceleration", "acc", "a"),
-}
-_UNITS_OF = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "acceleration": r".+/s(²|\^?2|/s)|m?g"}
 
 _SWITCHES = (
     "# y[k] is the acceleration just before the input goes from u[k-1] to u[k], where it is held (docs/own_data.md)."
@@ -104,29 +95,22 @@ def from_record(path: Path, step: float | None = None) -> str:
     if path.suffix.lower() == ".mat":
         if step is None:
             raise ValueError(f"{path} must be a CSV file to tell the step, but is a MAT file; add --step SECONDS")
-        read(path, step)
+        read(path, Rig(step))
         return text_of(Rig(step), f", from {printable(path.name)}")
     table = read_table(path)
     own = table.step()
     if step is None and own is None:
-        raise ValueError(f"{path} must have a column of times, such as 'time [s]', but has none; add --step SECONDS")
+        raise ValueError(
+            f"{path} must have a column of times, such as 'time [s]', but has {list(table.names)}; rename one, or add "
+            f"--step SECONDS"
+        )
     if step is None:
         # Times are written with some digits, and their mean difference is off by the last of them.
         step = float(f"{own:.6g}")
-    rig = Rig(step, input=Channel(table.unit(table.u) or "1"), output=_output(table))
-    return text_of(rig, f", from {printable(path.name)}")
-
-
-def _output(table: Table) -> Channel:
-    word, unit = table.word(table.y), table.unit(table.y) or "1"
-    kind = next((one for one, known in _WORDS.items() if word in known), None)
-    told = next((one for one, known in _UNITS_OF.items() if re.fullmatch(known, unit)), None)
-    if kind and told and kind != told:
-        raise ValueError(
-            f"{table.path}: unit of {table.names[table.y]!r:.60} must be of a kind with the name, {kind}, but tells "
-            f"{told}; mend one of them"
-        )
-    return Channel(unit, kind=kind or told or "displacement")
+    output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement")
+    rig = Rig(step, input=Channel(table.unit(table.u) or "1"), output=output)
+    told = "" if table.names else ", which names no column: its times were taken for seconds, its output for y"
+    return text_of(rig, f", from {printable(path.name)}{told}")
 
 
 def ask() -> Rig:

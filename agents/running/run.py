@@ -152,7 +152,8 @@ def run(
                     late = ticker.late
         ended, status = "complete", 0
     except Tripped as trip:
-        ended, message = trip.reason, str(trip)
+        missed = f"; {late} ticks of the clock were missed before, in which the input stood" if late else ""
+        ended, message = trip.reason, str(trip) + missed
     except Stopped as stopped:
         ended, message, status = str(stopped), f"stopped by {stopped}", 128 + stopped.signum
     except BaseException as error:

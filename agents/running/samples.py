@@ -20,7 +20,7 @@ from estimator.parameters import FloatArray
 TOLERANCE = 0.1
 
 #: More lost outputs than this, in parts of all, are worth a warning.
-_MANY = 0.1
+_MANY = 0.02
 
 _REMEDY = "play blocks (--block 64), or take a longer step"
 
@@ -113,7 +113,11 @@ class Ticker:
     def warning(self) -> str:
         """What speaks against a run that was complete; empty where nothing does."""
         many = self.lost > _MANY * self.tick
-        return f"{self.lost} of {self.tick} outputs came too late to be used; {_REMEDY}" if many else ""
+        return (
+            f"{self.lost} of {self.tick} outputs came too late to be used: intervals may be too narrow; {_REMEDY}"
+            if many
+            else ""
+        )
 
     @property
     def _due(self) -> float:

@@ -19,6 +19,9 @@ _STEPS = 8
 #: Longest stretch that is integrated, in samples: of a longer pause the rest is left out.
 _PAUSE = 2_000
 
+#: A noise that the rig does not give, in parts of the input's limit or the output's range.
+_NOISE = 1e-4
+
 #: Between two blocks an unknown time passes; here up to so many samples.
 _GAP = 200
 
@@ -26,8 +29,9 @@ _GAP = 200
 class SimulatedPlant:
     """An oscillator that follows the clock, or plays blocks at once.
 
-    Its parameters are the middle of the rig's guess, its noises those of the channels, 0 where they are not given. It
-    watches as an instrument does: silence of the watchdog's time brings its input to zero.
+    Its parameters are the middle of the rig's guess, its noises those of the channels; where the rig gives none, a
+    ten-thousandth of the limit and of the range. It watches as an instrument does: silence of the watchdog's time
+    brings its input to zero.
 
     Args:
         rig: with a guess, or ``truth``.
@@ -52,6 +56,8 @@ class SimulatedPlant:
             raise ValueError(f"rig must have a delay of 0 to be simulated here, but has {rig.delay}; set it to 0")
         self.truth = dict(truth) if truth is not None else {k: sum(v) / 2 for k, v in (rig.guess or {}).items()}
         self.rig, self.clock = rig, RealClock() if clock is None else clock
+        widest = ((rig.input, rig.input.limit), (rig.output, rig.output.range))
+        self._noises = [_NOISE * (most or 0.0) if one.noise is None else one.noise for one, most in widest]
         self._rng = np.random.default_rng(seed)
         self._x = self._v = self._u = self._force = 0.0
         self._armed, self._watchdog = False, math.inf
@@ -123,14 +129,14 @@ class SimulatedPlant:
     def _shown(self) -> float:
         order = KINDS[self.rig.output.kind]
         value = (self._x, self._v, self._acceleration(self._x, self._v))[order]
-        return value + self.rig.output.offset + (self.rig.output.noise or 0.0) * self._rng.standard_normal()
+        return value + self.rig.output.offset + self._noises[1] * self._rng.standard_normal()
 
     def _move(self, samples: float) -> None:
         """Runge and Kutta's method, with a force noise that is new for every sample."""
         samples = min(samples, float(_PAUSE))
         while samples > 1e-9:
             part = min(samples, 1.0)
-            self._force = (self.rig.input.noise or 0.0) * self._rng.standard_normal()
+            self._force = self._noises[0] * self._rng.standard_normal()
             h = part * self.rig.step / _STEPS
             for _ in range(_STEPS):
                 self._runge_kutta(h)

@@ -61,11 +61,11 @@ def run(seeds: int, workers: int) -> list[Cell]:
 def words(outcomes: Sequence[Outcome]) -> tuple[list[bool], list[bool]]:
     """Of what is out of reach, whether that is said; of what is within it, whether the contrary is.
 
-    A warning names the parameters as words of its message.
+    A warning begins with the names of the parameters.
     """
     said, wrongly = [], []
     for outcome in outcomes:
-        message = outcome.warnings.get(NOT_IDENTIFIED, "").replace(",", " ").replace(":", " ").split()
+        message = outcome.warnings.get(NOT_IDENTIFIED, "").split(":")[0].replace(",", " ").split()
         for name, bound in zip(PARAMETERS, outcome.bound, strict=True):
             if bound > OUT_OF_REACH:
                 said.append(name in message)

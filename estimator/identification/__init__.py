@@ -66,7 +66,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         (True, 'kg')
     """
     rig = Rig.of(rig)
-    read = records_of(records, rig.step)
+    read = records_of(records, rig)
     with _teller(progress) as tell:
         scales = _scales(rig, read)
         u = tuple(one.u / scales.input for one in read)

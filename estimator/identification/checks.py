@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.identification.fit import Fitter, Hypothesis
-from estimator.identification.guesses import astray, of_guess, without_guess
+from estimator.identification.guesses import astray, leads_astray, of_guess, without_guess
 from estimator.identification.problem import EXTRA, LATEST, Problem, explicable
 from estimator.identification.records import Record, residuals
 from estimator.identification.result import Warning
@@ -46,6 +46,10 @@ _LINEAR = 0.05
 #: Standard deviations below zero that are far.
 _FAR = 5.0
 
+#: Smallest errors of the forecasts, in parts of the output, that are judged: smaller ones are those of the integration,
+#: and all that is left of a simulated record without noise.
+_FINEST = 1e-6
+
 #: Fewest samples in a period.
 _SLOWEST = 5.0
 
@@ -73,20 +77,30 @@ def examine(
         records: as they were read.
         forecasts: of their outputs.
     """
-    guess, of_records = problem.rig.guess, _of_records(problem, records)
+    guess, of_records, noisy = problem.rig.guess, _of_records(problem, records), _error(records, forecasts) > _FINEST
     of_fit = [
-        *_of_hypotheses(problem, found),
+        *(_of_hypotheses(problem, found) if noisy else []),
         *_of_noise(problem, disturbance),
         *_of_signs(parameters),
         *_of_parameters(problem, found, parameters),
-        *([] if guess is None else of_guess(guess, parameters)),
-        *_of_residuals(problem, records, forecasts),
+        *([] if guess is None else of_guess(guess, parameters, problem.rig.output.kind)),
+        *(_of_residuals(problem, records, forecasts) if noisy else []),
     ]
     if guess is not None and of_fit:
         alone, gain = without_guess(problem, found)
-        if gain > _EVIDENCE:  # the other checks judge a fit that the guess has spoilt
-            return (*of_records, *_of_signs(alone), *astray(guess, parameters, alone, gain))
+        if gain > _EVIDENCE and leads_astray(guess, parameters, alone):  # the other checks judge a fit that it spoilt
+            kind = problem.rig.output.kind
+            return (*of_records, *_of_signs(alone), *astray(guess, parameters, alone, gain, kind))
     return (*of_records, *of_fit)
+
+
+def _error(records: Sequence[Record], forecasts: Sequence[FloatArray]) -> float:
+    """Errors to be expected of the forecasts, in parts of the outputs' deviation."""
+    variances = np.concatenate(
+        [forecast[np.isfinite(one.y), 1] for one, forecast in zip(records, forecasts, strict=True)]
+    )
+    outputs = np.concatenate([one.y for one in records])
+    return float(np.sqrt(np.nanmedian(variances)) / np.nanstd(outputs))
 
 
 def _of_records(problem: Problem, records: Sequence[Record]) -> list[Warning]:
@@ -95,10 +109,15 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Warning]:
     if stops:
         message = f"{stops} outputs stand at a stop and were taken as missing; widen the range, or drive it less"
         warnings.append(Warning("clipped", message))
-    if rig.input.limit and max(np.abs(one.u).max() for one in records) > rig.input.limit * (1 + 1e-6):
-        warnings.append(Warning("limit", f"inputs exceed the rig's limit of {rig.input.limit:g} {rig.input.unit}"))
-    if rig.output.range and max(np.nanmax(np.abs(one.y)) for one in records) > rig.output.range * (1 + 1e-6):
-        warnings.append(Warning("range", f"outputs leave the rig's range of {rig.output.range:g} {rig.output.unit}"))
+    largest = max(np.abs(one.u).max() for one in records)
+    widest = max(np.nanmax(np.abs(one.y)) for one in records)
+    source, sink = rig.input, rig.output
+    if source.limit and largest > source.limit * (1 + 1e-6):
+        message = f"inputs of {largest:.3g} {source.unit} exceed the rig's limit of {source.limit:g} {source.unit}"
+        warnings.append(Warning("limit", message))
+    if sink.range and widest > sink.range * (1 + 1e-6):
+        message = f"outputs of {widest:.3g} {sink.unit} leave the rig's range of {sink.range:g} {sink.unit}"
+        warnings.append(Warning("range", message))
     if 2 * np.pi / problem.frequency < _SLOWEST:
         message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, 6 at least"
         warnings.append(Warning("sampling_too_slow", message))

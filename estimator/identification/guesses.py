@@ -22,9 +22,12 @@ Guess = Mapping[str, tuple[float, float]]
 #: Standard deviations from the guess that are far.
 _FAR = 5.0
 
+#: A guess leads astray where it moves a parameter by more than this part of it.
+_ASTRAY = 0.01
+
 #: A wrong step or scale is looked for that is nearer to a factor of 2, either way, than to 1, where the guess of the
 #: parameters that it changes has less than 1 % of a chance: chi square is larger, of so many of them.
-_FACTOR, _UNLIKELY = 0.5 * np.log(2), {2: 9.21, 4: 13.28}
+_FACTOR, _UNLIKELY = 0.5 * np.log(2), {2: 9.21, 3: 11.34, 4: 13.28}
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class _Slip:
     Attributes:
         check: its name.
         message: with a place for the factor.
-        powers: parameter to the power of the factor that would mend it.
+        powers: parameter to the power of the factor that would mend it; the first one tells the factor.
     """
 
     check: str
@@ -42,12 +45,17 @@ class _Slip:
     powers: Mapping[str, int]
 
 
+_STEP = " would be those of the guess if the sampling step were about {:.2g} times the rig's"
+
+#: Kind of the output to what a wrong sampling step does: what the sensor shows keeps its scale, and not what is
+#: integrated or differentiated of it.
+_OF_STEP = {
+    "displacement": _Slip("step", "m and c" + _STEP, {"m": 2, "c": 1}),
+    "velocity": _Slip("step", "m, a and b" + _STEP, {"m": 1, "a": -1, "b": -3}),
+    "acceleration": _Slip("step", "c, a and b" + _STEP, {"a": -2, "b": -6, "c": -1}),
+}
+
 _SLIPS = (
-    _Slip(
-        "step",
-        "m and c would be those of the guess if the sampling step were about {:.2g} times the rig's",
-        {"m": 2, "c": 1},
-    ),
     _Slip(
         "guess",
         "m, c, a and b would be those of the guess if the input were about {:.2g} times what is recorded; check its "
@@ -63,8 +71,14 @@ _SLIPS = (
 )
 
 
-def of_guess(guess: Guess, parameters: Parameters) -> list[Warning]:
-    """Whether parameters are far from the guess, and what explains most of it; a negative mass is no matter of it."""
+def of_guess(guess: Guess, parameters: Parameters, kind: str) -> list[Warning]:
+    """Whether parameters are far from the guess, and what explains most of it; a negative mass is no matter of it.
+
+    Args:
+        guess: of the rig.
+        parameters: that were found.
+        kind: of the output.
+    """
     if parameters["m"][0] <= 0:
         return []
     off, warnings = _surprise(guess, parameters), list[Warning]()
@@ -73,9 +87,12 @@ def of_guess(guess: Guess, parameters: Parameters) -> list[Warning]:
         message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
         warnings = [Warning("guess", message)]
     least = sum(off.values()) / 2
-    for slip in _SLIPS:
-        # The guess of m is of one sign, and tells the factor.
-        factor = float((sum(guess["m"]) / 2 / parameters["m"][0]) ** (1 / slip.powers["m"]))
+    for slip in (_OF_STEP[kind], *_SLIPS):
+        first = next(iter(slip.powers))
+        ratio = sum(guess[first]) / 2 / parameters[first][0]
+        if ratio <= 0:
+            continue
+        factor = float(ratio ** (1 / slip.powers[first]))
         mended = {name: _times(parameters[name], factor ** slip.powers.get(name, 0)) for name in guess}
         left = sum(_surprise(guess, mended).values())
         unlikely = sum(off[name] for name in slip.powers) > _UNLIKELY[len(slip.powers)]
@@ -112,9 +129,16 @@ def without_guess(problem: Problem, found: Found) -> tuple[Parameters, float]:
     return {name: (mean, std) for name, (mean, std, _) in told.items()}, float(own - alone.fits.free_energy.min())
 
 
-def astray(guess: Guess, parameters: Parameters, alone: Parameters, gain: float) -> list[Warning]:
+def leads_astray(guess: Guess, parameters: Parameters, alone: Parameters) -> bool:
+    """Whether the records alone say something else that matters."""
+    return any(abs(alone[name][0] - parameters[name][0]) > _ASTRAY * abs(alone[name][0]) for name in guess)
+
+
+def astray(guess: Guess, parameters: Parameters, alone: Parameters, gain: float, kind: str) -> list[Warning]:
     """That the guess has led the fit astray: by so many nats the records are more probable with what they say alone."""
     values = ", ".join(f"{name} = {alone[name][0]:.4g} and not {parameters[name][0]:.4g}" for name in guess)
     led = f"the guess leads the fit astray: by {gain:.0f} nats the records speak for {values}"
-    why = of_guess(guess, alone) or [Warning("guess", "check the units of guess and columns, or leave out the guess")]
+    why = of_guess(guess, alone, kind) or [
+        Warning("guess", "check the units of guess and columns, or leave out the guess")
+    ]
     return [Warning(one.name, f"{led}; {one.message}") for one in why]

@@ -16,6 +16,7 @@ from estimator.checks import series
 from estimator.files import whole_file
 from estimator.identification.tables import read_table
 from estimator.parameters import FloatArray
+from estimator.rig import Rig
 
 #: No file of a record is larger [bytes].
 _LARGEST_FILE = 2**30
@@ -57,7 +58,7 @@ class Record:
     missing: int = 0
 
 
-def records_of(given: Any, step: float) -> list[Record]:
+def records_of(given: Any, rig: Rig) -> list[Record]:
     """Records from a pair (u, y), a file name, or a list of these.
 
     A record is cut in two where an input is missing; clipped outputs are taken as missing. Pieces of fewer than 8
@@ -65,7 +66,7 @@ def records_of(given: Any, step: float) -> list[Record]:
 
     Args:
         given: what the caller has.
-        step: sampling step of the rig [s], which a file's time column must have.
+        rig: whose sampling step a file's times must have, and whose units and kind of output the names of its columns.
 
     Raises:
         ValueError: naming the record, and in a file the line, and what is wrong.
@@ -83,7 +84,7 @@ def records_of(given: Any, step: float) -> list[Record]:
     for number, one in enumerate(listed):
         name = str(one) if isinstance(one, str | Path) else f"record {number}"
         if isinstance(one, str | Path):
-            u, y = read(one, step)
+            u, y = read(one, rig)
         elif _is_pair(one):
             u, y = (series(f"{part} of {name}", values, missing=True) for part, values in zip("uy", one, strict=True))
         else:
@@ -156,7 +157,7 @@ def clipped(y: FloatArray) -> npt.NDArray[np.bool_]:
     return found
 
 
-def read(path: str | Path, step: float) -> tuple[FloatArray, FloatArray]:
+def read(path: str | Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
     """Inputs and outputs of a CSV or MAT file.
 
     A CSV is as `estimator.identification.tables.read_table` says. A MAT file holds the variables ``u`` and ``y``.
@@ -166,7 +167,7 @@ def read(path: str | Path, step: float) -> tuple[FloatArray, FloatArray]:
         FileNotFoundError: if there is no such file.
     """
     place = whole_file(path, "record must be a CSV or MAT file", _LARGEST_FILE)
-    return _read_mat(place) if place.suffix.lower() == ".mat" else _read_csv(place, step)
+    return _read_mat(place) if place.suffix.lower() == ".mat" else _read_csv(place, rig)
 
 
 def _read_mat(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -184,11 +185,14 @@ def _read_mat(path: Path) -> tuple[FloatArray, FloatArray]:
     return series(f"u of {path}", held["u"], missing=True), series(f"y of {path}", held["y"], missing=True)
 
 
-def _read_csv(path: Path, step: float) -> tuple[FloatArray, FloatArray]:
+def _read_csv(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
     table = read_table(path)
     own = table.step()
-    if own is not None and abs(own / step - 1) > 0.01:
-        raise ValueError(f"{path}: times are {own:.6g} s apart, but the rig's step is {step:.6g} s; mend one of them")
+    if own is not None and abs(own / rig.step - 1) > 0.01:
+        raise ValueError(
+            f"{path}: times are {own:.6g} s apart, but the rig's step is {rig.step:.6g} s; mend one of them"
+        )
+    table.check(rig.input, rig.output)
     return table.columns[table.u], table.columns[table.y]
 
 

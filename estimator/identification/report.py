@@ -14,6 +14,7 @@ from estimator.files import write_atomically
 from estimator.identification.records import Record, residuals
 from estimator.page import page, plain, svg, table
 from estimator.parameters import FloatArray
+from estimator.units import digits_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,8 +77,9 @@ def _parameters(result: Result) -> str:
     intervals, rows = result.interval(0.9), []
     for name, (mean, std) in result.parameters.items():
         low, high = intervals[name]
-        label, interval = f"{name}, {_MEANINGS[name]}", f"{low:.6g} to {high:.6g}"
-        rows.append([label, f"{mean:.6g}", f"{std:.2g}", interval, escape(result.units[name])])
+        digits = digits_of(low, high, 6)
+        label, interval = f"{name}, {_MEANINGS[name]}", f"{low:.{digits}g} to {high:.{digits}g}"
+        rows.append([label, f"{mean:.{digits}g}", f"{std:.2g}", interval, escape(result.units[name])])
     for name, what in (("input", "disturbance of the force"), ("output", "noise of the sensor")):
         mean, std = result.noises[name]
         interval = f"{max(mean - 1.645 * std, 0):.3g} to {mean + 1.645 * std:.3g}"

@@ -15,6 +15,7 @@ from estimator.identification.records import Record
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
+from estimator.units import digits_of
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,9 @@ class Result:
     def __str__(self) -> str:
         intervals, units = self.interval(0.9), self.units
         rows = [
-            f"{name:>3} = {mean:.6g} {units[name]}, 90 % in [{low:.6g}, {high:.6g}]"
+            f"{name:>3} = {mean:.{digits}g} {units[name]}, 90 % in [{low:.{digits}g}, {high:.{digits}g}]"
             for (name, (mean, _)), (low, high) in zip(self.parameters.items(), intervals.values(), strict=True)
+            for digits in [digits_of(low, high, 6)]
         ]
         told = [f"WARNING {warning}" for warning in self.warnings] or ["no check speaks against it"]
         return "\n".join([*rows, *told])

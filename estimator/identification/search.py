@@ -210,7 +210,10 @@ def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: flo
         logs = np.clip(middle + np.linspace(-width, width, _GRID), *bounds)
         fits = fitter.fit(with_ratios(hypothesis, np.exp(logs)), start, level)
         if not np.isfinite(fits.free_energy).any():
-            raise ValueError("records must keep the fit finite, but it ran away; check units and the sampling step")
+            raise ValueError(
+                "records must keep the fit finite, but it ran away; check units and the sampling step, and give a "
+                "simulated record some noise, of 1e-8 of its size at least"
+            )
         away = logs - np.log(unit)
         energies = fits.free_energy + half_cauchy(away)
         best = int(np.argmin(energies))

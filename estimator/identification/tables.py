@@ -13,14 +13,20 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.parameters import FloatArray
+from estimator.rig import Channel
 
 #: Names of columns, in lower case, up to the first character that is not a letter.
 _INPUTS = ("u", "input", "force", "f", "in", "drive", "excitation")
-_OUTPUTS = (
-    *("y", "output", "out", "response", "x", "displacement", "disp", "position", "pos"),
-    *("v", "velocity", "vel", "a", "acceleration", "acc"),
-)
+_KINDS = {
+    "displacement": ("displacement", "disp", "position", "pos"),
+    "velocity": ("velocity", "vel", "v"),
+    "acceleration": ("acceleration", "acc", "a"),
+}
+_OUTPUTS = ("y", "output", "out", "response", "x", *(word for words in _KINDS.values() for word in words))
 _TIMES = ("t", "time")
+
+#: Units that only one kind of output has.
+_UNITS = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "acceleration": r".+/s(²|\^?2|/s)|m?g"}
 
 #: What a time column may be in [s].
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
@@ -99,12 +105,44 @@ class Table:
 
     def unit(self, place: int) -> str | None:
         """What stands in brackets behind the name of a column, as N in ``force [N]``; None where nothing does."""
-        found = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", self.names[place]) if self.names else None
-        return found.group(1) if found else None
+        return _unit(self.names[place]) if self.names else None
 
-    def word(self, place: int) -> str:
-        """The first word of a column's name, in lower case."""
-        return _word(self.names[place]) if self.names else ""
+    def kind(self) -> str | None:
+        """What the name of the output, or else its unit, says that it is: a displacement, for one; or None.
+
+        Raises:
+            ValueError: where name and unit say different things.
+        """
+        word, unit = _word(self.names[self.y]) if self.names else "", self.unit(self.y) or ""
+        named = next((kind for kind, words in _KINDS.items() if word in words), None)
+        told = next((kind for kind, units in _UNITS.items() if re.fullmatch(units, unit)), None)
+        if named and told and named != told:
+            raise ValueError(
+                f"{self.path}: unit of {self.names[self.y]!r:.60} must be of a kind with the name, {named}, but tells "
+                f"{told}; mend one of them"
+            )
+        return named or told
+
+    def check(self, source: Channel, sink: Channel) -> None:
+        """Refuse names of columns that contradict the channels of a rig; a pure number, 1, contradicts nothing.
+
+        Raises:
+            ValueError: naming the column, for another unit, or another kind of output.
+        """
+        for place, channel in ((self.u, source), (self.y, sink)):
+            unit = self.unit(place)
+            if unit and channel.unit != "1" and _plain(unit) != _plain(channel.unit):
+                raise ValueError(
+                    f"{self.path}: {self.names[place]!r:.60} must be in the rig's unit, {channel.unit}, but is in "
+                    f"{unit}; convert the column, or write its unit into the rig"
+                )
+        word = _word(self.names[self.y]) if self.names else ""
+        kind = next((one for one, words in _KINDS.items() if word in words and len(word) > 1), sink.kind)
+        if kind != sink.kind:
+            raise ValueError(
+                f"{self.path}: {self.names[self.y]!r:.60} must be the rig's kind of output, {sink.kind}, but is called "
+                f"{kind}; mend one of them"
+            )
 
 
 def read_table(path: Path) -> Table:
@@ -113,7 +151,8 @@ def read_table(path: Path) -> Table:
     Fields stand between commas, or semicolons or tabs (then 0,5 is a number), or blanks. Empty ones are missing, and
     NaN, NA, N/A, null, none or - in them. Lines that begin with # are passed over; one of separators alone sets records
     apart. The first line may hold names, such as ``u,y`` or ``time [ms],force [N],x [mm]``, and the next one units,
-    such as ``ms,N,mm``; of numbers alone there are the columns u and y, or time, u and y.
+    such as ``ms,N,mm``; of numbers alone there are the columns u and y, or time in seconds, u and y. A column in a unit
+    of time is the time, whatever its name.
 
     Raises:
         ValueError: naming the file, the line and what is wrong.
@@ -194,6 +233,22 @@ def _word(name: str) -> str:
     return words[0] if words else ""
 
 
+def _unit(name: str) -> str | None:
+    found = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
+    return found.group(1) if found else None
+
+
+def _plain(unit: str) -> str:
+    """A unit in one way of writing."""
+    for written, plain in (("µ", "u"), ("μ", "u"), ("²", "2"), ("^", ""), ("·", " "), ("*", " ")):
+        unit = unit.replace(written, plain)
+    return unit.replace(" ", "")
+
+
+def _listed(words: Sequence[str]) -> str:
+    return f"{', '.join(words[:-1])} or {words[-1]}"
+
+
 def _chosen(path: Path, names: Sequence[str], count: int) -> tuple[int | None, int, int]:
     """Places of time (or None), input and output."""
     if not names:
@@ -201,8 +256,10 @@ def _chosen(path: Path, names: Sequence[str], count: int) -> tuple[int | None, i
             raise ValueError(f"{path} must have two columns, u and y, or three with the time, but has {count}")
         return (None, 0, 1) if count == 2 else (0, 1, 2)
     time, u, y = ([k for k, name in enumerate(names) if _word(name) in known] for known in (_TIMES, _INPUTS, _OUTPUTS))
+    time = time or [k for k, name in enumerate(names) if _unit(name) in _SECONDS]
     if len(u) != 1 or len(y) != 1 or len(time) > 1:
         raise ValueError(
-            f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename"
+            f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename: "
+            f"an input is called {_listed(_INPUTS)}, an output {_listed(_OUTPUTS)}"
         )
     return (time[0] if time else None), u[0], y[0]

@@ -1,6 +1,7 @@
 """What `identify` warns of: each check names its fault. benchmarks/rigs says how often, and that good records pass."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,6 +90,43 @@ def test_a_wrong_scale_is_told_from_a_wrong_step(channel, factor):
     assert warning.name == "guess"
     told = re.findall(rf"if the {channel} were about (\S+) times what is recorded", warning.message)
     assert [float(one) for one in told] == pytest.approx([factor], rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["velocity", "acceleration"])
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_wrong_step_is_named_whatever_the_sensor_shows(kind, factor):
+    u, y = simulated(BENCH, kind=kind)
+    wrong = replace(rig_of(BENCH, kind, guess=GUESS), step=factor * BENCH[1])
+    (message,) = (one.message for one in identify(wrong, (u, y)).warnings if one.name == "step")
+    told = re.findall(r"if the sampling step were about (\S+) times the rig's", message)
+    assert [float(one) for one in told] == pytest.approx([1 / factor], rel=0.15)
+
+
+@pytest.mark.parametrize(("kind", "noise"), [("displacement", 0.0), ("velocity", 1e-8)])
+def test_a_record_without_noise_is_judged_by_no_check(kind, noise):
+    (m, c, a, b), h, (u, _) = BENCH[0].values(), BENCH[1] / 8, simulated(BENCH)
+    rates = lambda x, force: np.array([x[1], (force - c * x[1] - a * x[0] - b * x[0] ** 3) / m])  # noqa: E731
+    x, shown = np.zeros(2), []
+    for force in u:
+        shown.append(x[int(kind == "velocity")])
+        for _ in range(8):
+            k1 = rates(x, force)
+            k2 = rates(x + h / 2 * k1, force)
+            k3 = rates(x + h / 2 * k2, force)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + h * k3, force))
+    y = np.array(shown) * (1 + noise * np.random.default_rng(0).standard_normal(len(u)))
+    result = identify(rig_of(BENCH, kind), (u, y))
+    assert result.warnings == ()
+    assert [result.parameters[name][0] for name in "mcab"] == pytest.approx([m, c, a, b], rel=1e-5)
+
+
+def test_a_guess_that_is_right_is_not_blamed_for_a_wrong_limit():
+    u, y = simulated(BENCH)
+    source, sink = Channel("N", limit=0.012), Channel("m", range=1e-5)
+    warnings = identify(Rig(BENCH[1], input=source, output=sink, guess=GUESS), (u, y)).warnings
+    assert {"limit", "range"} <= {one.name for one in warnings}
+    assert "guess" not in {one.name for one in warnings}
+    assert "inputs of 6 N exceed the rig's limit of 0.012 N" in {one.message for one in warnings}
 
 
 def test_a_wrong_step_and_a_parameter_that_does_nothing_are_named():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oscillators import BENCH, SOFT, rig_of, simulated
 
-from estimator import identify
+from estimator import Channel, Rig, identify
 from estimator.identification.records import clipped, read, records_of
 
 
@@ -28,7 +28,7 @@ def test_a_stop_that_single_samples_meet_is_found():
 def test_a_short_piece_between_missing_inputs_is_left_out():
     u, y = simulated(SOFT, samples=400)
     u[[200, 205]] = np.nan
-    assert [(one.name, len(one.u)) for one in records_of((u, y), 0.01)] == [
+    assert [(one.name, len(one.u)) for one in records_of((u, y), Rig(0.01))] == [
         ("record 0", 200),
         ("record 0, from sample 206", 194),
     ]
@@ -41,21 +41,21 @@ def test_files(tmp_path):
     plain.write_text("\n".join(lines))
     lines[7] = lines[7].rsplit(",", 1)[0] + ","
     named.write_text("# a comment\nTime [s],Force [N],Displacement [m]\n" + "\n".join(lines) + "\n")
-    one, other = records_of([plain, str(named)], 0.01)
+    one, other = records_of([plain, str(named)], Rig(0.01))
     np.testing.assert_array_equal(one.u, u)
     assert (one.missing, other.missing) == (0, 1)
     from scipy.io import savemat
 
     savemat(tmp_path / "r.mat", {"u": u, "y": y})
-    np.testing.assert_array_equal(records_of(tmp_path / "r.mat", 0.01)[0].y, y)
+    np.testing.assert_array_equal(records_of(tmp_path / "r.mat", Rig(0.01))[0].y, y)
     whole = bytearray((tmp_path / "r.mat").read_bytes())
     whole[176] ^= 1  # an unknown kind of number, of which SciPy's reader dies
     (tmp_path / "r.mat").write_bytes(whole)
     with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file .*, but is not: the reader died"):
-        records_of(tmp_path / "r.mat", 0.01)
+        records_of(tmp_path / "r.mat", Rig(0.01))
     (tmp_path / "r.mat").write_bytes(b"none")
     with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file"):
-        records_of(tmp_path / "r.mat", 0.01)
+        records_of(tmp_path / "r.mat", Rig(0.01))
 
 
 @pytest.mark.parametrize(
@@ -72,14 +72,14 @@ def test_files(tmp_path):
 )
 def test_tables_as_programs_write_them(tmp_path, text):
     (tmp_path / "r.csv").write_text(text, encoding="utf-8")
-    u, y = read(tmp_path / "r.csv", 0.01)
+    u, y = read(tmp_path / "r.csv", Rig(0.01))
     np.testing.assert_array_equal(u, [0.5, 1.5, np.nan])
     np.testing.assert_array_equal(y, [1.0, -0.2, 3.0])
 
 
 def test_times_are_even_between_missing_inputs_only(tmp_path):
     (tmp_path / "r.csv").write_text("t,u,y\n0,1,2\n0.01,1,3\n,,\n7,1,2\n7.01,2,3\n7.02,,3\n9,2,2\n9.01,2,2\n,,,,\n")
-    u, _ = read(tmp_path / "r.csv", 0.01)
+    u, _ = read(tmp_path / "r.csv", Rig(0.01))
     np.testing.assert_array_equal(u, [1, 1, np.nan, 1, 2, np.nan, 2, 2, np.nan])
 
 
@@ -109,7 +109,7 @@ def test_times_are_even_between_missing_inputs_only(tmp_path):
 def test_errors_of_files_name_the_line(tmp_path, text, message):
     (tmp_path / "r.csv").write_text(text)
     with pytest.raises(ValueError, match=re.escape(message)) as error:
-        records_of(tmp_path / "r.csv", 0.01)
+        records_of(tmp_path / "r.csv", Rig(0.01))
     assert "r.csv" in str(error.value)
 
 
@@ -135,3 +135,28 @@ def test_errors_of_files_name_the_line(tmp_path, text, message):
 def test_errors_name_the_record(records, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         identify(rig_of(BENCH), records)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ("u [kN],y [mm/s]", "'u [kN]' must be in the rig's unit, N, but is in kN; convert the column"),
+        ("force [N],velocity [m/s]", "'velocity [m/s]' must be in the rig's unit, mm/s, but is in m/s"),
+        ("force [N],displacement [mm/s]", "must be the rig's kind of output, velocity, but is called displacement"),
+        ("Kraft [N],v [mm/s]", "rename: an input is called u, input, force"),
+    ],
+)
+def test_names_of_columns_that_contradict_the_rig_are_refused(tmp_path, names, message):
+    (tmp_path / "r.csv").write_text(f"{names}\n1,2\n3,4\n")
+    rig = Rig(0.01, input=Channel("N"), output=Channel("mm/s", kind="velocity"))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        read(tmp_path / "r.csv", rig)
+
+
+def test_units_in_another_way_of_writing_and_times_of_another_name_are_taken(tmp_path):
+    rig = Rig(0.002, input=Channel("µN"), output=Channel("m/s²", kind="acceleration"))
+    (tmp_path / "r.csv").write_text("Zeit [ms];u [μN];a [m/s^2]\n0;1;2\n2;3;4\n")
+    np.testing.assert_array_equal(read(tmp_path / "r.csv", rig), [[1, 3], [2, 4]])
+    (tmp_path / "r.csv").write_text("Zeit [ms];u [μN];a [m/s^2]\n0;1;2\n3;3;4\n")
+    with pytest.raises(ValueError, match=re.escape("times are 0.003 s apart, but the rig's step is 0.002 s")):
+        read(tmp_path / "r.csv", rig)

@@ -508,7 +508,9 @@ def test_a_read_that_becomes_slow_ends_the_run_as_a_dead_sensor_does(steps, tmp_
 def test_a_complete_run_that_lost_many_outputs_warns(tmp_path):
     result = play(tmp_path / "run", slow_to_read(3, after=16), samples=128, stale=0)
     assert (result.ended, result.exit_status, result.late) == ("complete", 0, 132)
-    assert result.message.startswith("132 of 148 outputs came too late to be used; play blocks")
+    assert result.message.startswith(
+        "132 of 148 outputs came too late to be used: intervals may be too narrow; play blocks"
+    )
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["message"] == result.message
     assert play(tmp_path / "other").message == ""
 
