@@ -219,10 +219,11 @@ def test_the_verdicts_of_faults() -> None:
 
 
 def test_the_sweep_reads_what_is_said_of_each_parameter() -> None:
-    told = outcome(bound=2.0, not_identified="not identified by this input: c, b")
+    left = "not identified by this input; the records leave more than a third of it open"
+    told = outcome(bound=2.0, not_identified=f"c, b: {left}")
     assert sweep.words([told]) == ([False, True, False, True], [])
-    wrong = outcome(bound=0.01, not_identified="a is not identified")
-    assert sweep.words([wrong]) == ([], [False, False, True, False])
+    wrong = outcome(bound=0.01, not_identified=f"b: {left}")
+    assert sweep.words([wrong]) == ([], [False, False, False, True])
 
 
 def test_the_sweep_spans_its_rates() -> None:
