@@ -62,9 +62,10 @@ def checked_rig(rig: AnyRig | None, needs_guess: bool = True) -> Rig:
     if rig is None:
         raise ValueError("rig must be a Rig, a dictionary or a file name, but is None; pass rig='rig.toml'")
     rig = Rig.of(rig)
-    for missing, where in (("limit", rig.input.limit), ("range", rig.output.range), ("guess", rig.guess)):
-        if where is None and (needs_guess or missing != "guess"):
-            raise ValueError(f"rig must have a {missing} for an environment, but has none; add it to the rig")
+    needed = {"input.limit": rig.input.limit, "output.range": rig.output.range, "guess": rig.guess}
+    for name, given in needed.items():
+        if given is None and (needs_guess or name != "guess"):
+            raise ValueError(f"rig must have {name} to be played, but has none; add it to the rig")
     if rig.delay > 0:
         raise ValueError(
             f"rig must have no delay for an environment, but has {rig.delay}; the plant waits for its input"

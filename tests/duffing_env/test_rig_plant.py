@@ -219,7 +219,7 @@ def test_nobody_knows_the_truth():
             {"prior": rig_prior(replace(VOLTS, step=1.0, guess=GUESS))},
             "prior must have the scales Scales",
         ),
-        (Difference(), {"prior": None}, "rig must have a guess for an environment, but has none"),
+        (Difference(), {"prior": None}, "rig must have guess to be played, but has none"),
     ],
 )
 def test_bad_arguments_are_refused_with_a_remedy(plant, options, message):

@@ -82,7 +82,7 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
         ({"bound": 1.0}, "bound must be"),
         ({"policy": "prsb"}, "did you mean 'prbs'"),
         ({"rig": replace(RIG, guess=None)}, "rig must have a guess"),
-        ({"rig": replace(RIG, input=replace(RIG.input, limit=None))}, "rig must have a limit"),
+        ({"rig": replace(RIG, input=replace(RIG.input, limit=None))}, "rig must have input.limit"),
         ({"rig": replace(RIG, output=replace(RIG.output, range=1e-5))}, "even without input"),
     ],
 )
