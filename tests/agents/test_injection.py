@@ -165,7 +165,7 @@ def record(path):
         y[k + 1] = x
     y += 5e-6 * rng.standard_normal(256)
     rows = np.column_stack([1e-3 * np.arange(256), u, y])
-    np.savetxt(path, rows, delimiter=",", header="time [s],u [N],y [m]", comments="")
+    np.savetxt(path, rows, delimiter=",", header="time [s],u,y", comments="")
     return path
 
 
