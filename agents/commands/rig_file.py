@@ -109,7 +109,7 @@ def from_record(path: Path, step: float | None = None) -> str:
         step = float(f"{own:.6g}")
     output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement")
     rig = Rig(step, input=Channel(table.unit(table.u) or "1"), output=output)
-    told = "" if table.names else ", which names no column: its times were taken for seconds, its output for y"
+    told = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
     return text_of(rig, f", from {printable(path.name)}{told}")
 
 

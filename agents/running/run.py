@@ -152,8 +152,9 @@ def run(
                     late = ticker.late
         ended, status = "complete", 0
     except Tripped as trip:
-        missed = f"; {late} ticks of the clock were missed before, in which the input stood" if late else ""
-        ended, message = trip.reason, str(trip) + missed
+        ended, message = trip.reason, str(trip)
+        if late and ended == "range":
+            message += f"; {late} ticks of the clock were missed before, in which the input stayed as it was"
     except Stopped as stopped:
         ended, message, status = str(stopped), f"stopped by {stopped}", 128 + stopped.signum
     except BaseException as error:

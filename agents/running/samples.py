@@ -112,12 +112,9 @@ class Ticker:
     @property
     def warning(self) -> str:
         """What speaks against a run that was complete; empty where nothing does."""
-        many = self.lost > _MANY * self.tick
-        return (
-            f"{self.lost} of {self.tick} outputs came too late to be used: intervals may be too narrow; {_REMEDY}"
-            if many
-            else ""
-        )
+        if self.lost <= _MANY * self.tick:
+            return ""
+        return f"{self.lost} of {self.tick} outputs came too late to be used: intervals may be too narrow; {_REMEDY}"
 
     @property
     def _due(self) -> float:

@@ -17,6 +17,7 @@ from estimator.rig import Channel
 
 #: Names of columns, in lower case, up to the first character that is not a letter.
 _INPUTS = ("u", "input", "force", "f", "in", "drive", "excitation")
+#: Kind of an output to the words that name it.
 _KINDS = {
     "displacement": ("displacement", "disp", "position", "pos"),
     "velocity": ("velocity", "vel", "v"),

@@ -505,6 +505,21 @@ def test_a_read_that_becomes_slow_ends_the_run_as_a_dead_sensor_does(steps, tmp_
     assert result.message.startswith("32 outputs in a row came too late")
 
 
+def test_a_run_that_left_its_range_tells_of_the_ticks_that_it_missed(tmp_path):
+    plant = slow_to_read(3, after=16)
+    plant.fault = lambda k, y: 0.09 if k == 24 else y
+    result = play(tmp_path / "run", plant, samples=128, stale=0)
+    assert (result.ended, plant.applied) == ("range", 0.0)
+    assert result.late > 0
+    assert f"beyond its range of ±0.08; {result.late} ticks of the clock were missed before" in result.message
+
+
+def test_a_simulated_plant_has_some_noise_where_its_rig_states_none():
+    quiet = replace(RIG, input=replace(RIG.input, noise=None), output=replace(RIG.output, noise=None))
+    _, shown = SimulatedPlant(quiet, TRUTH, clock=JumpingClock()).play(np.zeros(400))
+    assert 0.5e-4 * RIG.output.range < np.std(shown) < 0.5 * RIG.output.range
+
+
 def test_a_complete_run_that_lost_many_outputs_warns(tmp_path):
     result = play(tmp_path / "run", slow_to_read(3, after=16), samples=128, stale=0)
     assert (result.ended, result.exit_status, result.late) == ("complete", 0, 132)
