@@ -6,6 +6,7 @@ work where nothing can be written, and which cannot see a bit that flipped.
 
 from __future__ import annotations
 
+import atexit
 import gc
 import hashlib
 import os
@@ -30,6 +31,10 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from estimator.files import write_atomically
+
+# Where the process ends, Python's garbage collector would look through all of Numba several times, which takes longer
+# than many a script. So it finds nothing to look through.
+atexit.register(gc.freeze)
 
 
 @cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -23,11 +22,11 @@ class Straight(_Intrinsic):  # type: ignore[misc]
 
     Args:
         function: as Python defined it.
-        tree: its definition, where its file does not hold it.
+        text: that was executed to define it; None where its file holds it.
     """
 
-    def __init__(self, function: Callable[..., Any], tree: ast.FunctionDef | None = None) -> None:
-        self.source = Source(function, tree)
+    def __init__(self, function: Callable[..., Any], text: str | None = None) -> None:
+        self.source = Source(function, text)
         self._translated: dict[Kinds, Translated] = {}
         self._libraries: dict[Kinds, _Library] = {}
         arguments = ", ".join(["_typing", *self.source.arguments])
@@ -113,8 +112,7 @@ def straight(function: Callable[..., Any]) -> Any:
 
 def straight_within(source: str) -> Callable[[Callable[..., Any]], Any]:
     """As `straight`, for functions of a source that is executed, and need not be in a file."""
-    trees = {node.name: node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
-    return lambda function: Straight(function, trees[function.__name__])
+    return lambda function: Straight(function, source)
 
 
 class _Library:

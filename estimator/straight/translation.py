@@ -9,7 +9,7 @@ import linecache
 import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, reduce
+from functools import cache, cached_property, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,30 +25,30 @@ class Source:
 
     Args:
         function: as Python defined it.
-        tree: its definition, where its file does not hold it.
+        text: that was executed to define it; None where its file holds it.
     """
 
-    def __init__(self, function: Callable[..., Any], tree: ast.FunctionDef | None = None) -> None:
-        self.function, self._tree = function, tree
+    def __init__(self, function: Callable[..., Any], text: str | None = None) -> None:
+        self.function = function
         self.name = function.__qualname__
-        if tree is None:
+        if text is None:
             # The text as it is now, and not when it is compiled: the file may have changed then.
             linecache.checkcache(function.__code__.co_filename)
-            self._text = "".join(linecache.getlines(function.__code__.co_filename))
+            text = "".join(linecache.getlines(function.__code__.co_filename))
+        self._text = text
 
-    @property
+    @cached_property
     def tree(self) -> ast.FunctionDef:
         """The definition.
 
         Raises:
             TypeError: where the function's file does not hold it.
         """
-        if self._tree is None:
-            code = self.function.__code__
-            self._tree = _definitions(self._text).get(code.co_firstlineno)
-            if self._tree is None or self._tree.name != self.function.__name__:
-                raise TypeError(f"{self.name} is not defined in {code.co_filename}; use straight_within its source")
-        return self._tree
+        code = self.function.__code__
+        tree = _definitions(self._text).get(code.co_firstlineno)
+        if tree is None or tree.name != self.function.__name__:
+            raise TypeError(f"{self.name} is not defined in {code.co_filename}; use straight_within its source")
+        return tree
 
     @property
     def arguments(self) -> list[str]:
