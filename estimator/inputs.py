@@ -81,7 +81,7 @@ def feed(model: Model, rig: Rig) -> Feed:
 
 def lengths_of(series: FloatArray) -> npt.NDArray[np.int64]:
     """Samples (n,) of each of some series (n, T), which may have none, before its first NaN."""
-    return (np.cumsum(np.isnan(series), axis=1) == 0).sum(axis=1)
+    return (~np.logical_or.accumulate(np.isnan(series), axis=1)).sum(axis=1)
 
 
 def degree(model: Model, rig: Rig) -> int:

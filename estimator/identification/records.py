@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -127,7 +128,7 @@ def _cut(record: Record) -> list[Record]:
     missing = np.isnan(record.y)
     y = np.where(stops, np.nan, record.y)
     pieces = []
-    for piece in np.ma.clump_unmasked(np.ma.masked_invalid(record.u)):
+    for piece in _runs(np.isfinite(record.u)):
         seen = np.flatnonzero(np.isfinite(y[piece]))
         if len(seen) < _SHORTEST:
             continue
@@ -140,6 +141,13 @@ def _cut(record: Record) -> list[Record]:
     return pieces
 
 
+def _runs(flags: npt.NDArray[np.bool_]) -> Iterator[slice]:
+    """Where flags are set, one after another."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    for begin, end in edges.reshape(-1, 2):
+        yield slice(int(begin), int(end))
+
+
 def clipped(y: FloatArray) -> npt.NDArray[np.bool_]:
     """(T,) whether an output stands at a stop: the largest or smallest value, which several outputs have exactly.
 
@@ -147,7 +155,8 @@ def clipped(y: FloatArray) -> npt.NDArray[np.bool_]:
     almost as often. Nor is a start at rest: the signal comes to a stop again.
     """
     found = np.zeros(len(y), dtype=np.bool_)
-    levels = np.unique(_seen(y))
+    levels = np.sort(_seen(y))
+    levels = levels[np.diff(levels, prepend=-np.inf) > 0]
     if len(levels) < 10:
         return found
     for at, beside in ((levels[-1], levels[-2]), (levels[0], levels[1])):

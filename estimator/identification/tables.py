@@ -162,15 +162,19 @@ def read_table(path: Path) -> Table:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} must be text in UTF-8, but is not: {error}; save it as CSV again") from error
-    rows, lines = list[list[float]](), list[int]()
+    kept = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    numbers, lines = [number for number, _ in kept], [line for _, line in kept]
+    separator = _separator(lines)
+    rows, places = list[list[float]](), list[int]()
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     width = 0
-    for number, words in _fields(text):
+    for place, words in enumerate(_fields(lines, separator)):
+        number = numbers[place]
         if not any(word.strip() for word in words):
             if rows:
                 rows.append([math.nan] * width)
-                lines.append(number)
+                places.append(place)
             continue
         values = [_number(word) for word in words]
         if not width and None in values:
@@ -188,8 +192,12 @@ def read_table(path: Path) -> Table:
         if None in values:
             bad = words[values.index(None)]
             raise ValueError(f"{path}, line {number}: {bad!r:.40} must be a number; leave it empty where it is missing")
+        regular = None if rows else _regular(lines[place:], separator, width)
+        if regular is not None:
+            rows, places = regular, list(range(place, len(lines)))
+            break
         rows.append([value for value in values if value is not None])
-        lines.append(number)
+        places.append(place)
     if not rows:
         raise ValueError(f"{path} must hold numbers, but holds none")
     if units:
@@ -198,19 +206,32 @@ def read_table(path: Path) -> Table:
             for name, unit in zip(names, units, strict=True)
         )
     columns = np.array(rows).T
-    return Table(path, names, columns, np.array(lines), *_chosen(path, names, len(columns)))
+    return Table(path, names, columns, np.array(numbers)[places], *_chosen(path, names, len(columns)))
 
 
-def _fields(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and fields of the lines that hold something, if only separators."""
-    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
-    first = "".join(line for _, line in lines[:2])
-    separator = next((mark for mark in "\t;," if mark in first), None)
+def _separator(lines: Sequence[str]) -> str | None:
+    """What stands between the fields; None for blanks."""
+    first = "".join(lines[:2])
+    return next((mark for mark in "\t;," if mark in first), None)
+
+
+def _fields(lines: Sequence[str], separator: str | None) -> Iterator[list[str]]:
+    """The fields of each line."""
     if separator is None:
-        yield from ((number, line.split()) for number, line in lines)
+        yield from (line.split() for line in lines)
         return
-    for (number, _), words in zip(lines, csv.reader((line for _, line in lines), delimiter=separator), strict=False):
-        yield number, words if separator == "," else [word.replace(",", ".") for word in words]
+    for words in csv.reader(lines, delimiter=separator):
+        yield words if separator == "," else [word.replace(",", ".") for word in words]
+
+
+def _regular(lines: Sequence[str], separator: str | None, width: int) -> list[list[float]] | None:
+    """The numbers of lines that hold nothing but finite ones, in many times less time; None of other lines."""
+    mended = lines if separator in (",", None) else [line.replace(",", ".") for line in lines]
+    try:
+        values = np.loadtxt(mended, delimiter=separator, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return values.tolist() if values.shape[1] == width and np.isfinite(values).all() else None
 
 
 def _number(word: str) -> float | None:

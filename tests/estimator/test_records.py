@@ -77,6 +77,17 @@ def test_tables_as_programs_write_them(tmp_path, text):
     np.testing.assert_array_equal(y, [1.0, -0.2, 3.0])
 
 
+@pytest.mark.parametrize(("separator", "mark"), [(",", "."), (";", ","), ("\t", "."), (" ", ".")])
+def test_regular_lines_are_read_as_others_are(tmp_path, separator, mark):
+    values = np.random.default_rng(0).standard_normal((50, 2)) * 10.0 ** np.arange(-25, 25)[:, None]
+    lines = [separator.join(map(repr, map(float, row))).replace(".", mark) for row in values]
+    (tmp_path / "regular.csv").write_text("\n".join([separator.join("uy"), *lines]))
+    (tmp_path / "missing.csv").write_text("\n".join([separator.join("uy"), *lines, f"1{separator}nan"]))
+    regular, missing = (read(tmp_path / f"{name}.csv", Rig(0.01)) for name in ("regular", "missing"))
+    np.testing.assert_array_equal(np.transpose(regular), values)
+    np.testing.assert_array_equal(np.transpose(missing)[:-1], values)
+
+
 def test_times_are_even_between_missing_inputs_only(tmp_path):
     (tmp_path / "r.csv").write_text("t,u,y\n0,1,2\n0.01,1,3\n,,\n7,1,2\n7.01,2,3\n7.02,,3\n9,2,2\n9.01,2,2\n,,,,\n")
     u, _ = read(tmp_path / "r.csv", Rig(0.01))
