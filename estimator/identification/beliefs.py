@@ -111,7 +111,7 @@ def refit(
     fitter = Fitter(problem, Prior.of(prior))
     hypothesis = Hypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)))
     level = float(np.sqrt(r))
-    hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start, level))
+    hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start[None], level)[0])
     try:
         found = settle(fitter, hypothesis, start, level, _NEAR)
     except ValueError:

@@ -30,6 +30,10 @@ _DELAYS, _LATE = range(-LATEST, LATEST + 1), (5, 8, 12, 16, 20, 25, 30, 40)
 #: Steps of a fit of another hypothesis, at most.
 _STEPS = 12
 
+#: Samples of a record on which other hypotheses about the input are tried first, and the nats by which one that is
+#: given up is worse there.
+_SCREENED, _HOPELESS = 1024, 10.0
+
 #: Probability of a false alarm of a test of the residuals.
 _ALARM = 1e-4
 
@@ -135,7 +139,7 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
         if (way, later) != (rig.interpolation, 0) and rig.delay + later >= (-1 if way == "zero_order" else 0)
     ]
     others += [replace(found.best, delay=rig.delay + later) for later in _LATE]
-    others = [other for other in others if other.delay <= LONGEST_DELAY]
+    others = _screened(problem, found, [other for other in others if other.delay <= LONGEST_DELAY])
     gains = own - _energies(found.fitter, others, found, own)
     of_terms = []
     for name in EXTRA:
@@ -143,8 +147,8 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
         fitter = Fitter(replace(problem, terms=(name,)), prior)
         of_terms.append(float(own - _energies(fitter, [found.best], found, own)[0]))
     warnings = []
-    best = int(np.argmax(gains))
-    if gains[best] > _EVIDENCE:
+    if gains.max(initial=0.0) > _EVIDENCE:
+        best = int(np.argmax(gains))
         better = others[best]
         name = "interpolation" if better.interpolation != rig.interpolation else "delay"
         message = (
@@ -163,8 +167,21 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
     return warnings
 
 
+def _screened(problem: Problem, found: Found, others: list[Hypothesis]) -> list[Hypothesis]:
+    """Those that the first part of the records does not speak against; all, where that is no small part."""
+    part = problem.shortened(_SCREENED)
+    if part.samples > problem.samples / 2:
+        return others
+    fitter = found.fitter.on(part)
+    own = float(_energies(fitter, [found.best], found, np.inf)[0])
+    worse = _energies(fitter, others, found, own) - own
+    return [other for other, nats in zip(others, worse, strict=True) if nats < _HOPELESS]
+
+
 def _energies(fitter: Fitter, hypotheses: Sequence[Hypothesis], found: Found, own: float) -> FloatArray:
     """(H,) free energies of other hypotheses, each in the best of some ratios of the noises."""
+    if not hypotheses:
+        return np.zeros(0)
     tried = [replace(h, ratio=h.ratio * part) for h in hypotheses for part in _RATIOS]
     start = np.append(found.mean, np.zeros(len(fitter.prior.mean) - len(found.mean)))
     fits = fitter.fit(tried, start, found.level, _STEPS, bar=own)

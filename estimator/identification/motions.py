@@ -41,40 +41,41 @@ _PARTS = np.array([1.0, 0.3, 0.1, 0.01])
 _AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]], dtype=np.float64)
 
 
-def motions(problem: Problem, hypothesis: Hypothesis, point: FloatArray, level: float) -> FloatArray:
+def motions(problem: Problem, hypothesis: Hypothesis, points: FloatArray, level: float) -> FloatArray:
     """The most probable displacement and velocity a sample before each record.
 
     Args:
         problem: the records.
         hypothesis: about the input and the noises, with the motions that were found before.
-        point: (K,) coefficients.
+        points: (P, K) coefficients.
         level: σ_v.
 
     Returns:
-        (records, 2), scaled.
+        (P, records, 2), scaled.
     """
     period = 2 * np.pi / problem.frequency
     first = problem.shortened(int(np.clip(period, *_PERIOD)))
     places = np.linspace(-_WIDEST, _WIDEST, _GRID)
     grid = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 1, 2)
-    records, unit = np.arange(len(problem.u)), problem.largest
+    series, unit = np.arange(len(points) * len(problem.u)), problem.largest
 
-    losses = _judge(first, hypothesis, point, np.zeros((2, 2)))
+    losses = _judge(first, hypothesis, points, np.zeros((2, 2)))
     coarse = max(level, _COARSE * problem.size)
     # In parts, where many records make many series.
-    parts = np.array_split(np.repeat(grid, len(records), axis=1), -(-len(records) * len(grid) // _AT_ONCE))
+    parts = np.array_split(np.repeat(grid, len(series), axis=1), -(-len(series) * len(grid) // _AT_ONCE))
     found = grid[np.concatenate([losses(unit * part, coarse) for part in parts]).argmin(axis=0), 0]
     for sensor in np.repeat([coarse, level], _STEPS):
         around = losses(unit * (found + _APART * _AROUND[:, None]), sensor)
         candidates = found + _PARTS[:, None, None] * _newton(around)
         tried = losses(unit * candidates, sensor)
         best = tried.argmin(axis=0)
-        found = np.where((tried[best, records] < around[0])[:, None], candidates[best, records], found)
+        found = np.where((tried[best, series] < around[0])[:, None], candidates[best, series], found)
     rest = np.zeros_like(found)
-    choice = np.stack([unit * found, rest if hypothesis.motions is None else hypothesis.motions, rest])
-    chosen = _judge(problem, hypothesis, point, problem.start)(choice, level)
+    before = rest if hypothesis.motions is None else np.tile(hypothesis.motions, (len(points), 1))
+    choice = np.stack([unit * found, before, rest])
+    chosen = _judge(problem, hypothesis, points, problem.start)(choice, level)
     chosen[0] -= _BETTER
-    return np.asarray(choice[chosen.argmin(axis=0), records])
+    return np.asarray(choice[chosen.argmin(axis=0), series]).reshape(len(points), -1, 2)
 
 
 def _newton(around: FloatArray) -> FloatArray:
@@ -95,22 +96,27 @@ def _newton(around: FloatArray) -> FloatArray:
 
 
 def _judge(
-    problem: Problem, hypothesis: Hypothesis, point: FloatArray, cov: FloatArray
+    problem: Problem, hypothesis: Hypothesis, points: FloatArray, cov: FloatArray
 ) -> Callable[[FloatArray, float], FloatArray]:
-    """Candidates (C, records, 2) and σ_v to minus the log likelihoods (C, records) of what begins there, within cov."""
+    """Candidates (C, S, 2) and σ_v to minus the log likelihoods (C, S) of what begins there, within cov.
+
+    Each of the S series is a record at one of the points (P, K).
+    """
     inputs, ratio = problem.inputs(hypothesis.interpolation, hypothesis.delay), hypothesis.ratio
+    at = np.repeat(points, len(inputs), axis=0)
 
     def losses(candidates: FloatArray, sensor: float) -> FloatArray:
-        count, records = candidates.shape[:2]
+        count, series = candidates.shape[:2]
+        times = count * series // len(inputs)
         loss = follow(
             problem.model,
-            np.tile(point, (count * records, 1)),
-            np.tile(inputs, (count, 1, 1)),
-            np.tile(problem.outputs, (count, 1, 1)),
+            np.tile(at, (count, 1)),
+            np.tile(inputs, (times, 1, 1)),
+            np.tile(problem.outputs, (times, 1, 1)),
             np.array([(ratio * sensor) ** 2, sensor**2]),
             cov,
             candidates.reshape(-1, 2),
         ).loss
-        return np.where(np.isfinite(loss), loss, np.inf).reshape(count, records)
+        return np.where(np.isfinite(loss), loss, np.inf).reshape(count, series)
 
     return losses

@@ -122,7 +122,7 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
     tell("fitting coefficients and noises")
     for _ in range(_ROUNDS):
         problem = replace(problem, substeps=substeps)
-        hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start, level))
+        hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start[None], level)[0])
         found = settle(fitter.on(problem), hypothesis, start, level, reach)
         start, level, hypothesis, reach = found.mean, found.level, found.best, 2.0
         substeps = max(substeps, enough_substeps(problem, start, found.cov))
@@ -133,7 +133,8 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
 
 def _begins_otherwise(found: Found) -> bool:
     """Whether the records begin in motions other than the filter was linear about, and it matters."""
-    hypothesis = replace(found.best, motions=motions(found.fitter.problem, found.best, found.mean, found.level))
+    begins = motions(found.fitter.problem, found.best, found.mean[None], found.level)
+    hypothesis = replace(found.best, motions=begins[0])
     fits = found.fitter.fit([found.best, hypothesis], found.mean, found.level, iterations=0)
     before, after = fits.free_energy
     return not np.isclose(before, after, rtol=0.0, atol=_SMALL)
@@ -157,7 +158,8 @@ def _look(fitter: Fitter) -> tuple[Fits, float]:
     ratios = _RATIOS * problem.frequency ** (2 - problem.scales.order)
     base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]))
     level = np.array(0.1 * problem.size)
-    moving = [replace(base, motions=motions(short.problem, base, point, float(level))) for point in candidates]
+    begins = motions(short.problem, base, np.array(candidates), float(level))
+    moving = [replace(base, motions=begin) for begin in begins]
     begun = [base] * len(candidates) + moving
     points = np.repeat(np.array([*candidates, *candidates]), len(_RATIOS), axis=0)
     hypotheses = [h for one in begun for h in with_ratios(one, ratios)]

@@ -115,10 +115,12 @@ def test_the_motion_before_each_record_is_found(kind):
     )
     assert problem.model.digest == replace(model, substeps=4).digest
     level = 1e-4 * np.abs(shown[kind]).max()
-    found = motions(problem, Hypothesis("zero_order", 0, 0.1), known, level)
+    other = 0.9 * known
+    found, beside = motions(problem, Hypothesis("zero_order", 0, 0.1), np.array([known, other]), level)
     size = np.array([np.abs(unit * shown["displacement"]).max(), np.abs(v).max()])
     expected = np.stack([unit * shown["displacement"][places - 1], v[places - 1]], axis=1)
     np.testing.assert_allclose(found / size, expected / size, atol=1e-3)
+    np.testing.assert_array_equal(beside, motions(problem, Hypothesis("zero_order", 0, 0.1), other[None], level)[0])
 
 
 def test_the_result_goes_on(tmp_path):
