@@ -86,36 +86,10 @@ def start(problem: Problem) -> tuple[Any, float, float]:
     return np.array([1, c, a, b]) / m, size, size * omega
 
 
-@cache
-def compiled_filter(kind: str, step: float) -> Callable[..., Any]:
-    """The filter of dynamax, of a joint state (x, v, four coefficients, sensor offset), each in a unit of its own."""
+def filtered(problem: Problem, run: Callable[..., Any]) -> Any:
+    """What a filter (`filter_of`) makes of a record, told the true noises."""
     import jax
-    from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
-
-    @jax.jit
-    def run(mean: Any, cov: Any, process_cov: Any, sensor_cov: Any, scale: Any, y: Any, inputs: Any) -> Any:
-        def transition(state: Any, forces: Any) -> Any:
-            s = state * scale
-            h = 2 * step / (len(forces) - 1)
-            triples = jax.numpy.stack([forces[:-1:2], forces[1::2], forces[2::2]], axis=1)
-            # A loop of its own: JAX compiles the steps for minutes where they stand one after the other.
-            (x, v), _ = jax.lax.scan(lambda xv, three: (substep(*xv, s[2:6], three, h), None), (s[0], s[1]), triples)
-            return jax.numpy.concatenate([jax.numpy.stack([x, v]) / scale[:2], state[2:]])
-
-        def emission(state: Any, forces: Any) -> Any:
-            x, v, g, c, a, b, offset = state * scale
-            outputs = {"displacement": x, "velocity": v, "acceleration": g * forces[-1] - c * v - a * x - b * x**3}
-            return jax.numpy.stack([outputs[kind] + offset])
-
-        model = ParamsNLGSSM(mean, cov, transition, process_cov, emission, sensor_cov)
-        return extended_kalman_filter(model, y, inputs=inputs, output_fields=["filtered_means"]).filtered_means[-1]
-
-    return run
-
-
-def dynamax(problem: Problem) -> Any:
-    """The extended Kalman filter, told the true noises."""
-    import jax
+    import jax.numpy as jnp
 
     guess, size, speed = start(problem)
     scale = np.array([size, speed, *guess, size if problem.kind == "displacement" else np.std(problem.y)])
@@ -127,12 +101,59 @@ def dynamax(problem: Problem) -> Any:
     )
     # It conditions on a sample before it takes that sample's inputs: those that led to it, then.
     inputs = np.roll(acting(problem), 1, axis=0)
+    given = (mean, np.diag(std**2), np.outer(kick, kick) + 1e-24 * np.eye(7), np.array([[sensor]]), scale,
+             problem.y[:, None], inputs)  # fmt: skip
     with jax.enable_x64(True):
-        last = compiled_filter(problem.kind, problem.step)(
-            mean, np.diag(std**2), np.outer(kick, kick) + 1e-24 * np.eye(7), np.array([[sensor]]), scale,
-            problem.y[:, None], inputs,
-        )  # fmt: skip
-    return physical(np.asarray(last)[2:6] * guess)
+        return physical(np.asarray(run(*map(jnp.asarray, given)))[2:6] * guess)
+
+
+def filter_of(kind: str, step: float, moving: Callable[..., Any]) -> Callable[..., Any]:
+    """The filter of dynamax, of a joint state (x, v, four coefficients, sensor offset), each in a unit of its own."""
+    import jax.numpy as jnp
+    from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
+
+    def run(mean: Any, cov: Any, process_cov: Any, sensor_cov: Any, scale: Any, y: Any, inputs: Any) -> Any:
+        def transition(state: Any, forces: Any) -> Any:
+            s = state * scale
+            x, v = moving(s[0], s[1], s[2:6], forces, step)
+            return jnp.concatenate([jnp.stack([x, v]) / scale[:2], state[2:]])
+
+        def emission(state: Any, forces: Any) -> Any:
+            x, v, g, c, a, b, offset = state * scale
+            outputs = {"displacement": x, "velocity": v, "acceleration": g * forces[-1] - c * v - a * x - b * x**3}
+            return jnp.stack([outputs[kind] + offset])
+
+        model = ParamsNLGSSM(mean, cov, transition, process_cov, emission, sensor_cov)
+        return extended_kalman_filter(model, y, inputs=inputs, output_fields=["filtered_means"]).filtered_means[-1]
+
+    return run
+
+
+def dynamax(problem: Problem) -> Any:
+    """The extended Kalman filter of dynamax, called as in its documentation, about the steps that SciPy takes, too."""
+    return filtered(problem, filter_of(problem.kind, problem.step, move))
+
+
+def dynamax_jit(problem: Problem) -> Any:
+    """The same by somebody who knows JAX: it loops over the steps itself, and keeps what it compiled for a rig."""
+    return filtered(problem, compiled_filter(problem.kind, problem.step))
+
+
+@cache
+def compiled_filter(kind: str, step: float) -> Callable[..., Any]:
+    """A filter that JAX compiles as a whole."""
+    import jax
+
+    return jax.jit(filter_of(kind, step, looped))
+
+
+def looped(x: Any, v: Any, p: Any, forces: Any, step: float) -> tuple[Any, Any]:
+    """As `move`, by a loop of JAX's own: it compiles steps for seconds where they stand one after the other."""
+    import jax
+
+    h = 2 * step / (len(forces) - 1)
+    triples = jax.numpy.stack([forces[:-1:2], forces[1::2], forces[2::2]], axis=1)
+    return jax.lax.scan(lambda xv, three: (substep(*xv, p, three, h), None), (x, v), triples)[0]
 
 
 def shooting(problem: Problem) -> Any:
@@ -222,11 +243,12 @@ def pysindy(problem: Problem) -> Any:
                      -found[3] / gain / size**3])  # fmt: skip
 
 
-PEERS = {"dynamax": dynamax, "scipy": shooting, "pysindy": pysindy}
+PEERS = {"dynamax": dynamax, "dynamax-jit": dynamax_jit, "scipy": shooting, "pysindy": pysindy}
 
 #: What a user writes for each, beside its own function.
 HELPERS: dict[str, tuple[Callable[..., Any], ...]] = {
-    "dynamax": (acting, substep, physical, start, compiled_filter),
+    "dynamax": (acting, move, substep, physical, start, filtered, filter_of),
+    "dynamax-jit": (acting, looped, substep, physical, start, filtered, filter_of, compiled_filter),
     "scipy": (acting, move, substep, physical, start, shot),
     "pysindy": (start,),
 }

@@ -25,7 +25,8 @@ from benchmarks.rigs.simulator import FloatArray
 
 OURS = "identify"
 #: Geometric mean of our error over theirs, at most; how much slower dynamax must be, at least; statements of ours.
-RATIO_BARS, TIME_BAR, MOST_STATEMENTS = {"dynamax": 1.1, "scipy": 1.0, "pysindy": 1.0}, 5.0, 5
+RATIO_BARS = {"dynamax": 1.1, "dynamax-jit": 1.1, "scipy": 1.0, "pysindy": 1.0}
+TIMED, TIME_BAR, MOST_STATEMENTS = ("dynamax", "dynamax-jit"), 5.0, 5
 
 _STEPS_PER_PERIOD = 64  # of the peers' integration
 _STARTS = 5  # of Python, for the time of a whole script
@@ -38,13 +39,13 @@ def ours(rig_file: str, data_file: str) -> dict[str, tuple[float, float]]:
     return identify(Rig.from_file(rig_file), [data_file]).parameters
 
 
-def scripts(names: Sequence[str]) -> dict[str, float]:
-    """How many times as long as ours a script of dynamax takes for one record of each rig, from the start of Python.
+def scripts(names: Sequence[str], against: Sequence[str]) -> dict[str, dict[str, float]]:
+    """How many times as long as ours each other's script takes for one record of each rig, from the start of Python.
 
     In turns, ratios of medians. Before it begins, both have been run once: ours finds its kernels compiled on disk, JAX
-    compiles anew, as both do for whoever runs a script again. Empty where dynamax is not available.
+    compiles anew, as both do for whoever runs a script again. Empty where the peers are not available.
     """
-    ratios: dict[str, float] = {}
+    ratios: dict[str, dict[str, float]] = {method: {} for method in against}
     with tempfile.TemporaryDirectory() as folder:
         rig, data, problems = (Path(folder) / file for file in ("rig.toml", "data.csv", "problems.npz"))
         write_problems(problems, names, 1)
@@ -54,20 +55,21 @@ def scripts(names: Sequence[str]) -> dict[str, float]:
             write_rig(rig, bench, guess(bench, 0))
             write_record(data, made.u, made.y)
             code = f"{inspect.getsource(ours)}\nours({str(rig)!r}, {str(data)!r})"
-            taken: dict[str, list[float]] = {OURS: [], "dynamax": []}
+            taken: dict[str, list[float]] = {method: [] for method in (OURS, *against)}
             for _ in range(1 + _STARTS):
                 started = time.perf_counter()
                 subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
                 taken[OURS].append(time.perf_counter() - started)
-                started = time.perf_counter()
-                try:
-                    with Peers(problems) as peers:
-                        peers.ask(f"rigs dynamax {name}", 0)
-                except NotAvailable:
-                    return {}
-                taken["dynamax"].append(time.perf_counter() - started)
-            mine, theirs = (statistics.median(times[1:]) for times in taken.values())
-            ratios[name] = theirs / mine
+                for method in against:
+                    started = time.perf_counter()
+                    try:
+                        with Peers(problems) as peers:
+                            peers.ask(f"rigs {method} {name}", 0)
+                    except NotAvailable:
+                        return {}
+                    taken[method].append(time.perf_counter() - started)
+            for method in against:
+                ratios[method][name] = statistics.median(taken[method][1:]) / statistics.median(taken[OURS][1:])
     return ratios
 
 
@@ -163,7 +165,7 @@ def ratio(mine: Any, theirs: Any) -> tuple[float, float]:
     return float(np.exp(known.mean())), float(np.exp(1.96 * known.std() / np.sqrt(max(len(known) - 1, 1))))
 
 
-def show(results: dict[str, dict[str, Any]], whole: dict[str, float]) -> dict[str, Any]:
+def show(results: dict[str, dict[str, Any]], whole: dict[str, dict[str, float]]) -> dict[str, Any]:
     """Print the table and the verdict, with what `scripts` found; return the verdict for the JSON file."""
     from rich import box
     from rich.console import Console
@@ -195,16 +197,16 @@ def show(results: dict[str, dict[str, Any]], whole: dict[str, float]) -> dict[st
     counts |= {peer: statements(function, *peer_rows.HELPERS[peer]) for peer, function in peer_rows.PEERS.items()}
     console.print("Statements of user code: " + ", ".join(f"{name} {count}" for name, count in counts.items()))
     console.print(f"{'PASS' if counts[OURS] <= MOST_STATEMENTS else 'MISS'}: at most {MOST_STATEMENTS} of ours")
-    slower: dict[str, float] = {}
-    if all("dynamax" in methods for methods in results.values()):
-        times = np.array([[seconds(methods["dynamax"]), seconds(methods[OURS])] for methods in results.values()])
-        whens = ("a rig's first record, dynamax's compilation included", "others")
-        slower = dict(zip(whens, np.nanmedian(times[:, 0] / times[:, 1], axis=0).tolist(), strict=True))
-    if whole:
-        slower["a script of one record, from the start of Python"] = statistics.median(whole.values())
-    for when, value in slower.items():
-        word = "PASS" if value >= TIME_BAR else "MISS"
-        console.print(f"{word}: dynamax takes {value:.3g} times as long as ours (at least {TIME_BAR:g}), {when}")
+    slower: dict[str, dict[str, float]] = {}
+    for peer in [peer for peer in TIMED if all(peer in methods for methods in results.values())]:
+        times = np.array([[seconds(methods[peer]), seconds(methods[OURS])] for methods in results.values()])
+        whens = ("a rig's first record, JAX's compilation included", "others")
+        slower[peer] = dict(zip(whens, np.nanmedian(times[:, 0] / times[:, 1], axis=0).tolist(), strict=True))
+        if whole:
+            slower[peer]["a script of one record, from the start of Python"] = statistics.median(whole[peer].values())
+        for when, value in slower[peer].items():
+            word = "PASS" if value >= TIME_BAR else "MISS"
+            console.print(f"{word}: {peer} takes {value:.3g} times as long as ours (at least {TIME_BAR:g}), {when}")
     return {"statements": counts, "slower": slower, "rows": verdict}
 
 
