@@ -44,6 +44,8 @@ class Channel:
         noise: standard deviation, per sample: of an output its sensor's, of an input what disturbs the force. A first
             value of what stays unknown; None: nothing is known of it.
         offset: first value of the offset, which stays unknown.
+        column: its name in CSV files, with or without the unit behind it, or in MAT files. A file that has no such
+            column is read as without: None stands for the usual names (`estimator.identification.tables.read_table`).
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -55,6 +57,7 @@ class Channel:
     kind: str = "displacement"
     noise: float | None = None
     offset: float = 0.0
+    column: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.unit, str) or not self.unit.strip() or len(self.unit) > 40:
@@ -67,6 +70,10 @@ class Channel:
                 number(name, value, *SIZES, "leave it out where it is not known")
         one_of("kind", self.kind, KINDS)
         number("offset", self.offset, -SIZES[1], SIZES[1], "0 where nothing is known")
+        if self.column is not None and not (isinstance(self.column, str) and 0 < len(self.column.strip()) <= 80):
+            raise ValueError(
+                f"column must be a name in the records' files, but is {self.column!r:.60}; or leave it out"
+            )
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,18 @@ class Run:
     $ duffing-env run rig.toml --plant agents.running.simulated:plant --out run
     $ duffing-env run rig.toml --plant agents.running.instrument:plant --policy prbs --out run
     $ duffing-env run rig.toml --plant lab:plant --block 64 --out run
+    $ duffing-env run rig.toml run/estimator.npz --plant lab:plant --out next
     $ duffing-env identify rig.toml run/samples.csv
     """
 
     rig: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RIG")]
-    """Rig file, with input.limit, output.range and a guess."""
+    """Rig file, with input.limit and output.range, and a guess where there is no posterior."""
     plant: Annotated[str, tyro.conf.arg(metavar="MODULE:FACTORY")]
     """What makes the plant: factory(rig, **instrument), with the table [instrument] of the rig file."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
     """New folder for the samples and the manifest."""
+    posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="POSTERIOR")] = None
+    """What is known before: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=Plan)
     """What to do."""
 
@@ -41,13 +44,16 @@ class Run:
         from agents.running.run import run
         from estimator import Rig
         from estimator.checks import printable
+        from estimator.saving import load_estimator
 
         rig = Rig.of(self.rig)
+        prior = None if self.posterior is None else load_estimator(self.posterior).belief
         plant = load_plant(self.plant, rig, instrument_of(self.rig))
         try:
             with progress_bar() as bar:
                 task = bar.add_task(printable(self.plan.policy), total=self.plan.samples)
-                result = run(rig, plant, self.out, self.plan, told=lambda done: bar.update(task, completed=done))
+                shown = lambda done: bar.update(task, completed=done)  # noqa: E731
+                result = run(rig, plant, self.out, self.plan, prior=prior, told=shown)
         finally:
             if hasattr(plant, "close"):
                 plant.close()

@@ -73,11 +73,11 @@ class Follower:
     """Follows a run. Sample k of a run is the output at a tick and the input that is applied from that tick on.
 
     Args:
-        rig: with a guess.
+        rig: with a guess, where there is no prior.
         prior: what is believed before the run, such as the ``belief`` of `estimator.identify`; the guess where None.
 
     Raises:
-        ValueError: for a rig without a guess, or whose input is not held, or comes early.
+        ValueError: for a rig with neither guess nor prior, or whose input is not held, or comes early.
     """
 
     def __init__(self, rig: Rig, prior: Belief | None = None) -> None:
@@ -87,8 +87,10 @@ class Follower:
             )
         if rig.delay < 0:
             raise ValueError(f"delay must be 0 or more for a run, but is {rig.delay}; an input acts after its tick")
-        if rig.guess is None:
-            raise ValueError("rig must have a guess of m, c, a and b for a run, but has none; add one to the rig")
+        if rig.guess is None and prior is None:
+            raise ValueError(
+                "rig must have a guess of m, c, a and b for a run, but has none; add one, or go on from a posterior"
+            )
         # What came before an output is given with it: so the belief is that of the tick, before the next input.
         self.delay, paired = rig.delay, replace(rig, delay=rig.delay - 1)
         prior = rig_prior(rig) if prior is None else prior

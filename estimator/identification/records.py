@@ -33,9 +33,10 @@ _FEWEST, _SHORTEST = 50, 8
 _MAT_READER = """
 import io, sys
 import numpy, scipy.io
-held = scipy.io.loadmat(sys.argv[1], squeeze_me=True, variable_names=("u", "y"))
+path, *names = sys.argv[1:]
+held = scipy.io.loadmat(path, squeeze_me=True, variable_names=names)
 buffer = io.BytesIO()
-numpy.savez(buffer, **{name: held[name] for name in ("u", "y") if name in held})
+numpy.savez(buffer, **{name: held[name] for name in names if name in held})
 sys.stdout.buffer.write(buffer.getvalue())
 """
 
@@ -169,18 +170,21 @@ def clipped(y: FloatArray) -> npt.NDArray[np.bool_]:
 def read(path: str | Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
     """Inputs and outputs of a CSV or MAT file.
 
-    A CSV is as `estimator.identification.tables.read_table` says. A MAT file holds the variables ``u`` and ``y``.
+    A CSV is as `estimator.identification.tables.read_table` says. A MAT file holds the variables ``u`` and ``y``, or
+    those that the rig names as columns.
 
     Raises:
         ValueError: naming the file, the line and what is wrong.
         FileNotFoundError: if there is no such file.
     """
     place = whole_file(path, "record must be a CSV or MAT file", _LARGEST_FILE)
-    return _read_mat(place) if place.suffix.lower() == ".mat" else _read_csv(place, rig)
+    return _read_mat(place, rig) if place.suffix.lower() == ".mat" else _read_csv(place, rig)
 
 
-def _read_mat(path: Path) -> tuple[FloatArray, FloatArray]:
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", _MAT_READER, str(path)], capture_output=True)
+def _read_mat(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
+    wished = ((rig.input.column, "u"), (rig.output.column, "y"))
+    asked = {name for names in wished for name in names if name}
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", _MAT_READER, path, *asked], capture_output=True)
     if done.returncode != 0:
         told = done.stderr.decode(errors="replace").strip().splitlines() or ["the reader died of it"]
         raise ValueError(f"{path} must be a sound MAT file up to version 7.2, but is not: {told[-1]:.200}")
@@ -189,13 +193,18 @@ def _read_mat(path: Path) -> tuple[FloatArray, FloatArray]:
             held = {name: arrays[name] for name in arrays.files}
     except ValueError as error:
         raise ValueError(f"{path} must hold u and y as plain numbers, but does not: {error}") from error
-    if not {"u", "y"} <= set(held):
-        raise ValueError(f"{path} must hold the variables u and y, but does not; rename them, or write a CSV")
-    return series(f"u of {path}", held["u"], missing=True), series(f"y of {path}", held["y"], missing=True)
+    names = [wish if wish in held else usual for wish, usual in wished]
+    if not set(names) <= set(held):
+        raise ValueError(
+            f"{path} must hold the variables {names[0]} and {names[1]}, but does not; rename them, or write the names "
+            f"as column = '...' into the rig's [input] and [output]"
+        )
+    u, y = (series(f"{name} of {path}", held[name], missing=True) for name in names)
+    return u, y
 
 
 def _read_csv(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
-    table = read_table(path)
+    table = read_table(path, rig.input.column, rig.output.column)
     own = table.step()
     if own is not None and abs(own / rig.step - 1) > 0.01:
         raise ValueError(

@@ -146,8 +146,13 @@ class Table:
             )
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path, source: str | None = None, sink: str | None = None) -> Table:
     """Read a CSV file.
+
+    Args:
+        path: of the file.
+        source: name of the input's column; where it is None, or the file has none of it, one of the usual names.
+        sink: of the output's, likewise.
 
     Fields stand between commas, or semicolons or tabs (then 0,5 is a number), or blanks. Empty ones are missing, and
     NaN, NA, N/A, null, none or - in them. Lines that begin with # are passed over; one of separators alone sets records
@@ -206,7 +211,7 @@ def read_table(path: Path) -> Table:
             for name, unit in zip(names, units, strict=True)
         )
     columns = np.array(rows).T
-    return Table(path, names, columns, np.array(numbers)[places], *_chosen(path, names, len(columns)))
+    return Table(path, names, columns, np.array(numbers)[places], *_chosen(path, names, len(columns), source, sink))
 
 
 def _separator(lines: Sequence[str]) -> str | None:
@@ -255,6 +260,12 @@ def _word(name: str) -> str:
     return words[0] if words else ""
 
 
+def _is(name: str, wish: str | None) -> bool:
+    """Whether a column is the one that is wished, with or without the unit behind its name."""
+    plain = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", name)
+    return wish is not None and wish.strip().lower() in (name.strip().lower(), plain.strip().lower())
+
+
 def _unit(name: str) -> str | None:
     found = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
     return found.group(1) if found else None
@@ -271,17 +282,23 @@ def _listed(words: Sequence[str]) -> str:
     return f"{', '.join(words[:-1])} or {words[-1]}"
 
 
-def _chosen(path: Path, names: Sequence[str], count: int) -> tuple[int | None, int, int]:
+def _chosen(
+    path: Path, names: Sequence[str], count: int, source: str | None, sink: str | None
+) -> tuple[int | None, int, int]:
     """Places of time (or None), input and output."""
     if not names:
         if count not in (2, 3):
             raise ValueError(f"{path} must have two columns, u and y, or three with the time, but has {count}")
         return (None, 0, 1) if count == 2 else (0, 1, 2)
-    time, u, y = ([k for k, name in enumerate(names) if _word(name) in known] for known in (_TIMES, _INPUTS, _OUTPUTS))
+    wished = [[k for k, name in enumerate(names) if _is(name, wish)] for wish in (source, sink)]
+    free = [k for k in range(len(names)) if [k] not in wished]
+    time, u, y = ([k for k in free if _word(names[k]) in known] for known in (_TIMES, _INPUTS, _OUTPUTS))
+    u, y = wished[0] or u, wished[1] or y
     time = time or [k for k, name in enumerate(names) if _unit(name) in _SECONDS]
     if len(u) != 1 or len(y) != 1 or len(time) > 1:
         raise ValueError(
             f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename: "
-            f"an input is called {_listed(_INPUTS)}, an output {_listed(_OUTPUTS)}"
+            f"an input is called {_listed(_INPUTS)}, an output {_listed(_OUTPUTS)}; or write the names as column = "
+            f"'...' into the rig's [input] and [output]"
         )
     return (time[0] if time else None), u[0], y[0]

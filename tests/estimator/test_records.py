@@ -77,6 +77,23 @@ def test_tables_as_programs_write_them(tmp_path, text):
     np.testing.assert_array_equal(y, [1.0, -0.2, 3.0])
 
 
+def test_columns_of_any_name_are_named_in_the_rig(tmp_path):
+    rig = Rig(0.01, input=Channel("N", column="Kraft"), output=Channel("mm", column="Weg [mm]"))
+    (tmp_path / "r.csv").write_text("Zeit [s];Weg [mm];kraft [N];x\n0;1;5;7\n0,01;2;6;8\n")
+    np.testing.assert_array_equal(read(tmp_path / "r.csv", rig), [[5, 6], [1, 2]])
+    (tmp_path / "usual.csv").write_text("u,y\n5,1\n6,2\n")
+    np.testing.assert_array_equal(read(tmp_path / "usual.csv", rig), [[5, 6], [1, 2]])
+    assert Rig.from_dict(rig.to_dict()) == rig
+    from scipy.io import savemat
+
+    savemat(tmp_path / "r.mat", {"Kraft": [5.0, 6.0], "y": [1.0, 2.0], "Weg": [0.0, 0.0]})
+    np.testing.assert_array_equal(read(tmp_path / "r.mat", rig), [[5, 6], [1, 2]])
+    with pytest.raises(ValueError, match=r"r\.mat must hold the variables u and y, but does not"):
+        read(tmp_path / "r.mat", Rig(0.01))
+    with pytest.raises(ValueError, match="column must be a name"):
+        Channel(column=3)
+
+
 @pytest.mark.parametrize(("separator", "mark"), [(",", "."), (";", ","), ("\t", "."), (" ", ".")])
 def test_regular_lines_are_read_as_others_are(tmp_path, separator, mark):
     values = np.random.default_rng(0).standard_normal((50, 2)) * 10.0 ** np.arange(-25, 25)[:, None]

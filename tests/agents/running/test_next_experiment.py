@@ -1,5 +1,6 @@
 """The next experiment as a signal: within the limits, worth what is said of it, and readable again."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from agents.planner.futures import rests
 from agents.running.clock import JumpingClock
 from agents.running.experiment import design
 from agents.running.simulated import SimulatedPlant
-from estimator import identify, load_estimator
+from estimator import OnlineEstimator, identify, load_estimator, save_estimator
 from estimator.identification.tables import read_table
 from estimator.models.duffing import duffing
 
@@ -73,6 +74,26 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
     table = read_table(tmp_path / "answer.csv")
     assert (table.step(), table.unit(table.u)) == (pytest.approx(RIG.step), "N")
     np.testing.assert_allclose(table.columns[table.u], found.u, rtol=1e-9)
+
+
+def test_a_run_goes_on_from_a_posterior(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text(RIG_FILE.partition("[guess]")[0])
+    plant = SimulatedPlant(RIG, TRUTH, clock=JumpingClock())
+    plant.arm(None)
+    u, y = plant.play(np.repeat(np.random.default_rng(0).choice([-3.0, 3.0], 16), 8))
+    known = identify(RIG, (u, y))
+    save_estimator(OnlineEstimator(known.belief.model, known.belief, RIG), tmp_path / "posterior.npz")
+    factory = "from loopback import RIG, TRUTH\nfrom agents.running.simulated import SimulatedPlant\n"
+    (tmp_path / "lab.py").write_text(factory + "def plant(rig, **_):\n    return SimulatedPlant(rig, TRUTH, seed=1)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = ["--plant", "lab:plant", "--policy", "prbs", "--samples", "48", "--out", "next"]
+    with pytest.raises(SystemExit) as left:
+        main(["run", "rig.toml", "posterior.npz", *arguments])
+    assert left.value.code == 0
+    told = json.loads((tmp_path / "next" / "parameters.json").read_text())
+    assert told["m"]["std"] < 0.9 * known.parameters["m"][1]
+    assert abs(told["m"]["mean"] - TRUTH["m"]) < 4 * told["m"]["std"]
 
 
 @pytest.mark.parametrize(
