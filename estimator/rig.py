@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -173,12 +174,15 @@ class Rig:
         """
         must = f"rig must be a file, a short TOML, or one of {', '.join(SHIPPED)}"
         place = whole_file(path, must, _LARGEST_FILE, "write it by hand, or by duffing-env rig init")
+        text = ""
         try:
-            described = tomllib.loads(place.read_text(encoding="utf-8"))
+            text = place.read_text(encoding="utf-8")
+            described = tomllib.loads(text)
             described.pop("instrument", None)
             return cls.from_dict(described)
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{place} must be a rig file, but is not: {error}") from error
+            comma = " (a number has a point: 0.5, not 0,5)" if re.search(r"=\s*[-+]?\d+,\d", text) else ""
+            raise ValueError(f"{place} must be a rig file, but is not: {error}{comma}") from error
 
     @classmethod
     def of(cls, rig: Rig | Mapping[str, Any] | str | Path) -> Rig:

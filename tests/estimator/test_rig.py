@@ -77,6 +77,9 @@ def test_a_broken_file_is_named(tmp_path):
     (tmp_path / "rig.toml").write_text("step = ")
     with pytest.raises(ValueError, match=r"rig\.toml must be a rig file, but is not: Invalid"):
         Rig.from_file(tmp_path / "rig.toml")
+    (tmp_path / "rig.toml").write_text("step = 0,01")
+    with pytest.raises(ValueError, match=r"a number has a point: 0\.5, not 0,5"):
+        Rig.from_file(tmp_path / "rig.toml")
     for nested in ("[" * 100_000, "x = " + "[" * 100_000, "step = 1e999", "step = " + "9" * 400):
         (tmp_path / "rig.toml").write_text(nested)
         with pytest.raises(ValueError, match=r"rig\.toml must be a rig file, but is not: "):
