@@ -7,7 +7,7 @@ are JSON-able.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -298,9 +298,11 @@ def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be an estimator.Belief or None, but is {shown(prior)}")
     if prior.scales != scales:
+        pairs = {name: (getattr(scales, name), getattr(prior.scales, name)) for name in asdict(scales)}
+        other = ", ".join(f"{name} {own!r}, not {its!r}" for name, (own, its) in pairs.items() if own != its)
         raise ValueError(
-            f"prior must have the scales {scales}, but has {prior.scales}; a posterior of a rig has those of its limit "
-            f"and range: identify once more with the rig as it is now"
+            f"prior must have the rig's scales, but differs: {other}; input and output stand for its limit and range: "
+            f"identify once more with the rig as it is now"
         )
     if model is not None and prior.model != model:
         raise ValueError(f"prior must be of the model {model.name!r}, but is of {prior.model.name!r}")

@@ -45,8 +45,8 @@ class Channel:
         noise: standard deviation, per sample: of an output its sensor's, of an input what disturbs the force. A first
             value of what stays unknown; None: nothing is known of it.
         offset: first value of the offset, which stays unknown.
-        column: its name in CSV files, with or without the unit behind it, or in MAT files. A file that has no such
-            column is read as without: None stands for the usual names (`estimator.identification.tables.read_table`).
+        column: its name in CSV files, with or without the unit behind it, or in MAT files. None stands for the usual
+            names (`estimator.identification.tables.read_table`).
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -71,10 +71,11 @@ class Channel:
                 number(name, value, *SIZES, "leave it out where it is not known")
         one_of("kind", self.kind, KINDS)
         number("offset", self.offset, -SIZES[1], SIZES[1], "0 where nothing is known")
-        if self.column is not None and not (isinstance(self.column, str) and 0 < len(self.column.strip()) <= 80):
-            raise ValueError(
-                f"column must be a name in the records' files, but is {self.column!r:.60}; or leave it out"
-            )
+        if self.column is not None:
+            if not isinstance(self.column, str) or not 0 < len(self.column.strip()) <= 80:
+                raise ValueError(f"column must be a name in the records' files, but is {self.column!r:.60}")
+            if printable(self.column) != self.column or set(self.column) & set(',;"'):
+                raise ValueError(f"column must hold no control codes, commas or quotes, but is {self.column!r:.60}")
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ class Rig:
         place = whole_file(path, must, _LARGEST_FILE, "write it by hand, or by duffing-env rig init")
         text = ""
         try:
-            text = place.read_text(encoding="utf-8")
+            text = place.read_text(encoding="utf-8-sig")
             described = tomllib.loads(text)
             described.pop("instrument", None)
             return cls.from_dict(described)

@@ -59,13 +59,13 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
         ValueError: for a file that is damaged, of another kind, or of a format that this version does not know.
         FileNotFoundError: if there is no such file.
     """
-    place = whole_file(path, "path must be a file of save_estimator", _LARGEST)
+    place = whole_file(path, "path must be a file of save_estimator, identify --save or a run", _LARGEST)
     try:
         return _built(_read(place))
     except Exception as error:  # whatever the readers make of a foreign file
         raise ValueError(
-            f"path must be a whole file of save_estimator, but {place} is not ({type(error).__name__}: {error}); save "
-            f"the estimator again"
+            f"path must be a whole file of save_estimator, identify --save or a run, but {place} is not "
+            f"({type(error).__name__}: {error}); write it again"
         ) from error
 
 

@@ -16,6 +16,7 @@ class Init:
     $ duffing-env rig init
     $ duffing-env rig init rig.toml --from data.csv
     $ duffing-env rig init rig.toml --from data.csv --step 1e-3
+    $ duffing-env rig init rig.toml --from daten.csv --input Kraft --output Weg
     $ duffing-env rig init rig.toml --from beam
     """
 
@@ -25,6 +26,10 @@ class Init:
     """CSV or MAT file of a record, or the name of a rig that ships."""
     step: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Sampling step, for a record without a column of times, such as a MAT file."""
+    input: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Column or variable of a record that holds the input, where its name is none of the usual."""
+    output: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """The same of the output."""
     force: bool = False
     """Replace the file where there is one."""
 
@@ -37,14 +42,15 @@ class Init:
 
         if self.path.exists() and not self.force:
             raise ValueError(f"path must be a new file, but there is {self.path}; name another, or add --force")
-        if self.step is not None and (self.source is None or self.source in SHIPPED):
-            raise ValueError("step goes with a record; add --from data.csv, or leave it out")
+        for name in ("step", "input", "output"):
+            if getattr(self, name) is not None and (self.source is None or self.source in SHIPPED):
+                raise ValueError(f"{name} goes with a record; add --from data.csv, or leave it out")
         if self.source is None:
             text = text_of(ask())
         elif self.source in SHIPPED:
             text = SHIPPED[self.source].read_text(encoding="utf-8")
         else:
-            text = from_record(Path(self.source), self.step)
+            text = from_record(Path(self.source), self.step, self.input, self.output)
         write_atomically(self.path, text)
         print(f"Wrote {self.path}: read it, and correct what is not so.")
         data = "data.csv" if self.source is None or self.source in SHIPPED else self.source

@@ -44,10 +44,12 @@ def text_of(rig: Rig, told: str = "") -> str:
         "",
         "[input]",
         f"unit = {_quoted(source.unit)}{_UNITS if source.unit == '1' else ''}",
+        *_column(source),
         _known("limit", source.limit, "never exceeded, in either direction"),
         "",
         "[output]",
         f"unit = {_quoted(sink.unit)}{_UNITS if sink.unit == '1' else ''}",
+        *_column(sink),
         f"kind = {_quoted(sink.kind)}  # displacement, velocity or acceleration",
         *([_SWITCHES] if sink.kind == "acceleration" else []),
         _known("range", sink.range, "an experiment stops outside of it, in either direction"),
@@ -65,6 +67,10 @@ def text_of(rig: Rig, told: str = "") -> str:
     return "\n".join([*lines, ""])
 
 
+def _column(channel: Channel) -> list[str]:
+    return [] if channel.column is None else [f"column = {_quoted(channel.column)}  # in the records' files"]
+
+
 def _known(name: str, value: float | None, meaning: str) -> str:
     return f"# {name} = ...  # {meaning}" if value is None else f"{name} = {value!r}  # {meaning}"
 
@@ -73,7 +79,7 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-def from_record(path: Path, step: float | None = None) -> str:
+def from_record(path: Path, step: float | None = None, source: str | None = None, sink: str | None = None) -> str:
     """The file for a record: step from its column of times, units and kind from the names of its columns.
 
     A MAT file tells none of these.
@@ -81,6 +87,8 @@ def from_record(path: Path, step: float | None = None) -> str:
     Args:
         path: of a CSV or MAT file.
         step: sampling step [s]; None: that of the times.
+        source: name of the input's column or variable; None: one of the usual.
+        sink: of the output's, likewise.
 
     Raises:
         ValueError: where the step is neither given nor told, or the file is not as it must be.
@@ -95,9 +103,10 @@ def from_record(path: Path, step: float | None = None) -> str:
     if path.suffix.lower() == ".mat":
         if step is None:
             raise ValueError(f"{path} must be a CSV file to tell the step, but is a MAT file; add --step SECONDS")
-        read(path, Rig(step))
-        return text_of(Rig(step), f", from {printable(path.name)}")
-    table = read_table(path)
+        rig = Rig(step, input=Channel(column=source), output=Channel(column=sink))
+        read(path, rig)
+        return text_of(rig, f", from {printable(path.name)}")
+    table = read_table(path, source, sink)
     own = table.step()
     if step is None and own is None:
         raise ValueError(
@@ -107,8 +116,8 @@ def from_record(path: Path, step: float | None = None) -> str:
     if step is None:
         # Times are written with some digits, and their mean difference is off by the last of them.
         step = float(f"{own:.6g}")
-    output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement")
-    rig = Rig(step, input=Channel(table.unit(table.u) or "1"), output=output)
+    output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement", column=sink)
+    rig = Rig(step, input=Channel(table.unit(table.u) or "1", column=source), output=output)
     told = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
     return text_of(rig, f", from {printable(path.name)}{told}")
 

@@ -12,10 +12,11 @@ from typing import Any
 
 from agents.results import finite, versions
 from estimator.files import append_atomically, write_atomically
+from estimator.rig import Rig
 
-#: Columns of samples.csv; `identify` takes ``time``, ``u`` and ``y``. ``time`` is that of the tick, ``clock`` the one
-#: when the row was complete; ``u`` the mean of the applied input until the next tick, ``asked`` what was asked for;
-#: ``untimely`` an output that came too late to be used.
+#: Columns of samples.csv. `identify` takes ``time``, ``u`` and ``y``, which are called as the rig calls its columns.
+#: ``time`` is that of the tick, ``clock`` the one when the row was complete; ``u`` the mean of the applied input until
+#: the next tick, ``asked`` what was asked for; ``untimely`` an output that came too late to be used.
 COLUMNS = ("sample", "time", "u", "y", "asked", "block", "late", "clock", "untimely")
 
 
@@ -30,19 +31,21 @@ class Recording:
     Args:
         folder: is made; must be empty.
         manifest: what is to be kept about the run.
+        rig: whose names of columns the samples have.
 
     Raises:
         ValueError: for a folder that holds something.
     """
 
-    def __init__(self, folder: str | Path, manifest: dict[str, Any]) -> None:
+    def __init__(self, folder: str | Path, manifest: dict[str, Any], rig: Rig) -> None:
         self.folder = Path(folder)
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise ValueError(f"out must be a new or empty folder, but {self.folder} holds something; name another one")
         self.folder.mkdir(parents=True, exist_ok=True)
         self._manifest = {**manifest, "versions": versions(), "commit": _commit(), "started": _time(), "ended": None}
         self._write_manifest()
-        append_atomically(self.samples, ",".join(COLUMNS) + "\n")
+        names = {"u": rig.input.column or "u", "y": rig.output.column or "y"}
+        append_atomically(self.samples, ",".join(names.get(name, name) for name in COLUMNS) + "\n")
 
     @property
     def samples(self) -> Path:

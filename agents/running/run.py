@@ -26,8 +26,14 @@ from agents.running.session import Session, Tripped, check_session
 from agents.running.stopping import Stopped
 from estimator.belief import Belief
 from estimator.files import write_atomically
+from estimator.identification.beliefs import disturbance
+from estimator.identification.checks import disturbed
+from estimator.identification.tables import read_table
 from estimator.rig import Rig
 from estimator.saving import save_estimator
+
+#: Fewer outputs do not tell how much noise there is.
+_FEWEST = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +133,7 @@ def run(
     choose: Chooser | None = None if design else asking(policy, observed, follower)
     _warm_up(follower, observed, design, policy, plan)
     described = {"command": sys.argv, "rig": rig.to_dict(), "plan": asdict(plan), "watchdog": silence}
-    recording = Recording(out, {**described, "plant": repr(plant)[:200]})
+    recording = Recording(out, {**described, "plant": repr(plant)[:200]}, rig)
     message, status, late = "", 1, 0
     try:
         with Session(plant, rig, recording.note, silence, plan.stale) as session:
@@ -151,6 +157,7 @@ def run(
                 finally:
                     late = ticker.late
         ended, status = "complete", 0
+        message = message or _contradiction(rig, follower.belief, recording.samples)
     except Tripped as trip:
         ended, message = trip.reason, str(trip)
         if late and ended == "range":
@@ -165,6 +172,21 @@ def run(
     result = Run(rig, Path(out), ended, message, follower.belief, late, status)
     _write(result, follower)
     return result
+
+
+def _contradiction(rig: Rig, belief: Belief, samples: Path) -> str:
+    """Says it where the samples speak against what was believed before them, so that noise explains them; else nothing.
+
+    A belief that is sure of wrong coefficients keeps them.
+    """
+    table = read_table(samples, rig.input.column, rig.output.column)
+    u, y = table.columns[table.u], table.columns[table.y]
+    if np.isfinite(y).sum() < _FEWEST:
+        return ""
+    said = disturbed(rig.input, float(np.sqrt(np.nanmean(u**2))), disturbance(belief))
+    return (
+        said and f"{said}; the equation does not hold, or what was believed before is wrong: identify {samples} alone"
+    )
 
 
 def _warm_up(follower: Follower, observed: Observed, design: Design | None, policy: Any, plan: Plan) -> None:

@@ -9,9 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.running.clock import Clock, RealClock
+from estimator.checks import number, shown
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
+from estimator.units import SIZES
 
 #: Runge-Kutta steps of a sampling step.
 _STEPS = 8
@@ -50,8 +52,11 @@ class SimulatedPlant:
     ) -> None:
         if truth is None and rig.guess is None:
             raise ValueError(
-                "rig must have a guess of m, c, a and b to be simulated, but has none; add one, or a truth"
+                "rig must have a guess of m, c, a and b to be simulated, but has none; add one, or "
+                "truth = { m = ..., c = ..., a = ..., b = ... } to its table [instrument]"
             )
+        if truth is not None:
+            check_truth(truth)
         if rig.delay != 0:
             raise ValueError(f"rig must have a delay of 0 to be simulated here, but has {rig.delay}; set it to 0")
         self.truth = dict(truth) if truth is not None else {k: sum(v) / 2 for k, v in (rig.guess or {}).items()}
@@ -157,6 +162,14 @@ class SimulatedPlant:
         return (force - c * v - a * x - b * x * x * x) / m
 
 
-def plant(rig: Rig, seed: int = 0, **instrument: object) -> SimulatedPlant:
-    """For ``--plant agents.running.simulated:plant``; an instrument's table in the rig file is not looked at."""
-    return SimulatedPlant(rig, seed=seed)
+def check_truth(truth: object) -> None:
+    """Refuse what are not m, c, a and b."""
+    if not isinstance(truth, Mapping) or set(truth) != set("mcab"):
+        raise ValueError(f"truth must give m, c, a and b, but is {shown(truth)}")
+    for name in "mcab":
+        number(f"truth of {name}", truth[name], SIZES[0] if name == "m" else -SIZES[1], SIZES[1])
+
+
+def plant(rig: Rig, seed: int = 0, truth: Mapping[str, float] | None = None, **instrument: object) -> SimulatedPlant:
+    """For ``--plant agents.running.simulated:plant``; seed and truth may stand in the rig file's table [instrument]."""
+    return SimulatedPlant(rig, truth, seed)

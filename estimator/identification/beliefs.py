@@ -39,14 +39,23 @@ def posterior(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[f
     shapes = np.full(len(found.weights), problem.samples / 2)
     gamma, xi = (matched_gamma(found.weights, shapes, shapes * noise**2) for noise in found.noises)
     belief = Belief.of(problem.believed, belief.mean, _with_start(belief, problem), gamma, xi, scales=scales)
-    gain = dict(zip(problem.model.coefficients, found.mean, strict=True))["gain"]
-    # What moves the velocity as much when it is held over a sample (`estimator.rig_prior`).
-    worth = scales.input * np.sqrt(3) / abs(gain), scales.output
+    worth = _force(belief), scales.output
     noises = {
         name: (float(found.weights @ values) * unit, _spread(found.weights, values, shapes) * unit)
         for name, values, unit in zip(("input", "output"), found.noises, worth, strict=True)
     }
     return belief, noises
+
+
+def disturbance(belief: Belief) -> float:
+    """Of the force in every sample, as a standard deviation in the unit of the input."""
+    return _force(belief) * float(np.sqrt(belief.noises[1] / belief.noises[0]))
+
+
+def _force(belief: Belief) -> float:
+    """The input that moves the velocity, when it is held over a sample, as a process noise of 1 does."""
+    gain = dict(zip(belief.model.coefficients, belief.coefficients_mean, strict=True))["gain"]
+    return float(belief.scales.input * np.sqrt(3) / abs(gain))
 
 
 def _with_start(belief: Belief, problem: Problem) -> FloatArray:

@@ -15,7 +15,7 @@ from estimator.identification.result import Warning
 from estimator.identification.search import Found
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
-from estimator.rig import INTERPOLATIONS, LONGEST_DELAY
+from estimator.rig import INTERPOLATIONS, LONGEST_DELAY, Channel
 
 #: Nats by which another hypothesis must be better.
 _EVIDENCE = 7.0
@@ -188,19 +188,25 @@ def _energies(fitter: Fitter, hypotheses: Sequence[Hypothesis], found: Found, ow
     return np.asarray(fits.free_energy.reshape(-1, len(_RATIOS)).min(axis=1))
 
 
-def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
-    channel = problem.rig.input
-    strength = problem.strength * problem.scales.input
+def disturbed(channel: Channel, strength: float, disturbance: float) -> str:
+    """Says it where more disturbs the force than is usual; else nothing.
+
+    Args:
+        channel: the input.
+        strength: of the inputs, as a root mean square.
+        disturbance: of the force in every sample, as a standard deviation in the unit of the input.
+    """
     usual = max(_DISTURBANCE * strength, _REST * (channel.limit or 0.0))
-    allowed = _BEYOND * channel.noise if channel.noise else usual
-    if disturbance <= allowed:
-        return []
-    message = (
-        f"the force is disturbed by {disturbance:.3g} {channel.unit} in every sample, "
-        f"{100 * disturbance / strength:.1f} % of the input; either the recorded input is noisy, or "
-        f"the equation lacks something"
-    )
-    return [Warning("process_noise", message)]
+    if disturbance <= (_BEYOND * channel.noise if channel.noise else usual):
+        return ""
+    part = f", {100 * disturbance / strength:.1f} % of the input" if strength else ""
+    return f"the force is disturbed by {disturbance:.3g} {channel.unit} in every sample{part}"
+
+
+def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
+    said = disturbed(problem.rig.input, problem.strength * problem.scales.input, disturbance)
+    because = "either the recorded input is noisy, or the equation lacks something"
+    return [Warning("process_noise", f"{said}; {because}")] if said else []
 
 
 def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Warning]:

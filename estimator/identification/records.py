@@ -182,9 +182,8 @@ def read(path: str | Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
 
 
 def _read_mat(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
-    wished = ((rig.input.column, "u"), (rig.output.column, "y"))
-    asked = {name for names in wished for name in names if name}
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", _MAT_READER, path, *asked], capture_output=True)
+    names = (rig.input.column or "u", rig.output.column or "y")
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", _MAT_READER, path, *names], capture_output=True)
     if done.returncode != 0:
         told = done.stderr.decode(errors="replace").strip().splitlines() or ["the reader died of it"]
         raise ValueError(f"{path} must be a sound MAT file up to version 7.2, but is not: {told[-1]:.200}")
@@ -193,11 +192,11 @@ def _read_mat(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
             held = {name: arrays[name] for name in arrays.files}
     except ValueError as error:
         raise ValueError(f"{path} must hold u and y as plain numbers, but does not: {error}") from error
-    names = [wish if wish in held else usual for wish, usual in wished]
-    if not set(names) <= set(held):
+    lacking = set(names) - set(held)
+    if lacking:
         raise ValueError(
-            f"{path} must hold the variables {names[0]} and {names[1]}, but does not; rename them, or write the names "
-            f"as column = '...' into the rig's [input] and [output]"
+            f"{path} must hold the variables {names[0]} and {names[1]}, but lacks {' and '.join(sorted(lacking))}; "
+            f"mend the names, there or as column = '...' in the rig's [input] and [output]"
         )
     u, y = (series(f"{name} of {path}", held[name], missing=True) for name in names)
     return u, y

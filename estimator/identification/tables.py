@@ -12,25 +12,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from estimator.identification.columns import KINDS, SECONDS, UNITS, chosen, plain, unit_of, with_unit, word_of
 from estimator.parameters import FloatArray
 from estimator.rig import Channel
-
-#: Names of columns, in lower case, up to the first character that is not a letter.
-_INPUTS = ("u", "input", "force", "f", "in", "drive", "excitation")
-#: Kind of an output to the words that name it.
-_KINDS = {
-    "displacement": ("displacement", "disp", "position", "pos"),
-    "velocity": ("velocity", "vel", "v"),
-    "acceleration": ("acceleration", "acc", "a"),
-}
-_OUTPUTS = ("y", "output", "out", "response", "x", *(word for words in _KINDS.values() for word in words))
-_TIMES = ("t", "time")
-
-#: Units that only one kind of output has.
-_UNITS = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "acceleration": r".+/s(²|\^?2|/s)|m?g"}
-
-#: What a time column may be in [s].
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 
 #: What stands for a missing number, in lower case.
 _MISSING = ("", "na", "n/a", "#n/a", "null", "none", "-")
@@ -72,9 +56,9 @@ class Table:
         if self.time is None:
             return None
         unit = self.unit(self.time) or "s"
-        if unit not in _SECONDS:
-            raise ValueError(f"{self.path}: times must be in one of {', '.join(_SECONDS)}, but are in {unit!r:.40}")
-        time, driven = self.columns[self.time] * _SECONDS[unit], np.isfinite(self.columns[self.u])
+        if unit not in SECONDS:
+            raise ValueError(f"{self.path}: times must be in one of {', '.join(SECONDS)}, but are in {unit!r:.40}")
+        time, driven = self.columns[self.time] * SECONDS[unit], np.isfinite(self.columns[self.u])
         for k in np.flatnonzero(driven & np.isnan(time))[:1]:
             raise ValueError(
                 f"{self._line(k)}: there must be a time beside the input, but there is none; fill it in, or remove "
@@ -106,7 +90,7 @@ class Table:
 
     def unit(self, place: int) -> str | None:
         """What stands in brackets behind the name of a column, as N in ``force [N]``; None where nothing does."""
-        return _unit(self.names[place]) if self.names else None
+        return unit_of(self.names[place]) if self.names else None
 
     def kind(self) -> str | None:
         """What the name of the output, or else its unit, says that it is: a displacement, for one; or None.
@@ -114,9 +98,9 @@ class Table:
         Raises:
             ValueError: where name and unit say different things.
         """
-        word, unit = _word(self.names[self.y]) if self.names else "", self.unit(self.y) or ""
-        named = next((kind for kind, words in _KINDS.items() if word in words), None)
-        told = next((kind for kind, units in _UNITS.items() if re.fullmatch(units, unit)), None)
+        word, unit = word_of(self.names[self.y]) if self.names else "", self.unit(self.y) or ""
+        named = next((kind for kind, words in KINDS.items() if word in words), None)
+        told = next((kind for kind, units in UNITS.items() if re.fullmatch(units, unit)), None)
         if named and told and named != told:
             raise ValueError(
                 f"{self.path}: unit of {self.names[self.y]!r:.60} must be of a kind with the name, {named}, but tells "
@@ -132,13 +116,13 @@ class Table:
         """
         for place, channel in ((self.u, source), (self.y, sink)):
             unit = self.unit(place)
-            if unit and channel.unit != "1" and _plain(unit) != _plain(channel.unit):
+            if unit and channel.unit != "1" and plain(unit) != plain(channel.unit):
                 raise ValueError(
                     f"{self.path}: {self.names[place]!r:.60} must be in the rig's unit, {channel.unit}, but is in "
                     f"{unit}; convert the column, or write its unit into the rig"
                 )
-        word = _word(self.names[self.y]) if self.names else ""
-        kind = next((one for one, words in _KINDS.items() if word in words and len(word) > 1), sink.kind)
+        word = word_of(self.names[self.y]) if self.names else ""
+        kind = next((one for one, words in KINDS.items() if word in words and len(word) > 1), sink.kind)
         if kind != sink.kind:
             raise ValueError(
                 f"{self.path}: {self.names[self.y]!r:.60} must be the rig's kind of output, {sink.kind}, but is called "
@@ -151,14 +135,14 @@ def read_table(path: Path, source: str | None = None, sink: str | None = None) -
 
     Args:
         path: of the file.
-        source: name of the input's column; where it is None, or the file has none of it, one of the usual names.
+        source: name of the input's column; one of the usual names where it is None.
         sink: of the output's, likewise.
 
-    Fields stand between commas, or semicolons or tabs (then 0,5 is a number), or blanks. Empty ones are missing, and
-    NaN, NA, N/A, null, none or - in them. Lines that begin with # are passed over; one of separators alone sets records
-    apart. The first line may hold names, such as ``u,y`` or ``time [ms],force [N],x [mm]``, and the next one units,
-    such as ``ms,N,mm``; of numbers alone there are the columns u and y, or time in seconds, u and y. A column in a unit
-    of time is the time, whatever its name.
+    Fields stand between commas, or semicolons or tabs (then 0,5 is a number, in a file without points), or blanks.
+    Empty ones are missing, and NaN, NA, N/A, null, none or - in them. Lines that begin with # are passed over; one of
+    separators alone sets records apart. The first line may hold names, such as ``u,y`` or ``time [ms],force [N],x
+    [mm]``, and the next one units, such as ``ms,N,mm``; of numbers alone there are the columns u and y, or time in
+    seconds, u and y. A column in a unit of time is the time, whatever its name.
 
     Raises:
         ValueError: naming the file, the line and what is wrong.
@@ -166,14 +150,14 @@ def read_table(path: Path, source: str | None = None, sink: str | None = None) -
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} must be text in UTF-8, but is not: {error}; save it as CSV again") from error
+        raise ValueError(f"{path} must be text in UTF-8, but is not: {error}; save it as CSV UTF-8") from error
     kept = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     numbers, lines = [number for number, _ in kept], [line for _, line in kept]
     separator = _separator(lines)
     rows, places = list[list[float]](), list[int]()
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    width = 0
+    width, mark = 0, ""
     for place, words in enumerate(_fields(lines, separator)):
         number = numbers[place]
         if not any(word.strip() for word in words):
@@ -181,7 +165,7 @@ def read_table(path: Path, source: str | None = None, sink: str | None = None) -
                 rows.append([math.nan] * width)
                 places.append(place)
             continue
-        values = [_number(word) for word in words]
+        values = [_number(word, separator) for word in words]
         if not width and None in values:
             names, width = tuple(word.strip() for word in words), len(words)
             continue
@@ -196,7 +180,19 @@ def read_table(path: Path, source: str | None = None, sink: str | None = None) -
             continue
         if None in values:
             bad = words[values.index(None)]
-            raise ValueError(f"{path}, line {number}: {bad!r:.40} must be a number; leave it empty where it is missing")
+            remedy = "leave it empty where it is missing"
+            if not rows:
+                remedy = "begin lines before the names with #, or mend the line"
+            elif re.fullmatch(r"\s*[-+]?\d+,\d+\s*", bad):
+                remedy = "beside decimal commas let semicolons or tabs separate the fields"
+            raise ValueError(f"{path}, line {number}: {bad!r:.40} must be a number; {remedy}")
+        for word in words if separator in (";", "\t") else ():
+            mark = mark or next((one for one in ",." if one in word), "")
+            if {",", "."} - {mark} & set(word) and mark:
+                raise ValueError(
+                    f"{path}, line {number}: {word!r:.40} must have the decimal mark {mark!r} alone, as before; leave "
+                    f"out marks of thousands"
+                )
         regular = None if rows else _regular(lines[place:], separator, width)
         if regular is not None:
             rows, places = regular, list(range(place, len(lines)))
@@ -206,12 +202,9 @@ def read_table(path: Path, source: str | None = None, sink: str | None = None) -
     if not rows:
         raise ValueError(f"{path} must hold numbers, but holds none")
     if units:
-        names = tuple(
-            f"{name} [{unit.strip()}]" if _number(unit) is None else name
-            for name, unit in zip(names, units, strict=True)
-        )
+        names = tuple(with_unit(path, name, unit) for name, unit in zip(names, units, strict=True))
     columns = np.array(rows).T
-    return Table(path, names, columns, np.array(numbers)[places], *_chosen(path, names, len(columns), source, sink))
+    return Table(path, names, columns, np.array(numbers)[places], *chosen(path, names, len(columns), source, sink))
 
 
 def _separator(lines: Sequence[str]) -> str | None:
@@ -225,24 +218,30 @@ def _fields(lines: Sequence[str], separator: str | None) -> Iterator[list[str]]:
     if separator is None:
         yield from (line.split() for line in lines)
         return
-    for words in csv.reader(lines, delimiter=separator):
-        yield words if separator == "," else [word.replace(",", ".") for word in words]
+    yield from csv.reader(lines, delimiter=separator)
 
 
 def _regular(lines: Sequence[str], separator: str | None, width: int) -> list[list[float]] | None:
     """The numbers of lines that hold nothing but finite ones, in many times less time; None of other lines."""
-    mended = lines if separator in (",", None) else [line.replace(",", ".") for line in lines]
+    if separator in (";", "\t") and any("," in line for line in lines):
+        if any("." in line for line in lines):
+            return None
+        lines = [line.replace(",", ".") for line in lines]
     try:
-        values = np.loadtxt(mended, delimiter=separator, comments=None, ndmin=2)
+        values = np.loadtxt(lines, delimiter=separator, comments=None, ndmin=2)
     except ValueError:
         return None
     return values.tolist() if values.shape[1] == width and np.isfinite(values).all() else None
 
 
-def _number(word: str) -> float | None:
+def _number(word: str, separator: str | None = None) -> float | None:
     """The number that a field holds, NaN where it is missing; None where it is no finite number."""
     if word.strip().lower() in _MISSING:
         return math.nan
+    if "_" in word:  # Python's
+        return None
+    if separator in (";", "\t"):
+        word = word.replace(",", ".")
     try:
         value = float(word)
     except ValueError:
@@ -253,52 +252,3 @@ def _number(word: str) -> float | None:
 def _told(value: float | None) -> bool:
     """Whether a field holds a number that is not missing."""
     return value is not None and not math.isnan(value)
-
-
-def _word(name: str) -> str:
-    words = "".join(c if c.isalpha() else " " for c in name.lower()).split()
-    return words[0] if words else ""
-
-
-def _is(name: str, wish: str | None) -> bool:
-    """Whether a column is the one that is wished, with or without the unit behind its name."""
-    plain = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", name)
-    return wish is not None and wish.strip().lower() in (name.strip().lower(), plain.strip().lower())
-
-
-def _unit(name: str) -> str | None:
-    found = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
-    return found.group(1) if found else None
-
-
-def _plain(unit: str) -> str:
-    """A unit in one way of writing."""
-    for written, plain in (("µ", "u"), ("μ", "u"), ("²", "2"), ("^", ""), ("·", " "), ("*", " ")):
-        unit = unit.replace(written, plain)
-    return unit.replace(" ", "")
-
-
-def _listed(words: Sequence[str]) -> str:
-    return f"{', '.join(words[:-1])} or {words[-1]}"
-
-
-def _chosen(
-    path: Path, names: Sequence[str], count: int, source: str | None, sink: str | None
-) -> tuple[int | None, int, int]:
-    """Places of time (or None), input and output."""
-    if not names:
-        if count not in (2, 3):
-            raise ValueError(f"{path} must have two columns, u and y, or three with the time, but has {count}")
-        return (None, 0, 1) if count == 2 else (0, 1, 2)
-    wished = [[k for k, name in enumerate(names) if _is(name, wish)] for wish in (source, sink)]
-    free = [k for k in range(len(names)) if [k] not in wished]
-    time, u, y = ([k for k in free if _word(names[k]) in known] for known in (_TIMES, _INPUTS, _OUTPUTS))
-    u, y = wished[0] or u, wished[1] or y
-    time = time or [k for k, name in enumerate(names) if _unit(name) in _SECONDS]
-    if len(u) != 1 or len(y) != 1 or len(time) > 1:
-        raise ValueError(
-            f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename: "
-            f"an input is called {_listed(_INPUTS)}, an output {_listed(_OUTPUTS)}; or write the names as column = "
-            f"'...' into the rig's [input] and [output]"
-        )
-    return (time[0] if time else None), u[0], y[0]

@@ -96,6 +96,20 @@ def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
     assert Rig.from_dict(described["rig"]) == rig
 
 
+def test_columns_of_any_name_are_named_once(run, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    _, *lines = Path("record.csv").read_text().splitlines()
+    Path("daten.csv").write_text("\n".join(["Zeit [ms],Kraft [N],Weg [mm]", *lines]))
+    status, _, told = run("rig", "init", "hart.toml", "--from", "daten.csv")
+    assert status == 2
+    assert "by --input and --output of duffing-env rig init" in told
+    assert run("rig", "init", "hart.toml", "--from", "daten.csv", "--input", "Kraft", "--output", "Weg")[0] == 0
+    rig = Rig.from_file("hart.toml")
+    assert (rig.input.column, rig.output.column, rig.output.unit) == ("Kraft", "Weg", "mm")
+    status, told, _ = run("identify", "hart.toml", "daten.csv", "--json")
+    assert json.loads(told)["parameters"]["m"]["mean"] == pytest.approx(4e-4, rel=0.01)
+
+
 def test_warnings_are_told(run, folder, monkeypatch):
     monkeypatch.chdir(folder)
     Path("late.toml").write_text('step = 1e-3\ndelay = 1\n[input]\nunit = "N"\n[output]\nunit = "mm"\n')

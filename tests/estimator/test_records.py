@@ -66,6 +66,7 @@ def test_files(tmp_path):
         "# written by a tool, with; signs\n0.5 1\n  1.5   -0.2 \nnan 3\n",
         "response [mm], time [ms], force [N]\n1, 10, 0.5\n-0.2, 20, 1.5\n3, 30, \n",
         "time,force,displacement\ns,N,mm\n0,0.5,1\n0.01,1.5,-0.2\n0.02,n/a,3\n",
+        "time,force [N],displacement\n[ms],(N),[mm]\n0,0.5,1\n10,1.5,-0.2\n20,n/a,3\n",
         "u y\n0.5 1\n1.5 -0.2\nNA 3\n",
         ",,,\nu,y\n,\n0.5,1\n1.5,-0.2\nnull,3\n",
     ],
@@ -81,15 +82,24 @@ def test_columns_of_any_name_are_named_in_the_rig(tmp_path):
     rig = Rig(0.01, input=Channel("N", column="Kraft"), output=Channel("mm", column="Weg [mm]"))
     (tmp_path / "r.csv").write_text("Zeit [s];Weg [mm];kraft [N];x\n0;1;5;7\n0,01;2;6;8\n")
     np.testing.assert_array_equal(read(tmp_path / "r.csv", rig), [[5, 6], [1, 2]])
-    (tmp_path / "usual.csv").write_text("u,y\n5,1\n6,2\n")
-    np.testing.assert_array_equal(read(tmp_path / "usual.csv", rig), [[5, 6], [1, 2]])
     assert Rig.from_dict(rig.to_dict()) == rig
+    for text, message in (
+        ("u,y\n5,1\n", r"one column 'Kraft', which the rig's \[input\] names, but has \['u', 'y'\]"),
+        ("Kraft,Weg [mm],Weg [mm]\n5,1,2\n", r"one column 'Weg \[mm\]', which the rig's \[output\] names"),
+        ("5,1\n6,2\n", "must name its columns, because the rig does"),
+    ):
+        (tmp_path / "other.csv").write_text(text)
+        with pytest.raises(ValueError, match=message):
+            read(tmp_path / "other.csv", rig)
+    with pytest.raises(ValueError, match="the rig names 'Kraft' for input and output"):
+        read(tmp_path / "r.csv", Rig(0.01, input=rig.input, output=Channel("N", column="Kraft")))
     from scipy.io import savemat
 
     savemat(tmp_path / "r.mat", {"Kraft": [5.0, 6.0], "y": [1.0, 2.0], "Weg": [0.0, 0.0]})
-    np.testing.assert_array_equal(read(tmp_path / "r.mat", rig), [[5, 6], [1, 2]])
-    with pytest.raises(ValueError, match=r"r\.mat must hold the variables u and y, but does not"):
-        read(tmp_path / "r.mat", Rig(0.01))
+    of_mat = Rig(0.01, input=rig.input, output=Channel("mm"))
+    np.testing.assert_array_equal(read(tmp_path / "r.mat", of_mat), [[5, 6], [1, 2]])
+    with pytest.raises(ValueError, match=r"r\.mat must hold the variables Kraft and Weg \[mm\], but lacks Weg \[mm\]"):
+        read(tmp_path / "r.mat", rig)
     with pytest.raises(ValueError, match="column must be a name"):
         Channel(column=3)
 
@@ -115,7 +125,14 @@ def test_times_are_even_between_missing_inputs_only(tmp_path):
     ("text", "message"),
     [
         ("u,y\n1,2\n3", "line 3: must have 2 columns, but has 1"),
-        ("u,y\n1,2\n3,x4", "line 3: 'x4' must be a number"),
+        ("u,y\n1,2\n3,x4", "line 3: 'x4' must be a number; leave it empty"),
+        ("u,y\n1,2\n1_0,2", "line 3: '1_0' must be a number"),
+        ('u,y\n1,2\n"0,5",2', "line 3: '0,5' must be a number; beside decimal commas let semicolons or tabs separate"),
+        ("t;u;y\n0,01;8.000;0,5\n", "line 2: '8.000' must have the decimal mark ',' alone"),
+        ("u;y\n1,5;2\n1.234,5;2\n", "line 3: '1.234,5' must be a number"),
+        ("u;y\n1,5;2\n;2\n1;2.5\n", "line 4: '2.5' must have the decimal mark ',' alone"),
+        ("Test;;\nBy: X;;\nt;u;y\n0;1;2\n", "line 3: 't' must be a number; begin lines before the names with #"),
+        ("t,u [N],y\n[s],[kN],[m]\n0,1,2\n", "'u [N]' must have one unit, but 'kN' stands below"),
         ("a_column,b_column\n1,2", "must have one column of inputs and one of outputs"),
         ("1,2,3,4\n1,2,3,4", "must have two columns, u and y"),
         ("t,u,y\n0,1,2\n0.5,1,3\n1.0,2,3\n", "times are 0.5 s apart, but the rig's step is 0.01 s"),

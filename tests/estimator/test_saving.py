@@ -79,7 +79,7 @@ def test_a_file_with_wrong_content_is_refused(what, written):
     path, arrays = written
     np.savez(path, **REFUSED[what](arrays))
     with pytest.raises(
-        ValueError, match=f"path must be a whole file of save_estimator, but {re.escape(str(path))} is not"
+        ValueError, match=f"path must be a whole file of .* or a run, but {re.escape(str(path))} is not"
     ):
         load_estimator(path)
 

@@ -11,7 +11,10 @@ from agents.commands import main
 from agents.planner.futures import rests
 from agents.running.clock import JumpingClock
 from agents.running.experiment import design
+from agents.running.plan import Plan
+from agents.running.run import run
 from agents.running.simulated import SimulatedPlant
+from agents.running.simulated import plant as simulated
 from estimator import OnlineEstimator, identify, load_estimator, save_estimator
 from estimator.identification.tables import read_table
 from estimator.models.duffing import duffing
@@ -87,13 +90,38 @@ def test_a_run_goes_on_from_a_posterior(tmp_path, monkeypatch):
     factory = "from loopback import RIG, TRUTH\nfrom agents.running.simulated import SimulatedPlant\n"
     (tmp_path / "lab.py").write_text(factory + "def plant(rig, **_):\n    return SimulatedPlant(rig, TRUTH, seed=1)\n")
     monkeypatch.syspath_prepend(tmp_path)
-    arguments = ["--plant", "lab:plant", "--policy", "prbs", "--samples", "48", "--out", "next"]
+    arguments = ["--plant", "lab:plant", "--policy", "prbs", "--samples", "48", "--block", "24", "--out", "next"]
     with pytest.raises(SystemExit) as left:
         main(["run", "rig.toml", "posterior.npz", *arguments])
     assert left.value.code == 0
     told = json.loads((tmp_path / "next" / "parameters.json").read_text())
+    assert json.loads((tmp_path / "next" / "manifest.json").read_text())["message"] == ""
     assert told["m"]["std"] < 0.9 * known.parameters["m"][1]
     assert abs(told["m"]["mean"] - TRUTH["m"]) < 4 * told["m"]["std"]
+
+
+@pytest.mark.parametrize("block", [None, 64])
+def test_a_posterior_that_the_plant_contradicts_is_told(tmp_path, block):
+    plant = SimulatedPlant(RIG, TRUTH, clock=JumpingClock())
+    plant.arm(None)
+    u, y = plant.play(np.repeat(np.random.default_rng(0).choice([-3.0, 3.0], 32), 8))
+    known, said = identify(RIG, (u, y)).belief, {}
+    for stiffness in (TRUTH["a"], 1.1 * TRUTH["a"]):
+        clock = JumpingClock()
+        plant = SimulatedPlant(RIG, TRUTH | {"a": stiffness}, clock=clock)
+        plan = Plan(policy="prbs", samples=128, block=block)
+        said[stiffness] = run(RIG, plant, tmp_path / f"{stiffness}", plan, prior=known, clock=clock).message
+    right, wrong = said.values()
+    assert right == ""
+    assert "what was believed before is wrong: identify" in wrong
+
+
+def test_the_instrument_s_table_tells_what_is_simulated(tmp_path):
+    assert simulated(replace(RIG, guess=None), truth=TRUTH).truth == TRUTH
+    with pytest.raises(ValueError, match="truth must give m, c, a and b"):
+        simulated(RIG, truth={"a": 1.0})
+    with pytest.raises(ValueError, match=r"add one, or truth = \{ m"):
+        simulated(replace(RIG, guess=None))
 
 
 @pytest.mark.parametrize(
