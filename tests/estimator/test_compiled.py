@@ -244,3 +244,9 @@ def test_garbage_is_collected_again_after_compilation(place):
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_nothing_is_collected_where_the_process_ends():
+    text = "import atexit, gc; atexit.register(lambda: print(gc.get_freeze_count() > 0)); import estimator.compiled"
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"
