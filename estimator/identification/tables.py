@@ -19,6 +19,9 @@ from estimator.rig import Channel
 #: What stands for a missing number, in lower case.
 _MISSING = ("", "na", "n/a", "#n/a", "null", "none", "-")
 
+#: What separates fields in files whose numbers may have a decimal comma.
+_WITH_COMMAS = (";", "\t")
+
 #: Steps of a time column may be uneven by so much, which rounding does.
 _UNEVEN = 0.2
 
@@ -180,15 +183,11 @@ def read_table(path: Path, source: str | None = None, sink: str | None = None) -
             continue
         if None in values:
             bad = words[values.index(None)]
-            remedy = "leave it empty where it is missing"
-            if not rows:
-                remedy = "begin lines before the names with #, or mend the line"
-            elif re.fullmatch(r"\s*[-+]?\d+,\d+\s*", bad):
-                remedy = "beside decimal commas let semicolons or tabs separate the fields"
+            remedy = _remedy(bad) if rows else "begin lines before the names with #, or mend the line"
             raise ValueError(f"{path}, line {number}: {bad!r:.40} must be a number; {remedy}")
-        for word in words if separator in (";", "\t") else ():
+        for word in words if separator in _WITH_COMMAS else ():
             mark = mark or next((one for one in ",." if one in word), "")
-            if {",", "."} - {mark} & set(word) and mark:
+            if mark and {",": ".", ".": ","}[mark] in word:
                 raise ValueError(
                     f"{path}, line {number}: {word!r:.40} must have the decimal mark {mark!r} alone, as before; leave "
                     f"out marks of thousands"
@@ -223,7 +222,7 @@ def _fields(lines: Sequence[str], separator: str | None) -> Iterator[list[str]]:
 
 def _regular(lines: Sequence[str], separator: str | None, width: int) -> list[list[float]] | None:
     """The numbers of lines that hold nothing but finite ones, in many times less time; None of other lines."""
-    if separator in (";", "\t") and any("," in line for line in lines):
+    if separator in _WITH_COMMAS and any("," in line for line in lines):
         if any("." in line for line in lines):
             return None
         lines = [line.replace(",", ".") for line in lines]
@@ -240,13 +239,22 @@ def _number(word: str, separator: str | None = None) -> float | None:
         return math.nan
     if "_" in word:  # Python's
         return None
-    if separator in (";", "\t"):
+    if separator in _WITH_COMMAS:
         word = word.replace(",", ".")
     try:
         value = float(word)
     except ValueError:
         return None
     return None if math.isinf(value) else value
+
+
+def _remedy(bad: str) -> str:
+    """What to do about a field that is no number."""
+    if {",", "."} <= set(bad):
+        return "leave out marks of thousands"
+    if re.fullmatch(r"\s*[-+]?\d+,\d+\s*", bad):
+        return "beside decimal commas let semicolons or tabs separate the fields"
+    return "leave it empty where it is missing"
 
 
 def _told(value: float | None) -> bool:

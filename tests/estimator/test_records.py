@@ -129,7 +129,7 @@ def test_times_are_even_between_missing_inputs_only(tmp_path):
         ("u,y\n1,2\n1_0,2", "line 3: '1_0' must be a number"),
         ('u,y\n1,2\n"0,5",2', "line 3: '0,5' must be a number; beside decimal commas let semicolons or tabs separate"),
         ("t;u;y\n0,01;8.000;0,5\n", "line 2: '8.000' must have the decimal mark ',' alone"),
-        ("u;y\n1,5;2\n1.234,5;2\n", "line 3: '1.234,5' must be a number"),
+        ("u;y\n1,5;2\n1.234,5;2\n", "line 3: '1.234,5' must be a number; leave out marks"),
         ("u;y\n1,5;2\n;2\n1;2.5\n", "line 4: '2.5' must have the decimal mark ',' alone"),
         ("Test;;\nBy: X;;\nt;u;y\n0;1;2\n", "line 3: 't' must be a number; begin lines before the names with #"),
         ("t,u [N],y\n[s],[kN],[m]\n0,1,2\n", "'u [N]' must have one unit, but 'kN' stands below"),
