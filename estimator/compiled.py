@@ -6,7 +6,6 @@ work where nothing can be written, and which cannot see a bit that flipped.
 
 from __future__ import annotations
 
-import atexit
 import gc
 import hashlib
 import os
@@ -32,9 +31,11 @@ from numba.core.serialize import dumps
 
 from estimator.files import write_atomically
 
-# Where the process ends, Python's garbage collector would look through all of Numba several times, which takes longer
-# than many a script. So it finds nothing to look through.
-atexit.register(gc.freeze)
+# Numba's objects live as long as the process, and are so many that Python's garbage collector takes longer to look
+# through them, several times where the process ends, than many a script to run. Where there is little else yet, as
+# where a script begins, they are taken out of its sight. Elsewhere that would keep alive what others have done with.
+if len(gc.get_objects()) < 80_000:
+    gc.freeze()
 
 
 @cache
