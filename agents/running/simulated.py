@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.running.clock import Clock, RealClock
-from estimator.checks import number, shown
+from estimator.checks import number, shown, whole
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -42,7 +42,8 @@ class SimulatedPlant:
         clock: the machine's where it is None.
 
     Raises:
-        ValueError: for a rig without a guess where no truth is given, or with a delay.
+        ValueError: for a rig without a guess where no truth is given, or with a delay; for a truth that is not m, c, a
+            and b, or a seed that is no whole number.
     """
 
     watches = True
@@ -57,6 +58,7 @@ class SimulatedPlant:
             )
         if truth is not None:
             check_truth(truth)
+        whole("seed", seed, 2**128, 0)
         if rig.delay != 0:
             raise ValueError(f"rig must have a delay of 0 to be simulated here, but has {rig.delay}; set it to 0")
         self.truth = dict(truth) if truth is not None else {k: sum(v) / 2 for k, v in (rig.guess or {}).items()}

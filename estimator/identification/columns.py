@@ -24,7 +24,7 @@ UNITS = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "accelera
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 
 #: What stands in place of a unit where there is none.
-_NONE = ("", "-", "1")
+_NONE = ("", "-")
 
 
 def word_of(name: str) -> str:

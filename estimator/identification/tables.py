@@ -201,7 +201,8 @@ def read_table(path: Path, source: str | None = None, sink: str | None = None) -
     if not rows:
         raise ValueError(f"{path} must hold numbers, but holds none")
     if units:
-        names = tuple(with_unit(path, name, unit) for name, unit in zip(names, units, strict=True))
+        pairs = zip(names, units, strict=True)
+        names = tuple(with_unit(path, name, unit) if _number(unit) is None else name for name, unit in pairs)
     columns = np.array(rows).T
     return Table(path, names, columns, np.array(numbers)[places], *chosen(path, names, len(columns), source, sink))
 

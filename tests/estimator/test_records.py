@@ -67,6 +67,7 @@ def test_files(tmp_path):
         "response [mm], time [ms], force [N]\n1, 10, 0.5\n-0.2, 20, 1.5\n3, 30, \n",
         "time,force,displacement\ns,N,mm\n0,0.5,1\n0.01,1.5,-0.2\n0.02,n/a,3\n",
         "time,force [N],displacement\n[ms],(N),[mm]\n0,0.5,1\n10,1.5,-0.2\n20,n/a,3\n",
+        "time,force,displacement [mm]\ns,none,[-]\n0,0.5,1\n0.01,1.5,-0.2\n0.02,n/a,3\n",
         "u y\n0.5 1\n1.5 -0.2\nNA 3\n",
         ",,,\nu,y\n,\n0.5,1\n1.5,-0.2\nnull,3\n",
     ],
