@@ -6,6 +6,8 @@ The record is never in the repository. The tests look for it where `load_record`
 
 import os
 import signal
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 # One thread for matrices and networks, before any of them is loaded: results then do not depend on the machine's
@@ -34,6 +36,17 @@ def record() -> SilverboxRecord:
     if not record_available():
         pytest.skip("the Silverbox record is not on this machine; set SILVERBOX_DATA")
     return load_record()
+
+
+@pytest.fixture(autouse=True)
+def modules_of_the_test(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Forget the modules that a test wrote and imported: another test may give its own the same name."""
+    before = set(sys.modules)
+    yield
+    written = str(tmp_path_factory.getbasetemp())
+    for name in sys.modules.keys() - before:
+        if (getattr(sys.modules[name], "__file__", None) or "").startswith(written):
+            del sys.modules[name]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
