@@ -7,15 +7,17 @@ import numpy as np
 from duffing_env.noise import draw, to_unit
 from estimator.lanes import jit
 
+#: Inputs to choose from, in parts of the largest. Of a plan that is far off, the first two will do.
+CHOICES = (1.0, -1.0, 0.0, 0.5, -0.5)
+
+#: Of small changes, so many move an input by up to so much of the largest; the higher the power, the sooner in a plan.
+_MOVED, _BY, _SOON = 0.5, 0.3, 3
+
 
 @jit
 def choose(choice, last, terms):
-    """The highest input after ``last``, the lowest, or the one nearest to zero."""
-    if choice == 0:
-        return min(terms.amplitude, last + terms.slew)
-    if choice == 1:
-        return max(-terms.amplitude, last - terms.slew)
-    return max(last - terms.slew, min(0.0, last + terms.slew))
+    """The input nearest to one of `CHOICES` that is allowed after ``last``."""
+    return max(last - terms.slew, min(CHOICES[choice] * terms.amplitude, last + terms.slew))
 
 
 @jit
@@ -28,7 +30,13 @@ def bound(candidate, steps, last, terms):
 
 @jit
 def change(candidate, steps, amplitude, words):
-    """Change a candidate a little: turn one, two or a run of inputs over, shift it, or put one anywhere."""
+    """Change a candidate a little: move one input or two, turn one, two or a run of them over, or shift it."""
+    if uniform(words) < _MOVED:
+        h = np.int64(uniform(words) ** _SOON * steps)
+        move(candidate, h, amplitude, words)
+        if h + 1 < steps and uniform(words) < 0.5:
+            move(candidate, h + 1, amplitude, words)
+        return
     kind = uniform(words)
     h = np.int64(uniform(words) * steps)
     if kind < 0.35:
@@ -49,6 +57,13 @@ def change(candidate, steps, amplitude, words):
             candidate[k] = candidate[k - 1]
     else:
         candidate[h] = amplitude * (2.0 * uniform(words) - 1.0)
+
+
+@jit
+def move(candidate, h, amplitude, words):
+    """Move an input a little: how near to its limit a signal turns depends on little."""
+    moved = candidate[h] + _BY * amplitude * (2.0 * uniform(words) - 1.0)
+    candidate[h] = max(-amplitude, min(moved, amplitude))
 
 
 @jit

@@ -2,9 +2,11 @@
 
 The teaching of a plan has many summits, and changing a long plan here and there finds a poor one, even of a system that
 is known. So the plan is built sample by sample, as by dynamic programming: of all ways that lead into the same cell of
-the plane of the first two states only the best is followed, with the highest input, the lowest, and the one nearest to
-zero. A way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of
-the last plans. Without the latter a way would be praised for what every way teaches sooner or later.
+the plane of the first two states only the best is followed, with the highest input, the lowest, none, and half of
+either, since near its limit a signal may be led too far by a whole push and not far enough by none. Far ahead, where
+the plan will be made anew, only the highest and the lowest are tried. A way's score is what it has taught together with
+what the rest of the episode will teach anyway, at the rate of the last plans. Without the latter a way would be praised
+for what every way teaches sooner or later.
 
 The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
 line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.Swing`). Other
@@ -22,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.planner.candidates import bound, change, choose, uniform
+from agents.planner.candidates import CHOICES, bound, change, choose, uniform
 from agents.planner.design import half_log_det
 from agents.planner.imagination import mind
 from estimator.arrays import copy, copy_scaled, fill, highest
@@ -38,11 +40,11 @@ _CELLS, _NEAR, _FAR_CELLS = 24, 10, 12
 #: finer everywhere, the rounds are more by this factor, and plans look no further than so many moves.
 _LATE, _LATE_CELLS, _LATE_ROUNDS, _LATE_HORIZON = 48, 32, 4, 20
 
-#: Inputs that are tried at every cell.
-_CHOICES = 3
+#: For so many first moves all inputs are tried, and for those after them only so many.
+_FINE, _COARSE_CHOICES = 7, 2
 
 #: A way this much [nats] worse than the best of its length is followed no further.
-_HOPELESS = 1.0
+_HOPELESS = 0.5
 
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
@@ -111,6 +113,7 @@ class Task(NamedTuple):
         M: (K, K) factor of the information per sample that is to come.
         cells: of the map along each axis.
         far_cells: the same after the first moves.
+        fine: moves for which all inputs are tried.
     """
 
     record: Any
@@ -122,6 +125,7 @@ class Task(NamedTuple):
     M: Any
     cells: int
     far_cells: int
+    fine: int
 
 
 @cache
@@ -136,7 +140,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     def memory(horizon, cells):
         blocks = -(-(cells * cells if is_plane else cells) // LANES)
         most = blocks * LANES
-        ways, continued = np.empty((blocks, size)), np.empty((_CHOICES * blocks, size))
+        ways, continued = np.empty((blocks, size)), np.empty((len(CHOICES) * blocks, size))
         origins, inputs = np.empty((horizon, most), np.int64), np.empty((horizon, most))
         return Memory(ways, continued, origins, inputs, np.empty((LANES, horizon)))
 
@@ -152,7 +156,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         for cell in range(len(best)):
             if best[cell] >= enough and best[cell] > -np.inf:
                 b, j = ends[cell] // LANES, ends[cell] % LANES
-                memory.origins[h, count] = b // _CHOICES * LANES + j
+                memory.origins[h, count] = b // len(CHOICES) * LANES + j
                 memory.inputs[h, count] = continued[b, U + j]
                 best[count] = best[cell]
                 way, lane = ways[count // LANES], count % LANES
@@ -177,15 +181,18 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         for h in range(task.steps):
             cells = task.cells if h < _NEAR else task.far_cells
             fill(best, -np.inf)
-            for b in range(_CHOICES * (-(-count // LANES))):
+            tried = len(CHOICES) if h < task.fine else _COARSE_CHOICES
+            for i in range(tried * (-(-count // LANES))):
+                block, choice = i // tried, i % tried
+                b = block * len(CHOICES) + choice
                 W = continued[b]
-                copy(W, 0, ways[b // _CHOICES], kept)
+                copy(W, 0, ways[block], kept)
                 for j in range(LANES):
-                    W[U + j] = choose(b % _CHOICES, W[U + j], terms)
+                    W[U + j] = choose(choice, W[U + j], terms)
                 for _ in range(task.pace):
                     advance(W, task.record, terms)
                 appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
-                for j in range(min(LANES, count - b // _CHOICES * LANES)):
+                for j in range(min(LANES, count - block * LANES)):
                     cell = place(W[j], terms.scales[0], cells, right)
                     if is_plane:
                         cell = cell * cells + place(W[LANES + j], terms.scales[1], cells, up)
@@ -237,7 +244,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             steps, rounds = min(steps, _LATE_HORIZON), _LATE_ROUNDS * rounds
         M = np.zeros((k, k))
         factorise(rate, M)
-        task = Task(record, left, steps, pace, terms, lasts, M, cells, far)
+        task = Task(record, left, steps, pace, terms, lasts, M, cells, far, _FINE)
         turned = -best[0]
         for h in range(len(best) - 1):
             best[h] = best[h + 1]
@@ -311,7 +318,8 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         for t in range(first):
             go_on(W, record, u[t], lasts, terms)
         left = len(u) - first
-        find_way(memory(left, cells), Task(record, left, left, 1, terms, lasts, M, cells, cells), u[first:], words)
+        task = Task(record, left, left, 1, terms, lasts, M, cells, cells, left)
+        find_way(memory(left, cells), task, u[first:], words)
 
     return Search(plan, play, through)
 
