@@ -16,8 +16,8 @@ is imagined too.
 What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then
 predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
 exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes
-true. Where hypotheses about the noises are weighed (``noise_hypotheses``), but on a rig, an output is believed to be a
-mixture, with heavier tails: the quantile is that of Student's t with `TAILS` degrees of freedom. Where an input comes
+true. Where hypotheses about the noises are weighed (``noise_hypotheses``) an output is believed to be a mixture, with
+heavier tails: the quantile is that of Student's t with `TAILS` degrees of freedom. Where an input comes
 to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the sample
 between moves the next output about as much again, and no input makes up for it: the margin is then twice as wide.
 
@@ -166,7 +166,7 @@ class Planner:
         swing = swing_of(self.view, means, setup.max_input, setup.max_output)
         of_rig = getattr(experiment, "rig", None) is not None
         room = seen(experiment.believed, float(swing.scales[0])) if of_rig else 1.0
-        weighs = experiment.noise_hypotheses != 1 and not of_rig
+        weighs = experiment.noise_hypotheses != 1
         self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,
