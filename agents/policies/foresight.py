@@ -2,11 +2,12 @@
 
 The best input is a sharp function of the belief: it turns over where a push would come too late or lead too far. A
 network learns such a function poorly from means, deviations and displacements. It learns it well from what the believed
-oscillator does with a push up, none or a push down, and what that would teach (`agents.policies.prospects`). Three
+oscillator does with a push up, none or a push down, and what that would teach (`agents.policies.prospects`). Four
 things are done for it:
 
 - **Features.** Where the model is odd, observations are turned upright, so that the first sensor shows nothing
   negative, and the action is turned back.
+- **A measure.** Where half a push is worth more than a whole one, or is safe where that is not, it is played.
 - **A shield.** An action in whose direction no way is left to stay within the displacement limit is replaced by none,
   or by a push the other way, whichever is safe. So also a policy that still tries its actions out seldom ends an
   episode, and learns to go close to the limit.
@@ -16,7 +17,6 @@ things are done for it:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,14 +28,11 @@ from agents.planner.motion import View, places, survey, swing_of
 from agents.planner.motion import seen as seen_part
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, MARGIN, Outlook, feature_names, look_at
+from agents.policies.sight import Sight, acted
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
-
-#: How hard the drive pushes, in parts of what the oscillator moves by itself in two samples: at action 0, which swings
-#: it up, and what an action of 1 adds; an action of -1 brakes.
-_DRIVE, _DRIVE_SPAN = 0.06, 0.1
 
 #: An oscillator that is within this part of the limit is at rest; it is pushed as if it moved by so much.
 _REST, _NUDGE = 0.007, 0.05
@@ -52,23 +49,6 @@ _USUAL = 0.1
 
 _THRIFT = FEATURES.index("thrift")
 _FREE = [FEATURES.index(f"free_{t}") for t in (1, 2, 3)]
-
-
-@dataclass(frozen=True)
-class Sight:
-    """What n observations look like with foresight.
-
-    Attributes:
-        features: (n, features) float32 what the network sees.
-        safe: (n, 3) whether a push up, none, a push down need not lead beyond the limit.
-        signs: (n,) -1.0 where the observation was turned over.
-        motions: (n,) the input that is all of the motion, upright; zeros where no action is a drive.
-    """
-
-    features: npt.NDArray[np.float32]
-    safe: npt.NDArray[np.bool_]
-    signs: FloatArray
-    motions: FloatArray
 
 
 class Foresight:
@@ -168,7 +148,8 @@ class Foresight:
 
     def look(self, observations: npt.ArrayLike) -> Sight:
         """What observations (n, features) look like."""
-        return Sight(*look_at(observations, self._outlook, self._view))
+        found = look_at(observations, self._outlook, self._view)
+        return Sight(*found, np.ones((len(found[0]), 2)))
 
     def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
         """The actions (n, 1) in [-1, 1] that a network's choices (n,) in [-1, 1] stand for."""
@@ -226,7 +207,9 @@ class CommonForesight:
         of_rig = getattr(experiment, "rig", None) is not None
         weighs = experiment.noise_hypotheses != 1 and not of_rig
         known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
-        self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, known, _BURST if drive else HASTE)
+        self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, known)
+        if drive and np.isfinite(setup.budget):  # how hard to push is any number then
+            self._ahead = self._ahead._replace(haste=_BURST, firsts=3)
         self._terms = Terms(
             setup.max_input,
             np.inf,
@@ -288,13 +271,15 @@ class CommonForesight:
         """What beliefs look like."""
         n = len(seen)
         features, safe = np.empty((n, len(FEATURES)), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
-        signs = np.empty(n)
-        imaginer(self._view)(records, seen, self._ahead, self._ahead.blocks, self._terms, features, safe, signs)
+        signs, shares = np.empty(n), np.empty((n, 2))
+        look = imaginer(self._view)
+        look(records, seen, self._ahead, self._ahead.blocks, self._terms, features, safe, signs, shares)
         if self._own:
             upright = np.clip(seen, -BOUND, BOUND)
             upright[:, self._odd] *= signs[:, None].astype(np.float32)
             features = np.concatenate([features, upright], axis=1)
-        return Sight(features, safe, signs, self._motions(features, records, signs) if self.is_drive else np.zeros(n))
+        motions = self._motions(features, records, signs) if self.is_drive else np.zeros(n)
+        return Sight(features, safe, signs, motions, shares)
 
     def _motions(self, features: npt.NDArray[np.float32], records: FloatArray, signs: FloatArray) -> FloatArray:
         """(n,) the inputs that are all of a motion, upright: what it moves by in two samples, by itself."""
@@ -313,24 +298,6 @@ class CommonForesight:
             motions = np.where(at_rest, self._nudge, view.motions)
             return acted(choices, view, motions, self._terms.amplitude, pushes)
         return acted(pushes * np.asarray(choices), view, None, self._terms.amplitude, pushes)
-
-
-def acted(
-    choices: npt.ArrayLike, view: Sight, motions: FloatArray | None, max_input: float, push: npt.ArrayLike = 1.0
-) -> npt.NDArray[np.float32]:
-    """The actions (n, 1) of choices (n,), that drive along ``motions`` (n,) where there are any, by at most a ``push``.
-
-    One in whose direction no way is left within the limit becomes none or a ``push`` the other way.
-    """
-    chosen, most = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0), np.asarray(push)
-    if motions is not None:
-        chosen = np.clip((_DRIVE + _DRIVE_SPAN * chosen) * motions / max_input, -most, most)
-    up, none, down = view.safe.T
-    chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -most), chosen)
-    chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, most), chosen)
-    chosen = np.where((chosen == 0) & ~none, np.where(up, most, -most), chosen)
-    actions: npt.NDArray[np.float32] = (chosen * view.signs).astype(np.float32)[:, None]
-    return actions
 
 
 def _outlook_of(experiment: Experiment, rate: FloatArray) -> Outlook:

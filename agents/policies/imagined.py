@@ -1,7 +1,8 @@
 """What the beliefs of all oscillators have in common: what they expect of simple ways to go on, imagined exactly.
 
 From the belief the oscillator is imagined for as many moves as `look_ahead` says, each held for as many samples as
-`agents.planner.motion.Swing` says. The first move is a push up, none, or a push down; then follows one of
+`agents.planner.motion.Swing` says. The first move is a push up, none, or a push down, or half of either: near the limit
+a whole push may lead beyond it, where none falls short of it. Then follows one of
 
 - the signs of the next five or six pushes, and then pushes along the motion, but against it where they would lead
   beyond the limit; or the same signs, and then none; or all of these pushes up, or down, and then along (the *best* of
@@ -36,6 +37,9 @@ from estimator.parameters import FloatArray
 CONTINUATIONS = ("best", "brake", "rest")
 PARTS = ("half", "whole")
 FIRST_INPUTS = ("up", "none", "down")
+
+#: The first inputs in parts of a push; the last two are halves of the first and of the third.
+_FIRST = (1.0, 0.0, -1.0, 0.5, -0.5)
 
 #: What all observations become.
 FEATURES = (
@@ -79,6 +83,7 @@ class Ahead(NamedTuple):
         rate: (K, K) information about the coefficients that a sample usually brings.
         known: (K, K) what is known of them before the episode, the inverse of their covariance.
         haste: `HASTE`.
+        firsts: first inputs that are imagined: 5, or 3 without halves.
     """
 
     push: float
@@ -88,6 +93,7 @@ class Ahead(NamedTuple):
     rate: FloatArray
     known: FloatArray
     haste: float = HASTE
+    firsts: int = len(_FIRST)
 
     @property
     def blocks(self) -> int:
@@ -110,14 +116,16 @@ def look_ahead(built: float, moves: float) -> int:
 
 @cache
 def imaginer(view: View) -> Any:
-    """``look(records, observations, ahead, blocks, terms, features, safe, signs)``: what n beliefs of a model become.
+    """``look(records, observations, ahead, blocks, terms, features, safe, signs, shares)``: what n beliefs become.
 
     - ``records`` (n, size): the beliefs, as `estimator.Belief` keeps them;
     - ``observations`` (n, entries) float32, as they were shown with them;
     - ``ahead``: `Ahead`, and its ``blocks``; ``terms``: `agents.planner.imagination.Terms`;
     - ``features`` (n, len(FEATURES)) float32, receives the features, upright, all finite and at most `BOUND` in size;
-    - ``safe`` (n, 3) bool, receives which first moves need not lead beyond the limit; one of them is the safest;
-    - ``signs`` (n,) receives -1.0 where up and down changed places, so that the motion is upwards without input.
+    - ``safe`` (n, 3) bool, receives which of up, none and down need not lead beyond the limit; one is the safest;
+    - ``signs`` (n,) receives -1.0 where up and down changed places, so that the motion is upwards without input;
+    - ``shares`` (n, 2) receives how much of a push up, and of one down, to play: of all and half, what is safe, or if
+      both are, what brings more.
     """
     model = view.model
     size, _, U, SCORE, begin, _, advance, appraise, precision = mind(*view)
@@ -164,7 +172,7 @@ def imaginer(view: View) -> Any:
             way = c * LANES + j
             last = way - 2 * half
             if t == 0:
-                W[U + j] = (1.0 - first) * push
+                W[U + j] = _FIRST[first] * push
             elif last == 3:
                 W[U + j] = 0.0
             elif last < 0 and is_tried:
@@ -188,6 +196,19 @@ def imaginer(view: View) -> Any:
         return found
 
     @inner
+    def better(values, blocks, first, group, firsts):
+        """The same, or that of half a push where it is better: of the best ways, the others tell of whole ones."""
+        found = best(values, blocks, first, group)
+        return (
+            max(found, best(values, blocks, 3 + first // 2, 0)) if firsts > 3 and first != 1 and group == 0 else found
+        )
+
+    @inner
+    def nearest(heights, blocks, first):
+        """How near to the limit the way of a first move leads that stays furthest from it; heights are negative."""
+        return -max(best(heights, blocks, first, 0), best(heights, blocks, first, 1), best(heights, blocks, first, 2))
+
+    @inner
     def learn_rate(W, ahead, elapsed, now, rate, M):
         """The factor M of the information per sample, of the usual one and of what the episode has told so far."""
         precision(W, now)
@@ -200,10 +221,10 @@ def imaginer(view: View) -> Any:
             factorise(ahead.rate, M)
 
     @entry
-    def look(records, observations, ahead, blocks, terms, features, safe, signs):
+    def look(records, observations, ahead, blocks, terms, features, safe, signs, shares):
         W, still = np.zeros(size), np.zeros(width)
-        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(3 * blocks * LANES)
-        brought = np.empty((len(PARTS), 3 * blocks * LANES))
+        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(ahead.firsts * blocks * LANES)
+        brought = np.empty((len(PARTS), len(peaks)))
         free, now, rate = np.empty((3, 3)), np.empty((k, k)), np.empty((k, k))
         for i in range(len(observations)):
             record, seen, told = records[i], observations[i], features[i]
@@ -224,7 +245,7 @@ def imaginer(view: View) -> Any:
             to_come = W[SCORE]
             fill(peaks, 0.0)
             unforeseen = terms.shaken * record[noise + 1] / record[noise]
-            for lane in range(0, 3 * blocks * LANES, LANES):
+            for lane in range(0, len(peaks), LANES):
                 first, c = lane // LANES // blocks, lane // LANES % blocks
                 begin(W, record, lasts)
                 for t in range(ahead.moves):
@@ -235,7 +256,7 @@ def imaginer(view: View) -> Any:
                             for j in range(LANES):
                                 peak = abs(W[shown + j]) + room(W, j, unforeseen, terms)
                                 peaks[lane + j] = max(peaks[lane + j], peak)
-                    if t < 3:
+                    if t < 3 and first < 3:
                         free[t, first] = W[shown + LANES - 1]  # at last that of rest
                     if 2 * (t + 1) % ahead.moves == 0:
                         appraise(W, M, np.sqrt(max(0.0, share * ahead.samples - (t + 1) * terms.pace)))
@@ -259,8 +280,9 @@ def imaginer(view: View) -> Any:
             to = 8
             for group in range(3):
                 for h in range(len(PARTS)):
-                    rise, calm = best(brought[h], blocks, up, group), best(brought[h], blocks, 1, group)
-                    fall = best(brought[h], blocks, down, group)
+                    rise = better(brought[h], blocks, up, group, ahead.firsts)
+                    fall = better(brought[h], blocks, down, group, ahead.firsts)
+                    calm = best(brought[h], blocks, 1, group)
                     told[to] = np.arcsinh(_NAT * (rise - fall))
                     told[to + 1] = np.arcsinh(_NAT * (calm - max(rise, fall)))
                     to += 2
@@ -274,17 +296,25 @@ def imaginer(view: View) -> Any:
                 told[to + t] = sign * free[t, 1] / terms.limit
             for t in range(2):
                 told[to + 3 + t] = (free[t, 0] - free[t, 2]) / terms.limit
-            most = max(
-                best(brought[-1], blocks, 0, 0), best(brought[-1], blocks, 1, 0), best(brought[-1], blocks, 2, 0)
-            )
+            most = -np.inf
+            for first in range(ahead.firsts):
+                most = max(most, best(brought[-1], blocks, first, 0))
             told[to + 5] = np.arcsinh(_NAT * (most - to_come))
             told[to + 6] = to_come - known
             lowest = np.inf
             for first in range(3):
                 lowest = min(lowest, -best(peaks, blocks, first, 0))
             for first in range(3):
-                peak = -max(best(peaks, blocks, first, 0), best(peaks, blocks, first, 1), best(peaks, blocks, first, 2))
-                safe[i, first if sign > 0.0 else 2 - first] = peak <= terms.limit or peak <= lowest
+                peak, share = nearest(peaks, blocks, first), 1.0
+                is_safe = peak <= terms.limit
+                if ahead.firsts > 3 and first != 1 and nearest(peaks, blocks, 3 + first // 2) <= terms.limit:
+                    half = best(brought[-1], blocks, 3 + first // 2, 0)
+                    share = 0.5 if not is_safe or half > best(brought[-1], blocks, first, 0) else 1.0
+                    is_safe = True
+                place_at = first if sign > 0.0 else 2 - first
+                safe[i, place_at] = is_safe or peak <= lowest
+                if first != 1:
+                    shares[i, place_at // 2] = share
             for j in range(len(told)):
                 # NaN becomes 0.
                 told[j] = max(-BOUND, min(told[j], BOUND)) if told[j] == told[j] else 0.0

@@ -13,8 +13,9 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from agents.evaluation.batch import make
-from agents.policies.foresight import CommonForesight, Sight
+from agents.policies.foresight import CommonForesight
 from agents.policies.imagined import BOUND, FEATURES
+from agents.policies.sight import Sight
 from agents.vec_env import BatchVecEnv
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.lanes import LANES

@@ -291,6 +291,12 @@ def test_the_shield_takes_what_is_safe_and_nearest():
     for safe, choice, action in cases:
         view.safe[:] = safe
         assert foresight.act([choice], view)[0, 0] == np.float32(action), (safe, choice)
+    view.shares[:] = 0.5, 1.0  # half of a push up
+    for safe, choice, action in [
+        ((1, 1, 1), 0.4, 0.4), ((1, 1, 1), 0.9, 0.5), ((1, 1, 1), -0.9, -0.9), ((1, 0, 0), -0.3, 0.5)
+    ]:  # fmt: skip
+        view.safe[:] = safe
+        assert foresight.act([choice], view)[0, 0] == np.float32(action), (safe, choice)
 
 
 def test_the_drive_pushes_along_the_motion_within_the_budget():

@@ -43,7 +43,7 @@ def reference(belief, seen, ahead, terms):
     q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
     last_u, time_left = seen[18], seen[20]
     thrift = min(1.0, np.sqrt(seen[21] * ahead.energy / max(1.0, time_left * ahead.samples)) / ahead.push)
-    A = ahead.push * min(1.0, 2.0 * thrift)
+    A = ahead.push * min(1.0, ahead.haste * thrift)
     share = 0.5 * (time_left + seen[21]) if ahead.energy < np.inf else time_left
     told_so_far = np.linalg.inv(P[2:, 2:]) - ahead.known
     rate = (32 * ahead.rate + told_so_far) / (32 + (1 - time_left) * ahead.samples)
@@ -69,7 +69,7 @@ def reference(belief, seen, ahead, terms):
         margin = 0.0
         for t in range(ahead.moves):
             if t == 0:
-                u = (1 - first) * A
+                u = (1.0, 0.0, -1.0, 0.5, -0.5)[first] * A
             elif code == number - 1:
                 u = 0.0
             elif code < 2 * half and t <= tried:
@@ -94,41 +94,54 @@ def reference(belief, seen, ahead, terms):
                 told.append(worth(C, max(0.0, share * ahead.samples - (t + 1) * terms.pace)) - cost)
         return np.cumsum(told) / [1, 2], peak, seen_at
 
-    ways = {(first, code): way(first, code) for first in range(3) for code in range(number)}
+    ways = {(first, code): way(first, code) for first in range(ahead.firsts) for code in range(number)}
     free = np.array([[ways[first, number - 1][2][t] for first in range(3)] for t in range(3)])
     sign = 1.0 if free[0, 1] >= 0 else -1.0
     up, down = (0, 2) if sign > 0 else (2, 0)
     groups = [range(number - 2), [number - 2], [number - 1]]
     brought = lambda group, first, h: max(ways[first, code][0][h] for code in groups[group])  # noqa: E731
-    peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(3)] for codes in groups])
+    halves = {0: 3, 2: 4} if ahead.firsts == 5 else {}
+    best_of = lambda first, h: max(brought(0, f, h) for f in (first, halves.get(first, first)))  # noqa: E731
+    peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(ahead.firsts)] for codes in groups])
     told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, thrift]
     for group in range(3):
         for h in range(2):
-            rise, calm, fall = (brought(group, first, h) for first in (up, 1, down))
+            rise, calm, fall = (best_of(f, h) if group == 0 else brought(group, f, h) for f in (up, 1, down))
             told += [np.arcsinh(20 * (rise - fall)), np.arcsinh(20 * (calm - max(rise, fall)))]
     told += [peaks[group, first] / L for group in range(3) for first in (up, 1, down)]
     told += [*(sign * free[:, 1] / L), *((free[:2, 0] - free[:2, 2]) / L)]
     now = worth(P, share * ahead.samples)
-    told += [np.arcsinh(20 * (max(brought(0, first, 1) for first in range(3)) - now)), now - worth(P, 0.0)]
-    allowed = peaks.min(axis=0) <= max(L, peaks[0].min())
-    return np.clip(told, -BOUND, BOUND), allowed if sign > 0 else allowed[::-1], sign
+    told += [np.arcsinh(20 * (max(brought(0, first, 1) for first in range(ahead.firsts)) - now)), now - worth(P, 0.0)]
+    lowest = peaks.min(axis=0)
+    allowed, shares = lowest[:3] <= max(L, peaks[0, :3].min()), np.ones(3)
+    for whole, half in halves.items():
+        if lowest[half] <= L and (lowest[whole] > L or brought(0, half, 1) > brought(0, whole, 1)):
+            allowed[whole], shares[whole] = True, 0.5
+    turned = slice(None, None, int(sign))
+    return np.clip(told, -BOUND, BOUND), allowed[turned], sign, shares[turned][::2]
 
 
-@pytest.mark.parametrize(("track", "pace"), [("Amplitude", 1), ("Amplitude", 2), ("Power", 1)])
-def test_features_are_those_of_the_matrices(track, pace):
+@pytest.mark.parametrize(
+    ("track", "pace", "drive", "firsts"),
+    [("Amplitude", 1, False, 5), ("Amplitude", 2, False, 5), ("Power", 1, False, 5), ("Power", 1, True, 3)],
+)
+def test_features_are_those_of_the_matrices(track, pace, drive, firsts):
     envs = make(f"duffing_env/{track}-v0", 12)
     seen = observations_of(envs, 40)
-    foresight = CommonForesight(envs)
+    foresight = CommonForesight(envs, drive=drive)
     terms = foresight._terms._replace(pace=pace, shaken=3.0)
     features, safe = np.empty((12, len(FEATURES)), np.float32), np.empty((12, 3), np.bool_)
-    signs = np.empty(12)
+    signs, shares = np.empty(12), np.empty((12, 2))
     ahead = foresight._ahead
-    imaginer(View(difference()))(envs.records, seen, ahead, ahead.blocks, terms, features, safe, signs)
+    assert ahead.firsts == firsts
+    imaginer(View(difference()))(envs.records, seen, ahead, ahead.blocks, terms, features, safe, signs, shares)
     assert {*signs} == {-1.0, 1.0}
+    assert {*shares.flat} == ({0.5, 1.0} if track == "Amplitude" else {1.0})
     for i in range(12):
-        told, allowed, sign = reference(envs.belief(i), seen[i], ahead, terms)
+        told, allowed, sign, share = reference(envs.belief(i), seen[i], ahead, terms)
         np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
         np.testing.assert_array_equal(safe[i], allowed)
+        np.testing.assert_array_equal(shares[i], share)
         assert signs[i] == sign
 
 
