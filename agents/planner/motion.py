@@ -181,7 +181,7 @@ def seen(belief: Belief, displacement: float) -> float:
 _SAMPLES, _TURN = 128, 0.95
 
 #: Moves of the input in a period of the motion: fewer cannot follow it, more take time and look less far.
-_MOVES = 9
+MOVES = 9
 
 
 class Swing(NamedTuple):
@@ -279,4 +279,4 @@ def swing_of(view: View, prior_means: npt.ArrayLike, max_input: float, limit: fl
     scales = limit * np.divide(sizes, peak, out=np.ones(model.n_states), where=~keeps)
     # Kicks of the velocity, of variance 3 a sample, after a quarter period 2π/4ω: 3 (t/2ω²), of the displacement.
     shaken = max(0.0, 3.0 * period**3 / (32.0 * np.pi**2) - 1.0) * float(limit / scales[0]) ** 2
-    return Swing(scales, max(1, round(period / _MOVES)), float(shaken), taught, float(built) or np.inf)
+    return Swing(scales, max(1, round(period / MOVES)), float(shaken), taught, float(built) or np.inf)

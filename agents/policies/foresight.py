@@ -11,8 +11,8 @@ things are done for it:
 - **A shield.** An action in whose direction no way is left to stay within the displacement limit is replaced by none,
   or by a push the other way, whichever is safe. So also a policy that still tries its actions out seldom ends an
   episode, and learns to go close to the limit.
-- **A drive**, where the energy is limited: the action is how hard to push along the motion (or against it), not the
-  input itself. Of all ways to swing an oscillator up, to push in proportion to its motion takes least energy.
+- **A burst**, where the energy is limited: the action is how much harder to push than the best burst does that is
+  imagined to the end of the episode (`agents.policies.bursts`), not the input itself.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from scipy.special import ndtr, stdtrit
 from agents.planner.imagination import TAILS, Terms
 from agents.planner.motion import View, places, survey, swing_of
 from agents.planner.motion import seen as seen_part
-from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, imaginer, look_ahead
+from agents.policies.bursts import burster, drawn
+from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, MARGIN, Outlook, feature_names, look_at
 from agents.policies.sight import Sight, acted
 from duffing_env.experiment import Experiment
@@ -34,21 +35,14 @@ from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 
-#: An oscillator that is within this part of the limit is at rest; it is pushed as if it moved by so much.
-_REST, _NUDGE = 0.007, 0.05
-
 #: A push alone changes the displacement by no more than half of this part of its limit in a move.
 _LEAP = 1.0
-
-#: As `agents.policies.imagined.HASTE`, of a drive: it saves energy for a burst.
-_BURST = 6.0
 
 #: What a sample of the rest of an episode brings, in parts of one of a swing at the limit. All of it praises ways that
 #: teach what such a swing does not, such as to rest with a push on.
 _USUAL = 0.1
 
-_THRIFT = FEATURES.index("thrift")
-_FREE = [FEATURES.index(f"free_{t}") for t in (1, 2, 3)]
+_HARDER, _AS_IT_IS = (FEATURES.index(f"best_{way}_whole") for way in ("up", "none"))
 
 
 class Foresight:
@@ -141,30 +135,14 @@ class Foresight:
         """Which of the features is what is still to come."""
         return self.features - len(EXPECTED) + EXPECTED.index("to_come")
 
-    @property
-    def is_drive(self) -> bool:
-        """Whether an action is how hard to push along the motion."""
-        return bool(np.isfinite(self._outlook.energy))
-
     def look(self, observations: npt.ArrayLike) -> Sight:
         """What observations (n, features) look like."""
         found = look_at(observations, self._outlook, self._view)
-        return Sight(*found, np.ones((len(found[0]), 2)))
+        return Sight(*found, np.ones((len(found[0]), 2)), np.ones(len(found[0])))
 
     def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
         """The actions (n, 1) in [-1, 1] that a network's choices (n,) in [-1, 1] stand for."""
-        nudge = None
-        if self.is_drive:
-            outlook = self._outlook
-            first = places(self._view.model).state
-            # In the observation all states are in parts of the first sensor's limit.
-            sizes = (outlook.scales / outlook.max_output).astype(np.float32)
-            states = view.features[:, first : first + self._view.model.n_states] / sizes
-            at_rest_gain = survey(self._view.model, outlook.center, np.zeros(self._view.model.n_states)).gains[0]
-            nudge = np.where(
-                np.abs(states).max(axis=1) < _REST, _NUDGE * outlook.max_output / abs(at_rest_gain), view.motions
-            )
-        return acted(choices, view, nudge, self._outlook.max_input)
+        return acted(choices, view)
 
 
 class CommonForesight:
@@ -175,18 +153,18 @@ class CommonForesight:
     observation itself it tells more of one model, and a policy plays environments of that. Outputs keep
     `agents.policies.prospects.MARGIN` standard deviations from the limit; where noises are weighed, as many as make the
     same chance under Student's t. On a rig the limit is lower by what a swing at it can hide between two samples. An
-    action is a push, where the energy is limited in proportion to what is left of it; or, as a ``drive``, how hard.
+    action is a push; where the energy is limited, how much harder to push than the best burst, and the features of what
+    is best tell what harder, as hard and softer ways bring in place of a push up, none and a push down.
 
     Args:
         env: the unwrapped environment.
         own: whether the observation stands behind the features, turned upright.
-        drive: whether an action is how hard to push along the motion, where the energy is limited.
 
     Raises:
         ValueError: where an action is held for several samples, or ``env`` is not one of duffing_env.
     """
 
-    def __init__(self, env: Any, *, own: bool = False, drive: bool = False) -> None:
+    def __init__(self, env: Any, *, own: bool = False) -> None:
         experiment: Experiment | None = getattr(env, "experiment", None)
         if experiment is None:
             raise ValueError(
@@ -205,11 +183,9 @@ class CommonForesight:
         slow = swing if lasting == setup.max_input else swing_of(self._view, center, lasting, setup.max_output)
         moves = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
         of_rig = getattr(experiment, "rig", None) is not None
-        weighs = experiment.noise_hypotheses != 1 and not of_rig
+        weighs = experiment.noise_hypotheses != 1
         known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
         self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, known)
-        if drive and np.isfinite(setup.budget):  # how hard to push is any number then
-            self._ahead = self._ahead._replace(haste=_BURST, firsts=3)
         self._terms = Terms(
             setup.max_input,
             np.inf,
@@ -223,8 +199,7 @@ class CommonForesight:
         at, model = places(self._view.model), self._view.model
         odd = (*range(at.state, at.state + model.n_states), at.last_input)
         self._odd = (*odd, *range(at.last_output, at.last_output + model.n_outputs))
-        self._own, self._env, self._push = own, env, push / setup.max_input
-        self._asked, self._nudge = drive, _NUDGE * setup.max_output / gain
+        self._own, self._env = own, env
 
     def to_tensors(self) -> dict[str, FloatArray]:
         """Nothing: all of it is taken from the environment at hand."""
@@ -232,12 +207,7 @@ class CommonForesight:
 
     def describe(self) -> dict[str, Any]:
         """As `Foresight.describe`."""
-        return {"is_common": True, "drives": self._asked}
-
-    @property
-    def is_drive(self) -> bool:
-        """Whether an action is how hard to push along the motion."""
-        return self._asked and bool(np.isfinite(self._ahead.energy))
+        return {"is_common": True}
 
     @property
     def observation_size(self) -> int:
@@ -269,35 +239,29 @@ class CommonForesight:
 
     def _seen(self, seen: npt.NDArray[np.float32], records: FloatArray) -> Sight:
         """What beliefs look like."""
-        n = len(seen)
+        n, largest, limited = len(seen), self._terms.amplitude, np.isfinite(self._ahead.energy)
         features, safe = np.empty((n, len(FEATURES)), dtype=np.float32), np.empty((n, 3), dtype=np.bool_)
-        signs, shares = np.empty(n), np.empty((n, 2))
-        look = imaginer(self._view)
-        look(records, seen, self._ahead, self._ahead.blocks, self._terms, features, safe, signs, shares)
+        signs, shares, bursts, worths = np.empty(n), np.empty((n, 2)), np.zeros(n), np.empty((n, 3))
+        if limited:
+            episode = float(self._ahead.samples), self._ahead.energy
+            burster(self._view)(records, seen, *episode, self._terms, drawn(), bursts, worths)
+        # What is foreseen to be safe is so for pushes that are no harder than these.
+        pushes = np.abs(bursts)
+        task = self._ahead, self._ahead.blocks, self._terms
+        imaginer(self._view)(records, seen, *task, features, safe, signs, shares, pushes)
+        if limited:
+            harder, best, softer = worths.T
+            features[:, _HARDER] = as_feature(harder - softer)
+            features[:, _AS_IT_IS] = np.maximum(1.0, as_feature(best - np.maximum(harder, softer)))
         if self._own:
             upright = np.clip(seen, -BOUND, BOUND)
             upright[:, self._odd] *= signs[:, None].astype(np.float32)
             features = np.concatenate([features, upright], axis=1)
-        motions = self._motions(features, records, signs) if self.is_drive else np.zeros(n)
-        return Sight(features, safe, signs, motions, shares)
-
-    def _motions(self, features: npt.NDArray[np.float32], records: FloatArray, signs: FloatArray) -> FloatArray:
-        """(n,) the inputs that are all of a motion, upright: what it moves by in two samples, by itself."""
-        n, d = self._view.model.n_states, len(self._view.model.names)
-        found = survey(self._view.model, records[:, n:d], records[:, :n])
-        moves = found.velocities + signs * features[:, _FREE[0]] * self._terms.limit - found.shown
-        motions: FloatArray = signs * moves / self._terms.pace * found.gains / np.maximum(found.gains**2, 1e-300)
-        return motions
+        return Sight(features, safe, signs, shares, pushes / largest, bursts / largest if limited else None)
 
     def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
         """As `Foresight.act`."""
-        # What is foreseen to be safe is so for pushes that are no harder than these.
-        pushes = self._push * np.minimum(1.0, self._ahead.haste * view.features[:, _THRIFT])
-        if self.is_drive:
-            at_rest = np.abs(view.features[:, _FREE]).max(axis=1) < _REST
-            motions = np.where(at_rest, self._nudge, view.motions)
-            return acted(choices, view, motions, self._terms.amplitude, pushes)
-        return acted(pushes * np.asarray(choices), view, None, self._terms.amplitude, pushes)
+        return acted(choices, view)
 
 
 def _outlook_of(experiment: Experiment, rate: FloatArray) -> Outlook:

@@ -82,8 +82,6 @@ class Ahead(NamedTuple):
         energy: limit of Σ u²; inf where there is none.
         rate: (K, K) information about the coefficients that a sample usually brings.
         known: (K, K) what is known of them before the episode, the inverse of their covariance.
-        haste: `HASTE`.
-        firsts: first inputs that are imagined: 5, or 3 without halves.
     """
 
     push: float
@@ -92,8 +90,6 @@ class Ahead(NamedTuple):
     energy: float
     rate: FloatArray
     known: FloatArray
-    haste: float = HASTE
-    firsts: int = len(_FIRST)
 
     @property
     def blocks(self) -> int:
@@ -114,9 +110,16 @@ def look_ahead(built: float, moves: float) -> int:
     return 2 * int(np.clip(min(_BUILT * built, _PART * moves), _LEAST, _MOST) / 2)
 
 
+def as_feature(nats: FloatArray) -> FloatArray:
+    """Differences of what ways bring, in nats, as features are: bounded, and fine where they are small."""
+    return np.clip(np.arcsinh(_NAT * nats), -BOUND, BOUND)
+
+
 @cache
 def imaginer(view: View) -> Any:
-    """``look(records, observations, ahead, blocks, terms, features, safe, signs, shares)``: what n beliefs become.
+    """``look(records, observations, ahead, blocks, terms, features, safe, signs, shares, pushes)``: what they become.
+
+    n beliefs become these:
 
     - ``records`` (n, size): the beliefs, as `estimator.Belief` keeps them;
     - ``observations`` (n, entries) float32, as they were shown with them;
@@ -125,7 +128,8 @@ def imaginer(view: View) -> Any:
     - ``safe`` (n, 3) bool, receives which of up, none and down need not lead beyond the limit; one is the safest;
     - ``signs`` (n,) receives -1.0 where up and down changed places, so that the motion is upwards without input;
     - ``shares`` (n, 2) receives how much of a push up, and of one down, to play: of all and half, what is safe, or if
-      both are, what brings more.
+      both are, what brings more;
+    - ``pushes`` (n,): how hard pushes are at least; receives how hard they are, no less than the energy allows for.
     """
     model = view.model
     size, _, U, SCORE, begin, _, advance, appraise, precision = mind(*view)
@@ -196,12 +200,10 @@ def imaginer(view: View) -> Any:
         return found
 
     @inner
-    def better(values, blocks, first, group, firsts):
+    def better(values, blocks, first, group):
         """The same, or that of half a push where it is better: of the best ways, the others tell of whole ones."""
         found = best(values, blocks, first, group)
-        return (
-            max(found, best(values, blocks, 3 + first // 2, 0)) if firsts > 3 and first != 1 and group == 0 else found
-        )
+        return max(found, best(values, blocks, 3 + first // 2, 0)) if first != 1 and group == 0 else found
 
     @inner
     def nearest(heights, blocks, first):
@@ -221,9 +223,9 @@ def imaginer(view: View) -> Any:
             factorise(ahead.rate, M)
 
     @entry
-    def look(records, observations, ahead, blocks, terms, features, safe, signs, shares):
+    def look(records, observations, ahead, blocks, terms, features, safe, signs, shares, pushes):
         W, still = np.zeros(size), np.zeros(width)
-        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(ahead.firsts * blocks * LANES)
+        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(len(_FIRST) * blocks * LANES)
         brought = np.empty((len(PARTS), len(peaks)))
         free, now, rate = np.empty((3, 3)), np.empty((k, k)), np.empty((k, k))
         for i in range(len(observations)):
@@ -236,7 +238,7 @@ def imaginer(view: View) -> Any:
                 left = max(1.0, share * ahead.samples)
                 share = 0.5 * (share + seen[at.budget_left])
                 thrift = min(1.0, np.sqrt(max(0.0, seen[at.budget_left]) * ahead.energy / left) / ahead.push)
-            push = ahead.push * min(1.0, ahead.haste * thrift)
+            push = pushes[i] = max(pushes[i], ahead.push * min(1.0, HASTE * thrift))
             begin(W, record, lasts)
             learn_rate(W, ahead, (1.0 - seen[at.time_left]) * ahead.samples, now, rate, M)
             appraise(W, none, 0.0)
@@ -280,8 +282,8 @@ def imaginer(view: View) -> Any:
             to = 8
             for group in range(3):
                 for h in range(len(PARTS)):
-                    rise = better(brought[h], blocks, up, group, ahead.firsts)
-                    fall = better(brought[h], blocks, down, group, ahead.firsts)
+                    rise = better(brought[h], blocks, up, group)
+                    fall = better(brought[h], blocks, down, group)
                     calm = best(brought[h], blocks, 1, group)
                     told[to] = np.arcsinh(_NAT * (rise - fall))
                     told[to + 1] = np.arcsinh(_NAT * (calm - max(rise, fall)))
@@ -297,7 +299,7 @@ def imaginer(view: View) -> Any:
             for t in range(2):
                 told[to + 3 + t] = (free[t, 0] - free[t, 2]) / terms.limit
             most = -np.inf
-            for first in range(ahead.firsts):
+            for first in range(len(_FIRST)):
                 most = max(most, best(brought[-1], blocks, first, 0))
             told[to + 5] = np.arcsinh(_NAT * (most - to_come))
             told[to + 6] = to_come - known
@@ -307,10 +309,10 @@ def imaginer(view: View) -> Any:
             for first in range(3):
                 peak, share = nearest(peaks, blocks, first), 1.0
                 is_safe = peak <= terms.limit
-                if ahead.firsts > 3 and first != 1 and nearest(peaks, blocks, 3 + first // 2) <= terms.limit:
+                if first != 1 and nearest(peaks, blocks, 3 + first // 2) <= terms.limit:
                     half = best(brought[-1], blocks, 3 + first // 2, 0)
                     share = 0.5 if not is_safe or half > best(brought[-1], blocks, first, 0) else 1.0
-                    is_safe = True
+                    is_safe = is_safe or terms.pace == 1  # a longer one is chosen anew before it is played
                 place_at = first if sign > 0.0 else 2 - first
                 safe[i, place_at] = is_safe or peak <= lowest
                 if first != 1:

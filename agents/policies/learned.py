@@ -125,11 +125,16 @@ class LearnedPolicy:
 
         Raises:
             ValueError: for a policy with foresight and an environment that is not one of duffing_env, or is of another
-                model than a policy was trained on that sees its observations too.
+                model than a policy was trained on that sees its observations too; for one whose actions are no longer
+                known.
         """
         if self._is_common:
-            drives = bool(self.card["foresight"].get("drives"))
-            foresight = CommonForesight(env, own=self._features > len(FEATURES), drive=drives)
+            if self.card["foresight"].get("drives"):
+                raise ValueError(
+                    "policy must choose how much harder to push than a burst, but was trained to drive, as policies "
+                    "once were where the energy is limited; train it again"
+                )
+            foresight = CommonForesight(env, own=self._features > len(FEATURES))
             if foresight.features != self._features:
                 raise ValueError(
                     f"env must have {self._features} features for this policy, but has {foresight.features}: it is of "

@@ -125,7 +125,7 @@ class Prospect(NamedTuple):
 
 @cache
 def lookout(view: View) -> Any:
-    """``look(observations, outlook, features, safe, signs, motions)``: what n observations of a model become.
+    """``look(observations, outlook, features, safe, signs)``: what n observations of a model become.
 
     - ``observations`` (n, entries) float32;
     - ``outlook``: `Outlook`;
@@ -133,7 +133,6 @@ def lookout(view: View) -> Any:
     - ``safe`` (n, 3) bool, receives which first inputs need not lead beyond the limit; one of them is the safest;
     - ``signs`` (n,) receives -1.0 where the observation was turned over, so that the first sensor shows nothing
       negative; all 1.0 for a model that is not the same turned over;
-    - ``motions`` (n,) receives what an input that is all of the motion in two samples would be, upright.
     """
     model = view.model
     found, at = motion(*view), places(model)
@@ -261,26 +260,18 @@ def lookout(view: View) -> Any:
         return sign
 
     @inner
-    def drift(start, prospect, outlook, shown, place):
-        """Follow the system without input; fills three features, and gives the motion in terms of an input."""
-        W, typical, limit = np.empty(size), np.empty(size), prospect.limit
+    def drift(start, prospect, shown, place):
+        """Follow the system without input; fills three features."""
+        W, limit = np.empty(size), prospect.limit
         copy(W, 0, start, size)
-        copy(typical, 0, start, size)
-        copy(typical, n, outlook.center, k)
-        sense(typical)
-        way = 1.0 if typical[gain] > 0.0 else -1.0
-        motion = start[velocity] - start[now]
         for t in range(3):
             W[u] = 0.0
             step(W)
-            if t == 0:
-                motion += W[shown_row]
             bound(W, prospect.scales)
             shown[place + t] = max(-2.0 * limit, min(W[shown_row], 2.0 * limit)) / limit
-        return way * motion / max(way * start[gain], 0.1 * way * typical[gain])
 
     @entry
-    def look(observations, outlook, features, safe, signs, motions):
+    def look(observations, outlook, features, safe, signs):
         samples, limit, rate = outlook.samples, outlook.max_output, outlook.rate
         C, unknown, work = np.empty((k, k)), np.empty((k, k)), np.empty((k, k))
         start, W, seen = np.zeros(size), np.zeros(size), np.empty(own)
@@ -304,7 +295,7 @@ def lookout(view: View) -> Any:
             prospect = Prospect(start, C, unknown, push, limit, variance, outlook.scales)
             attempt(prospect, W, shown, safe[i])
             place = n_features - 6
-            motions[i] = drift(start, prospect, outlook, shown, place)
+            drift(start, prospect, shown, place)
             shown[place + 3] = 5.0 * start[gain] * push / limit
             shown[place + 4] = to_come
             total = 0.0
@@ -340,10 +331,10 @@ def weigh(C, rate, count, W, work):
 
 def look_at(
     observations: npt.ArrayLike, outlook: Outlook, view: View
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_], FloatArray, FloatArray]:
-    """Features, safe, signs and motions of observations (n, entries); see `lookout`."""
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_], FloatArray]:
+    """Features, safe and signs of observations (n, entries); see `lookout`."""
     seen = np.ascontiguousarray(observations, dtype=np.float32)
     features = np.empty((len(seen), len(feature_names(view.model))), dtype=np.float32)
-    safe, (signs, motions) = np.empty((len(seen), 3), dtype=np.bool_), np.empty((2, len(seen)))
-    lookout(view)(seen, outlook, features, safe, signs, motions)
-    return features, safe, signs, motions
+    safe, signs = np.empty((len(seen), 3), dtype=np.bool_), np.empty(len(seen))
+    lookout(view)(seen, outlook, features, safe, signs)
+    return features, safe, signs

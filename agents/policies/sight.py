@@ -9,10 +9,6 @@ import numpy.typing as npt
 
 from estimator.parameters import FloatArray
 
-#: How hard the drive pushes, in parts of what the oscillator moves by itself in two samples: at action 0, which swings
-#: it up, and what an action of 1 adds; an action of -1 brakes.
-_DRIVE, _DRIVE_SPAN = 0.06, 0.1
-
 
 @dataclass(frozen=True)
 class Sight:
@@ -22,33 +18,37 @@ class Sight:
         features: (n, features) float32 what the network sees.
         safe: (n, 3) whether a push up, none, a push down need not lead beyond the limit.
         signs: (n,) -1.0 where the observation was turned over.
-        motions: (n,) the input that is all of the motion, upright; zeros where no action is a drive.
         shares: (n, 2) how much of a push up, and of one down, is played.
+        pushes: (n,) how hard a push is, in parts of the largest.
+        bursts: (n,) the first inputs of the best bursts, in parts of the largest and not turned over; None where the
+            energy is not limited.
     """
 
     features: npt.NDArray[np.float32]
     safe: npt.NDArray[np.bool_]
     signs: FloatArray
-    motions: FloatArray
     shares: FloatArray
+    pushes: FloatArray
+    bursts: FloatArray | None = None
 
 
-def acted(
-    choices: npt.ArrayLike, view: Sight, motions: FloatArray | None, max_input: float, push: npt.ArrayLike = 1.0
-) -> npt.NDArray[np.float32]:
-    """The actions (n, 1) of choices (n,), that drive along ``motions`` (n,) where there are any, by at most a ``push``.
+def acted(choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
+    """The actions (n, 1) of choices (n,), each of them a part of a push.
 
     Of a push no more is played than its share. One in whose direction no way is left within the limit becomes none or a
-    push the other way.
+    push the other way; where none is too little, it is played in full. Where there are bursts, a choice is how much
+    harder to push than the best of them does: not at all at -1, and twice as hard at 1, but no harder than a push is.
     """
-    chosen, most = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0), np.asarray(push)
-    rise, fall = most * view.shares.T
-    if motions is not None:
-        chosen = (_DRIVE + _DRIVE_SPAN * chosen) * motions / max_input
-    chosen = np.clip(chosen, -fall, rise)
     up, none, down = view.safe.T
+    chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
+    rise, fall = view.pushes * view.shares.T
+    if view.bursts is not None:
+        chosen = np.clip(view.signs * view.bursts * (1.0 + chosen), -view.pushes, view.pushes)
+    else:
+        chosen = np.clip(view.pushes * chosen, -fall, rise)
     chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -fall), chosen)
     chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, rise), chosen)
     chosen = np.where((chosen == 0) & ~none, np.where(up, rise, -fall), chosen)
+    chosen = np.where(none, chosen, np.where(chosen > 0, rise, -fall))
     actions: npt.NDArray[np.float32] = (chosen * view.signs).astype(np.float32)[:, None]
     return actions

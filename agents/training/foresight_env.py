@@ -93,7 +93,7 @@ class ForesightVecEnv(VecEnvWrapper):
 
 
 def foresight_of(
-    envs: DuffingVectorEnv, env_id: str, options: dict[str, Any], seed: int, *, levels: int = 0
+    envs: DuffingVectorEnv, env_id: str, options: dict[str, Any], seed: int
 ) -> Foresight | CommonForesight:
     """What a policy is trained with: the foresight of all oscillators; where the belief forgets, that of Eq. (2) alone.
 
@@ -104,18 +104,17 @@ def foresight_of(
         env_id: of their track.
         options: of theirs.
         seed: of the example that `Foresight` needs.
-        levels: of the choices; a network that has none, and chooses any number, drives where the energy is limited.
     """
     if not envs.experiment.setup.drifts:
-        return CommonForesight(envs, own=True, drive=levels == 0)
+        return CommonForesight(envs, own=True)
     return Foresight.of(envs, example_rate(env_id, options, seed))
 
 
 def example_rate(env_id: str, options: dict[str, Any], seed: int) -> FloatArray:
     """(K, K) information about the coefficients that a sample brings on average, by a simple rule's example.
 
-    The rule is that of foresight without a network: the push that brings most in four samples; or, of a drive, the same
-    strength throughout. It needs a rate itself, which a feedback law's example gives.
+    The rule is that of foresight without a network: the push that brings most in four samples. It needs a rate itself,
+    which a feedback law's example gives.
 
     Args:
         env_id: the track.
@@ -129,7 +128,7 @@ def example_rate(env_id: str, options: dict[str, Any], seed: int) -> FloatArray:
     def rule(observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         view = foresight.look(observations)
         push = np.where(view.features[:, _BEST] >= 0, 1.0, -1.0)
-        return foresight.act(0.0 * push if foresight.is_drive else push, view)
+        return foresight.act(push, view)
 
     rate = _rate(envs, rule, seed)
     envs.close()

@@ -72,7 +72,6 @@ class MixedVecEnv(BatchVecEnv):
         scale: of rewards.
         levels: an action is one of so many evenly spaced choices from -1 to 1, by its number; 0: any between.
         own: as of `CommonForesight`; then all that is drawn has one model.
-        drive: as of `CommonForesight`.
 
     Raises:
         ValueError: for another number of rows.
@@ -88,14 +87,13 @@ class MixedVecEnv(BatchVecEnv):
         scale: float,
         levels: int = 0,
         own: bool = False,
-        drive: bool = False,
     ) -> None:
         if num_envs % LANES:
             raise ValueError(f"num_envs must be a multiple of {LANES} for drawn options, but is {num_envs}")
         self.render_mode = None
         self._rngs = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(num_envs // LANES)]
         self._scale = scale
-        self._draw, self._seen = draw, {"own": own, "drive": drive}
+        self._draw, self._seen = draw, {"own": own}
         self._fixed = {"reward": reward, "autoreset_mode": AutoresetMode.SAME_STEP}
         self._levels = np.linspace(-1.0, 1.0, levels) if levels else None
         self._groups = [self._drawn(rng) for rng in self._rngs]

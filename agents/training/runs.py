@@ -289,9 +289,9 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
         for name, end in ((name, end) for name, ends in config.vary.items() for end in ends):
             make(config.env, 1, options | {name: end}).close()  # which refuses what the option may not be
         draw = partial(draw_options, env_id=config.env, options=config.options, ranges=config.vary)
-        return MixedVecEnv(asked.num_envs, seed, draw, scale=SCALE, own=True, drive=levels == 0, **mixed)
+        return MixedVecEnv(asked.num_envs, seed, draw, scale=SCALE, own=True, **mixed)
     envs = DuffingVecEnv(config.env, asked.num_envs, seed=seed, **options)
-    foresight = foresight_of(envs.envs, config.env, config.options, config.seed, levels=levels)
+    foresight = foresight_of(envs.envs, config.env, config.options, config.seed)
     return ForesightVecEnv(envs, foresight, levels, in_nats=config.reward in IN_NATS)
 
 

@@ -28,8 +28,9 @@ from estimator.models.model import Model
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of a model; all functions are of one system in a flat block ``W``.
+    """The motion of a model; all functions are of one system, or of as many as there are lanes, in a flat block ``W``.
 
+    Of several systems in a block, the quantity in row r of lane j is ``W[r * lanes + j]`` (`estimator.lanes`).
     The input of a sample stands in row ``INPUT``; older ones, where the model looks at them, in ``LAST_INPUT`` and
     ``OLDER_INPUT``, and move on by themselves.
 
@@ -54,31 +55,31 @@ class Motion:
 
 
 @cache
-def motion(model: Model, degree: int = 0, lag: int = 0) -> Motion:
-    """The motion of a model; arguments as `estimator.engine.imagination.imagination`."""
+def motion(model: Model, degree: int = 0, lag: int = 0, lanes: int = 1) -> Motion:
+    """The motion of a model; arguments as `estimator.engine.imagination.imagination`, and the systems in a block."""
     coarse = coarsened(model)
     names = [*model.names, "INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN"]
     names += [f"{letter}_{c}" for letter in ("PHI", "E") for c in model.coefficients]
     names += [f"A_{i}_{j}" for i in model.states for j in model.states]
     place = rows(*names, *carried_names(model))
-    key = repr((coarse.digest, degree, lag))
-    code = stored.load(model.name, "motion", key, lambda: _source(coarse, degree, lag, place), NAMES)
+    key = repr((coarse.digest, degree, lag, lanes))
+    code = stored.load(model.name, "motion", key, lambda: _source(coarse, degree, lag, lanes, place), NAMES)
     return Motion(code.sense, code.glance, code.step, code.regress, code.linearise, place, code.IS_ODD)
 
 
-def _source(model: Model, degree: int, lag: int, place: Mapping[str, int]) -> str:
+def _source(model: Model, degree: int, lag: int, lanes: int, place: Mapping[str, int]) -> str:
     from estimator.engine import derive, emit, sensitivity
 
     found, symbol = derive.calculus(model), derive.symbol
     given = fed(model, degree, lag)
 
     def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
-        return emit.lane_loop(name, derive.renamed(lines, given), results, place, 1, uniform, doc=doc)
+        return emit.lane_loop(name, derive.renamed(lines, given), results, place, lanes, uniform, doc=doc)
 
     shown, velocity, gain = _sensor(model)
     values = {"NOW_e": shown, "VELOCITY_e": velocity, "GAIN_e": gain}
     source = loop("sense", "The sensor now.", derive.shared(values, "W"), {n.removesuffix("_e"): n for n in values})
-    source += sensitivity.motion_source(model, degree, place, 1, given=given)
+    source += sensitivity.motion_source(model, degree, place, lanes, given=given)
     source += _step_source(model, degree, lag, loop)
     still = {symbol("u1"): symbol("u"), symbol("u2"): symbol("u")}
     summed = {f"R_{c}": sum(m.diff(symbol(c)) for m in found.moves).xreplace(still) for c in model.coefficients}

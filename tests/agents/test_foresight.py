@@ -66,7 +66,7 @@ def observations_of(env_id, samples=40, count=24):
 
 
 def twin(o, outlook):
-    """Features, safety, sign and motion of one observation, with matrices."""
+    """Features, safety and sign of one observation, with matrices."""
     o = dict(zip(OBSERVATION, np.float64(o), strict=True))
     theta = outlook.center + outlook.std * [o[f"mean_{n}"] for n in COEFFICIENTS]
     stds = outlook.std * np.exp([o[f"log_std_{n}"] for n in COEFFICIENTS])
@@ -132,7 +132,6 @@ def twin(o, outlook):
         if follows is ways["best"]:
             most = max(0.0, brought[:, -1].max())
     x0, x1 = start
-    motion = (theta @ phi(x0, x1, 0.0) - x1) / max(theta[3], 0.1 * outlook.center[3])
     free = []
     for _ in range(3):
         x0, x1 = np.clip(theta @ phi(x0, x1, 0.0), -2 * limit, 2 * limit), x0
@@ -141,7 +140,7 @@ def twin(o, outlook):
     open_ = np.log(0.25 * outlook.samples * np.trace(W @ rate) + 1e-3)
     features += [np.log(most + 1e-3), *free, 5 * theta[3] * push / limit, to_come, open_]
     safe = (lowest <= limit) | (lowest == lowest.min())
-    return np.clip(features, -BOUND, BOUND), safe, sign, motion
+    return np.clip(features, -BOUND, BOUND), safe, sign
 
 
 @pytest.mark.parametrize("env_id", [AMPLITUDE, POWER, OUTPUT])
@@ -152,11 +151,10 @@ def test_features_are_those_of_the_twin(env_id):
     assert view.features.dtype == np.float32
     turned = 0
     for i, observation in enumerate(observations):
-        features, safe, sign, motion = twin(observation, foresight._outlook)
+        features, safe, sign = twin(observation, foresight._outlook)
         np.testing.assert_allclose(view.features[i], features, rtol=2e-5, atol=2e-5)
         np.testing.assert_array_equal(view.safe[i], safe)
         assert view.signs[i] == sign
-        np.testing.assert_allclose(view.motions[i], motion, rtol=1e-9, atol=1e-12)
         turned += sign < 0
     assert 0 < turned < len(observations)
 
@@ -172,7 +170,6 @@ def test_features_are_those_that_the_shipped_policies_were_trained_with(name):
     np.testing.assert_allclose(view.features, features, rtol=4e-7, atol=1e-9)
     np.testing.assert_array_equal(view.safe, stored["safe"])
     np.testing.assert_array_equal(view.signs, stored["signs"])
-    np.testing.assert_allclose(view.motions, stored["motions"], rtol=2e-7, atol=1e-12)
 
 
 @pytest.mark.slow  # seconds of compilation
@@ -286,7 +283,7 @@ def test_the_shield_takes_what_is_safe_and_nearest():
     view = foresight.look(np.zeros((1, N_OBSERVATION), dtype=np.float32))
     cases = [  # safe: up, none, down; choice; action
         ((1, 1, 1), 0.4, 0.4), ((0, 1, 1), 0.4, 0.0), ((0, 0, 1), 0.4, -1.0), ((0, 0, 1), 0.0, -1.0),
-        ((0, 0, 1), -0.3, -0.3), ((1, 0, 0), -0.3, 1.0), ((1, 1, 0), -0.3, 0.0), ((1, 0, 1), 0.0, 1.0),
+        ((0, 0, 1), -0.3, -1.0), ((1, 0, 0), -0.3, 1.0), ((1, 1, 0), -0.3, 0.0), ((1, 0, 1), 0.0, 1.0),
     ]  # fmt: skip
     for safe, choice, action in cases:
         view.safe[:] = safe
@@ -297,35 +294,6 @@ def test_the_shield_takes_what_is_safe_and_nearest():
     ]:  # fmt: skip
         view.safe[:] = safe
         assert foresight.act([choice], view)[0, 0] == np.float32(action), (safe, choice)
-
-
-def test_the_drive_pushes_along_the_motion_within_the_budget():
-    """A constant choice swings the oscillator up, and is worth far more than any signal of the same energy."""
-    envs = make(POWER, 32)
-    foresight = Foresight.of(envs, RATE)
-    assert foresight.is_drive
-    assert not Foresight.of(make(AMPLITUDE, 1), RATE).is_drive
-    observations, _ = envs.reset(seed=0)
-    prior = envs.belief(0).entropy()
-    gains = np.zeros(32)
-    for _ in range(envs.horizon):
-        observations, _, terminated, truncated, infos = envs.step(
-            foresight.act(np.zeros(32), foresight.look(observations))
-        )
-        for row in np.flatnonzero((terminated | truncated) & (gains == 0)):
-            gains[row] = prior - infos["belief"][row].entropy()
-    assert gains.mean() > 16.0  # the multisine of the record gains 11.2
-
-
-def test_at_rest_it_is_pushed_as_if_it_moved_by_a_twentieth_of_the_limit():
-    """A choice of 0 is 6 % of that motion and one of 1 is 16 %, from what an input of 1 V moves it by in a sample."""
-    envs = make(POWER, 1)
-    foresight = Foresight.of(envs, RATE)
-    observations, _ = envs.reset(seed=0)
-    eta = envs.belief(0).coefficients()["eta"][0]
-    for choice, part in ((0.0, 0.06), (1.0, 0.16)):
-        action = float(foresight.act([choice], foresight.look(observations))[0, 0])
-        assert abs(action) * envs.max_input * eta == pytest.approx(part * 0.05 * 0.6, rel=1e-6)
 
 
 def test_it_survives_being_written():
@@ -410,7 +378,7 @@ def test_a_policy_with_foresight_refuses_a_foreign_environment(name):
 
 def test_rewards_differ_from_the_environments_by_a_potential():
     """Over an episode they add up to the plain return less what was to come at its start, whatever is done."""
-    options = {"horizon": 24, "max_output": 0.1}  # too narrow for the shield to keep all within
+    options = {"horizon": 24, "max_output": 0.1, "process_noise": 0.04}  # too narrow for the shield to keep all within
     plain = DuffingVecEnv(AMPLITUDE, 6, seed=2, **options)
     envs = ForesightVecEnv(DuffingVecEnv(AMPLITUDE, 6, seed=2, **options), Foresight.of(plain.envs, RATE))
     features = envs.reset()

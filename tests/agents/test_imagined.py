@@ -36,14 +36,14 @@ def beside(envs, records):
     return SimpleNamespace(experiment=envs.experiment, records=records)
 
 
-def reference(belief, seen, ahead, terms):
+def reference(belief, seen, ahead, terms, least=0.0):
     """The features of one belief about Eq. (2), from its matrices, way by way."""
     L = terms.limit
     P, theta, z = belief.record[covariance_places(belief.model)], belief.coefficients_mean, belief.state_mean
     q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
     last_u, time_left = seen[18], seen[20]
     thrift = min(1.0, np.sqrt(seen[21] * ahead.energy / max(1.0, time_left * ahead.samples)) / ahead.push)
-    A = ahead.push * min(1.0, ahead.haste * thrift)
+    A = max(least, ahead.push * min(1.0, 2.0 * thrift))
     share = 0.5 * (time_left + seen[21]) if ahead.energy < np.inf else time_left
     told_so_far = np.linalg.inv(P[2:, 2:]) - ahead.known
     rate = (32 * ahead.rate + told_so_far) / (32 + (1 - time_left) * ahead.samples)
@@ -94,15 +94,15 @@ def reference(belief, seen, ahead, terms):
                 told.append(worth(C, max(0.0, share * ahead.samples - (t + 1) * terms.pace)) - cost)
         return np.cumsum(told) / [1, 2], peak, seen_at
 
-    ways = {(first, code): way(first, code) for first in range(ahead.firsts) for code in range(number)}
+    ways = {(first, code): way(first, code) for first in range(5) for code in range(number)}
     free = np.array([[ways[first, number - 1][2][t] for first in range(3)] for t in range(3)])
     sign = 1.0 if free[0, 1] >= 0 else -1.0
     up, down = (0, 2) if sign > 0 else (2, 0)
     groups = [range(number - 2), [number - 2], [number - 1]]
     brought = lambda group, first, h: max(ways[first, code][0][h] for code in groups[group])  # noqa: E731
-    halves = {0: 3, 2: 4} if ahead.firsts == 5 else {}
+    halves = {0: 3, 2: 4}
     best_of = lambda first, h: max(brought(0, f, h) for f in (first, halves.get(first, first)))  # noqa: E731
-    peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(ahead.firsts)] for codes in groups])
+    peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(5)] for codes in groups])
     told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, thrift]
     for group in range(3):
         for h in range(2):
@@ -111,34 +111,32 @@ def reference(belief, seen, ahead, terms):
     told += [peaks[group, first] / L for group in range(3) for first in (up, 1, down)]
     told += [*(sign * free[:, 1] / L), *((free[:2, 0] - free[:2, 2]) / L)]
     now = worth(P, share * ahead.samples)
-    told += [np.arcsinh(20 * (max(brought(0, first, 1) for first in range(ahead.firsts)) - now)), now - worth(P, 0.0)]
+    told += [np.arcsinh(20 * (max(brought(0, first, 1) for first in range(5)) - now)), now - worth(P, 0.0)]
     lowest = peaks.min(axis=0)
     allowed, shares = lowest[:3] <= max(L, peaks[0, :3].min()), np.ones(3)
     for whole, half in halves.items():
         if lowest[half] <= L and (lowest[whole] > L or brought(0, half, 1) > brought(0, whole, 1)):
-            allowed[whole], shares[whole] = True, 0.5
+            allowed[whole], shares[whole] = allowed[whole] or terms.pace == 1, 0.5
     turned = slice(None, None, int(sign))
     return np.clip(told, -BOUND, BOUND), allowed[turned], sign, shares[turned][::2]
 
 
 @pytest.mark.parametrize(
-    ("track", "pace", "drive", "firsts"),
-    [("Amplitude", 1, False, 5), ("Amplitude", 2, False, 5), ("Power", 1, False, 5), ("Power", 1, True, 3)],
+    ("track", "pace", "least"), [("Amplitude", 1, 0.0), ("Amplitude", 2, 0.0), ("Power", 1, 0.0), ("Power", 1, 0.1)]
 )
-def test_features_are_those_of_the_matrices(track, pace, drive, firsts):
+def test_features_are_those_of_the_matrices(track, pace, least):
     envs = make(f"duffing_env/{track}-v0", 12)
     seen = observations_of(envs, 40)
-    foresight = CommonForesight(envs, drive=drive)
+    foresight = CommonForesight(envs)
     terms = foresight._terms._replace(pace=pace, shaken=3.0)
     features, safe = np.empty((12, len(FEATURES)), np.float32), np.empty((12, 3), np.bool_)
-    signs, shares = np.empty(12), np.empty((12, 2))
+    signs, shares, pushes = np.empty(12), np.empty((12, 2)), np.full(12, least)
     ahead = foresight._ahead
-    assert ahead.firsts == firsts
-    imaginer(View(difference()))(envs.records, seen, ahead, ahead.blocks, terms, features, safe, signs, shares)
+    imaginer(View(difference()))(envs.records, seen, ahead, ahead.blocks, terms, features, safe, signs, shares, pushes)
     assert {*signs} == {-1.0, 1.0}
-    assert {*shares.flat} == ({0.5, 1.0} if track == "Amplitude" else {1.0})
+    assert {*shares.flat} == ({1.0} if track == "Power" and least == 0.0 else {0.5, 1.0})
     for i in range(12):
-        told, allowed, sign, share = reference(envs.belief(i), seen[i], ahead, terms)
+        told, allowed, sign, share = reference(envs.belief(i), seen[i], ahead, terms, least)
         np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
         np.testing.assert_array_equal(safe[i], allowed)
         np.testing.assert_array_equal(shares[i], share)
@@ -267,24 +265,3 @@ def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path):
     assert agrees.mean() > 0.9
     with pytest.raises(ValueError, match="another model than the policy was trained on"):
         make_policy(str(run.folder), make("duffing_env/Pendulum-v0", 1))
-
-
-def test_a_drive_pushes_along_the_motion_where_the_energy_is_limited():
-    envs = make("duffing_env/Power-v1", 8)
-    foresight = CommonForesight(envs, own=True, drive=True)
-    assert foresight.is_drive
-    assert foresight.describe()["drives"]
-    assert not CommonForesight(envs, own=True).is_drive
-    assert not CommonForesight(make("duffing_env/Amplitude-v1", 1), drive=True).is_drive
-    observations, _ = envs.reset(seed=0)
-    for t in range(24):
-        view = foresight.look(observations)
-        actions = foresight.act(np.ones(8), view)
-        if t > 8:
-            # The state is displacement and velocity, in parts of the limit.
-            velocity = envs.records[:, 1]
-            assert (np.sign(actions[:, 0]) == np.sign(velocity))[np.abs(velocity) > 0.05].all()
-            harder = np.abs(actions[:, 0]) >= np.abs(foresight.act(np.zeros(8), view)[:, 0])
-            assert harder[view.safe.all(axis=1)].all()
-        observations, *_ = envs.step(actions)
-    assert np.abs(envs.records[:, :2]).max() > 0.05, "it has been swung up"

@@ -31,7 +31,7 @@ def test_options_are_drawn_over_their_whole_range():
 
 
 def test_every_group_has_its_own_options_and_draws_anew():
-    envs = MixedVecEnv(4 * LANES, 3, DRAW, scale=1.0, own=True, drive=True)
+    envs = MixedVecEnv(4 * LANES, 3, DRAW, scale=1.0, own=True)
     lengths = [group.envs.horizon for group in envs._groups]
     assert len(set(lengths)) > 1
     envs.reset()
@@ -48,7 +48,7 @@ def test_every_group_has_its_own_options_and_draws_anew():
 
 def test_an_episode_adds_up_to_what_it_gained():
     """What is still to come is a difference of potentials: it adds the same to every episode of a group."""
-    envs = MixedVecEnv(LANES, 5, DRAW, scale=2.0, own=True, drive=True)
+    envs = MixedVecEnv(LANES, 5, DRAW, scale=2.0, own=True)
     to_come = envs.reset()[:, envs.foresight.to_come]
     total = np.zeros(LANES)
     for _ in range(envs._groups[0].envs.horizon):
