@@ -183,14 +183,13 @@ class CommonForesight:
         slow = swing if lasting == setup.max_input else swing_of(self._view, center, lasting, setup.max_output)
         moves = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
         of_rig = getattr(experiment, "rig", None) is not None
-        weighs = experiment.noise_hypotheses != 1
         known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
         self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, known)
         self._terms = Terms(
             setup.max_input,
             np.inf,
             setup.max_output * (seen_part(prior, float(swing.scales[0])) if of_rig else 1.0),
-            float(-stdtrit(TAILS, ndtr(-MARGIN)) if weighs else MARGIN),
+            float(-stdtrit(TAILS, ndtr(-MARGIN)) if experiment.noise_hypotheses != 1 else MARGIN),
             np.zeros(len(center)),
             swing.scales,
             swing.pace,
