@@ -17,7 +17,7 @@ What the first sensor shows must stay within the limit by a margin of standard d
 predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
 exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes
 true. Where hypotheses about the noises are weighed (``noise_hypotheses``) an output is believed to be a mixture, with
-heavier tails: the quantile is that of Student's t with `TAILS` degrees of freedom. Where an input comes
+heavier tails: the quantile is that of Student's t (`agents.planner.imagination.margin`). Where an input comes
 to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the sample
 between moves the next output about as much again, and no input makes up for it: the margin is then twice as wide.
 
@@ -38,10 +38,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtri, stdtrit
 
 from agents.asked import check_rows, starts
-from agents.planner.imagination import TAILS, Terms
+from agents.planner.imagination import RISK, Terms, margin
 from agents.planner.motion import View, places, seen, swing_of
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
@@ -120,7 +119,7 @@ class Planner:
         *,
         horizon: int | None = None,
         rounds: int = 4,
-        risk: float = 0.05,
+        risk: float = RISK,
         goal: float = 0.0,
         goal_std: float | None = None,
         input_cost: float = 0.0,
@@ -162,7 +161,7 @@ class Planner:
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
-        means, chance = experiment.believed.coefficients_mean, risk / env.horizon
+        means = experiment.believed.coefficients_mean
         swing = swing_of(self.view, means, setup.max_input, setup.max_output)
         of_rig = getattr(experiment, "rig", None) is not None
         room = seen(experiment.believed, float(swing.scales[0])) if of_rig else 1.0
@@ -171,8 +170,7 @@ class Planner:
             amplitude=setup.max_input,
             slew=setup.max_slew,
             limit=setup.max_output * (room * (1 - _COARSE * (self.view.model.is_continuous and not of_rig))),
-            margin=float(-stdtrit(TAILS, chance) if weighs else -ndtri(chance))
-            * (1 + max(self.view.degree, self.view.lag)),
+            margin=margin(env.horizon, weighs=weighs, risk=risk) * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
             scales=swing.scales,
             pace=min(swing.pace, -(-env.horizon // min(horizon, _LEAST_MOVES))),

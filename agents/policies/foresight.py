@@ -21,14 +21,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr, stdtrit
 
-from agents.planner.imagination import TAILS, Terms
+from agents.planner.imagination import Terms, margin
 from agents.planner.motion import View, places, survey, swing_of
 from agents.planner.motion import seen as seen_part
 from agents.policies.bursts import burster, drawn
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
-from agents.policies.prospects import EXPECTED, MARGIN, Outlook, feature_names, look_at
+from agents.policies.prospects import EXPECTED, Outlook, feature_names, look_at
 from agents.policies.sight import Sight, acted
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
@@ -150,11 +149,12 @@ class CommonForesight:
 
     What it sees is `agents.policies.imagined`, of the environment's beliefs as the planner reads them; nothing of it is
     of the systems that a policy was trained on. So with that alone a policy plays any environment. Beside the
-    observation itself it tells more of one model, and a policy plays environments of that. Outputs keep
-    `agents.policies.prospects.MARGIN` standard deviations from the limit; where noises are weighed, as many as make the
-    same chance under Student's t. On a rig the limit is lower by what a swing at it can hide between two samples. An
-    action is a push; where the energy is limited, how much harder to push than the best burst, and the features of what
-    is best tell what harder, as hard and softer ways bring in place of a push up, none and a push down.
+    observation itself it tells more of one model, and a policy plays environments of that. Outputs keep the planner's
+    margin from the limit (`agents.planner.imagination.margin`). On a rig the limit is lower by what a swing at it can
+    hide between two samples.
+
+    An action is a push. Where the energy is limited it is how much harder to push than the best burst, and the features
+    of what is best tell what harder, as hard and softer ways bring, in place of a push up, none and a push down.
 
     Args:
         env: the unwrapped environment.
@@ -189,7 +189,7 @@ class CommonForesight:
             setup.max_input,
             np.inf,
             setup.max_output * (seen_part(prior, float(swing.scales[0])) if of_rig else 1.0),
-            float(-stdtrit(TAILS, ndtr(-MARGIN)) if experiment.noise_hypotheses != 1 else MARGIN),
+            margin(setup.horizon, weighs=experiment.noise_hypotheses != 1),
             np.zeros(len(center)),
             swing.scales,
             swing.pace,
