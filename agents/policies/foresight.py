@@ -28,7 +28,7 @@ from agents.planner.motion import seen as seen_part
 from agents.policies.bursts import burster, drawn
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, Outlook, feature_names, look_at
-from agents.policies.sight import Sight, acted
+from agents.policies.sight import Sight
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -138,10 +138,6 @@ class Foresight:
         """What observations (n, features) look like."""
         found = look_at(observations, self._outlook, self._view)
         return Sight(*found, np.ones((len(found[0]), 2)), np.ones(len(found[0])))
-
-    def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
-        """The actions (n, 1) in [-1, 1] that a network's choices (n,) in [-1, 1] stand for."""
-        return acted(choices, view)
 
 
 class CommonForesight:
@@ -257,10 +253,6 @@ class CommonForesight:
             upright[:, self._odd] *= signs[:, None].astype(np.float32)
             features = np.concatenate([features, upright], axis=1)
         return Sight(features, safe, signs, shares, pushes / largest, bursts / largest if limited else None)
-
-    def act(self, choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
-        """As `Foresight.act`."""
-        return acted(choices, view)
 
 
 def _outlook_of(experiment: Experiment, rate: FloatArray) -> Outlook:

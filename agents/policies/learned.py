@@ -175,7 +175,7 @@ class LearnedPolicy:
         if self._foresight is not None:
             view = self._foresight.look(np.atleast_2d(hidden))
             choices, state = self._choose(view.features, state, episode_start, deterministic)
-            return self._foresight.act(choices[:, 0], view).reshape(*hidden.shape[:-1], 1), state
+            return view.act(choices[:, 0]).reshape(*hidden.shape[:-1], 1), state
         return self._choose(hidden, state, episode_start, deterministic)
 
     def _choose(

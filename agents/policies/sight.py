@@ -31,24 +31,24 @@ class Sight:
     pushes: FloatArray
     bursts: FloatArray | None = None
 
+    def act(self, choices: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """The actions (n, 1) of choices (n,), each of them a part of a push.
 
-def acted(choices: npt.ArrayLike, view: Sight) -> npt.NDArray[np.float32]:
-    """The actions (n, 1) of choices (n,), each of them a part of a push.
-
-    Of a push no more is played than its share. One in whose direction no way is left within the limit becomes none or a
-    push the other way; where none is too little, it is played in full. Where there are bursts, a choice is how much
-    harder to push than the best of them does: not at all at -1, and twice as hard at 1, but no harder than a push is.
-    """
-    up, none, down = view.safe.T
-    chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
-    rise, fall = view.pushes * view.shares.T
-    if view.bursts is not None:
-        chosen = np.clip(view.signs * view.bursts * (1.0 + chosen), -view.pushes, view.pushes)
-    else:
-        chosen = np.clip(view.pushes * chosen, -fall, rise)
-    chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -fall), chosen)
-    chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, rise), chosen)
-    chosen = np.where((chosen == 0) & ~none, np.where(up, rise, -fall), chosen)
-    chosen = np.where(none, chosen, np.where(chosen > 0, rise, -fall))
-    actions: npt.NDArray[np.float32] = (chosen * view.signs).astype(np.float32)[:, None]
-    return actions
+        Of a push no more is played than its share. One in whose direction no way is left within the limit becomes none
+        or a push the other way; where none is too little, it is played in full. Where there are bursts, a choice is how
+        much harder to push than the best of them does: not at all at -1, and twice as hard at 1, but no harder than a
+        push is.
+        """
+        up, none, down = self.safe.T
+        chosen = np.clip(np.asarray(choices, dtype=np.float64), -1.0, 1.0)
+        rise, fall = self.pushes * self.shares.T
+        if self.bursts is not None:
+            chosen = np.clip(self.signs * self.bursts * (1.0 + chosen), -self.pushes, self.pushes)
+        else:
+            chosen = np.clip(self.pushes * chosen, -fall, rise)
+        chosen = np.where((chosen > 0) & ~up, np.where(none, 0.0, -fall), chosen)
+        chosen = np.where((chosen < 0) & ~down, np.where(none, 0.0, rise), chosen)
+        chosen = np.where((chosen == 0) & ~none, np.where(up, rise, -fall), chosen)
+        chosen = np.where(none, chosen, np.where(chosen > 0, rise, -fall))
+        actions: npt.NDArray[np.float32] = (chosen * self.signs).astype(np.float32)[:, None]
+        return actions

@@ -69,7 +69,7 @@ class ForesightVecEnv(VecEnvWrapper):
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Take what the network chose, as the foresight's actions."""
         choices = actions[:, 0] if self._levels is None else self._levels[actions]
-        self.venv.step_async(self.foresight.act(choices, self._view))
+        self.venv.step_async(self._view.act(choices))
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows."""
@@ -128,7 +128,7 @@ def example_rate(env_id: str, options: dict[str, Any], seed: int) -> FloatArray:
     def rule(observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         view = foresight.look(observations)
         push = np.where(view.features[:, _BEST] >= 0, 1.0, -1.0)
-        return foresight.act(push, view)
+        return view.act(push)
 
     rate = _rate(envs, rule, seed)
     envs.close()

@@ -125,7 +125,7 @@ class MixedVecEnv(BatchVecEnv):
         for g, group in enumerate(self._groups):
             mine = slice(g * LANES, (g + 1) * LANES)
             before = group.view.features[:, _TO_COME]
-            actions = group.foresight.act(self._choices[mine], group.view)
+            actions = group.view.act(self._choices[mine])
             observations, gained, terminated, truncated, _ = group.envs.step(actions)
             ended = terminated | truncated
             group.view = group.foresight.look(observations)

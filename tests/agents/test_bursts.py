@@ -9,7 +9,7 @@ from agents.policies import make_policy
 from agents.policies.bursts import burster, drawn
 from agents.policies.foresight import CommonForesight
 from agents.policies.imagined import FEATURES
-from agents.policies.sight import Sight, acted
+from agents.policies.sight import Sight
 from estimator.belief import covariance_places
 from estimator.models.difference import difference
 
@@ -150,9 +150,9 @@ def test_choices_push_harder_than_the_burst_or_less():
     view = Sight(
         np.zeros((4, 1), np.float32), safe, np.array([1.0, -1.0, 1.0, 1.0]), np.ones((4, 2)), np.full(4, 0.9), bursts
     )
-    np.testing.assert_allclose(acted(np.zeros(4), view)[:, 0], bursts, rtol=1e-6)
-    np.testing.assert_allclose(acted(np.full(4, -1.0), view)[:, 0], 0.0)
-    np.testing.assert_allclose(acted(np.full(4, 0.5), view)[:, 0], [0.3, -0.45, 0.9, 0.15], rtol=1e-6)
+    np.testing.assert_allclose(view.act(np.zeros(4))[:, 0], bursts, rtol=1e-6)
+    np.testing.assert_allclose(view.act(np.full(4, -1.0))[:, 0], 0.0)
+    np.testing.assert_allclose(view.act(np.full(4, 0.5))[:, 0], [0.3, -0.45, 0.9, 0.15], rtol=1e-6)
     safe[0] = False, True, True  # none instead of up
     safe[1] = (
         True,
@@ -160,7 +160,7 @@ def test_choices_push_harder_than_the_burst_or_less():
         False,
     )  # it moves down, so that the push is up of what is upright: in full, none is not enough
     safe[3] = False, False, True  # the other way
-    np.testing.assert_allclose(acted(np.zeros(4), view)[:, 0], [0.0, -0.9, 0.8, -0.9], rtol=1e-6)
+    np.testing.assert_allclose(view.act(np.zeros(4))[:, 0], [0.0, -0.9, 0.8, -0.9], rtol=1e-6)
 
 
 def test_features_tell_what_harder_and_softer_ways_bring():

@@ -189,7 +189,7 @@ def test_equation_1_has_features_too_and_its_rule_is_worth_more_than_chance():
             assert np.isfinite(view.features).all()
             push = np.where(view.features[:, best] >= 0, 1.0, -1.0)
             actions, state = policy.predict(observations, state)
-            actions = foresight.act(push, view) if name == "rule" else actions
+            actions = view.act(push) if name == "rule" else actions
             observations, rewards, terminated, _, _ = envs.step(actions.astype(np.float32))
             gains[name] += (~gone * rewards).mean()
             gone |= terminated
@@ -235,7 +235,7 @@ def test_turning_the_task_over_turns_the_action_over():
     one, other = foresight.look(observations[moving]), foresight.look(over[moving])
     np.testing.assert_array_equal(one.features, other.features)
     choices = np.random.default_rng(0).uniform(-1, 1, len(one.features))
-    np.testing.assert_array_equal(foresight.act(choices, one), -foresight.act(choices, other))
+    np.testing.assert_array_equal(one.act(choices), -other.act(choices))
 
 
 @cache
@@ -256,7 +256,7 @@ def test_features_of_any_observation_are_finite_and_bounded(seed):
     assert np.isfinite(view.features).all()
     assert (np.abs(view.features) <= BOUND).all()
     assert view.safe.any(axis=1).all()
-    assert np.isfinite(foresight.act(rng.uniform(-2, 2, 8), view)).all()
+    assert np.isfinite(view.act(rng.uniform(-2, 2, 8))).all()
 
 
 def test_the_shield_keeps_even_random_pushes_within_the_limit():
@@ -270,7 +270,7 @@ def test_the_shield_keeps_even_random_pushes_within_the_limit():
         gone = np.zeros(64, dtype=bool)
         for _ in range(envs.horizon):
             choices = rng.choice([-1.0, 1.0], 64)
-            actions = foresight.act(choices, foresight.look(observations)) if shielded else choices[:, None]
+            actions = foresight.look(observations).act(choices) if shielded else choices[:, None]
             observations, _, terminated, _, _ = envs.step(actions.astype(np.float32))
             gone |= terminated
         ended[shielded] = gone.sum()
@@ -287,13 +287,13 @@ def test_the_shield_takes_what_is_safe_and_nearest():
     ]  # fmt: skip
     for safe, choice, action in cases:
         view.safe[:] = safe
-        assert foresight.act([choice], view)[0, 0] == np.float32(action), (safe, choice)
+        assert view.act([choice])[0, 0] == np.float32(action), (safe, choice)
     view.shares[:] = 0.5, 1.0  # half of a push up
     for safe, choice, action in [
         ((1, 1, 1), 0.4, 0.4), ((1, 1, 1), 0.9, 0.5), ((1, 1, 1), -0.9, -0.9), ((1, 0, 0), -0.3, 0.5)
     ]:  # fmt: skip
         view.safe[:] = safe
-        assert foresight.act([choice], view)[0, 0] == np.float32(action), (safe, choice)
+        assert view.act([choice])[0, 0] == np.float32(action), (safe, choice)
 
 
 def test_it_survives_being_written():
@@ -388,7 +388,7 @@ def test_rewards_differ_from_the_environments_by_a_potential():
     returns, running, early = np.zeros(6), np.ones(6, dtype=bool), 0
     for _ in range(24):
         choices = rng.uniform(-1, 1, (6, 1)).astype(np.float32)
-        actions = envs.foresight.act(choices[:, 0], envs._view)
+        actions = envs._view.act(choices[:, 0])
         features, rewards, dones, infos = envs.step(choices)
         observations, _, plain_dones, plain_infos = plain.step(actions)
         np.testing.assert_array_equal(dones, plain_dones)
@@ -418,7 +418,7 @@ def test_rewards_that_count_no_information_stay_as_they_are():
     envs.reset()
     plain.reset()
     for _ in range(5):
-        actions = envs.foresight.act([1.0, 0.0, -1.0], envs._view)
+        actions = envs._view.act([1.0, 0.0, -1.0])
         _, rewards, _, _ = envs.step(np.array([[1.0], [0.0], [-1.0]], dtype=np.float32))
         np.testing.assert_allclose(rewards, 5 * plain.step(actions)[1], rtol=1e-6, atol=1e-9)
 
@@ -459,7 +459,7 @@ def test_a_policy_that_was_trained_with_it_acts_the_same_from_its_file(tmp_path,
             view = one._foresight.look(observations[2:3])
             choice, _ = one._choose(view.features, None, None, True)
             bound, _ = play(tensors, policy.card["network"], view.features)
-            ends = [one._foresight.act((choice + step)[:, 0], view) for step in (-bound, bound)]
+            ends = [view.act((choice + step)[:, 0]) for step in (-bound, bound)]
             assert np.min(ends) - U32 <= alone[0] <= np.max(ends) + U32
             assert np.min(ends) - U32 <= actions[2] <= np.max(ends) + U32
         else:
