@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimator.arrays import fill
+from estimator.arrays import copy_scaled, fill
 from estimator.engine.feeding import older_inputs
 from estimator.engine.gradient import pieces
 from estimator.lanes import jit, kernel, part
@@ -205,3 +205,12 @@ def invert(L, inverse):
             column[i] = total / L[i, i]
         for i in range(size):
             inverse[i, j] = column[i]
+
+
+@jit
+def factorise(information, M):
+    """The factor M of an information M Mᵀ; zeros where there is none, or it tells nothing of a coefficient."""
+    copy_scaled(M, 1.0, information)
+    if half_log_det(M) == -np.inf:
+        for row in range(len(M)):
+            fill(M[row], 0.0)

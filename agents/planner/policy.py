@@ -41,7 +41,7 @@ import numpy.typing as npt
 
 from agents.asked import check_rows, starts
 from agents.planner.imagination import RISK, Terms, margin
-from agents.planner.motion import View, places, seen, swing_of
+from agents.planner.motion import View, limit_of, places, swing_of
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
 from estimator.checks import LARGEST, SMALLEST, number, numbers, shown, whole
@@ -76,10 +76,6 @@ _LEAST_MOVES = 24
 
 #: Moves of a plan, at most.
 _MOST_MOVES = 100_000
-
-#: Part of the limit that is left to the imagination of a differential equation: its two Runge-Kutta steps a sample err
-#: by up to 2.1 mV at 0.6 V and 0.5 V a sample.
-_COARSE = 0.004
 
 
 class Planner:
@@ -163,13 +159,11 @@ class Planner:
         self.horizon, self.rounds = int(horizon), int(rounds)
         means = experiment.believed.coefficients_mean
         swing = swing_of(self.view, means, setup.max_input, setup.max_output)
-        of_rig = getattr(experiment, "rig", None) is not None
-        room = seen(experiment.believed, float(swing.scales[0])) if of_rig else 1.0
         weighs = experiment.noise_hypotheses != 1
         self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,
-            limit=setup.max_output * (room * (1 - _COARSE * (self.view.model.is_continuous and not of_rig))),
+            limit=limit_of(experiment, swing.scales),
             margin=margin(env.horizon, weighs=weighs, risk=risk) * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
             scales=swing.scales,

@@ -14,7 +14,9 @@ states, and older inputs, are followed with their way, and do not tell ways apar
 `agents.planner.imagination.Terms.pace` samples, a *move*. Towards the end of an episode moves become shorter: a plan
 comes near to the end then, too, and is as fine as it can be.
 
-The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one.
+The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one, by
+what is known, on average, when parts of them have been followed, the first of them a few moves long: judged by its end
+alone, the best plan may be to wait for a move, and so at every decision anew.
 """
 
 from __future__ import annotations
@@ -25,9 +27,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner.candidates import CHOICES, bound, change, choose, uniform
-from agents.planner.design import half_log_det
+from agents.planner.design import factorise
 from agents.planner.imagination import mind
-from estimator.arrays import copy, copy_scaled, fill, highest
+from estimator.arrays import copy, fill, highest
 from estimator.lanes import LANES, jit, kernel, part
 from estimator.models.model import Model
 
@@ -45,6 +47,9 @@ _FINE, _COARSE_CHOICES = 7, 2
 
 #: A way this much [nats] worse than the best of its length is followed no further.
 _HOPELESS = 0.5
+
+#: Parts of a plan after which it counts what is known.
+_MARKS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
@@ -206,14 +211,27 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             way = memory.origins[h, way]
 
     @inner
-    def follow(W, task, candidates):
-        """Imagine the candidates (LANES, horizon) from the belief on, or one for all lanes."""
+    def weigh(W, task, candidates, worths):
+        """What candidates (LANES, horizon) are worth (LANES,).
+
+        That is what is known at the end of the episode, or on average after parts of a plan that does not reach it.
+        """
+        steps, ends = task.steps, task.left <= task.steps * task.pace
         begin(W, task.record, task.lasts)
-        for h in range(task.steps):
+        fill(worths, 0.0)
+        for h in range(steps):
             for j in range(LANES):
-                W[U + j] = candidates[j % len(candidates), h]
+                W[U + j] = candidates[j, h]
             for _ in range(task.pace):
                 advance(W, task.record, task.terms)
+            weight = 1.0 if ends and h + 1 == steps else 0.0
+            for mark in _MARKS:
+                if not ends and h + 1 == max(1, int(mark * steps + 0.5)):
+                    weight += 1.0 / len(_MARKS)
+            if weight > 0.0:
+                appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
+                for j in range(LANES):
+                    worths[j] += weight * W[SCORE + j]
 
     @inner
     def refresh(W, task, best, rate):
@@ -221,7 +239,11 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         before, after = np.empty((k, k)), np.empty((k, k))
         begin(W, task.record, task.lasts)
         precision(W, before)
-        follow(W, task, best.reshape(1, -1))
+        for h in range(task.steps):
+            for j in range(LANES):
+                W[U + j] = best[h]
+            for _ in range(task.pace):
+                advance(W, task.record, task.terms)
         precision(W, after)
         share, is_finite = _REFRESHED if rate[0, 0] > 0.0 else 1.0, True
         for a in range(k):
@@ -258,24 +280,19 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             copy(candidates[j], 0, candidates[2 * (j % 2)], len(best))
             change(candidates[j], steps, terms.amplitude, words)
             bound(candidates[j], steps, last, terms)
-        W = memory.ways[0]
-        score = -np.inf
+        W, worths, score = memory.ways[0], np.empty(LANES), -np.inf
         for round_ in range(rounds):
             for j in range(LANES if round_ > 0 else 0):
                 copy(candidates[j], 0, best, len(best))
                 change(candidates[j], steps, terms.amplitude, words)
                 bound(candidates[j], steps, last, terms)
-            follow(W, task, candidates)
-            appraise(W, M, np.sqrt(max(0, left - steps * pace)))
+            weigh(W, task, candidates, worths)
             for j in range(LANES):
-                if W[SCORE + j] > score:
-                    score = W[SCORE + j]
+                if worths[j] > score:
+                    score = worths[j]
                     copy(best, 0, candidates[j], len(best))
         # Where the coefficients walk, what is learned later does not add to what is learned now.
-        walks = False
-        for variance in terms.walk:
-            walks = walks or variance > 0.0
-        if not walks:
+        if not (terms.walk > 0.0).any():
             refresh(W, task, best, rate)
         return pace
 
@@ -331,12 +348,3 @@ def place(x, scale, cells, offset):
     if not where > 0.0:
         return 0
     return np.int64(min(where, cells - 1.0))
-
-
-@jit
-def factorise(information, M):
-    """The factor M of an information M Mᵀ; zeros where there is none, or it tells nothing of a coefficient."""
-    copy_scaled(M, 1.0, information)
-    if half_log_det(M) == -np.inf:
-        for row in range(len(M)):
-            fill(M[row], 0.0)
