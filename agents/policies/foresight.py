@@ -7,7 +7,7 @@ things are done for it:
 
 - **Features.** Where the model is odd, observations are turned upright, so that the first sensor shows nothing
   negative, and the action is turned back.
-- **A measure.** Where half a push is worth more than a whole one, or is safe where that is not, it is played.
+- **A measure.** A push is as hard as the best way that begins with one in its direction has it.
 - **A shield.** An action in whose direction no way is left to stay within the displacement limit is replaced by none,
   or by a push the other way, whichever is safe. So also a policy that still tries its actions out seldom ends an
   episode, and learns to go close to the limit.
@@ -23,8 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.planner.imagination import Terms, margin
-from agents.planner.motion import View, places, survey, swing_of
-from agents.planner.motion import seen as seen_part
+from agents.planner.motion import View, limit_of, places, survey, swing_of
 from agents.policies.bursts import burster, drawn
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, Outlook, feature_names, look_at
@@ -146,8 +145,8 @@ class CommonForesight:
     What it sees is `agents.policies.imagined`, of the environment's beliefs as the planner reads them; nothing of it is
     of the systems that a policy was trained on. So with that alone a policy plays any environment. Beside the
     observation itself it tells more of one model, and a policy plays environments of that. Outputs keep the planner's
-    margin from the limit (`agents.planner.imagination.margin`). On a rig the limit is lower by what a swing at it can
-    hide between two samples.
+    margin from the limit (`agents.planner.imagination.margin`). It is the planner's own
+    (`agents.planner.motion.limit_of`).
 
     An action is a push. Where the energy is limited it is how much harder to push than the best burst, and the features
     of what is best tell what harder, as hard and softer ways bring, in place of a push up, none and a push down.
@@ -178,13 +177,12 @@ class CommonForesight:
         lasting = min(setup.max_input, HASTE * float(np.sqrt(setup.budget / setup.horizon)))
         slow = swing if lasting == setup.max_input else swing_of(self._view, center, lasting, setup.max_output)
         moves = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
-        of_rig = getattr(experiment, "rig", None) is not None
         known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
         self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, known)
         self._terms = Terms(
             setup.max_input,
             np.inf,
-            setup.max_output * (seen_part(prior, float(swing.scales[0])) if of_rig else 1.0),
+            limit_of(experiment, swing.scales),
             margin(setup.horizon, weighs=experiment.noise_hypotheses != 1),
             np.zeros(len(center)),
             swing.scales,
@@ -242,8 +240,7 @@ class CommonForesight:
             burster(self._view)(records, seen, *episode, self._terms, drawn(), bursts, worths)
         # What is foreseen to be safe is so for pushes that are no harder than these.
         pushes = np.abs(bursts)
-        task = self._ahead, self._ahead.blocks, self._terms
-        imaginer(self._view)(records, seen, *task, features, safe, signs, shares, pushes)
+        imaginer(self._view)(records, seen, self._ahead, self._terms, features, safe, signs, shares, pushes)
         if limited:
             harder, best, softer = worths.T
             features[:, _HARDER] = as_feature(harder - softer)

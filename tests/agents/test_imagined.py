@@ -13,6 +13,7 @@ from agents.planner.motion import View
 from agents.policies import make_policy
 from agents.policies.foresight import CommonForesight
 from agents.policies.imagined import BOUND, FEATURES, imaginer
+from agents.policies.ways import CHANGES
 from agents.studies.universal import play, unseen
 from agents.training import PPOSettings, TrainConfig, train
 from agents.training.family import draw_member
@@ -47,8 +48,12 @@ def reference(belief, seen, ahead, terms, least=0.0):
     share = 0.5 * (time_left + seen[21]) if ahead.energy < np.inf else time_left
     told_so_far = np.linalg.inv(P[2:, 2:]) - ahead.known
     rate = (32 * ahead.rate + told_so_far) / (32 + (1 - time_left) * ahead.samples)
-    number = 32 * ahead.blocks
-    half, tried = number // 2 - 2, int(np.log2(number // 2))
+    left, to_come = time_left * ahead.samples, share * ahead.samples
+    pace = min(terms.pace, max(1, int(left / ahead.moves + 0.5)))
+    moves = max(4, min(ahead.moves, int(np.ceil(round(left) / pace))))
+    marks = [int(part * moves + 0.5) for part in (0.5, 0.75, 1.0)]
+    weights = [1 / 3, 1 / 3, 1 / 3] if left > moves * pace else [0.0, 0.0, 1.0]
+    number, half, tried = 64, 30, 5
 
     def sample(z, P, u):
         moved = np.array([theta[0] * z[0] + theta[1] * z[0] ** 3 + theta[2] * z[1] + theta[3] * u, z[0]])
@@ -64,82 +69,113 @@ def reference(belief, seen, ahead, terms, least=0.0):
     def worth(P, left):
         return 0.5 * np.linalg.slogdet(np.linalg.inv(P[2:, 2:]) + left * rate)[1]
 
-    def way(first, code):
-        x, C, cost, peak, told, seen_at = z, P, 0.0, 0.0, [], []
-        margin = 0.0
-        for t in range(ahead.moves):
-            if t == 0:
-                u = (1.0, 0.0, -1.0, 0.5, -0.5)[first] * A
-            elif code == number - 1:
-                u = 0.0
-            elif code < 2 * half and t <= tried:
-                u = A if (code % half + 1 >> (t - 1)) & 1 else -A
-            elif code < number - 2 and t <= tried:
-                u = A if code == 2 * half else -A
-            elif half <= code < 2 * half:
-                u = 0.0
-            else:
-                along = A if x[0] - x[1] >= 0 else -A
-                then = theta[0] * x[0] + theta[1] * x[0] ** 3 + theta[2] * x[1] + theta[3] * along
-                pump = -along if abs(then + (terms.pace - 1) * (then - x[0])) > L - margin else along
-                u = pump if code < number - 2 else -along
-            for _ in range(terms.pace):
+    def follow(push):
+        """Worths, peak, what was seen, and inputs of a way whose push at move t is push(t, x, margin)."""
+        x, C, cost, peak, told, seen_at, inputs, margin = z, P, 0.0, 0.0, [], [], [], 0.0
+        for t in range(moves):
+            u = push(t, x, margin)
+            inputs.append(u)
+            for _ in range(pace):
                 x, C, spread = sample(x, C, u)
                 margin = min(terms.margin * np.sqrt(spread + terms.shaken * q), 0.5 * L)
                 reach = abs(x[0]) + margin
                 cost += 1e4 / L * max(0.0, reach - L)
                 peak = max(peak, reach) if t < 8 else peak
             seen_at.append(x[0])
-            if t + 1 in (ahead.moves // 2, ahead.moves):
-                told.append(worth(C, max(0.0, share * ahead.samples - (t + 1) * terms.pace)) - cost)
-        return np.cumsum(told) / [1, 2], peak, seen_at
+            if t + 1 in marks:
+                told.append(worth(C, max(0.0, to_come - (t + 1) * pace)) - cost)
+        return [told[0], np.dot(weights, told)], peak, seen_at, inputs
 
-    ways = {(first, code): way(first, code) for first in range(5) for code in range(number)}
+    def way(first, code):
+        def push(t, x, margin):
+            if t == 0:
+                return (1.0, 0.0, -1.0)[first] * A
+            if code == number - 1:
+                return 0.0
+            if code < 2 * half and t <= tried:
+                return A if (code % half + 1 >> (t - 1)) & 1 else -A
+            if code < number - 2 and t <= tried:
+                return A if code == 2 * half else -A
+            if half <= code < 2 * half:
+                return 0.0
+            along = A if x[0] - x[1] >= 0 else -A
+            then = theta[0] * x[0] + theta[1] * x[0] ** 3 + theta[2] * x[1] + theta[3] * along
+            pump = -along if abs(then + (pace - 1) * (then - x[0])) > L - margin else along
+            return pump if code < number - 2 else -along
+
+        return follow(push)
+
+    def refined(first, sign):
+        """The best way of a first move after its changes."""
+        best = max((ways[first, code] for code in range(number - 2)), key=lambda found: found[0][1])
+        for r in range(6 if first != 1 else 1):
+            tries = []
+            for j in range(32):
+                plan = np.array(best[3])
+                h = int(CHANGES.where[r, j] * moves)
+                turned = slice(max(1, h), h + CHANGES.turned[r, j])
+                plan[turned] = np.where(plan[turned] != 0, -plan[turned], sign * A)
+                size = len(plan[h : h + 2])
+                plan[h : h + 2] = np.clip(plan[h : h + 2] + sign * A * CHANGES.moved[r, j, :size], -A, A)
+                direction = (1.0, 0.0, -1.0)[first]
+                plan[0] = direction * max(0.02 * A, direction * plan[0])
+                tries.append(follow(lambda t, x, margin, plan=plan: plan[t]))
+            best = max([best, *tries], key=lambda found: found[0][1])
+        return best
+
+    ways = {(first, code): way(first, code) for first in range(3) for code in range(number)}
     free = np.array([[ways[first, number - 1][2][t] for first in range(3)] for t in range(3)])
     sign = 1.0 if free[0, 1] >= 0 else -1.0
     up, down = (0, 2) if sign > 0 else (2, 0)
     groups = [range(number - 2), [number - 2], [number - 1]]
-    brought = lambda group, first, h: max(ways[first, code][0][h] for code in groups[group])  # noqa: E731
-    halves = {0: 3, 2: 4}
-    best_of = lambda first, h: max(brought(0, f, h) for f in (first, halves.get(first, first)))  # noqa: E731
-    peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(5)] for codes in groups])
+    best = [refined(first, sign) for first in range(3)]
+    peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(3)] for codes in groups])
     told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, thrift]
     for group in range(3):
         for h in range(2):
-            rise, calm, fall = (best_of(f, h) if group == 0 else brought(group, f, h) for f in (up, 1, down))
+            found = best if group == 0 else [ways[f, groups[group][0]] for f in range(3)]
+            rise, calm, fall = (found[f][0][h] for f in (up, 1, down))
             told += [np.arcsinh(20 * (rise - fall)), np.arcsinh(20 * (calm - max(rise, fall)))]
     told += [peaks[group, first] / L for group in range(3) for first in (up, 1, down)]
     told += [*(sign * free[:, 1] / L), *((free[:2, 0] - free[:2, 2]) / L)]
-    now = worth(P, share * ahead.samples)
-    told += [np.arcsinh(20 * (max(brought(0, first, 1) for first in range(5)) - now)), now - worth(P, 0.0)]
+    now = worth(P, to_come)
+    told += [np.arcsinh(20 * (max(found[0][1] for found in best) - now)), now - worth(P, 0.0)]
     lowest = peaks.min(axis=0)
-    allowed, shares = lowest[:3] <= max(L, peaks[0, :3].min()), np.ones(3)
-    for whole, half in halves.items():
-        if lowest[half] <= L and (lowest[whole] > L or brought(0, half, 1) > brought(0, whole, 1)):
-            allowed[whole], shares[whole] = allowed[whole] or terms.pace == 1, 0.5
+    allowed, shares = lowest <= max(L, peaks[0].min()), np.ones(3)
+    for push in (0, 2):
+        if best[push][1] <= L and (lowest[push] <= L or pace == 1):
+            allowed[push], shares[push] = True, abs(best[push][3][0]) / A if A > 0 else 1.0
     turned = slice(None, None, int(sign))
     return np.clip(told, -BOUND, BOUND), allowed[turned], sign, shares[turned][::2]
 
 
 @pytest.mark.parametrize(
-    ("track", "pace", "least"), [("Amplitude", 1, 0.0), ("Amplitude", 2, 0.0), ("Power", 1, 0.0), ("Power", 1, 0.1)]
+    ("track", "pace", "least", "samples"),
+    [
+        ("Amplitude", 1, 0.0, 256),
+        ("Amplitude", 2, 0.0, 256),
+        ("Amplitude", 1, 0.0, 46),  # the end is near
+        ("Amplitude", 3, 0.0, 58),
+        ("Power", 1, 0.0, 256),
+        ("Power", 1, 0.1, 256),
+    ],
 )
-def test_features_are_those_of_the_matrices(track, pace, least):
-    envs = make(f"duffing_env/{track}-v0", 12)
+def test_features_are_those_of_the_matrices(track, pace, least, samples):
+    envs = make(f"duffing_env/{track}-v0", 12, {"horizon": samples})
     seen = observations_of(envs, 40)
     foresight = CommonForesight(envs)
     terms = foresight._terms._replace(pace=pace, shaken=3.0)
     features, safe = np.empty((12, len(FEATURES)), np.float32), np.empty((12, 3), np.bool_)
     signs, shares, pushes = np.empty(12), np.empty((12, 2)), np.full(12, least)
     ahead = foresight._ahead
-    imaginer(View(difference()))(envs.records, seen, ahead, ahead.blocks, terms, features, safe, signs, shares, pushes)
+    imaginer(View(difference()))(envs.records, seen, ahead, terms, features, safe, signs, shares, pushes)
     assert {*signs} == {-1.0, 1.0}
-    assert {*shares.flat} == ({1.0} if track == "Power" and least == 0.0 else {0.5, 1.0})
+    assert (shares.min() < 1.0) == (track == "Amplitude" or least > 0.0)
     for i in range(12):
         told, allowed, sign, share = reference(envs.belief(i), seen[i], ahead, terms, least)
         np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
         np.testing.assert_array_equal(safe[i], allowed)
-        np.testing.assert_array_equal(shares[i], share)
+        np.testing.assert_allclose(shares[i], share, rtol=1e-6)
         assert signs[i] == sign
 
 
