@@ -3,8 +3,8 @@
 From the belief the oscillator is imagined for as many moves as `look_ahead` says, or to the end of the episode, each
 held for as many samples as `agents.planner.motion.Swing` says; fewer where the end is near. The first move is a push
 up, none, or a push down, and what follows are the ways of `agents.policies.ways`. Of each first move it is a feature
-what the *best* way brings, after small changes; how hard that way pushes first is how hard a push is. Others are what
-it brings to *brake*, and to *rest*.
+what the *best* way brings, after small changes; where a move is one sample, a push is as hard as that way's first.
+Others are what it brings to *brake*, and to *rest*.
 """
 
 from __future__ import annotations
@@ -216,11 +216,11 @@ def imaginer(view: View) -> Any:
                 lowest = min(lowest, -best(peaks, first, 0))
             for first in range(len(FIRST)):
                 peak, place_at = nearest(peaks, first), first if sign > 0.0 else 2 - first
-                is_safe, is_eased = peak <= terms.limit, first != 1 and known[first, 2] <= terms.limit
-                # A softer push is safe only where it is chosen anew before it is played in full.
-                safe[i, place_at] = is_safe or (is_eased and pace == 1) or peak <= lowest
+                # A longer move is chosen anew before it is played in full, and of a softer push no more is known then.
+                is_eased = first != 1 and pace == 1 and known[first, 2] <= terms.limit
+                safe[i, place_at] = is_eased or peak <= max(lowest, terms.limit)
                 if first != 1:
-                    shares[i, place_at // 2] = shared[first] if is_eased and (is_safe or pace == 1) else 1.0
+                    shares[i, place_at // 2] = shared[first] if is_eased else 1.0
             for j in range(len(told)):
                 # NaN becomes 0.
                 told[j] = max(-BOUND, min(told[j], BOUND)) if told[j] == told[j] else 0.0
