@@ -12,7 +12,6 @@ how safe a block is; and the *aim* is a bit lower. It begins as the planner's ow
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -26,6 +25,7 @@ from agents.planner.policy import Planner
 from agents.planner.search import search
 from estimator.arrays import copy, fill
 from estimator.belief import Belief
+from estimator.engine.imagination import coarsened
 from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
@@ -40,9 +40,6 @@ _STEPS, _MOST_STEPS, _MORE = 160, 512, 64
 #: The first step (`agents.planner.ascent`), the part of a step that goes into the next, and the last step in parts of
 #: the first.
 _RATE, _KEPT, _LAST = 0.05, 0.8, 0.05
-
-#: Runge-Kutta steps of a sample that are enough to plan by; how safe a block is, is judged with all.
-_COARSE = 2
 
 #: The aim in parts of the limit, and how often it falls: by this part of it at first, then by more and more, up to the
 #: last number. Each time so many systems that leave the limit are added to those that are planned for.
@@ -173,8 +170,7 @@ def best_block(
         Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and
         `Futures.chance` of leaving the limit.
     """
-    model = replace(view.model, substeps=_COARSE) if view.model.is_continuous else view.model
-    ascend = _climber(model, view.degree)
+    ascend = _climber(coarsened(view.model), view.degree)  # how safe a block is, is judged with all steps
     steps = min(_MOST_STEPS, _STEPS + candidates.shape[1])
     limits = Limits(futures.limit, _AIM * futures.limit, amplitude, np.inf)
     climbed = [np.array(candidate) for candidate in candidates]

@@ -45,6 +45,7 @@ from agents.planner.motion import View, limit_of, places, swing_of
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
 from estimator.checks import LARGEST, SMALLEST, number, numbers, shown, whole
+from estimator.engine.imagination import coarsened
 from estimator.parameters import FloatArray
 
 
@@ -153,7 +154,7 @@ class Planner:
         horizon = env.horizon if all_of_it else min(horizon or _HORIZON, env.horizon)
         self._energy = setup.budget if all_of_it else None
         if all_of_it:
-            self._pursue = pursuit(self.view.model, self.view.degree).pursue
+            self._pursue = pursuit(coarsened(self.view.model), self.view.degree).pursue
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
