@@ -60,6 +60,7 @@ class Terms(NamedTuple):
         price: nats for the square of an input.
         goal: mean of the goal prior of what the first sensor shows.
         goal_weight: half its precision; 0 for no goal.
+        soon: moves of a plan after which it first counts what is known (`agents.planner.search`).
     """
 
     amplitude: float
@@ -73,6 +74,7 @@ class Terms(NamedTuple):
     price: float = 0.0
     goal: float = 0.0
     goal_weight: float = 0.0
+    soon: int = 1
 
 
 class Mind(NamedTuple):

@@ -78,6 +78,9 @@ _LEAST_MOVES = 24
 #: Moves of a plan, at most.
 _MOST_MOVES = 100_000
 
+#: The first part of a plan that counts, in parts of the moves that a swing takes to come near the limit.
+_SOON = 1 / 3
+
 
 class Planner:
     """Expected free energy planning on the beliefs of an environment.
@@ -173,6 +176,7 @@ class Planner:
             price=float(input_cost),
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
+            soon=int(np.clip(_SOON * swing.built / swing.pace, 1, _MOST_MOVES)),
         )
 
     def predict(

@@ -15,8 +15,8 @@ states, and older inputs, are followed with their way, and do not tell ways apar
 comes near to the end then, too, and is as fine as it can be.
 
 The best way is then compared with the last plan, begun one sample ago, and with changed copies of the better one, by
-what is known, on average, when parts of them have been followed, the first of them a few moves long: judged by its end
-alone, the best plan may be to wait for a move, and so at every decision anew.
+what is known, on average, when parts of them have been followed: judged by its end alone, the best plan may be to wait
+for a move, and so at every decision anew. The first part is as long as a third of what it takes to swing to the limit.
 """
 
 from __future__ import annotations
@@ -47,9 +47,6 @@ _FINE, _COARSE_CHOICES = 7, 2
 
 #: A way this much [nats] worse than the best of its length is followed no further.
 _HOPELESS = 0.5
-
-#: Parts of a plan after which it counts what is known.
-_MARKS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
@@ -214,9 +211,11 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     def weigh(W, task, candidates, worths):
         """What candidates (LANES, horizon) are worth (LANES,).
 
-        That is what is known at the end of the episode, or on average after parts of a plan that does not reach it.
+        That is what is known at the end of the episode; of plans that do not reach it, the sum of what is known after
+        ``terms.soon`` moves, or half of them, after twice as many, and so on, and at the end.
         """
-        steps, ends = task.steps, task.left <= task.steps * task.pace
+        steps = task.steps
+        mark = steps if task.left <= steps * task.pace else max(1, min(task.terms.soon, steps // 2))
         begin(W, task.record, task.lasts)
         fill(worths, 0.0)
         for h in range(steps):
@@ -224,14 +223,11 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                 W[U + j] = candidates[j, h]
             for _ in range(task.pace):
                 advance(W, task.record, task.terms)
-            weight = 1.0 if ends and h + 1 == steps else 0.0
-            for mark in _MARKS:
-                if not ends and h + 1 == max(1, int(mark * steps + 0.5)):
-                    weight += 1.0 / len(_MARKS)
-            if weight > 0.0:
+            if h + 1 == mark or h + 1 == steps:
+                mark *= 2
                 appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
                 for j in range(LANES):
-                    worths[j] += weight * W[SCORE + j]
+                    worths[j] += W[SCORE + j]
 
     @inner
     def refresh(W, task, best, rate):

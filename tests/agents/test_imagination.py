@@ -264,8 +264,8 @@ def test_what_has_no_meaning_is_refused(model, degree, lag):
 def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
     case, horizon = "paper", 4
     model = CASES[case][0]
-    # Of four moves a sixteenth, an eighth and a quarter are the first; a plan to the end is worth what is known there.
-    weights = np.array([0.6, 0.2, 0.0, 0.2]) if left > horizon else np.array([0.0, 0.0, 0.0, 1.0])
+    # What is known after one move, two and four counts; a plan to the end is worth what is known there.
+    weights = np.array([1.0, 1.0, 0.0, 1.0]) if left > horizon else np.array([0.0, 0.0, 0.0, 1.0])
     for seed in range(4):
         rng = np.random.default_rng(seed)
         belief = random_belief(model, rng)
