@@ -140,7 +140,7 @@ class Planner:
         if experiment.hold != 1:
             raise ValueError(
                 f"env must take an action for every sample, as plans do, but its hold is {experiment.hold}; "
-                "make it with hold=1, or choose a learned policy or a signal"
+                "make it with hold=1, or choose a signal or a feedback law"
             )
         setup, self.view = experiment.setup, View.of(experiment)
         all_of_it = bool(np.isfinite(setup.budget)) and horizon is None

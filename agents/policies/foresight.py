@@ -2,12 +2,12 @@
 
 The best input is a sharp function of the belief: it turns over where a push would come too late or lead too far. A
 network learns such a function poorly from means, deviations and displacements. It learns it well from what the believed
-oscillator does with a push up, none or a push down, and what that would teach (`agents.policies.prospects`). Four
+oscillator does with a push up, none or a push down, and what that would teach (`agents.policies.imagined`). Four
 things are done for it:
 
 - **Features.** Where the model is odd, observations are turned upright, so that the first sensor shows nothing
   negative, and the action is turned back.
-- **A measure.** A push is as hard as the best way that begins with one in its direction has it.
+- **A measure.** A push is as hard as that of the best imagined way that begins in its direction.
 - **A shield.** An action in whose direction no way is left to stay within the displacement limit is replaced by none,
   or by a push the other way, whichever is safe. So also a policy that still tries its actions out seldom ends an
   episode, and learns to go close to the limit.

@@ -1,10 +1,10 @@
-"""What the beliefs of all oscillators have in common: what they expect of simple ways to go on, imagined exactly.
+"""What the beliefs of all oscillators have in common: what they expect of simple ways to go on.
 
-From the belief the oscillator is imagined for as many moves as `look_ahead` says, or to the end of the episode, each
-held for as many samples as `agents.planner.motion.Swing` says; fewer where the end is near. The first move is a push
-up, none, or a push down, and what follows are the ways of `agents.policies.ways`. Of each first move it is a feature
-what the *best* way brings, after small changes; where a move is one sample, a push is as hard as that way's first.
-Others are what it brings to *brake*, and to *rest*.
+The oscillator is imagined from the belief, along the ways of `agents.policies.ways`, for as many moves as `look_ahead`
+says, or to the end of the episode. A move lasts as many samples as `agents.planner.motion.Swing` says, and fewer where
+the end is near. Features are what the *best* way brings after small changes, if the first move is a push up, none, or a
+push down; what it brings to *brake* and to *rest*; and how near to the limit all of that leads. Where a move is one
+sample, a push is as hard as the best way's first.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Ahead(NamedTuple):
     """What is ahead.
 
     Attributes:
-        push: largest push; no more than what moves the first sensor by a part of its limit in a move.
+        push: largest push; no more than what moves the first sensor by half of its limit in a move.
         moves: that are looked ahead, an even number.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
@@ -92,9 +92,7 @@ def as_feature(nats: FloatArray) -> FloatArray:
 
 @cache
 def imaginer(view: View) -> Any:
-    """``look(records, observations, ahead, terms, features, safe, signs, shares, pushes)``: what they become.
-
-    n beliefs become these:
+    """``look(records, observations, ahead, terms, features, safe, signs, shares, pushes)`` makes features of n beliefs.
 
     - ``records`` (n, size): the beliefs, as `estimator.Belief` keeps them;
     - ``observations`` (n, entries) float32, as they were shown with them;

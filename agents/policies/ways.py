@@ -1,21 +1,22 @@
 """Ways to go on, imagined from a belief: simple ones, and the best of them with small changes.
 
-A way begins with a push up, none, or a push down, and is as many moves long as `agents.policies.imagined.look_ahead`
-says, or reaches the end of the episode. Of every first move there are in the lanes of two blocks
+A *push* is an input as large as is allowed. A *move* is an input that is held for as many samples as
+`agents.planner.motion.Swing` says. A *way* is a sequence of moves, as long as `agents.policies.imagined.look_ahead`
+says, or to the end of the episode. Ways are imagined side by side, one in a lane.
 
-- the signs of the next five pushes, and then pushes along the motion, but against it where they would lead beyond the
-  limit; or the same signs, and then none; or all of these pushes up, or down, and then along,
-- *brake*: pushes against the motion,
-- *rest*: none.
+There are 64 ways of each first move: a push up, none, or a push down. Thirty of them then try the next five pushes with mixed
+signs, and go on with pushes along the motion, but against it where these would lead beyond the limit. Thirty more try
+the same signs, and then rest. Two make the next five pushes all up, or all down, and go on along the motion. All of
+these compete. The last two tell of themselves: *brake* pushes against the motion, *rest* does nothing.
 
-All but the last two compete. What the best of them brings depends on how hard it pushes where it turns, so it is
-changed a little in some rounds of a block each, as the planner changes its plans: some pushes are turned over, or a
-push or two are made harder or softer, the first ones rather than those far ahead. The first push keeps its direction.
+What the best way teaches depends on how hard it pushes where it turns. So it is changed a little in some rounds, as the
+planner changes its plans: some pushes are turned over, or one or two become harder or softer, the first ones more often
+than those far ahead. The first push keeps its direction.
 
 What a way is worth is in nats, as the planner imagines it: by belief propagation (`agents.planner.imagination`), so
 that what one sample teaches is not counted again by the next, with what the rest of the episode will bring anyway. It
-is the mean of what is known when a half, three quarters and all of it have been followed: by its end alone the best
-way may be to wait for a move, and so at every decision anew. Of a way that reaches the end of the episode it is what is
+is the mean of what is known when a half, three quarters and all of it have been followed. Judged only at its end,
+waiting for a move can look best at every decision, for ever. A way that reaches the end of the episode is worth what is
 known then.
 """
 
@@ -41,7 +42,7 @@ FIRST = (1.0, 0.0, -1.0)
 BLOCKS = 2
 WAYS = BLOCKS * LANES
 
-#: Of ways that lie behind one another, the last: two whose first pushes are all alike, brake, and rest.
+#: The last of the ways of a first move: two whose next pushes are all alike, brake, and rest.
 _LAST = 4
 
 #: Parts of a way after which it counts what is known; the first is what is known when half of it has been followed.
@@ -50,10 +51,14 @@ _MARKS = (0.5, 0.75, 1.0)
 #: Moves in which an output can still be kept within the limit: nearly a period.
 _IN_REACH = 8
 
-#: Rounds of changes; of a way that begins with none, one round. Of the changes so many turn pushes over, so many pushes
-#: at most; the others move one by up to so much, the higher the power, the sooner in a way.
+#: Rounds of changes of a way that begins with a push; one that begins with none has one round.
 ROUNDS = 6
-_TURN, _MOST_TURNED, _BY, _SOON = 0.5, 3, 0.3, 3
+
+#: The part of the changes that turn pushes over, and how many pushes at most.
+_TURN, _MOST_TURNED = 0.5, 3
+
+#: By how much of a push the others change it at most, and the power of a uniform number that says where in the way.
+_BY, _SOON = 0.3, 3
 
 #: The least part of a push that is one.
 _LEAST = 0.02
@@ -71,7 +76,7 @@ class Task(NamedTuple):
         left: samples left in the episode.
         to_come: samples that bring information at the usual rate from now on.
         M: (K, K) factor of that rate.
-        unforeseen: variance of the first sensor that comes to the predicted one.
+        unforeseen: variance that is added to the predicted one of the first sensor.
         terms: `agents.planner.imagination.Terms`.
     """
 

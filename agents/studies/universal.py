@@ -6,10 +6,9 @@ plays every policy on the same oscillators, one of each rig that is drawn (`agen
 ``test`` of the seeds. D-efficiency is exp(2 (I - I_efe) / K), with I the information gained about the K coefficients
 and I_efe that of the planner on the same oscillator with the same noise.
 
-    python train.py --env family --steps 8000000
-    python -m agents.studies.universal --policies runs/ppo-family-0 --ship
+    python -m agents.studies.universal --policies runs/rule prbs --ship
 
-writes the run's policy into the package, as ppo/universal, with these figures on its card.
+writes a run's policy into the package, as ppo/universal, with these figures on its card.
 """
 
 from __future__ import annotations
