@@ -4,9 +4,9 @@ A *push* is an input as large as is allowed. A *move* is an input that is held f
 `agents.planner.motion.Swing` says. A *way* is a sequence of moves, as long as `agents.policies.imagined.look_ahead`
 says, or to the end of the episode. Ways are imagined side by side, one in a lane.
 
-There are 64 ways of each first move: a push up, none, or a push down. Thirty of them then try the next five pushes with mixed
-signs, and go on with pushes along the motion, but against it where these would lead beyond the limit. Thirty more try
-the same signs, and then rest. Two make the next five pushes all up, or all down, and go on along the motion. All of
+There are 64 ways of each first move: a push up, none, or a push down. Thirty of them try the next five pushes with
+mixed signs, and go on with pushes along the motion, but against it where these would lead beyond the limit. Thirty more
+try the same signs, and then rest. Two make the next five pushes all up, or all down, and go on along the motion. All of
 these compete. The last two tell of themselves: *brake* pushes against the motion, *rest* does nothing.
 
 What the best way teaches depends on how hard it pushes where it turns. So it is changed a little in some rounds, as the
