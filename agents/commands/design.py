@@ -52,8 +52,16 @@ def show(found: Any) -> None:
     from agents.results import show as print_all
     from agents.results import table
 
+    # A mean that differs from 0 by rounding alone is 0.
     rows = [
-        [name, f"{mean:.5g}", f"{low:.5g} to {high:.5g}", f"± {half:.2g}", f"{(high - low) / 2 / half:.3g}", unit]
+        [
+            name,
+            f"{mean if abs(mean) > 1e-9 * (high - low) else 0.0:.5g}",
+            f"{low:.5g} to {high:.5g}",
+            f"± {half:.2g}",
+            f"{(high - low) / 2 / half:.3g}",
+            unit,
+        ]
         for name, mean, (low, high), half, unit in found.rows()
     ]
     made = f"{len(found.u)} samples by {found.policy}, up to {abs(found.u).max():.3g} {found.rig.input.unit}"
