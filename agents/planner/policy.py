@@ -10,7 +10,8 @@ with C_0 the covariance of the coefficients now and C_H the one after the H outp
 propagation: the joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample
 teaches is not counted again by the next. The teaching part then telescopes: a plan of the whole episode would be
 Bayesian D-optimal. J is the information that the rest of the episode after H will bring anyway, at the rate of the last
-plans; so a plan looks for what will be lacking at the end. Where the coefficients walk (``drift``) J is 0, and the walk
+plans; so a plan looks for what will be lacking at the end. Plans are compared by the mean of G after parts of them, the
+last of which is H (`agents.planner.search`). Where the coefficients walk (``drift``) J is 0, and the walk
 is imagined too.
 
 What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then

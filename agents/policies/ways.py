@@ -39,8 +39,8 @@ from estimator.parameters import FloatArray
 FIRST = (1.0, 0.0, -1.0)
 
 #: Blocks of ways for a first move, and all of its ways.
-BLOCKS = 2
-WAYS = BLOCKS * LANES
+_BLOCKS = 2
+WAYS = _BLOCKS * LANES
 
 #: The last of the ways of a first move: two whose next pushes are all alike, brake, and rest.
 _LAST = 4
@@ -52,7 +52,7 @@ _MARKS = (0.5, 0.75, 1.0)
 _IN_REACH = 8
 
 #: Rounds of changes of a way that begins with a push; one that begins with none has one round.
-ROUNDS = 6
+_ROUNDS = 6
 
 #: The part of the changes that turn pushes over, and how many pushes at most.
 _TURN, _MOST_TURNED = 0.5, 3
@@ -93,12 +93,12 @@ class Task(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """Changes of ways, (ROUNDS, LANES) each; in every round the first lane is left as it is.
+    """Changes of ways, (_ROUNDS, LANES) each; in every round the first lane is left as it is.
 
     Attributes:
         where: the first move that is changed, in parts of a way.
         turned: moves that are turned over.
-        moved: (ROUNDS, LANES, 2) how much harder that push becomes and the next one, in parts of a push.
+        moved: (_ROUNDS, LANES, 2) how much harder that push becomes and the next one, in parts of a push.
     """
 
     where: FloatArray
@@ -109,8 +109,8 @@ class Changes(NamedTuple):
 def _draw_changes() -> Changes:
     """They are always the same."""
     rng = np.random.default_rng(5)
-    turns = rng.random((ROUNDS, LANES)) < _TURN
-    where = rng.random((ROUNDS, LANES)) ** np.where(turns, 1, _SOON)
+    turns = rng.random((_ROUNDS, LANES)) < _TURN
+    where = rng.random((_ROUNDS, LANES)) ** np.where(turns, 1, _SOON)
     turned = turns * rng.integers(1, _MOST_TURNED + 1, turns.shape)
     moved = _BY * rng.uniform(-1.0, 1.0, (*turns.shape, 2)) * ~turns[..., None]
     moved[..., 1] *= rng.random(turns.shape) < 0.5
@@ -229,7 +229,7 @@ def ways(view: View) -> Ways:
     @inner
     def explore(W, still, task, worths, peaks, plans, free):
         for first in range(len(FIRST)):
-            for c in range(BLOCKS):
+            for c in range(_BLOCKS):
                 lane = first * WAYS + c * LANES
                 lanes = slice(lane, lane + LANES)
                 begin(W, task.record, task.lasts)
@@ -254,7 +254,7 @@ def ways(view: View) -> Ways:
     def refine(W, task, plan, direction, sign, candidates, known):
         least, worths, peaks = _LEAST * task.push, np.empty((2, LANES)), np.empty(LANES)
         known[1] = -np.inf
-        for r in range(ROUNDS if direction != 0.0 else 1):
+        for r in range(_ROUNDS if direction != 0.0 else 1):
             for j in range(LANES):
                 copy(candidates[j], 0, plan, task.moves)
                 change(candidates[j, : task.moves], r, j, sign * task.push)
