@@ -40,8 +40,8 @@ _LEAP = 1.0
 #: teach what such a swing does not, such as to rest with a push on.
 _USUAL = 0.1
 
-#: Chance that an episode on a simulated plant leaves the limit if every output were at the margin from it. The planner's
-#: is smaller, and so is that of policies on a rig: here an early end costs no more than what would have been learned.
+#: Chance that an episode on a simulated plant leaves the limit if every output were at the margin from it. The
+#: planner's is smaller, and so is that of policies on a rig: here an early end costs only what would have been learned.
 _RISK = 0.2
 
 _HARDER, _AS_IT_IS = (FEATURES.index(f"best_{way}_whole") for way in ("up", "none"))

@@ -279,11 +279,13 @@ def test_beside_the_observation_it_is_turned_upright():
     assert {*own.signs} == {-1.0, 1.0}
 
 
-def test_where_noises_are_weighed_it_keeps_further_from_the_limit():
-    margins = [CommonForesight(make(f"duffing_env/Amplitude-{v}", 1))._terms.margin for v in ("v0", "v1")]
-    # Of 256 outputs at the margin one is beyond the limit in one episode of twenty.
-    assert 256 * norm.sf(margins[0]) == pytest.approx(0.05, rel=1e-6)
-    assert 256 * student_t(16).sf(margins[1]) == pytest.approx(0.05, rel=1e-6)
+def test_where_noises_are_weighed_or_a_rig_is_played_it_keeps_further_from_the_limit():
+    simulated = [CommonForesight(make(f"duffing_env/Amplitude-{v}", 1))._terms.margin for v in ("v0", "v1")]
+    # Of 256 outputs at the margin one is beyond the limit in one episode of five, on a rig in one of twenty.
+    assert 256 * norm.sf(simulated[0]) == pytest.approx(0.2, rel=1e-6)
+    assert 256 * student_t(16).sf(simulated[1]) == pytest.approx(0.2, rel=1e-6)
+    rig = make("duffing_env/Rig-v0", 1, {"rig": draw_member(np.random.default_rng(1)).options["rig"], "horizon": 256})
+    assert 256 * student_t(16).sf(CommonForesight(rig)._terms.margin) == pytest.approx(0.05, rel=1e-6)
 
 
 def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path):
