@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from estimator.checks import hint, number, one_of, printable, shown, whole
-from estimator.files import whole_file
+from estimator.files import file_name, whole_file, write_atomically
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
 from estimator.units import SIZES, Scales
@@ -198,6 +198,24 @@ class Rig:
         if isinstance(rig, str | Path):
             return cls.shipped(rig) if isinstance(rig, str) and rig in SHIPPED else cls.from_file(rig)
         raise ValueError(f"rig must be a Rig, a dictionary or a file name, but is {rig!r:.60}; use Rig(step=...)")
+
+    def save(self, path: str | Path) -> None:
+        """Write a rig file, with comments, from which `from_file` gives the same rig; what was there is replaced.
+
+        Raises:
+            ValueError: for what is not the name of a file.
+            OSError: where it cannot be written; what was there before still is.
+
+        Example:
+            >>> from estimator import Rig
+            >>> rig = Rig(step=1e-3, guess={"m": (0.3, 0.5), "c": (0, 2), "a": (1e3, 5e3), "b": (0, 1e8)})
+            >>> rig.save("rig.toml")
+            >>> Rig.from_file("rig.toml") == rig
+            True
+        """
+        from estimator.rig_text import text_of
+
+        write_atomically(file_name("path", path), text_of(self))
 
     def to_dict(self) -> dict[str, Any]:
         """What JSON and TOML can hold, without what was left out."""

@@ -115,7 +115,8 @@ def test_every_check_is_explained():
         "agents.running.run",
     ],
 )
-def test_examples_of_the_docstrings_run(module):
+def test_examples_of_the_docstrings_run(module, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     failures, examples = doctest.testmod(importlib.import_module(module))
     assert examples > 0
     assert failures == 0

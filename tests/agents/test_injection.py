@@ -13,7 +13,7 @@ import pytest
 from agents.cli import progress_bar, told_in_one_line
 from agents.commands import main
 from agents.commands.identify import show as show_identified
-from agents.commands.rig_file import from_record, text_of
+from agents.commands.rig_file import from_record
 from agents.evaluation import board
 from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, save
 from agents.evaluation.leaderboard import print_table
@@ -141,7 +141,8 @@ def test_a_channel(name, tmp_path):
             Rig.from_dict(described)
         described["input"]["unit"] = "<b onerror=1>$\\frac{$"
     rig = Rig.from_dict(described)
-    assert Rig.from_dict(tomllib.loads(text_of(rig))) == rig
+    rig.save(tmp_path / "rig.toml")
+    assert Rig.from_file(tmp_path / "rig.toml") == rig
     design(rig, policy="prbs", samples=16).write(tmp_path / "next.csv")
     head, *rows = csv.reader((tmp_path / "next.csv").read_text().splitlines())
     assert head == ["time [s]", f"u [{rig.input.unit}]"]

@@ -46,6 +46,23 @@ def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "rig",
+    [
+        Rig(0.1),
+        BENCH,
+        Rig(np.float64(1 / 3), "linear", 2, {"unit": "N", "limit": np.float32(0.1), "noise": 1e-7, "offset": -0.2}),
+        replace(BENCH, delay=-1, output=Channel("µm", None, 3, "acceleration", 1e-300 * 1e280, 5.0, "Weg ü")),
+        *map(Rig.shipped, SHIPPED),
+    ],
+)
+def test_a_saved_rig_is_the_same(rig, tmp_path):
+    rig.save(tmp_path / "new" / "rig.toml")
+    assert Rig.from_file(tmp_path / "new" / "rig.toml") == rig
+    with pytest.raises(ValueError, match="path must be the name of a file"):
+        rig.save("a\0b")
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"stepp": 1.0}, "rig must have keys of"),
