@@ -14,6 +14,12 @@ GENERATED = ("tracks/", "reference/", "rewards.md", "leaderboard.md")
 WITH_EXAMPLES = ["README.md"]
 WITH_EXAMPLES += [f"docs/{name}.md" for name in ("estimators", "own_data", "own_model", "quickstart", "running")]
 WITH_EXAMPLES += ["docs/extending.md", "docs/rig_electronic_duffing.md", "docs/rig_beam.md"]
+MODULES = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for package in ("agents", "benchmarks", "duffing_env", "estimator")
+    for path in sorted((ROOT / package).rglob("*.py"))
+    if re.search(r"^ +>>> ", path.read_text(encoding="utf-8"), re.MULTILINE)
+]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -107,14 +113,7 @@ def test_every_check_is_explained():
     assert set(explained) == names
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        *("duffing_env.continuous", "duffing_env.limited", "duffing_env.model_env"),
-        *("estimator.electronic_duffing", "estimator.models.model", "estimator.offline", "estimator.rig"),
-        "agents.running.run",
-    ],
-)
+@pytest.mark.parametrize("module", MODULES)
 def test_examples_of_the_docstrings_run(module, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     failures, examples = doctest.testmod(importlib.import_module(module))

@@ -40,7 +40,7 @@ def margin(samples: float, *, weighs: bool, risk: float = RISK) -> float:
 
     Example:
         >>> [round(margin(samples, weighs=weighs), 1) for samples in (48, 256) for weighs in (False, True)]
-        [3.1, 3.7, 3.5, 4.4]
+        [3.1, 3.7, 3.5, 4.5]
     """
     return float(-stdtrit(_TAILS, risk / samples) if weighs else -ndtri(risk / samples))
 

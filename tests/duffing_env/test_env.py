@@ -1,8 +1,6 @@
 """The single environment: Gymnasium's contract, and what the class docstring promises."""
 
 import copy
-import doctest
-import importlib
 import json
 import pickle
 import re
@@ -68,13 +66,6 @@ def overwrite(env, name, value):
     """Put a value into the plant's or the belief's state."""
     batch = env.unwrapped._batch
     batch._blocks[0, batch._place[name], 0] = value
-
-
-@pytest.mark.parametrize("module", ["duffing_env.env", "duffing_env.vector_env", "estimator.online"])
-def test_examples_of_the_docstrings(module):
-    results = doctest.testmod(importlib.import_module(module))
-    assert results.attempted > 3
-    assert results.failed == 0
 
 
 @pytest.mark.parametrize(("factorisation", "reward"), PAIRS)

@@ -1,7 +1,6 @@
 """The online estimator: every kind against itself sample by sample, plain loops, and the published numbers."""
 
 import copy
-import doctest
 import pickle
 import re
 import time
@@ -16,7 +15,6 @@ from estimator import (
     Rig,
     difference,
     duffing,
-    online,
     paper_text_prior,
     published_run_prior,
     recorded_prior,
@@ -189,11 +187,6 @@ def test_what_is_known_stays_known(samples, options):
     assert belief.coefficients()["theta2"] == (0.0, 0.0)
     np.testing.assert_array_equal(belief.coefficients_cov[1], 0.0)
     assert np.isfinite(belief.entropy())
-
-
-def test_the_example_of_the_documentation():
-    results = doctest.testmod(online)
-    assert (results.failed, results.attempted > 5) == (0, True)
 
 
 def test_defaults():
