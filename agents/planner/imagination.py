@@ -22,6 +22,11 @@ from estimator.parameters import FloatArray
 #: Nats that an output beyond its limit costs, per limit that it is beyond: more than any plan can teach.
 _BEYOND = 1e4
 
+#: Nats that an output within the margin costs, times the fourth power of how many standard deviations it is within it.
+#: That rises as the chance of an early end does. Were it a wall, noise that led a bit too near would be answered by all
+#: the braking there is, which costs more than the chance; and a plan would be the worse the better it is searched for.
+_NEAR = 0.05
+
 #: A margin is no wider than this part of the limit: where noise alone leads beyond it, no plan is safe.
 MOST_MARGIN = 0.5
 
@@ -60,6 +65,8 @@ class Terms(NamedTuple):
         price: nats for the square of an input.
         goal: mean of the goal prior of what the first sensor shows.
         goal_weight: half its precision; 0 for no goal.
+        firm: 1 where the margin is as the limit itself, which a shield needs that calls unsafe what leads into it; 0
+            where it yields.
         soon: moves of a plan after which it first counts what is known (`agents.planner.search`).
     """
 
@@ -74,6 +81,7 @@ class Terms(NamedTuple):
     price: float = 0.0
     goal: float = 0.0
     goal_weight: float = 0.0
+    firm: float = 0.0
     soon: int = 1
 
 
@@ -105,12 +113,16 @@ class Mind(NamedTuple):
     precision: Any
 
 
-def _charge(INPUT, SHOWN, SPREAD, COST, noise, unforeseen, limit, margin, price, goal, goal_weight):
+def _charge(INPUT, SHOWN, SPREAD, COST, noise, unforeseen, limit, margin, firm, price, goal, goal_weight):
     """What a sample costs; of the output's variance ``noise`` is the sensor's own, ``unforeseen`` comes to it."""
-    over = abs(SHOWN) + min(margin * np.sqrt(SPREAD + unforeseen), MOST_MARGIN * limit) - limit
-    over = over if over > 0.0 else 0.0
+    deviation = np.sqrt(SPREAD + unforeseen)
+    wide = min(margin * deviation, MOST_MARGIN * limit)
+    near = (1.0 - firm) * (abs(SHOWN) + wide - limit) / deviation
+    over = abs(SHOWN) + firm * wide - limit
+    over, near = (over if over > 0.0 else 0.0), (near * near if near > 0.0 else 0.0)
     off = SHOWN - goal
-    return COST + _BEYOND / limit * over + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise)
+    kept = COST + _BEYOND / limit * over + _NEAR * near * near
+    return kept + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise)
 
 
 def _weigh(KNOWN, COST):
@@ -135,7 +147,7 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     covariance = place[f"P_{first}_{first}"] * LANES
     noise = names.index("GAMMA_SHAPE") + 2
     advance_belief, judge = imagined.advance, imagined.judge
-    uniform = "noise unforeseen limit margin price goal goal_weight"
+    uniform = "noise unforeseen limit margin firm price goal goal_weight"
     charge = lanewise(place, "COST", uniform=uniform)(_charge)
     weigh = lanewise(place, "SCORE")(_weigh)
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
@@ -162,7 +174,8 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     def advance(W, record, terms):
         advance_belief(W, record, terms.walk)
         r, q = record[noise + 1] / record[noise], record[noise - 1] / record[noise - 2]
-        charge(W, r, terms.shaken * q, terms.limit, terms.margin, terms.price, terms.goal, terms.goal_weight)
+        told = terms.price, terms.goal, terms.goal_weight
+        charge(W, r, terms.shaken * q, terms.limit, terms.margin, terms.firm, *told)
 
     @inner
     def appraise(W, M, scale):

@@ -14,13 +14,15 @@ plans; so a plan looks for what will be lacking at the end. Plans are compared b
 last of which is H (`agents.planner.search`). Where the coefficients walk (``drift``) J is 0, and the walk
 is imagined too.
 
-What the first sensor shows must stay within the limit by a margin of standard deviations of the output that is then
-predicted; plans that do not are the worse the further they go beyond. The margin is the quantile that a Gaussian
-exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so much less comes
-true. Where hypotheses about the noises are weighed (``noise_hypotheses``) an output is believed to be a mixture, with
-heavier tails: the quantile is that of Student's t (`agents.planner.imagination.margin`). Where an input comes
-to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the sample
-between moves the next output about as much again, and no input makes up for it: the margin is then twice as wide.
+What the first sensor shows should stay within the limit by a margin of standard deviations of the output that is then
+predicted; plans that do not are the worse the further they go within it, as fast as the chance of an early end grows,
+and beyond the limit they are worth nothing. On a rig the margin is as firm as the limit. The margin is the quantile
+that a Gaussian exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so
+much less comes true. Where hypotheses about the noises are weighed (``noise_hypotheses``) an output is believed to be
+a mixture, with heavier tails: the quantile is that of Student's t (`agents.planner.imagination.margin`). Where an
+input comes to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the
+sample between moves the next output about as much again, and no input makes up for it: the margin is then twice as
+wide.
 
 Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
 nothing helps: on a rig the limit is lower by what a swing at it can hide.
@@ -98,7 +100,7 @@ class Planner:
             last 48 of an episode.
         rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 moves; of no
             effect on a plan of the whole episode.
-        risk: upper bound of the probability that an episode ends early, in (0, 1), where the belief is right.
+        risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
         goal: mean of the goal prior of the displacement [V].
         goal_std: its standard deviation [V]; no goal where it is None.
         input_cost: nats for a V² of input energy.
@@ -177,6 +179,7 @@ class Planner:
             price=float(input_cost),
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
+            firm=float(getattr(experiment, "rig", None) is not None),
             soon=int(np.clip(_SOON * swing.built / swing.pace, 1, _MOST_MOVES)),
         )
 

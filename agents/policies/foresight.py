@@ -193,6 +193,7 @@ class CommonForesight:
             swing.scales,
             swing.pace,
             swing.shaken,
+            firm=1.0,
         )
         at, model = places(self._view.model), self._view.model
         odd = (*range(at.state, at.state + model.n_states), at.last_input)

@@ -165,19 +165,23 @@ def test_imagination_is_the_plain_recursion(case, walks):
         assert W[place["SCORE"], j] + W[place["COST"], j] == pytest.approx(nats, abs=1e-5)
 
 
+@pytest.mark.parametrize("firm", [0.0, 1.0])
 @pytest.mark.parametrize("limit", [0.05, 0.15])
 @pytest.mark.parametrize("case", CASES)
-def test_the_cost_is_price_goal_and_what_is_beyond_the_limit(case, limit):
+def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limit(case, limit, firm):
     model, degree, *_ = CASES[case]
     belief = random_belief(model, np.random.default_rng(1))
-    told = terms(model, limit=limit, price=3.0, goal=0.1, goal_weight=4.0, shaken=5.0)
+    told = terms(model, limit=limit, price=3.0, goal=0.1, goal_weight=4.0, shaken=5.0, firm=firm)
     W, _ = block_after(model, degree, belief, np.full((1, LANES), 0.1), told)
     place = imagination(model, degree).layout
     shown, variance = W[place["SHOWN"], 0], W[place["SPREAD"], 0]
     # Five times what process noise does in a sample comes to it; but at most half of the limit is kept from it.
-    beyond = abs(shown) + min(2.0 * np.sqrt(variance + 5.0 * 0.01**2), 0.5 * limit) - limit
-    assert beyond > 0
-    cost = 1e4 * beyond / limit + 3.0 * 0.1**2 + 4.0 * ((shown - 0.1) ** 2 + variance - 0.02**2)
+    deviation = np.sqrt(variance + 5.0 * 0.01**2)
+    within = abs(shown) + min(2.0 * deviation, 0.5 * limit) - limit
+    assert within > 0
+    yielding = 0.05 * (within / deviation) ** 4 + 1e4 * max(0.0, abs(shown) / limit - 1.0)
+    cost = 1e4 * within / limit if firm else yielding
+    cost += 3.0 * 0.1**2 + 4.0 * ((shown - 0.1) ** 2 + variance - 0.02**2)
     np.testing.assert_allclose(W[place["COST"]], cost, rtol=1e-9)
 
 
