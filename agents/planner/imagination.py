@@ -33,21 +33,19 @@ MOST_MARGIN = 0.5
 #: Chance that an episode leaves the limit if every output were at the margin from it.
 RISK = 0.05
 
-#: Degrees of freedom of what is predicted where the noises are not known.
-_TAILS = 16.0
-
 
 def margin(samples: float, *, weighs: bool, risk: float = RISK) -> float:
     """Predictive standard deviations to keep from the limit in an episode of so many samples.
 
     Outputs that are all at this margin leave the limit with the chance ``risk``: as Gaussians, or where the estimator
-    ``weighs`` noises that it does not know, as Student's t with 16 degrees of freedom.
+    ``weighs`` noises that it does not know, as Student's t. Its degrees of freedom are the root of the samples: in a
+    short episode the noises are known less.
 
     Example:
         >>> [round(margin(samples, weighs=weighs), 1) for samples in (48, 256) for weighs in (False, True)]
-        [3.1, 3.7, 3.5, 4.5]
+        [3.1, 4.8, 3.5, 4.5]
     """
-    return float(-stdtrit(_TAILS, risk / samples) if weighs else -ndtri(risk / samples))
+    return float(-stdtrit(np.sqrt(samples), risk / samples) if weighs else -ndtri(risk / samples))
 
 
 class Terms(NamedTuple):
