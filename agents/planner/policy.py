@@ -44,7 +44,7 @@ import numpy.typing as npt
 
 from agents.asked import check_rows, starts
 from agents.planner.imagination import RISK, Terms, margin
-from agents.planner.motion import View, limit_of, places, swing_of
+from agents.planner.motion import View, is_of_rig, limit_of, places, swing_of
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
 from estimator.checks import LARGEST, SMALLEST, number, numbers, shown, whole
@@ -179,7 +179,7 @@ class Planner:
             price=float(input_cost),
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
-            firm=float(getattr(experiment, "rig", None) is not None),
+            firm=float(is_of_rig(experiment)),
             soon=int(np.clip(_SOON * swing.built / swing.pace, 1, _MOST_MOVES)),
         )
 

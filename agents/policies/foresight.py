@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.planner.imagination import RISK, Terms, margin
-from agents.planner.motion import View, limit_of, places, survey, swing_of
+from agents.planner.motion import View, is_of_rig, limit_of, places, survey, swing_of
 from agents.policies.bursts import burster, drawn
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, Outlook, feature_names, look_at
@@ -182,7 +182,7 @@ class CommonForesight:
         slow = swing if lasting == setup.max_input else swing_of(self._view, center, lasting, setup.max_output)
         moves = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
         known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
-        risk = RISK if getattr(experiment, "rig", None) is not None else _RISK
+        risk = RISK if is_of_rig(experiment) else _RISK
         self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, known)
         self._terms = Terms(
             setup.max_input,
