@@ -25,27 +25,27 @@ _BEYOND = 1e4
 #: Nats that an output within the margin costs, times the fourth power of how many standard deviations it is within it.
 #: That rises as the chance of an early end does. Were it a wall, noise that led a bit too near would be answered by all
 #: the braking there is, which costs more than the chance; and a plan would be the worse the better it is searched for.
-_NEAR = 0.05
+NEAR_COST = 0.05
 
 #: A margin is no wider than this part of the limit: where noise alone leads beyond it, no plan is safe.
 MOST_MARGIN = 0.5
 
 #: Chance that an episode leaves the limit if every output were at the margin from it.
-RISK = 0.05
+RISK = 0.01
 
 
 def margin(samples: float, *, weighs: bool, risk: float = RISK) -> float:
     """Predictive standard deviations to keep from the limit in an episode of so many samples.
 
     Outputs that are all at this margin leave the limit with the chance ``risk``: as Gaussians, or where the estimator
-    ``weighs`` noises that it does not know, as Student's t. Its degrees of freedom are the root of the samples: in a
-    short episode the noises are known less.
+    ``weighs`` noises that it does not know, as Student's t. Its degrees of freedom are twice the root of the samples:
+    in a short episode the noises are known less.
 
     Example:
         >>> [round(margin(samples, weighs=weighs), 1) for samples in (48, 256) for weighs in (False, True)]
-        [3.1, 4.8, 3.5, 4.5]
+        [3.5, 4.6, 4.0, 4.5]
     """
-    return float(-stdtrit(np.sqrt(samples), risk / samples) if weighs else -ndtri(risk / samples))
+    return float(-stdtrit(2.0 * np.sqrt(samples), risk / samples) if weighs else -ndtri(risk / samples))
 
 
 class Terms(NamedTuple):
@@ -59,7 +59,8 @@ class Terms(NamedTuple):
         walk: (K,) variances of the coefficients' random walk in a sample; zeros for constants.
         scales: (n,) sizes of the states when the first sensor is at its limit.
         pace: samples that a planned input is held for, at most.
-        shaken: times the process noise's variance that a plan keeps from the limit besides (`agents.planner.motion`).
+        shaken: times the process noise's variance that a plan keeps from the limit besides (`agents.planner.motion`),
+            where that is more than what the output of the sample before may tell.
         price: nats for the square of an input.
         goal: mean of the goal prior of what the first sensor shows.
         goal_weight: half its precision; 0 for no goal.
@@ -91,6 +92,7 @@ class Mind(NamedTuple):
         kept: of these, from the first on, that stand for a plan between two samples.
         u: where the row of the newest input begins; before a sample, the input to apply.
         score: where the row of the scores begins.
+        near: where the row begins of how many standard deviations an output is within its margin.
         fill: ``fill(W, record, lasts)``: put a belief into every lane, and the last inputs, newest first (2,).
         collect: ``collect(W, record)``: take the belief of the first lane.
         advance: ``advance(W, record, terms)``: one expected sample in every lane, and its cost; coefficients and noises
@@ -104,6 +106,7 @@ class Mind(NamedTuple):
     kept: int
     u: int
     score: int
+    near: int
     fill: Any
     collect: Any
     advance: Any
@@ -111,16 +114,17 @@ class Mind(NamedTuple):
     precision: Any
 
 
-def _charge(INPUT, SHOWN, SPREAD, COST, noise, unforeseen, limit, margin, firm, price, goal, goal_weight):
-    """What a sample costs; of the output's variance ``noise`` is the sensor's own, ``unforeseen`` comes to it."""
-    deviation = np.sqrt(SPREAD + unforeseen)
+def _charge(INPUT, SHOWN, SPREAD, SURPRISE, COST, noise, shaken, limit, margin, firm, price, goal, goal_weight):
+    """What has been charged after a sample, and how near it leads; ``noise`` is the sensor's own variance."""
+    unforeseen = SURPRISE - shaken
+    deviation = np.sqrt(SPREAD + shaken + (unforeseen if unforeseen > 0.0 else 0.0))
     wide = min(margin * deviation, MOST_MARGIN * limit)
     near = (1.0 - firm) * (abs(SHOWN) + wide - limit) / deviation
     over = abs(SHOWN) + firm * wide - limit
-    over, near = (over if over > 0.0 else 0.0), (near * near if near > 0.0 else 0.0)
+    over, square = (over if over > 0.0 else 0.0), (near * near if near > 0.0 else 0.0)
     off = SHOWN - goal
-    kept = COST + _BEYOND / limit * over + _NEAR * near * near
-    return kept + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise)
+    kept = COST + _BEYOND / limit * over + NEAR_COST * square * square
+    return kept + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise), near
 
 
 def _weigh(KNOWN, COST):
@@ -141,12 +145,13 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     n_loaded = n_states + sum(name.startswith("P_") for name in names)
     inputs = tuple(place[name] * LANES for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT") if name in place)
     u, cost, score = inputs[0], place["COST"] * LANES, place["SCORE"] * LANES
+    begun, near = place["BEGUN"] * LANES, place["NEAR"] * LANES
     first = next(iter(model.coefficients))
     covariance = place[f"P_{first}_{first}"] * LANES
     noise = names.index("GAMMA_SHAPE") + 2
     advance_belief, judge = imagined.advance, imagined.judge
-    uniform = "noise unforeseen limit margin firm price goal goal_weight"
-    charge = lanewise(place, "COST", uniform=uniform)(_charge)
+    uniform = "noise shaken limit margin firm price goal goal_weight"
+    charge = lanewise(place, "COST NEAR", uniform=uniform)(_charge)
     weigh = lanewise(place, "SCORE")(_weigh)
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
 
@@ -162,6 +167,7 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
                 W[inputs[row] + j] = value
         for j in range(LANES):
             W[cost + j] = 0.0
+            W[begun + j] = 0.0
 
     @inner
     def collect(W, record):
@@ -191,4 +197,4 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
         half_log_det(work)
         invert(work, inverse)
 
-    return Mind(size, kept, u, score, fill, collect, advance, appraise, precision)
+    return Mind(size, kept, u, score, near, fill, collect, advance, appraise, precision)

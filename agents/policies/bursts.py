@@ -71,7 +71,7 @@ def burster(view: View) -> Any:
       that, that way's own, and the most of those whose first push is at least a quarter less.
     """
     model = view.model
-    size, _, U, SCORE, begin, _, advance, appraise, _ = mind(*view)
+    size, _, U, SCORE, _, begin, _, advance, appraise, _ = mind(*view)
     found, at, place = motion(*view, LANES), places(model), imagination(*view).layout
     row, sense, glance, step = found.layout, found.sense, found.glance, found.step
     spread, width, noise = place["SPREAD"] * LANES, len(row) * LANES, belief_names(model).index("GAMMA_SHAPE")

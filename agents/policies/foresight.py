@@ -42,7 +42,7 @@ _USUAL = 0.1
 
 #: Chance that an episode on a simulated plant leaves the limit if every output were at the margin from it. The
 #: planner's is smaller, and so is that of policies on a rig: here an early end costs only what would have been learned.
-_RISK = 0.1
+_RISK = 0.03
 
 _HARDER, _AS_IT_IS = (FEATURES.index(f"best_{way}_whole") for way in ("up", "none"))
 

@@ -104,7 +104,7 @@ def imaginer(view: View) -> Any:
     - ``pushes`` (n,): how hard pushes are at least; receives how hard they are, no less than the energy allows for.
     """
     model = view.model
-    size, _, _, SCORE, begin, _, _, appraise, precision = mind(*view)
+    size, _, _, SCORE, _, begin, _, _, appraise, precision = mind(*view)
     explore, refine = ways(view)
     at, width, noise = places(model), len(motion(*view).layout), belief_names(model).index("GAMMA_SHAPE")
     k, d = model.n_coefficients, model.n_states + model.n_coefficients

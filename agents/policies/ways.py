@@ -149,7 +149,7 @@ class Ways(NamedTuple):
 def ways(view: View) -> Ways:
     """Those of a model."""
     model = view.model
-    _, _, U, SCORE, begin, _, advance, appraise, _ = mind(*view)
+    _, _, U, SCORE, _, begin, _, advance, appraise, _ = mind(*view)
     found, place = motion(*view), imagination(*view).layout
     row, sense, glance = found.layout, found.sense, found.glance
     shown, spread, n = place["SHOWN"] * LANES, place["SPREAD"] * LANES, model.n_states

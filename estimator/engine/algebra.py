@@ -54,13 +54,14 @@ class Gaussian:
         self.names, self.states = list(model.names), list(model.states)
         self.lines = Lines()
         self.put = self.lines.put
-        if model.is_continuous and not model.held:
+        if not moved.is_sound:
             self.moved = replace(moved, noise=self._sound(moved.noise))
         self.mean: dict[str, sp.Expr] = {
             **dict(zip(self.states, moved.state, strict=True)),
             **{c: symbol(c) for c in model.coefficients},
         }
         self.cov: dict[tuple[str, str], sp.Expr] = {}
+        self.half: dict[str, dict[str, sp.Expr]] = {}  # rows of S P
         self._predict()
 
     def __getitem__(self, key: tuple[str, str]) -> sp.Expr:
@@ -91,8 +92,7 @@ class Gaussian:
 
     def _predict(self) -> None:
         """Q = S P Sᵀ, or Q as it is where no S is given: the states' rows change, the coefficients' block stays."""
-        names, by = self.names, self.moved.by
-        rows = []
+        names, by, rows = self.names, self.moved.by, self.half
         for a, i in enumerate(names):
             for j in names[a:]:
                 self.cov[i, j] = pair("P" if i not in self.states else "Q", i, j, names)
@@ -103,17 +103,17 @@ class Gaussian:
             for j in names:
                 total = sum((a * pair("P", k, j, names) for k, a in zip(names, slopes, strict=True)), ZERO)
                 row[j] = self.put(f"B_{i}_{j}", total)
-            rows.append(row)
+            rows[i] = row
         n = len(self.states)
         for a, i in enumerate(self.states):
             for b in range(a, n):
-                total = sum((s * rows[a][k] for k, s in zip(names, by[b], strict=True)), ZERO)
+                total = sum((s * rows[i][k] for k, s in zip(names, by[b], strict=True)), ZERO)
                 if a == b and not total.is_Symbol:
                     terms = (s**2 * pair("P", k, k, names) for k, s in zip(names, by[b], strict=True))
                     total += ROUNDING * sum(terms, ZERO)
                 self.cov[i, self.states[b]] = self.put(f"Q_{i}_{self.states[b]}", total)
             for j in names[n:]:
-                self.cov[i, j] = rows[a][j]
+                self.cov[i, j] = rows[i][j]
 
     def expected(self, sensor: int, degree: int) -> tuple[sp.Expr, list[sp.Expr]]:
         """What a sensor is expected to show, and its derivative h by all quantities, at the mean now."""
@@ -122,6 +122,18 @@ class Gaussian:
             symbol("u"): input_at_end(self.model, degree)
         }
         return c.outputs[sensor].xreplace(at), [slope.xreplace(at) for slope in c.readouts[sensor]]
+
+    def surprise(self, readout: Sequence[sp.Expr], r: sp.Expr) -> sp.Expr:
+        """Variance by which the output of the sample before, not seen yet, moves what a sensor is expected to show.
+
+        With P after that output it is (hᵀ S P h)² / (r - hᵀ P h): its gain is P h / r, and its own variance
+        r² / (r - hᵀ P h). The P of a belief may be more than an output leaves: r / 20 is the least denominator.
+        """
+        h = {i: slope for i, slope in zip(self.names, readout, strict=True) if slope != 0}
+        before = {(i, j): pair("P", i, j, self.names) for i in h for j in h}
+        moved = sum((h[i] * h[j] * (self.half[i][j] if i in self.half else before[i, j]) for i, j in before), ZERO)
+        left = self.put("LEFT", r - sum((h[i] * h[j] * known for (i, j), known in before.items()), ZERO))
+        return self.put("TAKEN", moved) ** 2 / self.put("LEAST", select(left - r / 20, left, r / 20))
 
     def shown_noise(self, readout: Sequence[sp.Expr]) -> sp.Expr:
         """hᵀ N h: the variance that unit process noise has in a sensor."""
@@ -283,7 +295,8 @@ def _learn(
 def expected_sample(model: Model, moved: Moved, degree: int) -> tuple[Assignments, dict[str, str]]:
     """One imagined sample: `update` with outputs as expected and noise variances ``Q`` and ``R_<sensor>`` given.
 
-    Leaves what the first sensor is expected to show in ``SHOWN`` and its predictive variance in ``SPREAD``.
+    Leaves what the first sensor is expected to show in ``SHOWN``, its predictive variance in ``SPREAD``, and in
+    ``SURPRISE`` that of `Gaussian.surprise`, which is 0 for the first sample: the row ``BEGUN`` is 1 after it.
     """
     g = Gaussian(model, moved)
     results: dict[str, str] = {}
@@ -294,7 +307,9 @@ def expected_sample(model: Model, moved: Moved, degree: int) -> tuple[Assignment
         c, s = g.covariance_with(readout, tag)
         weight = g.put(f"L{tag}", 1 / (s + r))
         if k == 0:
+            surprise = g.put("MOVED", symbol("BEGUN") * g.surprise(readout, r))
             results |= {"SHOWN": text_of(g.put("Y0", expected)), "SPREAD": text_of(g.put("V0", s + r))}
+            results |= {"SURPRISE": text_of(surprise), "BEGUN": "1.0"}
         g.condition(readout, c, weight, ZERO, g.put(f"H{tag}", r * weight), tag)
     found = g.results()
     return g.lines, results | {row: value for row, value in found.items() if row not in model.coefficients}

@@ -137,12 +137,14 @@ def renamed(assignments: Iterable[tuple[str, sp.Expr]], names: Mapping[str, sp.E
 class Moved:
     """Where a sample moves the state: names or numbers of M, S and N after it, in symbols.
 
-    ``by`` is empty where the predicted covariance is not S P Sᵀ but stands in ``Q_i_j``.
+    ``by`` is empty where the predicted covariance is not S P Sᵀ but stands in ``Q_i_j``. ``is_sound`` where N is
+    positive semi-definite by how it is made.
     """
 
     state: tuple[sp.Expr, ...]
     by: tuple[tuple[sp.Expr, ...], ...]
     noise: tuple[tuple[sp.Expr, ...], ...]
+    is_sound: bool = True
 
 
 def difference_step(model: Model) -> tuple[Assignments, Moved]:
@@ -179,7 +181,7 @@ def carried_at_end(model: Model) -> Moved:
         noise = tuple(tuple(symbol(f"D_{i}") * symbol(f"D_{k}") for k in states) for i in states)
     else:
         noise = tuple(tuple(pair("N", i, k, states) for k in states) for i in states)
-    return Moved(tuple(symbol(f"M_{i}") for i in states), by, noise)
+    return Moved(tuple(symbol(f"M_{i}") for i in states), by, noise, is_sound=model.held)
 
 
 def moved(model: Model) -> tuple[Assignments, Moved]:

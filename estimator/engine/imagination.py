@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import Any
 
 from estimator.engine import cache as stored
-from estimator.engine.rows import carried_names, pairs
+from estimator.engine.rows import pairs
 from estimator.engine.tasks import NAMES
 from estimator.lanes import LANES, rows
 from estimator.models.model import Model
@@ -71,8 +71,8 @@ def imagination(model: Model, degree: int = 0, lag: int = 0) -> Imagination:
     if degree not in (0, 1) or lag not in (0, 1) or (model.is_continuous and lag):
         raise ValueError(f"degree and lag must be 0 or 1, and lag 0 for a differential equation: {degree}, {lag}")
     coarse, inputs = coarsened(model), inputs_of(model, degree, lag)
-    kept = [*model.states, *pairs("P", model.names), *inputs, "COST"]
-    place = rows(*kept, "SHOWN", "SPREAD", "KNOWN", "SCORE", *carried_names(model))
+    kept = [*model.states, *pairs("P", model.names), *inputs, "COST", "BEGUN"]
+    place = rows(*kept, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "NEAR")
     key = repr((coarse.digest, degree, lag))
     code = stored.load(model.name, "imagination", key, lambda: _source(coarse, degree, lag, inputs, place), NAMES)
     return Imagination(code.advance, code.judge, place, len(kept))
@@ -104,7 +104,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
 
     symbol, coefficients = derive.symbol, list(model.coefficients)
     given = fed(model, degree, lag)
-    lines, moved = derive.moved(model)
+    lines, moved = sensitivity.coarse_motion(model, degree) if model.is_continuous else derive.difference_step(model)
     more, results = algebra.expected_sample(model, moved, degree)
     # The coefficients walk before the sample, so that what it does begins with the wider covariance.
     walked = {f"P_{c}_{c}": f"WALKED_{c}" for c in coefficients}
@@ -114,15 +114,14 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
     results = {**walked, **results, **{older: newer for newer, older in pairwise(inputs)}}
     noises = ["Q", *(f"R_{y}" for y in model.outputs)]
     uniform = [*coefficients, *noises, *(f"WALK_{c}" for c in coefficients)]
-    source = sensitivity.motion_source(model, degree, place, LANES, coefficients, given)
-    source += emit.lane_loop("expect", lines, results, place, LANES, uniform, doc="One expected sample.")
+    source = emit.lane_loop("expect", lines, results, place, LANES, uniform, doc="One expected sample.")
     # What the loops want of a record.
     n, k = model.n_states, model.n_coefficients
     first = (n + k) + (n + k) * (n + k + 1) // 2
     means = ", ".join(f"record[{n + c}]" for c in range(k))
     told = [f"record[{first + 2 * i + 1}] / record[{first + 2 * i}]" for i in range(1 + model.n_outputs)]
     told += [f"walk[{c}]" for c in range(k)]
-    source += emit.sample("advance(W, record, walk)", model, f"expect(W, {means}, {', '.join(told)})", told=means)
+    source += f"@straight\ndef advance(W, record, walk):\n    expect(W, {means}, {', '.join(told)})\n"
     return source + _judgement(model, place)
 
 

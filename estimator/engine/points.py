@@ -128,5 +128,5 @@ def moments(model: Model) -> tuple[Assignments, Moved]:
         for j in model.coefficients:
             total = sum((symbol(f"LEAN_{c}_{i}") * symbol(f"L_{c}_{j}") for c in range(m)), ZERO)
             lines.append((f"Q_{i}_{j}", total))
-    noise = derive.moved(model)[1].noise
-    return lines, Moved(tuple(symbol(f"MIDDLE_{i}") for i in states), (), noise)
+    carried = derive.moved(model)[1]
+    return lines, Moved(tuple(symbol(f"MIDDLE_{i}") for i in states), (), carried.noise, carried.is_sound)

@@ -13,6 +13,7 @@ To take every column of S through the stages on its own is twice the work, and m
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import sympy as sp
@@ -115,3 +116,66 @@ def _stage(model: Model) -> tuple[Assignments, _Slopes]:
             )
             named[f"K_N_{states[a]}_{states[b]}"] = spread + noise[a] * noise[b]
     return shared(named, "W"), slopes
+
+
+def coarse_motion(model: Model, degree: int) -> tuple[Assignments, derive.Moved]:
+    """A sample of a differential equation that is only imagined: where it moves the state, and M, S and N.
+
+    The state takes two Runge-Kutta steps. The sensitivities take one, through the slopes at begin, middle and end of
+    the sample, which is half the work. With H of its stages and g what unit noise adds to the rates, N is Simpson's
+    rule:
+
+        N = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
+    """
+    states, lines = list(model.states), Lines()
+    points = [{i: symbol(i) for i in states}]
+    inputs: list[sp.Expr] = []
+    for s in range(2):
+        step = derive.plain_step(replace(model, substeps=2), degree)
+        own = {name: f"{name}_{s}" for name, _ in step}
+        begin = {f"M_{i}": value for i, value in points[-1].items()}
+        lines += derive.renamed(step, {**own, **begin, "T": sp.Rational(s, 2)})
+        inputs += [symbol(own[f"V_{tag}"]) for tag in "AD"]
+        points.append({i: symbol(own[f"M_{i}_E"]) for i in states})
+    end = {symbol(i): value for i, value in points[-1].items()}
+    noise = [g.xreplace(end) for g in calculus(model).noise]
+    stages = zip("ABD", points, (inputs[0], inputs[1], inputs[3]), strict=True)
+    slopes = {tag: _slopes_at(model, tag, point, u, lines) for tag, point, u in stages}
+    slopes["C"] = slopes["B"]
+    through: _Slopes = {}
+    total: _Slopes = dict.fromkeys(slopes["A"], sp.S.Zero)
+    kicks: dict[str, list[sp.Expr]] = {}
+    for tag in "DCBA":
+        counts, reach = _STAGES[tag]
+        H = {(i, k): lines.put(f"H_{i}_{k}_{tag}", (counts if i == k else 0) + reach * through.get((i, k), sp.S.Zero))
+             for i in states for k in states}  # fmt: skip
+        for i, j in total:
+            product = sum((H[i, k] * slopes[tag][k, j] for k in states), sp.S.Zero)
+            through[i, j] = lines.put(f"HJ_{i}_{j}_{tag}", product) if j in states else product
+            total[i, j] += through[i, j]
+        kicks[tag] = [sum((H[i, k] * g for k, g in zip(states, noise, strict=True)), sp.S.Zero) for i in states]
+    by = {(i, j): lines.put(f"S_{i}_{j}", total[i, j] + (1 if i == j else 0)) for i, j in total}
+    kicks["B"] = [b + c for b, c in zip(kicks["B"], kicks["C"], strict=True)]
+    shares = {"A": sp.Integer(6), "B": sp.Rational(3, 2), "D": sp.Integer(6)}
+    kicks = {tag: [lines.put(f"KICK_{i}_{tag}", k) for i, k in zip(states, kicks[tag], strict=True)] for tag in shares}
+    spread = {}
+    for a, i in enumerate(states):
+        for b, k in enumerate(states[a:], a):
+            value = sum((share * kicks[tag][a] * kicks[tag][b] for tag, share in shares.items()), sp.S.Zero)
+            spread[i, k] = spread[k, i] = lines.put(f"N_{i}_{k}", by[i, _HELD] * by[k, _HELD] if model.held else value)
+    return lines, derive.Moved(
+        tuple(points[-1].values()),
+        tuple(tuple(by[i, j] if j in model.movers else sp.S.Zero for j in model.names) for i in states),
+        tuple(tuple(spread[i, k] for k in states) for i in states),
+    )
+
+
+def _slopes_at(model: Model, tag: str, point: Mapping[str, sp.Expr], u: sp.Expr, lines: Lines) -> _Slopes:
+    """Slopes of the rates at a state and an input; what they have in common is assigned, with a tag."""
+    stage, slopes = _stage(model)
+    stage = [(name, value) for name, value in stage if not name.startswith("K_")]
+    own = {name: f"{name}_{tag}" for name, _ in stage}
+    there = {f"M_{i}": value for i, value in point.items()} | {"u": u}
+    lines += derive.renamed(stage, {**own, **there})
+    named = [("", symbol(f"J_{i}_{j}") if f"J_{i}_{j}" in own else value) for (i, j), value in slopes.items()]
+    return dict(zip(slopes, (value for _, value in derive.renamed(named, {**own, **there})), strict=True))

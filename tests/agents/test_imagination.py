@@ -25,56 +25,55 @@ DECAY = Model("decay", {"x": "V"}, {"rate": "1"}, noise=("1",), outputs={"y": "x
 
 
 def duffing_rates(z, p, u):
-    """The rates of Eq. (1), and their derivatives by the state."""
+    """The rates of Eq. (1), and their derivatives by the state and by the coefficients."""
     (x, v), (stiffness, cubic, damping, gain) = z, p
     rates = np.array([v, gain * u - damping * v - stiffness * x - cubic * x**3])
-    return rates, np.array([[0.0, 1.0], [-stiffness - 3 * cubic * x**2, -damping]])
+    by_state = np.array([[0.0, 1.0], [-stiffness - 3 * cubic * x**2, -damping]])
+    return rates, by_state, np.array([[0.0] * 4, [-x, -(x**3), -v, u]])
 
 
 def pendulum_rates(z, p, u):
     (q, w), (gravity, friction, torque) = z, p
     rates = np.array([w, torque * u - friction * w - gravity * np.sin(q)])
-    return rates, np.array([[0.0, 1.0], [-gravity * np.cos(q), -friction]])
+    by_state = np.array([[0.0, 1.0], [-gravity * np.cos(q), -friction]])
+    return rates, by_state, np.array([[0.0] * 3, [-np.sin(q), -w, u]])
+
+
+def runge_kutta(slope, start, h):
+    """A step of order 4 from ``start``; ``slope(value, stage)`` of stages 0 to 3."""
+    k1 = slope(start, 0)
+    k2 = slope(start + h / 2 * k1, 1)
+    k3 = slope(start + h / 2 * k2, 2)
+    return start + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(start + h * k3, 3))
 
 
 def integrate(rates, z, p, inputs):
-    """State and covariance N that unit white noise brings, by two Runge-Kutta steps of a sample.
+    """A sample: the state by two Runge-Kutta steps, what is linear by one through begin, middle and end.
 
-    The input goes linearly from the first of two numbers to the second; N' = A N + N Aᵀ + diag(0, 3).
+    The input goes linearly from the first of two numbers to the second. Gives the state, its slopes by state and
+    coefficients, and the covariance N that unit white noise brings, of variance 3 in the second rate: Simpson's rule
+    over where kicks in the first stage, in the two of the middle, and in the last one lead.
     """
-
-    def slope(both, u):
-        move, A = rates(both[:2], p, u)
-        N = both[2:].reshape(2, 2)
-        return np.concatenate([move, (A @ N + N @ A.T + np.diag([0.0, 3.0])).ravel()])
-
-    both = np.concatenate([z, np.zeros(4)])
+    halves = inputs[0] + np.array([0.0, 0.25, 0.5, 0.75, 1.0]) * (inputs[1] - inputs[0])
+    points = [z]
     for s in range(2):
-        u = [inputs[0] + (s + part) / 2 * (inputs[1] - inputs[0]) for part in (0.0, 0.5, 1.0)]
-        k1 = slope(both, u[0])
-        k2 = slope(both + k1 / 4, u[1])
-        k3 = slope(both + k2 / 4, u[1])
-        k4 = slope(both + k3 / 2, u[2])
-        both = both + (k1 + 2 * k2 + 2 * k3 + k4) / 12
-    return both[:2], both[2:].reshape(2, 2)
+        u = halves[2 * s + np.array([0, 1, 1, 2])]
+        points.append(runge_kutta(lambda at, stage, u=u: rates(at, p, u[stage])[0], points[-1], 0.5))
+    linear = [rates(points[k], p, halves[2 * k])[1:] for k in (0, 1, 1, 2)]
+    n, k = len(z), len(p)
+    S = runge_kutta(lambda S, i: linear[i][0] @ S + np.hstack([np.zeros((n, n)), linear[i][1]]), np.eye(n, n + k), 1.0)
+    kick = np.array([0.0, np.sqrt(3.0)])
+    N = np.zeros((n, n))
+    for stages, weight in (((0,), 1 / 6), ((1, 2), 4 / 6), ((3,), 1 / 6)):
+        moved = runge_kutta(lambda at, i, where=stages: linear[i][0] @ at + kick * (i in where), np.zeros(n), 1.0)
+        N += np.outer(moved, moved) / weight
+    return points[-1], S, N
 
 
 def paper_next(z, p, inputs):
     moved = np.array([p[0] * z[0] + p[1] * z[0] ** 3 + p[2] * z[1] + p[3] * inputs[1], z[0]])
-    return moved, np.diag([1.0, 0.0])
-
-
-def slopes(move, z, p, inputs):
-    """∂(next state)/∂(state, coefficients), by central differences."""
-    both, columns = np.concatenate([z, p]), []
-    for i in range(len(both)):
-        h = 1e-5 * max(1.0, abs(both[i]))
-        up, down = both.copy(), both.copy()
-        up[i] += h
-        down[i] -= h
-        ends = [move(b[: len(z)], b[len(z) :], inputs)[0] for b in (up, down)]
-        columns.append((ends[0] - ends[1]) / (2 * h))
-    return np.array(columns).T
+    slopes = np.array([[p[0] + 3 * p[1] * z[0] ** 2, p[2], z[0], z[0] ** 3, z[1], inputs[1]], [1.0] + [0.0] * 5])
+    return moved, slopes, np.diag([1.0, 0.0])
 
 
 #: Model, degree of its input, a sample of its motion, and the states that its sensors show.
@@ -102,24 +101,29 @@ def random_belief(model, rng):
 
 
 def expected(case, belief, u, last, walk):
-    """The belief's mean and covariance after inputs u (T,) whose outputs are as predicted."""
+    """The belief's mean and covariance after inputs u (T,) whose outputs are as predicted.
+
+    And the variance by which the first sensor's output before the last one moves what is expected of that.
+    """
     model, _, move, seen = CASES[case]
     n = model.n_states
-    mean, cov = belief.mean, belief.cov
+    mean, cov, surprise = belief.mean, belief.cov, 0.0
+    gain, spread = np.zeros(len(mean)), 0.0
     for value in u:
         cov = cov + np.diag([*np.zeros(n), *walk])
         inputs = (last, value)
         S = np.eye(len(mean))
-        S[:n] = slopes(move, mean[:n], mean[n:], inputs)
         noise = np.zeros_like(cov)
-        moved, noise[:n, :n] = move(mean[:n], mean[n:], inputs)
+        moved, S[:n], noise[:n, :n] = move(mean[:n], mean[n:], inputs)
+        surprise = (S @ gain)[seen[0]] ** 2 * spread
         cov = S @ cov @ S.T + 0.01**2 * noise
         mean = np.concatenate([moved, mean[n:]])
         for k in seen:
-            gain = cov[:, k] / (cov[k, k] + 0.02**2)
-            cov = cov - np.outer(gain, cov[k])
+            gain_of_k, spread_of_k = cov[:, k] / (cov[k, k] + 0.02**2), cov[k, k] + 0.02**2
+            cov = cov - np.outer(gain_of_k, cov[k])
+            gain, spread = (gain_of_k, spread_of_k) if k == seen[0] else (gain, spread)
         last = value
-    return mean, cov
+    return mean, cov, surprise
 
 
 def terms(model, **others):
@@ -152,17 +156,18 @@ def test_imagination_is_the_plain_recursion(case, walks):
     place = imagination(model, degree).layout
     found.appraise(W.reshape(-1), factor, 0.5)
     for j in range(0, LANES, 11):
-        mean, cov = expected(case, belief, u[:, j], 0.1, walk)
+        mean, cov, surprise = expected(case, belief, u[:, j], 0.1, walk)
+        if not walks and model.n_outputs == 1:
+            assert W[place["SURPRISE"], j] == pytest.approx(surprise, rel=1e-9)
         np.testing.assert_allclose(W[:n, j], mean[:n], rtol=1e-9)
         upper = np.triu_indices(n + k)
         got = np.empty_like(cov)
         got[upper] = W[n : n + len(upper[0]), j]
         got.T[upper] = got[upper]
-        # The reference's slopes are differences of second order.
         std = np.sqrt(np.diag(cov))
-        np.testing.assert_allclose(got / np.outer(std, std), cov / np.outer(std, std), atol=1e-6)
+        np.testing.assert_allclose(got / np.outer(std, std), cov / np.outer(std, std), atol=1e-9)
         nats = 0.5 * np.linalg.slogdet(np.linalg.inv(cov[n:, n:]) + 0.25 * factor @ factor.T)[1]
-        assert W[place["SCORE"], j] + W[place["COST"], j] == pytest.approx(nats, abs=1e-5)
+        assert W[place["SCORE"], j] + W[place["COST"], j] == pytest.approx(nats, abs=1e-8)
 
 
 @pytest.mark.parametrize("firm", [0.0, 1.0])
@@ -175,6 +180,7 @@ def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limi
     W, _ = block_after(model, degree, belief, np.full((1, LANES), 0.1), told)
     place = imagination(model, degree).layout
     shown, variance = W[place["SHOWN"], 0], W[place["SPREAD"], 0]
+    assert W[place["SURPRISE"], 0] == 0.0  # the output before the first sample has been seen
     # Five times what process noise does in a sample comes to it; but at most half of the limit is kept from it.
     deviation = np.sqrt(variance + 5.0 * 0.01**2)
     within = abs(shown) + min(2.0 * deviation, 0.5 * limit) - limit
@@ -183,6 +189,7 @@ def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limi
     cost = 1e4 * within / limit if firm else yielding
     cost += 3.0 * 0.1**2 + 4.0 * ((shown - 0.1) ** 2 + variance - 0.02**2)
     np.testing.assert_allclose(W[place["COST"]], cost, rtol=1e-9)
+    np.testing.assert_allclose(W[place["NEAR"]], (1 - firm) * within / deviation, rtol=1e-9)
 
 
 def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
@@ -214,21 +221,21 @@ def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
     assert others[0] > 0
 
 
-def test_two_runge_kutta_steps_are_enough_to_plan_with(monkeypatch):
-    """The nats of plans of Eq. (1) are those with sixteen steps within 0.03, and their differences within 0.01."""
-    model = replace(duffing(), substeps=16)
-    belief = ContinuousExperiment().believed
+@pytest.mark.parametrize("degree", [0, 1])
+def test_two_steps_are_enough_to_plan_with(degree):
+    """The nats of plans of Eq. (1) are those of sixteen exact steps within 0.06, and their differences within 0.02."""
+    belief, fine = ContinuousExperiment().believed, replace(duffing(), substeps=16)
     u = np.random.default_rng(2).choice([-0.15, 0.15], (24, LANES))
-    scores = []
-    for substeps in (2, 16):
-        monkeypatch.setattr("estimator.engine.imagination.SUBSTEPS", substeps)
-        asked = model if substeps == 16 else duffing()
-        W, found = block_after(asked, 1, belief, u, terms(asked))
-        found.appraise(W.reshape(-1), np.zeros((4, 4)), 1.0)
-        scores.append(W[imagination(asked, 1).layout["SCORE"]])
-    errors = scores[0] - scores[1]
-    assert 0 < np.abs(errors).max() < 0.03
-    assert errors.std() < 0.01
+    W, found = block_after(duffing(), degree, belief, u, terms(duffing()))
+    found.appraise(W.reshape(-1), np.zeros((4, 4)), 1.0)
+    exact, precision = designer(fine, degree), np.empty((4, 4))
+    start, (shape, rate, xi_shape, xi_rate) = np.empty(exact.start_size), belief.record[-4:]
+    pursuit(fine, degree).begin(belief.record.copy(), precision, start)
+    known = Known(belief.coefficients_mean, precision, (rate / shape, xi_rate / xi_shape))
+    nats = [exact.worth(known, 1e3, 0.0, start, u[:, j].copy(), exact.memory(24))[0] for j in range(LANES)]
+    errors = W[imagination(duffing(), degree).layout["SCORE"]] - nats
+    assert 0 < np.abs(errors).max() < 0.06
+    assert errors.std() < 0.02
 
 
 def test_older_inputs_move_on():

@@ -1,0 +1,178 @@
+"""The best ways through the map of a model's state, compiled: a plan, built move by move.
+
+As by dynamic programming, of all ways that lead into the same cell of the plane of the first two states only the best
+is followed, with the highest input, the lowest, none, and half of either, since near its limit a signal may be led too
+far by a whole push and not far enough by none. Far ahead, where the plan will be made anew, only the highest and the
+lowest are tried. A way's score is what it has taught together with what the rest of the episode will teach anyway, at
+the rate of the last plans. Without the latter a way would be praised for what every way teaches sooner or later.
+
+The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
+line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.Swing`). Other
+states, and older inputs, are followed with their way, and do not tell ways apart.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.planner.candidates import CHOICES, choose, uniform
+from agents.planner.imagination import mind
+from estimator.arrays import copy, fill, highest
+from estimator.lanes import LANES, jit, part
+from estimator.models.model import Model
+
+#: Where not all inputs are tried, so many are.
+_COARSE_CHOICES = 2
+
+#: A way this much [nats] worse than the best of its length is followed no further.
+_HOPELESS = 0.5
+
+
+class Map(NamedTuple):
+    """Compiled functions of one model.
+
+    Attributes:
+        memory: ``memory(horizon, cells)``: a `Memory` for plans of so many moves on a map of so many cells.
+        find: ``find(memory, task, found, words)``: the best way, a plan ``found`` (horizon,). The map is laid anew at
+            random every time.
+    """
+
+    memory: Any
+    find: Any
+
+
+class Memory(NamedTuple):
+    """What is written on.
+
+    Attributes:
+        ways: blocks of the ways that are followed.
+        continued: blocks of their continuations.
+        origins: (horizon, ways) of which way each continues.
+        inputs: (horizon, ways) with which input.
+    """
+
+    ways: Any
+    continued: Any
+    origins: Any
+    inputs: Any
+
+
+class Task(NamedTuple):
+    """What is searched for, of one environment.
+
+    Attributes:
+        record: the belief.
+        left: samples left in the episode.
+        steps: moves of the plan.
+        pace: samples of a move.
+        terms: `agents.planner.imagination.Terms`.
+        lasts: (2,) the inputs that were applied last, newest first.
+        M: (K, K) factor of the information per sample that is to come.
+        cells: of the map along each axis.
+        near: first moves for which it has so many.
+        far_cells: the same after them.
+        fine: moves for which all inputs are tried.
+    """
+
+    record: Any
+    left: int
+    steps: int
+    pace: int
+    terms: Any
+    lasts: Any
+    M: Any
+    cells: int
+    near: int
+    far_cells: int
+    fine: int
+
+
+@cache
+def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
+    """The ways through the map of a model; arguments as `estimator.engine.imagination.imagination`."""
+    size, kept, U, SCORE, _, begin, _, advance, appraise, _ = mind(model, degree, lag)
+    is_plane = model.n_states > 1
+    inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
+
+    @inner
+    def memory(horizon, cells):
+        blocks = -(-(cells * cells if is_plane else cells) // LANES)
+        most = blocks * LANES
+        ways, continued = np.empty((blocks, size)), np.empty((len(CHOICES) * blocks, size))
+        origins, inputs = np.empty((horizon, most), np.int64), np.empty((horizon, most))
+        return Memory(ways, continued, origins, inputs)
+
+    @inner
+    def gather(memory, h, best, ends):
+        """Make the best continuations the new ways, and note where they come from; gives their number.
+
+        ``best``, the scores of the cells, becomes that of the ways.
+        """
+        ways, continued = memory.ways, memory.continued
+        enough = best[highest(best, len(best))] - _HOPELESS
+        count = 0
+        for cell in range(len(best)):
+            if best[cell] >= enough and best[cell] > -np.inf:
+                b, j = ends[cell] // LANES, ends[cell] % LANES
+                memory.origins[h, count] = b // len(CHOICES) * LANES + j
+                memory.inputs[h, count] = continued[b, U + j]
+                best[count] = best[cell]
+                way, lane = ways[count // LANES], count % LANES
+                for row in range(0, kept, LANES):
+                    way[row + lane] = continued[b, row + j]
+                count += 1
+        # Lanes beyond the last way do the same work as the others, so that none of them runs wild.
+        for lane in range(count, -(-count // LANES) * LANES):
+            for row in range(0, kept, LANES):
+                ways[lane // LANES, row + lane % LANES] = ways[lane // LANES, row]
+        return count
+
+    @inner
+    def find(memory, task, found, words):
+        """Build a plan by the best ways into the cells of the map, which is laid anew at random every time."""
+        ways, continued, terms = memory.ways, memory.continued, task.terms
+        most = task.cells * task.cells if is_plane else task.cells
+        best, ends = np.empty(most), np.empty(most, np.int64)
+        right, up = uniform(words), uniform(words)
+        begin(ways[0], task.record, task.lasts)
+        count = 1
+        for h in range(task.steps):
+            cells = task.cells if h < task.near else task.far_cells
+            fill(best, -np.inf)
+            tried = len(CHOICES) if h < task.fine else _COARSE_CHOICES
+            for i in range(tried * (-(-count // LANES))):
+                block, choice = i // tried, i % tried
+                b = block * len(CHOICES) + choice
+                W = continued[b]
+                copy(W, 0, ways[block], kept)
+                for j in range(LANES):
+                    W[U + j] = choose(choice, W[U + j], terms)
+                for _ in range(task.pace):
+                    advance(W, task.record, terms)
+                appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
+                for j in range(min(LANES, count - block * LANES)):
+                    cell = place(W[j], terms.scales[0], cells, right)
+                    if is_plane:
+                        cell = cell * cells + place(W[LANES + j], terms.scales[1], cells, up)
+                    if W[SCORE + j] > best[cell]:
+                        best[cell] = W[SCORE + j]
+                        ends[cell] = b * LANES + j
+            count = gather(memory, h, best, ends)
+        way = highest(best, count)
+        for h in range(task.steps - 1, -1, -1):
+            found[h] = memory.inputs[h, way]
+            way = memory.origins[h, way]
+
+    return Map(memory, find)
+
+
+@jit
+def place(x, scale, cells, offset):
+    """The cell of a state along one axis; the first for one that is not a number."""
+    where = (x / scale + 1.0) * 0.5 * (cells - 1) + offset
+    if not where > 0.0:
+        return 0
+    return np.int64(min(where, cells - 1.0))

@@ -1,0 +1,162 @@
+"""Steps that improve a whole plan at once: the more it teaches, the nearer it leads to the limit.
+
+Near a limit, whatever is changed of one input alone makes the plan worse, as all that follows leads beyond it, or away
+from it. So the first inputs u of a plan are changed together, by a model of what the plan is worth,
+
+    J(u + d) ≈ J(u) + gᵀ d - K Σ_h w_h [max(0, z_h + Z_hᵀ d)⁴ - max(0, z_h)⁴] - ½ λ |d|²
+
+with z_h how many standard deviations the output of move h is within its margin (`agents.planner.imagination`), Z_h its
+derivative, w_h how often that counts, and g the derivative of what the plan teaches. Derivatives are differences: each
+lane of a block imagines the plan with one input nudged. The smaller λ, the longer the step. For one λ after another,
+the next step is the last one and an iteration of Newton's, within the largest input. Which step is best is then
+imagined.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.planner.imagination import NEAR_COST
+from estimator.arrays import copy, fill
+from estimator.lanes import LANES, jit
+
+#: Inputs of a plan that are changed together; later ones are planned again before they are played.
+_CHANGED = 20
+
+#: Steps; how much smaller λ becomes from step to step; and the last λ, as the largest input that g alone would ask for,
+#: in parts of the largest that there is.
+_STEPS, _LONGER, _LONGEST = 16, 1.6, 2.0
+
+#: How far an input is nudged, in parts of the largest.
+_NUDGE = 1e-3
+
+#: Outputs that are further from their margin than so many standard deviations are not in the model.
+_REACH = 12.0
+
+
+class Rivals(NamedTuple):
+    """Plans that compete, one in each lane, and what is known of them.
+
+    Attributes:
+        candidates: (LANES, horizon) the plans.
+        worths: (LANES,) what they are worth.
+        near: (horizon, LANES) standard deviations by which the output of a move is within its margin.
+        weights: (horizon,) how often what that costs counts.
+        plan: (horizon,) the one that was nudged.
+        nudges: (`_CHANGED`,) of its inputs; that of input i is in lane i + 1.
+    """
+
+    candidates: Any
+    worths: Any
+    near: Any
+    weights: Any
+    plan: Any
+    nudges: Any
+
+
+@jit
+def rivals_for(horizon):
+    """Memory for plans of so many moves."""
+    candidates, near = np.empty((LANES, horizon)), np.empty((horizon, LANES))
+    return Rivals(candidates, np.empty(LANES), near, np.empty(horizon), np.empty(horizon), np.empty(_CHANGED))
+
+
+@jit
+def nudge(rivals, plan, steps, amplitude):
+    """Put the plan into the first lane, and with one input nudged towards its middle into each lane after it.
+
+    Gives the first lane that is left.
+    """
+    candidates, changed = rivals.candidates, min(steps, _CHANGED)
+    copy(rivals.plan, 0, plan, len(plan))
+    copy(candidates[0], 0, plan, len(plan))
+    for i in range(changed):
+        rivals.nudges[i] = -_NUDGE * amplitude if plan[i] > 0.0 else _NUDGE * amplitude
+        copy(candidates[i + 1], 0, plan, len(plan))
+        candidates[i + 1, i] += rivals.nudges[i]
+    return changed + 1
+
+
+@jit
+def step(rivals, steps, amplitude):
+    """Put the plan that was nudged, with one step each, into the first lanes; gives the first lane that is left."""
+    candidates, worths, near, weights, plan, nudges = rivals
+    n = min(steps, _CHANGED)
+    g, d, slope = np.empty(n), np.zeros(n), np.empty(n)
+    free, rows = np.empty(n, np.int64), np.empty(steps, np.int64)
+    Z, H = np.empty((steps, n)), np.empty((n, n))
+    most, count = 0.0, 0
+    for i in range(n):
+        g[i] = (worths[i + 1] - worths[0]) / nudges[i]
+        if not (abs(plan[i]) >= amplitude and plan[i] * g[i] > 0.0):
+            most = max(most, abs(g[i]))
+    if not (most > 0.0 and most < np.inf):
+        return 0
+    for h in range(steps):
+        if abs(near[h, 0]) < _REACH:
+            rows[count] = h
+            for i in range(n):
+                Z[count, i] = (near[h, i + 1] - near[h, 0]) / nudges[i] if i <= h else 0.0
+                # The worth has what the margin costs in it; g is without.
+                g[i] += 4.0 * NEAR_COST * weights[h] * max(0.0, near[h, 0]) ** 3 * Z[count, i]
+            count += 1
+    for s in range(_STEPS):
+        price = most / (amplitude * _LONGEST) * _LONGER ** (_STEPS - 1 - s)
+        for i in range(n):
+            slope[i] = g[i] - price * d[i]
+            fill(H[i], 0.0)
+            H[i, i] = price
+        for r in range(count):
+            z = near[rows[r], 0]
+            for i in range(n):
+                z += Z[r, i] * d[i]
+            if z > 0.0:
+                cost = NEAR_COST * weights[rows[r]] * z * z
+                for i in range(n):
+                    slope[i] -= 4.0 * cost * z * Z[r, i]
+                    for k in range(i + 1):
+                        H[i, k] += 12.0 * cost * Z[r, i] * Z[r, k]
+        m = 0
+        for i in range(n):
+            at = plan[i] + d[i]
+            if not (abs(at) >= amplitude and at * slope[i] > 0.0):
+                free[m] = i
+                m += 1
+        _solve(H, free, m, slope)
+        for a in range(m):
+            i = free[a]
+            d[i] = max(-amplitude, min(plan[i] + d[i] + slope[i], amplitude)) - plan[i]
+        copy(candidates[s], 0, plan, len(plan))
+        for i in range(n):
+            candidates[s, i] = plan[i] + d[i]
+    return _STEPS
+
+
+@jit
+def _solve(H, free, m, x):
+    """Solve H x = given x for the first m of the ``free`` unknowns, by Cholesky's factor, which overwrites H."""
+    for a in range(m):
+        i = free[a]
+        for b in range(a):
+            k = free[b]
+            total = H[i, k]
+            for c in range(b):
+                total -= H[i, free[c]] * H[k, free[c]]
+            H[i, k] = total / H[k, k]
+        pivot = H[i, i]
+        for c in range(a):
+            pivot -= H[i, free[c]] * H[i, free[c]]
+        H[i, i] = math.sqrt(max(pivot, 1e-300))
+    for a in range(m):
+        i = free[a]
+        for b in range(a):
+            x[i] -= H[i, free[b]] * x[free[b]]
+        x[i] /= H[i, i]
+    for a in range(m - 1, -1, -1):
+        i = free[a]
+        for b in range(a + 1, m):
+            x[i] -= H[free[b], i] * x[free[b]]
+        x[i] /= H[i, i]
