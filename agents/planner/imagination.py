@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
+from scipy.special import stdtrit
 
 from agents.planner.design import half_log_det, invert
 from estimator.engine.imagination import LOST, imagination
@@ -34,18 +34,18 @@ MOST_MARGIN = 0.5
 RISK = 0.01
 
 
-def margin(samples: float, *, weighs: bool, risk: float = RISK) -> float:
+def margin(samples: float, risk: float = RISK) -> float:
     """Predictive standard deviations to keep from the limit in an episode of so many samples.
 
-    Outputs that are all at this margin leave the limit with the chance ``risk``: as Gaussians, or where the estimator
-    ``weighs`` noises that it does not know, as Student's t. Its degrees of freedom are twice the root of the samples:
-    in a short episode the noises are known less.
+    Outputs that are all at this margin leave the limit with the chance ``risk``, as Student's t: coefficients that are
+    not known well, and noises that are not known at all, make outputs far off more frequent than a Gaussian has them.
+    Its degrees of freedom are twice the root of the samples, since in a short episode they are known less.
 
     Example:
-        >>> [round(margin(samples, weighs=weighs), 1) for samples in (48, 256) for weighs in (False, True)]
-        [3.5, 4.6, 4.0, 4.5]
+        >>> [round(margin(samples), 1) for samples in (48, 256)]
+        [4.6, 4.5]
     """
-    return float(-stdtrit(2.0 * np.sqrt(samples), risk / samples) if weighs else -ndtri(risk / samples))
+    return float(-stdtrit(2.0 * np.sqrt(samples), risk / samples))
 
 
 class Terms(NamedTuple):
@@ -92,7 +92,8 @@ class Mind(NamedTuple):
         kept: of these, from the first on, that stand for a plan between two samples.
         u: where the row of the newest input begins; before a sample, the input to apply.
         score: where the row of the scores begins.
-        near: where the row begins of how many standard deviations an output is within its margin.
+        margin: where the row begins of what an output should keep from the limit.
+        near: where the row begins of how many standard deviations it is within that; 0 where the margin is firm.
         fill: ``fill(W, record, lasts)``: put a belief into every lane, and the last inputs, newest first (2,).
         collect: ``collect(W, record)``: take the belief of the first lane.
         advance: ``advance(W, record, terms)``: one expected sample in every lane, and its cost; coefficients and noises
@@ -106,6 +107,7 @@ class Mind(NamedTuple):
     kept: int
     u: int
     score: int
+    margin: int
     near: int
     fill: Any
     collect: Any
@@ -115,7 +117,7 @@ class Mind(NamedTuple):
 
 
 def _charge(INPUT, SHOWN, SPREAD, SURPRISE, COST, noise, shaken, limit, margin, firm, price, goal, goal_weight):
-    """What has been charged after a sample, and how near it leads; ``noise`` is the sensor's own variance."""
+    """What has been charged after a sample, its margin, and how near it leads; ``noise`` is the sensor's variance."""
     unforeseen = SURPRISE - shaken
     deviation = np.sqrt(SPREAD + shaken + (unforeseen if unforeseen > 0.0 else 0.0))
     wide = min(margin * deviation, MOST_MARGIN * limit)
@@ -124,7 +126,7 @@ def _charge(INPUT, SHOWN, SPREAD, SURPRISE, COST, noise, shaken, limit, margin, 
     over, square = (over if over > 0.0 else 0.0), (near * near if near > 0.0 else 0.0)
     off = SHOWN - goal
     kept = COST + _BEYOND / limit * over + NEAR_COST * square * square
-    return kept + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise), near
+    return kept + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise), wide, near
 
 
 def _weigh(KNOWN, COST):
@@ -145,13 +147,13 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     n_loaded = n_states + sum(name.startswith("P_") for name in names)
     inputs = tuple(place[name] * LANES for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT") if name in place)
     u, cost, score = inputs[0], place["COST"] * LANES, place["SCORE"] * LANES
-    begun, near = place["BEGUN"] * LANES, place["NEAR"] * LANES
+    begun, kept_off, near = (place[name] * LANES for name in ("BEGUN", "MARGIN", "NEAR"))
     first = next(iter(model.coefficients))
     covariance = place[f"P_{first}_{first}"] * LANES
     noise = names.index("GAMMA_SHAPE") + 2
     advance_belief, judge = imagined.advance, imagined.judge
     uniform = "noise shaken limit margin firm price goal goal_weight"
-    charge = lanewise(place, "COST NEAR", uniform=uniform)(_charge)
+    charge = lanewise(place, "COST MARGIN NEAR", uniform=uniform)(_charge)
     weigh = lanewise(place, "SCORE")(_weigh)
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
 
@@ -197,4 +199,4 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
         half_log_det(work)
         invert(work, inverse)
 
-    return Mind(size, kept, u, score, near, fill, collect, advance, appraise, precision)
+    return Mind(size, kept, u, score, kept_off, near, fill, collect, advance, appraise, precision)

@@ -93,7 +93,7 @@ class Task(NamedTuple):
 @cache
 def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
     """The ways through the map of a model; arguments as `estimator.engine.imagination.imagination`."""
-    size, kept, U, SCORE, _, begin, _, advance, appraise, _ = mind(model, degree, lag)
+    size, kept, U, SCORE, _, _, begin, _, advance, appraise, _ = mind(model, degree, lag)
     is_plane = model.n_states > 1
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
 

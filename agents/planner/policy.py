@@ -17,12 +17,12 @@ is imagined too.
 What the first sensor shows should stay within the limit by a margin of standard deviations of the output that is then
 predicted; plans that do not are the worse the further they go within it, as fast as the chance of an early end grows,
 and beyond the limit they are worth nothing. On a rig the margin is as firm as the limit. The margin is the quantile
-that a Gaussian exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin. Few are, so
-much less comes true. Where hypotheses about the noises are weighed (``noise_hypotheses``) an output is believed to be
-a mixture, with heavier tails: the quantile is that of Student's t (`agents.planner.imagination.margin`). Where an
-input comes to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the
-sample between moves the next output about as much again, and no input makes up for it: the margin is then twice as
-wide.
+that Student's t exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin
+(`agents.planner.imagination.margin`). Few are, so much less comes true. The standard deviation is what is expected two
+samples before: near its limit a plan brakes as hard as it can already, and cannot make up for what one more output
+tells. Where an input comes to act in full only a sample later, because it goes linearly from the last one to the new,
+the noise of the sample between moves the next output about as much again, and no input makes up for it: the margin is
+then twice as wide.
 
 Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
 nothing helps: on a rig the limit is lower by what a swing at it can hide.
@@ -166,12 +166,11 @@ class Planner:
         self.horizon, self.rounds = int(horizon), int(rounds)
         means = experiment.believed.coefficients_mean
         swing = swing_of(self.view, means, setup.max_input, setup.max_output)
-        weighs = experiment.noise_hypotheses != 1
         self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,
             limit=limit_of(experiment, swing.scales),
-            margin=margin(env.horizon, weighs=weighs, risk=risk) * (1 + max(self.view.degree, self.view.lag)),
+            margin=margin(env.horizon, risk) * (1 + max(self.view.degree, self.view.lag)),
             walk=setup.walk.copy(),
             scales=swing.scales,
             pace=min(swing.pace, -(-env.horizon // min(horizon, _LEAST_MOVES))),

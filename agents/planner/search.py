@@ -78,7 +78,7 @@ class Search(NamedTuple):
 @cache
 def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     """The search for a model; arguments as `estimator.engine.imagination.imagination`."""
-    size, _, U, SCORE, NEAR, begin, collect, advance, appraise, precision = mind(model, degree, lag)
+    size, _, U, SCORE, _, NEAR, begin, collect, advance, appraise, precision = mind(model, degree, lag)
     memory, find_way = mapped(model, degree, lag)
     k = model.n_coefficients
     kind = f"{model.name}_{model.digest}_{degree}_{lag}"

@@ -24,11 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from agents.planner.imagination import MOST_MARGIN, mind
+from agents.planner.imagination import mind
 from agents.planner.motion import MOVES, View, places
 from estimator.engine.imagination import LOST, imagination
 from estimator.engine.motion import motion
-from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, kernel, part
 from estimator.parameters import FloatArray
 
@@ -71,11 +70,10 @@ def burster(view: View) -> Any:
       that, that way's own, and the most of those whose first push is at least a quarter less.
     """
     model = view.model
-    size, _, U, SCORE, _, begin, _, advance, appraise, _ = mind(*view)
+    size, _, U, SCORE, MARGIN, _, begin, _, advance, appraise, _ = mind(*view)
     found, at, place = motion(*view, LANES), places(model), imagination(*view).layout
     row, sense, glance, step = found.layout, found.sense, found.glance, found.step
-    spread, width, noise = place["SPREAD"] * LANES, len(row) * LANES, belief_names(model).index("GAMMA_SHAPE")
-    n, k = model.n_states, model.n_coefficients
+    width, n, k = len(row) * LANES, model.n_states, model.n_coefficients
     u, now, velocity, later, gain = (row[name] * LANES for name in ("INPUT", "NOW", "VELOCITY", "SHOWN", "GAIN"))
     last = row["LAST_INPUT"] * LANES
     # An array, because an empty tuple has no type.
@@ -122,7 +120,6 @@ def burster(view: View) -> Any:
             lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
             T, E = int(max(1.0, np.round(seen[at.time_left] * samples))), max(0.0, seen[at.budget_left]) * energy
             even, most = np.sqrt(E / T), -np.inf
-            unforeseen = terms.shaken * record[noise + 1] / record[noise]
             peak = peak_of(V, record, MOVES * terms.pace)
             for block in range(len(drawn)):
                 for j in range(LANES):
@@ -137,7 +134,7 @@ def burster(view: View) -> Any:
                     left[j], phase[j], peaks[j] = E, 0.0, peak
                 begin(W, record, lasts)
                 for j in range(LANES):
-                    W[spread + j] = 0.0
+                    W[MARGIN + j] = 0.0
                 for t in range(T):
                     for a in range(n * LANES):
                         V[a] = W[a]
@@ -163,8 +160,7 @@ def burster(view: View) -> Any:
                     glance(V)
                     for j in range(LANES):
                         ahead = V[later + j] + (terms.pace - 1) * (V[later + j] - V[now + j])
-                        room = min(terms.margin * np.sqrt(W[spread + j] + unforeseen), MOST_MARGIN * terms.limit)
-                        push = -V[u + j] if abs(ahead) > terms.limit - room else V[u + j]
+                        push = -V[u + j] if abs(ahead) > terms.limit - W[MARGIN + j] else V[u + j]
                         W[U + j] = push if push * push <= left[j] else 0.0
                         left[j] -= W[U + j] ** 2
                         if t == 0:

@@ -42,7 +42,7 @@ _USUAL = 0.1
 
 #: Chance that an episode on a simulated plant leaves the limit if every output were at the margin from it. The
 #: planner's is smaller, and so is that of policies on a rig: here an early end costs only what would have been learned.
-_RISK = 0.03
+_RISK = 0.05
 
 _HARDER, _AS_IT_IS = (FEATURES.index(f"best_{way}_whole") for way in ("up", "none"))
 
@@ -188,11 +188,11 @@ class CommonForesight:
             setup.max_input,
             np.inf,
             limit_of(experiment, swing.scales),
-            margin(setup.horizon, weighs=experiment.noise_hypotheses != 1, risk=risk),
+            margin(setup.horizon, risk),
             np.zeros(len(center)),
             swing.scales,
             swing.pace,
-            swing.shaken,
+            swing.shaken * is_of_rig(experiment),
             firm=1.0,
         )
         at, model = places(self._view.model), self._view.model

@@ -20,7 +20,6 @@ from agents.planner.motion import View, places
 from agents.policies.ways import FIRST, WAYS, Task, ways
 from estimator.arrays import copy, highest
 from estimator.engine.motion import motion
-from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, kernel, part
 from estimator.parameters import FloatArray
 
@@ -104,9 +103,9 @@ def imaginer(view: View) -> Any:
     - ``pushes`` (n,): how hard pushes are at least; receives how hard they are, no less than the energy allows for.
     """
     model = view.model
-    size, _, _, SCORE, _, begin, _, _, appraise, precision = mind(*view)
+    size, _, _, SCORE, _, _, begin, _, _, appraise, precision = mind(*view)
     explore, refine = ways(view)
-    at, width, noise = places(model), len(motion(*view).layout), belief_names(model).index("GAMMA_SHAPE")
+    at, width = places(model), len(motion(*view).layout)
     k, d = model.n_coefficients, model.n_states + model.n_coefficients
     kind = f"{model.name}_{model.digest}_{view.degree}_{view.lag}"
     inner, entry = part(kind), kernel(kind=kind)
@@ -168,8 +167,7 @@ def imaginer(view: View) -> Any:
             to_come = W[SCORE]
             pace = min(terms.pace, max(1, int(left / ahead.moves + 0.5)))
             moves = max(_SHORTEST, min(ahead.moves, -(-int(left + 0.5) // pace)))
-            unforeseen = terms.shaken * record[noise + 1] / record[noise]
-            task = Task(record, lasts, push, moves, pace, left, share * ahead.samples, M, unforeseen, terms)
+            task = Task(record, lasts, push, moves, pace, left, share * ahead.samples, M, terms)
             explore(W, still, task, worths, peaks, plans, free)
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
             signs[i] = sign

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.planner.imagination import MOST_MARGIN, mind
+from agents.planner.imagination import mind
 from agents.planner.motion import View
 from estimator.arrays import copy, fill
 from estimator.engine.imagination import imagination
@@ -76,7 +76,6 @@ class Task(NamedTuple):
         left: samples left in the episode.
         to_come: samples that bring information at the usual rate from now on.
         M: (K, K) factor of that rate.
-        unforeseen: variance that is added to the predicted one of the first sensor.
         terms: `agents.planner.imagination.Terms`.
     """
 
@@ -88,7 +87,6 @@ class Task(NamedTuple):
     left: float
     to_come: float
     M: Any
-    unforeseen: float
     terms: Any
 
 
@@ -149,22 +147,16 @@ class Ways(NamedTuple):
 def ways(view: View) -> Ways:
     """Those of a model."""
     model = view.model
-    _, _, U, SCORE, _, begin, _, advance, appraise, _ = mind(*view)
+    _, _, U, SCORE, MARGIN, _, begin, _, advance, appraise, _ = mind(*view)
     found, place = motion(*view), imagination(*view).layout
     row, sense, glance = found.layout, found.sense, found.glance
-    shown, spread, n = place["SHOWN"] * LANES, place["SPREAD"] * LANES, model.n_states
+    shown, n = place["SHOWN"] * LANES, model.n_states
     u, now, velocity, later = (row[name] for name in ("INPUT", "NOW", "VELOCITY", "SHOWN"))
     last_input = row["LAST_INPUT"]
     # An array, because an empty tuple has no type.
     olders = np.array([place[x] * LANES for x in ("LAST_INPUT", "OLDER_INPUT") if x in place], dtype=np.int64)
     inner = part(f"{model.name}_{model.digest}_{view.degree}_{view.lag}")
     where, turned, moved = CHANGES
-
-    @inner
-    def room(W, j, task):
-        """How far from the limit lane j has to stay."""
-        terms = task.terms
-        return min(terms.margin * np.sqrt(W[spread + j] + task.unforeseen), MOST_MARGIN * terms.limit)
 
     @inner
     def along(W, j, still, task):
@@ -178,7 +170,7 @@ def ways(view: View) -> Ways:
         still[u] = way
         glance(still)
         ahead = still[later] + (task.pace - 1) * (still[later] - still[now])
-        return way, -way if abs(ahead) > task.terms.limit - room(W, j, task) else way
+        return way, -way if abs(ahead) > task.terms.limit - W[MARGIN + j] else way
 
     @inner
     def choose(W, c, first, t, still, task):
@@ -215,7 +207,7 @@ def ways(view: View) -> Ways:
             advance(W, task.record, task.terms)
             if t < _IN_REACH:
                 for j in range(LANES):
-                    peaks[j] = max(peaks[j], abs(W[shown + j]) + room(W, j, task))
+                    peaks[j] = max(peaks[j], abs(W[shown + j]) + W[MARGIN + j])
         for mark in range(len(_MARKS)):
             if t + 1 == int(_MARKS[mark] * task.moves + 0.5):
                 appraise(W, task.M, np.sqrt(max(0.0, task.to_come - (t + 1) * task.pace)))

@@ -72,7 +72,7 @@ def imagination(model: Model, degree: int = 0, lag: int = 0) -> Imagination:
         raise ValueError(f"degree and lag must be 0 or 1, and lag 0 for a differential equation: {degree}, {lag}")
     coarse, inputs = coarsened(model), inputs_of(model, degree, lag)
     kept = [*model.states, *pairs("P", model.names), *inputs, "COST", "BEGUN"]
-    place = rows(*kept, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "NEAR")
+    place = rows(*kept, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "MARGIN", "NEAR")
     key = repr((coarse.digest, degree, lag))
     code = stored.load(model.name, "imagination", key, lambda: _source(coarse, degree, lag, inputs, place), NAMES)
     return Imagination(code.advance, code.judge, place, len(kept))

@@ -39,7 +39,6 @@ def reference(belief, seen, samples, energy, terms):
     L, theta = terms.limit, belief.coefficients_mean
     z0, P0 = belief.state_mean, belief.record[covariance_places(belief.model)]
     q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
-    shaken = min(terms.margin * np.sqrt(terms.shaken * q), 0.5 * L)  # of an output that nothing has been told about
     T, E = round(float(seen[20]) * samples), float(seen[21]) * energy
     between = lambda part, low, high: low * (high / low) ** part  # noqa: E731
 
@@ -56,7 +55,8 @@ def reference(belief, seen, samples, energy, terms):
     def way(part):
         hold, drive = between(part[0], 0.1, 1.5) * np.sqrt(E / T), between(part[2], 0.02, 0.8) / terms.pace
         rise, keep, wait = drive * between(part[4], 0.02, 1.0), 0.7 * part[3] * E, 0.9 * part[1] * T
-        z, P, cost, left, phase, top, first, margin = z0, P0, 0.0, E, 0, peak, 0.0, shaken
+        z, P, cost, left, phase, top, first, margin = z0, P0, 0.0, E, 0, peak, 0.0, 0.0
+        gain, variance = np.zeros(6), 0.0
         for t in range(T):
             if phase == 0 and t >= wait:
                 phase = 1
@@ -81,9 +81,10 @@ def reference(belief, seen, samples, energy, terms):
             S[1] = [1, 0, 0, 0, 0, 0]
             z, P = np.array([after(z, u), z[0]]), S @ P @ S.T
             P[0, 0] += q
-            spread = P[0, 0] + r
-            P = P - np.outer(P[:, 0], P[0]) / spread
-            margin = min(terms.margin * np.sqrt(spread + terms.shaken * q), 0.5 * L)
+            surprise, variance = (S @ gain)[0] ** 2 * variance, P[0, 0] + r
+            gain = P[:, 0] / variance
+            P = P - np.outer(gain, P[0])
+            margin = min(terms.margin * np.sqrt(variance + max(surprise, terms.shaken * q)), 0.5 * L)
             cost += 1e4 / L * max(0.0, abs(z[0]) + margin - L)
         return first, 0.5 * np.linalg.slogdet(np.linalg.inv(P[2:, 2:]))[1] - cost
 
