@@ -305,3 +305,11 @@ def swing_of(view: View, prior_means: npt.ArrayLike, max_input: float, limit: fl
     # Kicks of the velocity, of variance 3 a sample, after a quarter period 2π/4ω: 3 (t/2ω²), of the displacement.
     shaken = max(0.0, 3.0 * period**3 / (32.0 * np.pi**2) - 1.0) * float(limit / scales[0]) ** 2
     return Swing(scales, max(1, round(period / MOVES)), float(shaken), taught, float(built) or np.inf)
+
+
+def shaken_of(experiment: Any, swing: Swing) -> float:
+    """`Swing.shaken`, where plans keep that from the limit besides what the last output may tell; else 0.
+
+    On a rig they do. With several sensors, too: the others tell of a kick before the first one shows it.
+    """
+    return swing.shaken if is_of_rig(experiment) or experiment.model.n_outputs > 1 else 0.0

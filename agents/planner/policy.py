@@ -44,7 +44,7 @@ import numpy.typing as npt
 
 from agents.asked import check_rows, starts
 from agents.planner.imagination import RISK, Terms, margin
-from agents.planner.motion import View, is_of_rig, limit_of, places, swing_of
+from agents.planner.motion import View, is_of_rig, limit_of, places, shaken_of, swing_of
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
 from estimator.checks import LARGEST, SMALLEST, number, numbers, shown, whole
@@ -174,7 +174,7 @@ class Planner:
             walk=setup.walk.copy(),
             scales=swing.scales,
             pace=min(swing.pace, -(-env.horizon // min(horizon, _LEAST_MOVES))),
-            shaken=swing.shaken * is_of_rig(experiment),
+            shaken=shaken_of(experiment, swing),
             price=float(input_cost),
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.planner.imagination import RISK, Terms, margin
-from agents.planner.motion import View, is_of_rig, limit_of, places, survey, swing_of
+from agents.planner.motion import View, is_of_rig, limit_of, places, shaken_of, survey, swing_of
 from agents.policies.bursts import burster, drawn
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, Outlook, feature_names, look_at
@@ -192,7 +192,7 @@ class CommonForesight:
             np.zeros(len(center)),
             swing.scales,
             swing.pace,
-            swing.shaken * is_of_rig(experiment),
+            shaken_of(experiment, swing),
             firm=1.0,
         )
         at, model = places(self._view.model), self._view.model

@@ -127,13 +127,14 @@ class Gaussian:
         """Variance by which the output of the sample before, not seen yet, moves what a sensor is expected to show.
 
         With P after that output it is (hᵀ S P h)² / (r - hᵀ P h): its gain is P h / r, and its own variance
-        r² / (r - hᵀ P h). The P of a belief may be more than an output leaves: r / 20 is the least denominator.
+        r² / (r - hᵀ P h). That is kept above 0, since the P of a belief may be more than an output leaves.
         """
         h = {i: slope for i, slope in zip(self.names, readout, strict=True) if slope != 0}
         before = {(i, j): pair("P", i, j, self.names) for i in h for j in h}
         moved = sum((h[i] * h[j] * (self.half[i][j] if i in self.half else before[i, j]) for i, j in before), ZERO)
         left = self.put("LEFT", r - sum((h[i] * h[j] * known for (i, j), known in before.items()), ZERO))
-        return self.put("TAKEN", moved) ** 2 / self.put("LEAST", select(left - r / 20, left, r / 20))
+        least = self.put("LITTLE", ROUNDING * r)
+        return self.put("TAKEN", moved) ** 2 / self.put("LEAST", select(left - least, left, least))
 
     def shown_noise(self, readout: Sequence[sp.Expr]) -> sp.Expr:
         """hᵀ N h: the variance that unit process noise has in a sensor."""
