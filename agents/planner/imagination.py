@@ -67,6 +67,7 @@ class Terms(NamedTuple):
         firm: 1 where the margin is as the limit itself, which a shield needs that calls unsafe what leads into it; 0
             where it yields.
         soon: moves of a plan after which it first counts what is known (`agents.planner.search`).
+        cells: of the map of the state along each axis, from minus a state's scale to plus (`agents.planner.mapped`).
     """
 
     amplitude: float
@@ -82,6 +83,7 @@ class Terms(NamedTuple):
     goal_weight: float = 0.0
     firm: float = 0.0
     soon: int = 1
+    cells: int = 24
 
 
 class Mind(NamedTuple):

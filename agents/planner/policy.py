@@ -84,6 +84,10 @@ _MOST_MOVES = 100_000
 #: The first part of a plan that counts, in parts of the moves that a swing takes to come near the limit.
 _SOON = 1 / 3
 
+#: Cells of the map, times the third root of the moves that a swing takes to come near the limit, and their bounds: the
+#: less a move does beside the limit, the finer the map.
+_CELLS, _FEWEST_CELLS, _MOST_CELLS = 10.0, 16, 28
+
 
 class Planner:
     """Expected free energy planning on the beliefs of an environment.
@@ -180,6 +184,7 @@ class Planner:
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
             firm=float(is_of_rig(experiment)),
             soon=int(np.clip(_SOON * swing.built / swing.pace, 1, _MOST_MOVES)),
+            cells=int(np.clip(_CELLS * np.cbrt(swing.built / swing.pace), _FEWEST_CELLS, _MOST_CELLS)),
         )
 
     def predict(

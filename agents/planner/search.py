@@ -27,14 +27,13 @@ from estimator.arrays import copy, fill, highest
 from estimator.lanes import LANES, kernel, part
 from estimator.models.model import Model
 
-#: Cells of the map along each axis, from minus a state's scale to plus: for so many first moves, and for those after
-#: them, which are planned again before they are played. A plan that looks far on a coarse map is better than one that
-#: looks less far on a fine one, in less time.
-_CELLS, _NEAR, _FAR_CELLS = 20, 7, 14
+#: After so many first moves, which are planned again before they are played, the map has so many cells in parts of the
+#: others. A plan that looks far on a coarse map is better than one that looks less far on a fine one, in less time.
+_NEAR, _FAR = 7, 0.6
 
 #: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: the map is then
-#: finer everywhere, and plans look no further than so many moves.
-_LATE, _LATE_CELLS, _LATE_HORIZON = 48, 32, 20
+#: finer everywhere by this factor, and plans look no further than so many moves.
+_LATE, _FINER, _LATE_HORIZON = 48, 1.7, 20
 
 #: For so many first moves all inputs are tried.
 _TRIED = 7
@@ -155,10 +154,11 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the samples of a move."""
         candidates, W = rivals.candidates, memory.ways[0]
         moves = min(len(best), _LATE_HORIZON)
-        cells, far, pace = _CELLS, _FAR_CELLS, min(terms.pace, max(1, int(left / moves + 0.5)))
+        cells, far = terms.cells, int(_FAR * terms.cells + 0.5)
+        pace = min(terms.pace, max(1, int(left / moves + 0.5)))
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
-            cells = far = _LATE_CELLS
+            cells = far = int(_FINER * terms.cells)
             steps = min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
@@ -196,7 +196,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
     @entry
     def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, held):
-        kept_memory, rivals = memory(horizon, _LATE_CELLS), rivals_for(horizon)
+        kept_memory, rivals = memory(horizon, int(_FINER * terms.cells)), rivals_for(horizon)
         for i in range(len(records)):
             others = rounds, terms, lasts[i], plans[i], rates[i], words[i]
             held[i] = improve(kept_memory, rivals, records[i], max(1, left[i]), *others)
@@ -204,7 +204,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
     @entry
     def play(record, first, horizon, rounds, terms, u, words):
-        kept_memory, rivals = memory(horizon, _LATE_CELLS), rivals_for(horizon)
+        kept_memory, rivals = memory(horizon, int(_FINER * terms.cells)), rivals_for(horizon)
         best, rate, W = np.zeros(horizon), np.zeros((k, k)), np.empty(size)
         lasts, held = np.zeros(2), 0
         for t in range(len(u)):
