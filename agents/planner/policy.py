@@ -28,7 +28,7 @@ Between two samples a rig goes further than what is seen of it, and a plan that 
 nothing helps: on a rig the limit is lower by what a swing at it can hide.
 
 The search (`agents.planner.search`) builds a plan sample by sample, by the best ways through the plane of the
-model's first two states, and improves it by small changes. Horizon 1 is myopic.
+model's first two states, and improves it by steps of the whole plan and by small changes. Horizon 1 is myopic.
 
 Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
 climbs by gradient (`agents.planner.pursuit`): then the question is when to spend, which no short horizon can answer.
@@ -102,8 +102,8 @@ class Planner:
         horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
             by default 40, and the whole episode sample by sample where the energy is limited. No more than 20 of the
             last 48 of an episode.
-        rounds: of changed copies, `estimator.lanes.LANES` each, four times as many within the last 48 moves; of no
-            effect on a plan of the whole episode.
+        rounds: of steps and changed copies, two blocks of `estimator.lanes.LANES` each; of no effect on a plan of the
+            whole episode.
         risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
         goal: mean of the goal prior of the displacement [V].
         goal_std: its standard deviation [V]; no goal where it is None.

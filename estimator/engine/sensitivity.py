@@ -27,6 +27,9 @@ from estimator.models.model import Model
 _STAGES = {"A": (sp.Rational(1, 6), sp.S.Half), "B": (sp.Rational(1, 3), sp.S.Half),
            "C": (sp.Rational(1, 3), sp.S.One), "D": (sp.Rational(1, 6), sp.S.Zero)}  # fmt: skip
 
+#: Steps of a sample that is only imagined.
+_HALVES = 2
+
 #: Process noise that is held over a sample moves the state as one more coefficient would.
 _HELD = "HELD"
 
@@ -130,11 +133,11 @@ def coarse_motion(model: Model, degree: int) -> tuple[Assignments, derive.Moved]
     states, lines = list(model.states), Lines()
     points = [{i: symbol(i) for i in states}]
     inputs: list[sp.Expr] = []
-    for s in range(2):
-        step = derive.plain_step(replace(model, substeps=2), degree)
+    for s in range(_HALVES):
+        step = derive.plain_step(replace(model, substeps=_HALVES), degree)
         own = {name: f"{name}_{s}" for name, _ in step}
         begin = {f"M_{i}": value for i, value in points[-1].items()}
-        lines += derive.renamed(step, {**own, **begin, "T": sp.Rational(s, 2)})
+        lines += derive.renamed(step, {**own, **begin, "T": sp.Rational(s, _HALVES)})
         inputs += [symbol(own[f"V_{tag}"]) for tag in "AD"]
         points.append({i: symbol(own[f"M_{i}_E"]) for i in states})
     end = {symbol(i): value for i, value in points[-1].items()}
