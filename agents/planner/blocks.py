@@ -35,7 +35,7 @@ SYSTEMS = 32
 
 #: Steps of the gradient for a candidate, besides one for each sample and up to so many in all; and after every change
 #: of the aim.
-_STEPS, _MOST_STEPS, _MORE = 480, 768, 128
+_STEPS, _MOST_STEPS, _MORE = 600, 1024, 200
 
 #: The first step (`agents.planner.ascent`), the part of a step that goes into the next, and the last step in parts of
 #: the first.
