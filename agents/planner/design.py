@@ -193,18 +193,27 @@ def invert(L, inverse):
     size = len(L)
     column = np.empty(size)
     for j in range(size):
-        for i in range(size):
-            total = 1.0 if i == j else 0.0
-            for k in range(i):
-                total -= L[i, k] * column[k]
-            column[i] = total / L[i, i]
-        for i in range(size - 1, -1, -1):
-            total = column[i]
-            for k in range(i + 1, size):
-                total -= L[k, i] * column[k]
-            column[i] = total / L[i, i]
+        fill(column, 0.0)
+        column[j] = 1.0
+        solve(L, column)
         for i in range(size):
             inverse[i, j] = column[i]
+
+
+@jit
+def solve(L, x):
+    """Solve L Lᵀ x = given x in place, from the lower triangle of L, of as many rows as x has."""
+    size = len(x)
+    for i in range(size):
+        total = x[i]
+        for k in range(i):
+            total -= L[i, k] * x[k]
+        x[i] = total / L[i, i]
+    for i in range(size - 1, -1, -1):
+        total = x[i]
+        for k in range(i + 1, size):
+            total -= L[k, i] * x[k]
+        x[i] = total / L[i, i]
 
 
 @jit

@@ -120,8 +120,7 @@ class Mind(NamedTuple):
 
 def _charge(INPUT, SHOWN, SPREAD, SURPRISE, COST, noise, shaken, limit, margin, firm, price, goal, goal_weight):
     """What has been charged after a sample, its margin, and how near it leads; ``noise`` is the sensor's variance."""
-    unforeseen = SURPRISE - shaken
-    deviation = np.sqrt(SPREAD + shaken + (unforeseen if unforeseen > 0.0 else 0.0))
+    deviation = np.sqrt(SPREAD + max(SURPRISE, shaken))
     wide = min(margin * deviation, MOST_MARGIN * limit)
     near = (1.0 - firm) * (abs(SHOWN) + wide - limit) / deviation
     over = abs(SHOWN) + firm * wide - limit

@@ -93,7 +93,9 @@ class Task(NamedTuple):
 @cache
 def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
     """The ways through the map of a model; arguments as `estimator.engine.imagination.imagination`."""
-    size, kept, U, SCORE, _, _, begin, _, advance, appraise, _ = mind(model, degree, lag)
+    imagined = mind(model, degree, lag)
+    size, kept, U, SCORE = imagined.size, imagined.kept, imagined.u, imagined.score
+    begin, advance, appraise = imagined.fill, imagined.advance, imagined.appraise
     is_plane = model.n_states > 1
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
 

@@ -19,7 +19,7 @@ predicted; plans that do not are the worse the further they go within it, as fas
 and beyond the limit they are worth nothing. On a rig the margin is as firm as the limit. The margin is the quantile
 that Student's t exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin
 (`agents.planner.imagination.margin`). Few are, so much less comes true. The standard deviation is what is expected two
-samples before: near its limit a plan brakes as hard as it can already, and cannot make up for what one more output
+samples before: near its limit a plan may brake as hard as it can already, and cannot make up for what one more output
 tells. Where an input comes to act in full only a sample later, because it goes linearly from the last one to the new,
 the noise of the sample between moves the next output about as much again, and no input makes up for it: the margin is
 then twice as wide.

@@ -64,9 +64,9 @@ class Search(NamedTuple):
         play: ``play(record, first, horizon, rounds, terms, u, words)`` plans the inputs u (T,) from sample ``first``
             on, where the means of the belief are the truth. The inputs before it are followed as they are. Arguments as
             of ``plan``; ``words`` is (4,), and the record is overwritten.
-        through: ``through(record, cells, terms, rate, words, u)`` finds all inputs u (T,) of an episode, where the
-            means of the belief are the truth, as the best way through so many cells along each axis. ``rate`` (K, K) is
-            the information per sample that is expected of the rest of the way.
+        through: ``through(record, first, cells, terms, rate, words, u)`` finds the inputs u (T,) from sample ``first``
+            on, where the means of the belief are the truth, as the best way through so many cells along each axis.
+            ``rate`` (K, K) is the information per sample that is expected of the rest of the way.
     """
 
     plan: Any
@@ -77,7 +77,10 @@ class Search(NamedTuple):
 @cache
 def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     """The search for a model; arguments as `estimator.engine.imagination.imagination`."""
-    size, _, U, SCORE, _, NEAR, begin, collect, advance, appraise, precision = mind(model, degree, lag)
+    imagined = mind(model, degree, lag)
+    size, U, SCORE, NEAR = imagined.size, imagined.u, imagined.score, imagined.near
+    begin, advance, appraise = imagined.fill, imagined.advance, imagined.appraise
+    collect, precision = imagined.collect, imagined.precision
     memory, find_way = mapped(model, degree, lag)
     k = model.n_coefficients
     kind = f"{model.name}_{model.digest}_{degree}_{lag}"

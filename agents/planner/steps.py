@@ -14,11 +14,11 @@ imagined.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from agents.planner.design import half_log_det, solve
 from agents.planner.imagination import NEAR_COST
 from estimator.arrays import copy, fill
 from estimator.lanes import LANES, jit
@@ -119,44 +119,21 @@ def step(rivals, steps, amplitude):
                     slope[i] -= 4.0 * cost * z * Z[r, i]
                     for k in range(i + 1):
                         H[i, k] += 12.0 * cost * Z[r, i] * Z[r, k]
+        # What the amplitude holds stays; the others move up to the front.
         m = 0
         for i in range(n):
             at = plan[i] + d[i]
             if not (abs(at) >= amplitude and at * slope[i] > 0.0):
-                free[m] = i
+                free[m], slope[m] = i, slope[i]
+                for k in range(m + 1):
+                    H[m, k] = H[i, free[k]]
                 m += 1
-        _solve(H, free, m, slope)
-        for a in range(m):
-            i = free[a]
-            d[i] = max(-amplitude, min(plan[i] + d[i] + slope[i], amplitude)) - plan[i]
+        if half_log_det(H[:m, :m]) > -np.inf:
+            solve(H, slope[:m])
+            for a in range(m):
+                i = free[a]
+                d[i] = max(-amplitude, min(plan[i] + d[i] + slope[a], amplitude)) - plan[i]
         copy(candidates[s], 0, plan, len(plan))
         for i in range(n):
             candidates[s, i] = plan[i] + d[i]
     return _STEPS
-
-
-@jit
-def _solve(H, free, m, x):
-    """Solve H x = given x for the first m of the ``free`` unknowns, by Cholesky's factor, which overwrites H."""
-    for a in range(m):
-        i = free[a]
-        for b in range(a):
-            k = free[b]
-            total = H[i, k]
-            for c in range(b):
-                total -= H[i, free[c]] * H[k, free[c]]
-            H[i, k] = total / H[k, k]
-        pivot = H[i, i]
-        for c in range(a):
-            pivot -= H[i, free[c]] * H[i, free[c]]
-        H[i, i] = math.sqrt(max(pivot, 1e-300))
-    for a in range(m):
-        i = free[a]
-        for b in range(a):
-            x[i] -= H[i, free[b]] * x[free[b]]
-        x[i] /= H[i, i]
-    for a in range(m - 1, -1, -1):
-        i = free[a]
-        for b in range(a + 1, m):
-            x[i] -= H[free[b], i] * x[free[b]]
-        x[i] /= H[i, i]

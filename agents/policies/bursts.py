@@ -70,7 +70,9 @@ def burster(view: View) -> Any:
       that, that way's own, and the most of those whose first push is at least a quarter less.
     """
     model = view.model
-    size, _, U, SCORE, MARGIN, _, begin, _, advance, appraise, _ = mind(*view)
+    mine = mind(*view)
+    size, U, SCORE, MARGIN = mine.size, mine.u, mine.score, mine.margin
+    begin, advance, appraise = mine.fill, mine.advance, mine.appraise
     found, at, place = motion(*view, LANES), places(model), imagination(*view).layout
     row, sense, glance, step = found.layout, found.sense, found.glance, found.step
     width, n, k = len(row) * LANES, model.n_states, model.n_coefficients

@@ -103,7 +103,8 @@ def imaginer(view: View) -> Any:
     - ``pushes`` (n,): how hard pushes are at least; receives how hard they are, no less than the energy allows for.
     """
     model = view.model
-    size, _, _, SCORE, _, _, begin, _, _, appraise, precision = mind(*view)
+    found = mind(*view)
+    size, SCORE, begin, appraise, precision = found.size, found.score, found.fill, found.appraise, found.precision
     explore, refine = ways(view)
     at, width = places(model), len(motion(*view).layout)
     k, d = model.n_coefficients, model.n_states + model.n_coefficients

@@ -147,7 +147,8 @@ class Ways(NamedTuple):
 def ways(view: View) -> Ways:
     """Those of a model."""
     model = view.model
-    _, _, U, SCORE, MARGIN, _, begin, _, advance, appraise, _ = mind(*view)
+    mine = mind(*view)
+    U, SCORE, MARGIN, begin, advance, appraise = mine.u, mine.score, mine.margin, mine.fill, mine.advance, mine.appraise
     found, place = motion(*view), imagination(*view).layout
     row, sense, glance = found.layout, found.sense, found.glance
     shown, n = place["SHOWN"] * LANES, model.n_states

@@ -126,13 +126,13 @@ def lane_loop(
     return "\n".join(source + [indent + line for line in body]) + "\n"
 
 
-def sample(head: str, model: Model, end: str, move: str = "move", told: str = "") -> str:
-    """Source of a straight function over a sample: ``begin(W)``, all steps ``move(W, T, told)``, and the ``end``.
+def sample(head: str, model: Model, end: str, move: str = "move") -> str:
+    """Source of a straight function over a sample: ``begin(W)``, all steps ``move(W, T)``, and the ``end``.
 
     Of a difference equation the end is all.
     """
     steps = model.substeps
-    body = ["begin(W)", f"for s in range({steps}):", f"    {move}(W, s / {steps}{told and ', '}{told})"]
+    body = ["begin(W)", f"for s in range({steps}):", f"    {move}(W, s / {steps})"]
     body = [*(body if model.is_continuous else []), end]
     return f"@straight\ndef {head}:\n" + "".join(f"    {line}\n" for line in body)
 

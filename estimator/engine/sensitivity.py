@@ -12,7 +12,7 @@ To take every column of S through the stages on its own is twice the work, and m
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +27,7 @@ from estimator.models.model import Model
 _STAGES = {"A": (sp.Rational(1, 6), sp.S.Half), "B": (sp.Rational(1, 3), sp.S.Half),
            "C": (sp.Rational(1, 3), sp.S.One), "D": (sp.Rational(1, 6), sp.S.Zero)}  # fmt: skip
 
-#: Steps of a sample that is only imagined.
+#: Steps of the state over a sample that is only imagined: begin, middle and end are the stages of what is linear.
 _HALVES = 2
 
 #: Process noise that is held over a sample moves the state as one more coefficient would.
@@ -41,17 +41,15 @@ def motion_source(
     degree: int,
     place: Mapping[str, int],
     lanes: int,
-    uniform: Sequence[str] = (),
     given: Mapping[str, Any] | None = None,
 ) -> str:
-    """Source of ``begin(W)`` and ``move(W, T, *uniform)``, which carry a state over a sample.
+    """Source of ``begin(W)`` and ``move(W, T)``, which carry a state over a sample.
 
     Args:
         model: whose state; of a difference equation the source is empty.
         degree: of the input's polynomial.
         place: rows of the block.
         lanes: systems in it.
-        uniform: names that are the same in all lanes.
         given: the input ``U_k`` in other rows.
     """
     if not model.is_continuous:
@@ -61,7 +59,7 @@ def motion_source(
     step = derive.renamed(motion_step(model, degree), given or {})
     source = emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
     told = "One Runge-Kutta step, from T in [0, 1) of a sample on."
-    return source + emit.lane_loop("move", step, moved, place, lanes, ("T", *uniform), told)
+    return source + emit.lane_loop("move", step, moved, place, lanes, ("T",), told)
 
 
 def motion_step(model: Model, degree: int) -> Assignments:

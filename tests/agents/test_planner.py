@@ -141,19 +141,20 @@ def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
 
 
 @pytest.mark.parametrize(
-    ("track", "options"),
+    ("track", "options", "most_early"),
     [
-        ("Amplitude-v1", {"horizon": 96}),
-        pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, marks=pytest.mark.slow),
-        pytest.param("WienerHammerstein", {"horizon": 48}, marks=pytest.mark.slow),  # seconds of compilation
-        ("Amplitude", {"horizon": 64, "max_output": 1.0}),  # which is near where the difference equation blows up
-        pytest.param("Amplitude-v1", {"horizon": 48, "estimator": "nlarx"}, marks=pytest.mark.slow),
+        ("Amplitude-v1", {"horizon": 96}, 0),
+        # Strong process noise, and a margin that yields: now and then an episode ends early.
+        pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, 1, marks=pytest.mark.slow),
+        pytest.param("WienerHammerstein", {"horizon": 48}, 0, marks=pytest.mark.slow),  # seconds of compilation
+        ("Amplitude", {"horizon": 64, "max_output": 1.0}, 0),  # which is near where the difference equation blows up
+        pytest.param("Amplitude-v1", {"horizon": 48, "estimator": "nlarx"}, 0, marks=pytest.mark.slow),
     ],
     ids=["Eq. (1)", "pendulum", "three states", "far limit", "Eq. (2) on Eq. (1)"],
 )
-def test_it_plays_any_model_within_its_limits_and_better_than_chance(track, options):
+def test_it_plays_any_model_within_its_limits_and_better_than_chance(track, options, most_early):
     *_, early, gains = roll_out(track, 16, options=options)
-    assert early <= 1  # the process noise of the pendulum alone ends one of a hundred
+    assert early <= most_early
     *_, chance = roll_out(track, 16, options=options, name="prbs")
     assert gains.mean() > chance.mean() + 0.5
 
