@@ -144,10 +144,10 @@ def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
     ("track", "options", "most_early"),
     [
         ("Amplitude-v1", {"horizon": 96}, 0),
-        # Strong process noise, and a margin that yields: now and then an episode ends early.
+        # Now and then an episode ends early: of strong process noise, or near where the difference equation blows up.
         pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, 1, marks=pytest.mark.slow),
         pytest.param("WienerHammerstein", {"horizon": 48}, 0, marks=pytest.mark.slow),  # seconds of compilation
-        ("Amplitude", {"horizon": 64, "max_output": 1.0}, 0),  # which is near where the difference equation blows up
+        ("Amplitude", {"horizon": 64, "max_output": 1.0}, 1),
         pytest.param("Amplitude-v1", {"horizon": 48, "estimator": "nlarx"}, 0, marks=pytest.mark.slow),
     ],
     ids=["Eq. (1)", "pendulum", "three states", "far limit", "Eq. (2) on Eq. (1)"],
