@@ -96,6 +96,8 @@ class Mind(NamedTuple):
         score: where the row of the scores begins.
         margin: where the row begins of what an output should keep from the limit.
         near: where the row begins of how many standard deviations it is within that; 0 where the margin is firm.
+        spread: where the row begins of the predictive variance of what the first sensor shows.
+        noise: where a record has the shape of the first sensor's precision; its rate is the next number.
         fill: ``fill(W, record, lasts)``: put a belief into every lane, and the last inputs, newest first (2,).
         collect: ``collect(W, record)``: take the belief of the first lane.
         advance: ``advance(W, record, terms)``: one expected sample in every lane, and its cost; coefficients and noises
@@ -111,6 +113,8 @@ class Mind(NamedTuple):
     score: int
     margin: int
     near: int
+    spread: int
+    noise: int
     fill: Any
     collect: Any
     advance: Any
@@ -148,7 +152,7 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     n_loaded = n_states + sum(name.startswith("P_") for name in names)
     inputs = tuple(place[name] * LANES for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT") if name in place)
     u, cost, score = inputs[0], place["COST"] * LANES, place["SCORE"] * LANES
-    begun, kept_off, near = (place[name] * LANES for name in ("BEGUN", "MARGIN", "NEAR"))
+    begun, kept_off, near, spread = (place[name] * LANES for name in ("BEGUN", "MARGIN", "NEAR", "SPREAD"))
     first = next(iter(model.coefficients))
     covariance = place[f"P_{first}_{first}"] * LANES
     noise = names.index("GAMMA_SHAPE") + 2
@@ -200,4 +204,5 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
         half_log_det(work)
         invert(work, inverse)
 
-    return Mind(size, kept, u, score, kept_off, near, fill, collect, advance, appraise, precision)
+    rows = size, kept, u, score, kept_off, near, spread, noise
+    return Mind(*rows, fill, collect, advance, appraise, precision)

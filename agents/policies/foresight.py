@@ -180,10 +180,10 @@ class CommonForesight:
         # A limit of energy allows for smaller pushes, under which a swing takes longer to build.
         lasting = min(setup.max_input, HASTE * float(np.sqrt(setup.budget / setup.horizon)))
         slow = swing if lasting == setup.max_input else swing_of(self._view, center, lasting, setup.max_output)
-        moves = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
+        moves, most = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
         known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
         risk = RISK if is_of_rig(experiment) else _RISK
-        self._ahead = Ahead(push, moves, setup.horizon, setup.budget, rate, known)
+        self._ahead = Ahead(push, moves, most, setup.horizon, setup.budget, rate, known)
         self._terms = Terms(
             setup.max_input,
             np.inf,

@@ -1,8 +1,9 @@
 """What the beliefs of all oscillators have in common: what they expect of simple ways to go on.
 
 The oscillator is imagined from the belief, along the ways of `agents.policies.ways`, for as many moves as `look_ahead`
-says, or to the end of the episode. A move lasts as many samples as `agents.planner.motion.Swing` says, and fewer where
-the end is near. Features are what the *best* way brings after small changes, if the first move is a push up, none, or a
+says, or to the end of the episode. Where sensors are noisy and the oscillator is hardly shaken, many outputs tell of a
+state together, and what a push teaches is known late: then ways are longer. A move lasts as many samples as
+`agents.planner.motion.Swing` says, and fewer where the end is near. Features are what the *best* way brings after small changes, if the first move is a push up, none, or a
 push down; what it brings to *brake* and to *rest*; and how near to the limit all of that leads. Where a move is one
 sample, a push is as hard as the best way's first.
 """
@@ -39,7 +40,10 @@ FEATURES = (
 BOUND, _NAT = 10.0, 20.0
 
 #: Moves that are looked ahead, at least and at most; in parts of what a swing takes to build, and of the episode.
-_LEAST, _MOST, _BUILT, _PART = 8, 24, 2 / 3, 1 / 3
+_LEAST, _MOST, _BUILT, _PART = 8, 36, 2 / 3, 1 / 3
+
+#: No fewer samples are looked ahead than so many times the outputs that tell of a state together.
+_TOGETHER = 3.0
 
 #: Moves of a way where the episode ends sooner.
 _SHORTEST = 4
@@ -56,7 +60,8 @@ class Ahead(NamedTuple):
 
     Attributes:
         push: largest push; no more than what moves the first sensor by half of its limit in a move.
-        moves: that are looked ahead, an even number.
+        moves: that are looked ahead, unless many outputs tell of a state together.
+        most: of these, at most.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
         rate: (K, K) information about the coefficients that a sample usually brings.
@@ -65,23 +70,27 @@ class Ahead(NamedTuple):
 
     push: float
     moves: int
+    most: int
     samples: float
     energy: float
     rate: FloatArray
     known: FloatArray
 
 
-def look_ahead(built: float, moves: float) -> int:
+def look_ahead(built: float, moves: float) -> tuple[int, int]:
     """How many moves to look ahead in an episode, where a swing takes ``built`` moves to come near the limit, or inf.
+
+    The first number is for where each output tells of a state by itself, the second the most that there are.
 
     Where the limit is near, ways that go on for long lead beyond it, and what they would teach says little. Where it is
     far, a swing has to be built, and pays late.
 
     Example:
         >>> look_ahead(5.0, 256), look_ahead(18.0, 256), look_ahead(float("inf"), 256), look_ahead(float("inf"), 48)
-        (8, 12, 24, 16)
+        ((8, 36), (12, 36), (36, 36), (16, 16))
     """
-    return 2 * int(np.clip(min(_BUILT * built, _PART * moves), _LEAST, _MOST) / 2)
+    most = int(np.clip(_PART * moves, _LEAST, _MOST))
+    return int(np.clip(_BUILT * built, _LEAST, most)), most
 
 
 def as_feature(nats: FloatArray) -> FloatArray:
@@ -105,6 +114,7 @@ def imaginer(view: View) -> Any:
     model = view.model
     found = mind(*view)
     size, SCORE, begin, appraise, precision = found.size, found.score, found.fill, found.appraise, found.precision
+    advance, SPREAD, NOISE = found.advance, found.spread, found.noise
     explore, refine = ways(view)
     at, width = places(model), len(motion(*view).layout)
     k, d = model.n_coefficients, model.n_states + model.n_coefficients
@@ -142,12 +152,20 @@ def imaginer(view: View) -> Any:
         if not M[0, 0] > 0.0:
             factorise(ahead.rate, M)
 
+    @inner
+    def together(W, record, lasts, terms):
+        """How many outputs tell of the state together: the inverse of the filter's gain, by the next output."""
+        begin(W, record, lasts)
+        advance(W, record, terms)
+        sensor = record[NOISE + 1] / record[NOISE]
+        return W[SPREAD] / (W[SPREAD] - sensor)
+
     @entry
     def look(records, observations, ahead, terms, features, safe, signs, shares, pushes):
         W, still = np.zeros(size), np.zeros(width)
         M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(len(FIRST) * WAYS)
-        worths, plans = np.empty((len(PARTS), len(peaks))), np.empty((len(peaks), ahead.moves))
-        candidates, known = np.empty((LANES, ahead.moves)), np.empty((len(FIRST), 3))
+        worths, plans = np.empty((len(PARTS), len(peaks))), np.empty((len(peaks), ahead.most))
+        candidates, known = np.empty((LANES, ahead.most)), np.empty((len(FIRST), 3))
         shared, free, now, rate = np.empty(len(FIRST)), np.empty((3, 3)), np.empty((k, k)), np.empty((k, k))
         for i in range(len(observations)):
             record, seen, told = records[i], observations[i], features[i]
@@ -166,8 +184,11 @@ def imaginer(view: View) -> Any:
             so_far = W[SCORE]
             appraise(W, M, np.sqrt(share * ahead.samples))
             to_come = W[SCORE]
-            pace = min(terms.pace, max(1, int(left / ahead.moves + 0.5)))
-            moves = max(_SHORTEST, min(ahead.moves, -(-int(left + 0.5) // pace)))
+            moves, wanted = ahead.moves, _TOGETHER * together(W, record, lasts, terms) / terms.pace
+            if wanted > moves:
+                moves = int(min(wanted, ahead.most))
+            pace = min(terms.pace, max(1, int(left / moves + 0.5)))
+            moves = max(_SHORTEST, min(moves, -(-int(left + 0.5) // pace)))
             task = Task(record, lasts, push, moves, pace, left, share * ahead.samples, M, terms)
             explore(W, still, task, worths, peaks, plans, free)
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
