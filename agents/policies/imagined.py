@@ -3,9 +3,11 @@
 The oscillator is imagined from the belief, along the ways of `agents.policies.ways`, for as many moves as `look_ahead`
 says, or to the end of the episode. Where sensors are noisy and the oscillator is hardly shaken, many outputs tell of a
 state together, and what a push teaches is known late: then ways are longer. A move lasts as many samples as
-`agents.planner.motion.Swing` says, and fewer where the end is near. Features are what the *best* way brings after small changes, if the first move is a push up, none, or a
-push down; what it brings to *brake* and to *rest*; and how near to the limit all of that leads. Where a move is one
-sample, a push is as hard as the best way's first.
+`agents.planner.motion.Swing` says, and fewer where the end is near.
+
+Features are what the *best* way brings after small changes, if the first move is a push up, none, or a push down; what
+it brings to *brake* and to *rest*; and how near to the limit all of that leads. Where a move is one sample, a push is
+as hard as the best way's first.
 """
 
 from __future__ import annotations

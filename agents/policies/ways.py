@@ -52,7 +52,7 @@ _MARKS = (0.5, 0.75, 1.0)
 _IN_REACH = 8
 
 #: Rounds of changes of a way that begins with a push; one that begins with none has one round.
-_ROUNDS = 6
+_ROUNDS = 12
 
 #: The part of the changes that turn pushes over, and how many pushes at most.
 _TURN, _MOST_TURNED = 0.5, 3

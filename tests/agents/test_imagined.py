@@ -113,7 +113,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
     def refined(first, sign):
         """The best way of a first move after its changes."""
         best = max((ways[first, code] for code in range(number - 2)), key=lambda found: found[0][1])
-        for r in range(6 if first != 1 else 1):
+        for r in range(12 if first != 1 else 1):
             tries = []
             for j in range(32):
                 plan = np.array(best[3])
