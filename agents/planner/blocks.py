@@ -192,12 +192,16 @@ def best_block(
 
 
 def drafts(planner: Planner, record: FloatArray, samples: int, seed: int) -> FloatArray:
-    """(2, samples) inputs to begin from: the planner's plan where a belief's means are the truth, and a weaker one."""
+    """(2, samples) inputs to begin from: the planner's plan where a belief's means are the truth, and a weaker one.
+
+    Their margin is the least of an episode's: the limits that a block must keep are `best_block`'s.
+    """
     u = np.zeros(samples)
+    terms = planner.terms._replace(margin=float(np.min(planner.terms.margin)))
     words = np.random.SFC64(seed).state["state"]["state"]
     horizon = min(planner.horizon, samples)
-    search(*planner.view).play(record.copy(), 0, horizon, planner.rounds, planner.terms, u, words)
-    u = np.clip(u, -planner.terms.amplitude, planner.terms.amplitude)
+    search(*planner.view).play(record.copy(), 0, horizon, planner.rounds, terms, u, words)
+    u = np.clip(u, -terms.amplitude, terms.amplitude)
     return np.stack([u, _WEAKER * u])
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from agents.planner.ascent import Limits, climber, project
 from agents.planner.candidates import uniform
 from agents.planner.design import Known, designer, half_log_det, invert
-from agents.planner.imagination import MOST_MARGIN
+from agents.planner.imagination import MOST_MARGIN, terms_of
 from estimator.arrays import copy
 from estimator.belief import covariance_places
 from estimator.engine.rows import belief_names
@@ -49,7 +49,8 @@ class Pursuit(NamedTuple):
 
             - ``records`` (n, size): their beliefs, as `estimator.Belief` keeps them.
             - ``left`` (n,) samples, and ``energies`` (n,) energy, left in their episodes.
-            - ``terms``: `agents.planner.imagination.Terms`; the margin is of the first sample's predictive deviations.
+            - ``terms``: `agents.planner.imagination.Terms` of the whole episode; the margin is of the first sample's
+              predictive deviations.
             - ``last`` (n,): the inputs applied last.
             - ``plans`` (n, T): the last plans, begun one sample ago; all zeros where there is none. Overwritten.
             - ``words`` (n, 4): streams of random numbers; overwritten.
@@ -150,7 +151,7 @@ def pursuit(model: Model, degree: int = 0) -> Pursuit:
                 variances[a] = records[i, noise + 2 * a + 1] / records[i, noise + 2 * a]
             known = Known(coefficients, precision, as_noises(variances))
             _, _, spread = rest(known, start, last[i], memory.tape)
-            margin = terms.margin * np.sqrt(spread + terms.shaken * variances[0])
+            margin = terms_of(terms, left[i]).margin * np.sqrt(spread + terms.shaken * variances[0])
             aim = terms.limit - min(margin, MOST_MARGIN * terms.limit)
             u, other = plans[i, :steps], challenger[:steps]
             fresh = plans[i, 0] == 0.0

@@ -20,7 +20,7 @@ import numpy as np
 
 from agents.planner.candidates import bound, change
 from agents.planner.design import factorise
-from agents.planner.imagination import mind
+from agents.planner.imagination import mind, terms_of
 from agents.planner.mapped import Task, mapped
 from agents.planner.steps import nudge, rivals_for, step
 from estimator.arrays import copy, fill, highest
@@ -53,7 +53,7 @@ class Search(NamedTuple):
             - ``left`` (n,): samples left in their episodes;
             - ``horizon``: moves to plan, at most;
             - ``rounds``: of steps and changed copies, two blocks of `LANES` each;
-            - ``terms``: `agents.planner.imagination.Terms`;
+            - ``terms``: `agents.planner.imagination.Terms` of the whole episode;
             - ``lasts`` (n, 2): the inputs that were applied last, newest first;
             - ``plans`` (n, horizon): the last plans, begun one move ago; overwritten by the new ones;
             - ``rates`` (n, K, K): information per sample that plans have brought, a running mean; zeros where there was
@@ -63,7 +63,7 @@ class Search(NamedTuple):
             - ``held`` (n,): receives the samples of its first move.
         play: ``play(record, first, horizon, rounds, terms, u, words)`` plans the inputs u (T,) from sample ``first``
             on, where the means of the belief are the truth. The inputs before it are followed as they are. Arguments as
-            of ``plan``; ``words`` is (4,), and the record is overwritten.
+            of ``plan``, but the terms are of all samples alike; ``words`` is (4,), and the record is overwritten.
         through: ``through(record, first, cells, terms, rate, words, u)`` finds the inputs u (T,) from sample ``first``
             on, where the means of the belief are the truth, as the best way through so many cells along each axis.
             ``rate`` (K, K) is the information per sample that is expected of the rest of the way.
@@ -201,7 +201,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, held):
         kept_memory, rivals = memory(horizon, int(_FINER * terms.cells)), rivals_for(horizon)
         for i in range(len(records)):
-            others = rounds, terms, lasts[i], plans[i], rates[i], words[i]
+            others = rounds, terms_of(terms, left[i]), lasts[i], plans[i], rates[i], words[i]
             held[i] = improve(kept_memory, rivals, records[i], max(1, left[i]), *others)
             actions[i] = plans[i, 0]
 

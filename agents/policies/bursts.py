@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.planner.imagination import mind
+from agents.planner.imagination import mind, terms_of
 from agents.planner.motion import MOVES, View, places
 from estimator.engine.imagination import LOST, imagination
 from estimator.engine.motion import motion
@@ -111,16 +111,17 @@ def burster(view: View) -> Any:
         return peak
 
     @entry
-    def plan(records, observations, samples, energy, terms, drawn, pushes, worths):
+    def plan(records, observations, samples, energy, whole, drawn, pushes, worths):
         W, V, none, lasts = np.zeros(size), np.zeros(width), np.zeros((k, k)), np.zeros(2)
         told, best = np.zeros((len(drawn), LANES, 5)), np.zeros(5)
         hold, wait, drive, keep, rise, left, phase, peaks = np.zeros((8, LANES))
         firsts, scores = np.zeros((2, len(drawn), LANES))
-        fall = _FALL ** (1.0 / terms.pace)
+        fall = _FALL ** (1.0 / whole.pace)
         for i in range(len(observations)):
             record, seen = records[i], observations[i]
-            lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
             T, E = int(max(1.0, np.round(seen[at.time_left] * samples))), max(0.0, seen[at.budget_left]) * energy
+            terms = terms_of(whole, T)
+            lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
             even, most = np.sqrt(E / T), -np.inf
             peak = peak_of(V, record, MOVES * terms.pace)
             for block in range(len(drawn)):

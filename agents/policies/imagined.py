@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner.design import factorise
-from agents.planner.imagination import mind
+from agents.planner.imagination import mind, terms_of
 from agents.planner.motion import View, places
 from agents.policies.ways import FIRST, WAYS, Task, ways
 from estimator.arrays import copy, highest
@@ -64,6 +64,7 @@ class Ahead(NamedTuple):
         push: largest push; no more than what moves the first sensor by half of its limit in a move.
         moves: that are looked ahead, unless many outputs tell of a state together.
         most: of these, at most.
+        rounds: of changes of the best ways.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
         rate: (K, K) information about the coefficients that a sample usually brings.
@@ -73,6 +74,7 @@ class Ahead(NamedTuple):
     push: float
     moves: int
     most: int
+    rounds: int
     samples: float
     energy: float
     rate: FloatArray
@@ -106,7 +108,7 @@ def imaginer(view: View) -> Any:
 
     - ``records`` (n, size): the beliefs, as `estimator.Belief` keeps them;
     - ``observations`` (n, entries) float32, as they were shown with them;
-    - ``ahead``: `Ahead`; ``terms``: `agents.planner.imagination.Terms`;
+    - ``ahead``: `Ahead`; ``terms``: `agents.planner.imagination.Terms` of the whole episode;
     - ``features`` (n, len(FEATURES)) float32, receives the features, upright, all finite and at most `BOUND` in size;
     - ``safe`` (n, 3) bool, receives which of up, none and down need not lead beyond the limit; one is the safest;
     - ``signs`` (n,) receives -1.0 where up and down changed places, so that the motion is upwards without input;
@@ -163,7 +165,7 @@ def imaginer(view: View) -> Any:
         return W[SPREAD] / (W[SPREAD] - sensor)
 
     @entry
-    def look(records, observations, ahead, terms, features, safe, signs, shares, pushes):
+    def look(records, observations, ahead, whole, features, safe, signs, shares, pushes):
         W, still = np.zeros(size), np.zeros(width)
         M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(len(FIRST) * WAYS)
         worths, plans = np.empty((len(PARTS), len(peaks))), np.empty((len(peaks), ahead.most))
@@ -171,6 +173,7 @@ def imaginer(view: View) -> Any:
         shared, free, now, rate = np.empty(len(FIRST)), np.empty((3, 3)), np.empty((k, k)), np.empty((k, k))
         for i in range(len(observations)):
             record, seen, told = records[i], observations[i], features[i]
+            terms = terms_of(whole, int(seen[at.time_left] * ahead.samples + 0.5))
             lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
             copy(still, 0, record, d)
             share, thrift = seen[at.time_left], 1.0
@@ -191,7 +194,7 @@ def imaginer(view: View) -> Any:
                 moves = int(min(wanted, ahead.most))
             pace = min(terms.pace, max(1, int(left / moves + 0.5)))
             moves = max(_SHORTEST, min(moves, -(-int(left + 0.5) // pace)))
-            task = Task(record, lasts, push, moves, pace, left, share * ahead.samples, M, terms)
+            task = Task(record, lasts, push, moves, ahead.rounds, pace, left, share * ahead.samples, M, terms)
             explore(W, still, task, worths, peaks, plans, free)
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
             signs[i] = sign

@@ -51,8 +51,9 @@ _MARKS = (0.5, 0.75, 1.0)
 #: Moves in which an output can still be kept within the limit: nearly a period.
 _IN_REACH = 8
 
-#: Rounds of changes of a way that begins with a push; one that begins with none has one round.
-_ROUNDS = 12
+#: Rounds of changes of a way that begins with a push, and fewer where bursts say how hard to push. One that begins with
+#: none has one round.
+ROUNDS, BESIDE_BURSTS = 12, 2
 
 #: The part of the changes that turn pushes over, and how many pushes at most.
 _TURN, _MOST_TURNED = 0.5, 3
@@ -72,6 +73,7 @@ class Task(NamedTuple):
         lasts: (2,) the inputs that were applied last, newest first.
         push: how hard pushes are.
         moves: of a way.
+        rounds: of changes.
         pace: samples of a move.
         left: samples left in the episode.
         to_come: samples that bring information at the usual rate from now on.
@@ -83,6 +85,7 @@ class Task(NamedTuple):
     lasts: Any
     push: float
     moves: int
+    rounds: int
     pace: int
     left: float
     to_come: float
@@ -91,12 +94,12 @@ class Task(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """Changes of ways, (_ROUNDS, LANES) each; in every round the first lane is left as it is.
+    """Changes of ways, (ROUNDS, LANES) each; in every round the first lane is left as it is.
 
     Attributes:
         where: the first move that is changed, in parts of a way.
         turned: moves that are turned over.
-        moved: (_ROUNDS, LANES, 2) how much harder that push becomes and the next one, in parts of a push.
+        moved: (ROUNDS, LANES, 2) how much harder that push becomes and the next one, in parts of a push.
     """
 
     where: FloatArray
@@ -107,8 +110,8 @@ class Changes(NamedTuple):
 def _draw_changes() -> Changes:
     """They are always the same."""
     rng = np.random.default_rng(5)
-    turns = rng.random((_ROUNDS, LANES)) < _TURN
-    where = rng.random((_ROUNDS, LANES)) ** np.where(turns, 1, _SOON)
+    turns = rng.random((ROUNDS, LANES)) < _TURN
+    where = rng.random((ROUNDS, LANES)) ** np.where(turns, 1, _SOON)
     turned = turns * rng.integers(1, _MOST_TURNED + 1, turns.shape)
     moved = _BY * rng.uniform(-1.0, 1.0, (*turns.shape, 2)) * ~turns[..., None]
     moved[..., 1] *= rng.random(turns.shape) < 0.5
@@ -247,7 +250,7 @@ def ways(view: View) -> Ways:
     def refine(W, task, plan, direction, sign, candidates, known):
         least, worths, peaks = _LEAST * task.push, np.empty((2, LANES)), np.empty(LANES)
         known[1] = -np.inf
-        for r in range(_ROUNDS if direction != 0.0 else 1):
+        for r in range(task.rounds if direction != 0.0 else 1):
             for j in range(LANES):
                 copy(candidates[j], 0, plan, task.moves)
                 change(candidates[j, : task.moves], r, j, sign * task.push)

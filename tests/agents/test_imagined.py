@@ -113,7 +113,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
     def refined(first, sign):
         """The best way of a first move after its changes."""
         best = max((ways[first, code] for code in range(number - 2)), key=lambda found: found[0][1])
-        for r in range(12 if first != 1 else 1):
+        for r in range(ahead.rounds if first != 1 else 1):
             tries = []
             for j in range(32):
                 plan = np.array(best[3])
@@ -177,6 +177,7 @@ def test_features_are_those_of_the_matrices(track, pace, least, options):
     imaginer(View(difference()))(envs.records, seen, ahead, terms, features, safe, signs, shares, pushes)
     assert {*signs} == {-1.0, 1.0}
     assert (shares.min() < 1.0) == ((track == "Amplitude" and pace == 1) or least > 0.0)
+    terms = terms._replace(margin=terms.margin[40])
     for i in range(12):
         told, allowed, sign, share = reference(envs.belief(i), seen[i], ahead, terms, least)
         np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
@@ -286,14 +287,15 @@ def test_beside_the_observation_it_is_turned_upright():
 
 
 def test_on_a_rig_it_keeps_further_from_the_limit():
-    # Of 256 outputs at the margin one is beyond the limit in one episode of ten, on a rig in one of a hundred.
+    # Of 256 outputs at the margin one is beyond the limit in one episode of twenty, on a rig in one of a hundred.
+    freedom = 8 + np.arange(256) / 4
     for track in ("Amplitude-v0", "Amplitude-v1"):
         simulated = CommonForesight(make(f"duffing_env/{track}", 1))._terms
-        assert 256 * student_t(32).sf(simulated.margin) == pytest.approx(0.1, rel=1e-6)
+        np.testing.assert_allclose(256 * student_t(freedom).sf(simulated.margin), 0.05, rtol=1e-6)
         assert simulated.shaken == 0.0
     rig = make("duffing_env/Rig-v0", 1, {"rig": draw_member(np.random.default_rng(1)).options["rig"], "horizon": 256})
     terms = CommonForesight(rig)._terms
-    assert 256 * student_t(32).sf(terms.margin) == pytest.approx(0.01, rel=1e-6)
+    np.testing.assert_allclose(256 * student_t(freedom).sf(terms.margin), 0.01, rtol=1e-6)
     assert terms.shaken > 0.0
 
 
