@@ -18,11 +18,11 @@ What the first sensor shows should stay within the limit by a margin of standard
 predicted; plans that do not are the worse the further they go within it, as fast as the chance of an early end grows,
 and beyond the limit they are worth nothing. On a rig the margin is as firm as the limit. The margin is the quantile
 that Student's t exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin
-(`agents.planner.imagination.margin`). Few are, so much less comes true. The standard deviation is what is expected two
-samples before: near its limit a plan may brake as hard as it can already, and cannot make up for what one more output
-tells. Where an input comes to act in full only a sample later, because it goes linearly from the last one to the new,
-the noise of the sample between moves the next output about as much again, and no input makes up for it: the margin is
-then twice as wide.
+(`agents.planner.imagination.margin`); it narrows as the noises become known. Few are at it, so much less comes true.
+The standard deviation is what is expected two samples before: near its limit a plan may brake as hard as it can
+already, and cannot make up for what one more output tells. Where an input comes to act in full only a sample later,
+because it goes linearly from the last one to the new, the noise of the sample between moves the next output about as
+much again, and no input makes up for it: the margin is then twice as wide.
 
 Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
 nothing helps: on a rig the limit is lower by what a swing at it can hide.
