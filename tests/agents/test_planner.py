@@ -141,21 +141,22 @@ def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
 
 
 @pytest.mark.parametrize(
-    ("track", "options", "most_early"),
+    ("track", "options", "systems", "most_early"),
     [
-        ("Amplitude-v1", {"horizon": 96}, 0),
-        # Now and then an episode ends early: of strong process noise, or near where the difference equation blows up.
-        pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, 1, marks=pytest.mark.slow),
-        pytest.param("WienerHammerstein", {"horizon": 48}, 0, marks=pytest.mark.slow),  # seconds of compilation
-        ("Amplitude", {"horizon": 64, "max_output": 1.0}, 1),
-        pytest.param("Amplitude-v1", {"horizon": 48, "estimator": "nlarx"}, 0, marks=pytest.mark.slow),
+        ("Amplitude-v1", {"horizon": 96}, 16, 0),
+        # Now and then an episode ends early: of strong process noise, or near where the difference equation blows up
+        # (20 of 512 on the branch `validation`).
+        pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, 16, 1, marks=pytest.mark.slow),
+        pytest.param("WienerHammerstein", {"horizon": 48}, 16, 0, marks=pytest.mark.slow),  # seconds of compilation
+        ("Amplitude", {"horizon": 64, "max_output": 1.0}, 64, 6),
+        pytest.param("Amplitude-v1", {"horizon": 48, "estimator": "nlarx"}, 16, 0, marks=pytest.mark.slow),
     ],
     ids=["Eq. (1)", "pendulum", "three states", "far limit", "Eq. (2) on Eq. (1)"],
 )
-def test_it_plays_any_model_within_its_limits_and_better_than_chance(track, options, most_early):
-    *_, early, gains = roll_out(track, 16, options=options)
+def test_it_plays_any_model_within_its_limits_and_better_than_chance(track, options, systems, most_early):
+    *_, early, gains = roll_out(track, systems, options=options)
     assert early <= most_early
-    *_, chance = roll_out(track, 16, options=options, name="prbs")
+    *_, chance = roll_out(track, systems, options=options, name="prbs")
     assert gains.mean() > chance.mean() + 0.5
 
 
