@@ -34,8 +34,8 @@ MOST_MARGIN = 0.5
 RISK = 0.01
 
 
-#: Degrees of freedom of Student's t at the first sample, and how many more there are with every sample. On `validation`
-#: outputs were as far off what policies expected of them, where the noises were not known.
+#: Degrees of freedom of Student's t at the first sample, and how many more there are with every sample: chosen on the
+#: branch `validation` of the tracks whose noises are not known.
 _FREEDOM, _LEARNED = 8.0, 0.25
 
 

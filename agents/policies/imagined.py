@@ -173,11 +173,11 @@ def imaginer(view: View) -> Any:
         shared, free, now, rate = np.empty(len(FIRST)), np.empty((3, 3)), np.empty((k, k)), np.empty((k, k))
         for i in range(len(observations)):
             record, seen, told = records[i], observations[i], features[i]
-            terms = terms_of(whole, int(seen[at.time_left] * ahead.samples + 0.5))
-            lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
-            copy(still, 0, record, d)
             share, thrift = seen[at.time_left], 1.0
             left = max(1.0, share * ahead.samples)
+            terms = terms_of(whole, int(left + 0.5))
+            lasts[0] = lasts[1] = terms.amplitude * seen[at.last_input]
+            copy(still, 0, record, d)
             if ahead.energy < np.inf:
                 # What is still to come takes time and energy.
                 share = 0.5 * (share + seen[at.budget_left])
