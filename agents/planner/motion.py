@@ -177,29 +177,20 @@ def seen(belief: Belief, displacement: float) -> float:
     return float(np.cos(min(np.sqrt(max(square, 0.0)) / 2, np.pi / 6)))
 
 
-#: Part of the limit that is left to the imagination of a differential equation, in two Runge-Kutta steps a sample.
-_COARSE = 0.002
-
-
 def is_of_rig(experiment: Any) -> bool:
     """Whether an experiment of duffing_env is one on a rig, where leaving the limit may cost more than information."""
     return getattr(experiment, "rig", None) is not None
 
 
 def limit_of(experiment: Any, sizes: FloatArray) -> float:
-    """The limit that plans keep in an experiment: less than its own by what they do not see of a peak.
-
-    On a rig that is what a swing can hide between two samples; elsewhere the error of what is imagined of a
-    differential equation, which is integrated in two steps a sample.
+    """The limit that plans keep in an experiment: on a rig less than its own, by what a swing hides between samples.
 
     Args:
         experiment: of duffing_env.
         sizes: (states,) when the first sensor is at its limit.
     """
-    limit, belief = float(experiment.setup.max_output), experiment.believed
-    if is_of_rig(experiment):
-        return limit * seen(belief, float(sizes[0]))
-    return limit * (1.0 - _COARSE * belief.model.is_continuous)
+    limit = float(experiment.setup.max_output)
+    return limit * seen(experiment.believed, float(sizes[0])) if is_of_rig(experiment) else limit
 
 
 #: Samples of the motion by which a system is measured, and where it turns, in parts of the limit.

@@ -125,7 +125,7 @@ class Planner:
         seed: int = 0,
         *,
         horizon: int | None = None,
-        rounds: int = 5,
+        rounds: int = 3,
         risk: float = RISK,
         goal: float = 0.0,
         goal_std: float | None = None,

@@ -19,10 +19,9 @@ from estimator.engine.tasks import NAMES
 from estimator.lanes import LANES, rows
 from estimator.models.model import Model
 
-#: Runge-Kutta steps per sample of what is only imagined. A filter needs an integration error far below the posterior's
-#: standard deviation, because it adds up over a record. A plan does not: it compares inputs, all imagined alike, by
-#: what they teach: the nats of 24 random pushes of Eq. (1) are those of exact steps within 0.06, and within 0.02 from
-#: plan to plan (tests/agents/test_imagination.py).
+#: Runge-Kutta steps per sample of a plan that climbs by gradient, and of a glance at the motion. A filter needs an
+#: integration error far below the posterior's standard deviation, because it adds up over a record. A plan does not: it
+#: compares inputs, all imagined alike, by what they teach.
 SUBSTEPS = 2
 
 #: What a belief that is no longer finite knows: less than any other, and still a number to compare with.
@@ -80,7 +79,7 @@ def imagination(model: Model, degree: int = 0, lag: int = 0) -> Imagination:
 
 
 def coarsened(model: Model) -> Model:
-    """The model with the steps of what is only imagined."""
+    """The model with the steps of a plan that climbs by gradient."""
     return replace(model, substeps=min(SUBSTEPS, model.substeps)) if model.is_continuous else model
 
 
