@@ -1,10 +1,11 @@
 """The best ways through the map of a model's state, compiled: a plan, built move by move.
 
 As by dynamic programming, of all ways that lead into the same cell of the plane of the first two states only the best
-is followed, with the highest input, the lowest, none, and half of either, since near its limit a signal may be led too
-far by a whole push and not far enough by none. Far ahead, where the plan will be made anew, only the highest and the
-lowest are tried. A way's score is what it has taught together with what the rest of the episode will teach anyway, at
-the rate of the last plans. Without the latter a way would be praised for what every way teaches sooner or later.
+is followed; and of these, so many of the best. So a long plan is found in the time of a short one. A way goes on with
+the highest input, the lowest, none, and half of either, since near its limit a signal may be led too far by a whole
+push and not far enough by none. Far ahead, where the plan will be made anew, only the highest and the lowest are tried.
+A way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of the
+last plans. Without the latter a way would be praised for what every way teaches sooner or later.
 
 The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
 line. Each state is measured by its size when the first sensor is at its limit (`agents.planner.motion.Swing`). Other
@@ -20,7 +21,7 @@ import numpy as np
 
 from agents.planner.candidates import CHOICES, choose, uniform
 from agents.planner.imagination import mind
-from estimator.arrays import copy, fill, highest
+from estimator.arrays import copy, highest
 from estimator.lanes import LANES, jit, part
 from estimator.models.model import Model
 
@@ -30,12 +31,16 @@ _COARSE_CHOICES = 2
 #: A way this much [nats] worse than the best of its length is followed no further.
 _HOPELESS = 0.5
 
+#: Halvings of that in which a score is searched that no more than so many ways reach.
+_HALVINGS = 12
+
 
 class Map(NamedTuple):
     """Compiled functions of one model.
 
     Attributes:
-        memory: ``memory(horizon, cells)``: a `Memory` for plans of so many moves on a map of so many cells.
+        memory: ``memory(horizon, ways)``: a `Memory` for plans of so many moves and so many ways, which are a multiple
+            of `LANES`.
         find: ``find(memory, task, found, words)``: the best way, a plan ``found`` (horizon,). The map is laid anew at
             random every time.
     """
@@ -52,12 +57,18 @@ class Memory(NamedTuple):
         continued: blocks of their continuations.
         origins: (horizon, ways) of which way each continues.
         inputs: (horizon, ways) with which input.
+        scores: (len(`CHOICES`) ways,) of the best continuations into the cells that any leads into.
+        ends: (len(`CHOICES`) ways,) which these are.
+        visited: (len(`CHOICES`) ways,) which cells.
     """
 
     ways: Any
     continued: Any
     origins: Any
     inputs: Any
+    scores: Any
+    ends: Any
+    visited: Any
 
 
 class Task(NamedTuple):
@@ -72,9 +83,8 @@ class Task(NamedTuple):
         lasts: (2,) the inputs that were applied last, newest first.
         M: (K, K) factor of the information per sample that is to come.
         cells: of the map along each axis.
-        near: first moves for which it has so many.
-        far_cells: the same after them.
         fine: moves for which all inputs are tried.
+        ways: that are followed, at most.
     """
 
     record: Any
@@ -85,9 +95,8 @@ class Task(NamedTuple):
     lasts: Any
     M: Any
     cells: int
-    near: int
-    far_cells: int
     fine: int
+    ways: int
 
 
 @cache
@@ -100,28 +109,29 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
 
     @inner
-    def memory(horizon, cells):
-        blocks = -(-(cells * cells if is_plane else cells) // LANES)
-        most = blocks * LANES
-        ways, continued = np.empty((blocks, size)), np.empty((len(CHOICES) * blocks, size))
-        origins, inputs = np.empty((horizon, most), np.int64), np.empty((horizon, most))
-        return Memory(ways, continued, origins, inputs)
+    def memory(horizon, ways):
+        blocks = ways // LANES
+        followed, continued = np.empty((blocks, size)), np.empty((len(CHOICES) * blocks, size))
+        origins, inputs = np.empty((horizon, ways), np.int64), np.empty((horizon, ways))
+        most = len(CHOICES) * ways
+        scores, ends, visited = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
+        return Memory(followed, continued, origins, inputs, scores, ends, visited)
 
     @inner
-    def gather(memory, h, best, ends):
-        """Make the best continuations the new ways, and note where they come from; gives their number.
+    def gather(memory, h, most, found):
+        """Make the best of the continuations found the new ways, and note where they come from; gives their number.
 
-        ``best``, the scores of the cells, becomes that of the ways.
+        The scores become those of the ways.
         """
-        ways, continued = memory.ways, memory.continued
-        enough = best[highest(best, len(best))] - _HOPELESS
+        ways, continued, scores = memory.ways, memory.continued, memory.scores
+        enough = enough_for(scores[:found], most)
         count = 0
-        for cell in range(len(best)):
-            if best[cell] >= enough and best[cell] > -np.inf:
-                b, j = ends[cell] // LANES, ends[cell] % LANES
+        for i in range(found):
+            if scores[i] >= enough and count < most:
+                b, j = memory.ends[i] // LANES, memory.ends[i] % LANES
                 memory.origins[h, count] = b // len(CHOICES) * LANES + j
                 memory.inputs[h, count] = continued[b, U + j]
-                best[count] = best[cell]
+                scores[count] = scores[i]
                 way, lane = ways[count // LANES], count % LANES
                 for row in range(0, kept, LANES):
                     way[row + lane] = continued[b, row + j]
@@ -135,15 +145,13 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
     @inner
     def find(memory, task, found, words):
         """Build a plan by the best ways into the cells of the map, which is laid anew at random every time."""
-        ways, continued, terms = memory.ways, memory.continued, task.terms
-        most = task.cells * task.cells if is_plane else task.cells
-        best, ends = np.empty(most), np.empty(most, np.int64)
+        ways, continued, _, _, scores, ends, visited = memory
+        terms, entered = task.terms, np.full(task.cells * task.cells if is_plane else task.cells, -1)
         right, up = uniform(words), uniform(words)
         begin(ways[0], task.record, task.lasts)
         count = 1
         for h in range(task.steps):
-            cells = task.cells if h < task.near else task.far_cells
-            fill(best, -np.inf)
+            reachable = 0
             tried = len(CHOICES) if h < task.fine else _COARSE_CHOICES
             for i in range(tried * (-(-count // LANES))):
                 block, choice = i // tried, i % tried
@@ -156,19 +164,50 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
                     advance(W, task.record, terms)
                 appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
                 for j in range(min(LANES, count - block * LANES)):
-                    cell = place(W[j], terms.scales[0], cells, right)
+                    cell = place(W[j], terms.scales[0], task.cells, right)
                     if is_plane:
-                        cell = cell * cells + place(W[LANES + j], terms.scales[1], cells, up)
-                    if W[SCORE + j] > best[cell]:
-                        best[cell] = W[SCORE + j]
-                        ends[cell] = b * LANES + j
-            count = gather(memory, h, best, ends)
-        way = highest(best, count)
+                        cell = cell * task.cells + place(W[LANES + j], terms.scales[1], task.cells, up)
+                    if entered[cell] < 0:
+                        entered[cell] = reachable
+                        visited[reachable], scores[reachable] = cell, -np.inf
+                        reachable += 1
+                    i = entered[cell]
+                    if W[SCORE + j] > scores[i]:
+                        scores[i], ends[i] = W[SCORE + j], b * LANES + j
+            for i in range(reachable):
+                entered[visited[i]] = -1
+            count = gather(memory, h, task.ways, reachable)
+        way = highest(scores, count)
         for h in range(task.steps - 1, -1, -1):
             found[h] = memory.inputs[h, way]
             way = memory.origins[h, way]
 
     return Map(memory, find)
+
+
+@jit
+def enough_for(scores, most):
+    """A score that no more than ``most`` of them reach, but where more are the highest, and none that is hopeless."""
+    high = scores[highest(scores, len(scores))]
+    low = high - _HOPELESS
+    if _reached(scores, low) <= most:
+        return low
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        if _reached(scores, middle) > most:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@jit
+def _reached(scores, enough):
+    """How many scores are as high."""
+    count = 0
+    for i in range(len(scores)):
+        count += scores[i] >= enough
+    return count
 
 
 @jit

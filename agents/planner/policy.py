@@ -73,7 +73,7 @@ class PlannerState(NamedTuple):
 
 
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
-_HORIZON = 40
+_HORIZON = 50
 
 #: Moves that a short episode is divided into: none is longer than these need to reach its end.
 _LEAST_MOVES = 24
@@ -86,7 +86,7 @@ _SOON = 1 / 3
 
 #: Cells of the map, times the third root of the moves that a swing takes to come near the limit, and their bounds: the
 #: less a move does beside the limit, the finer the map.
-_CELLS, _FEWEST_CELLS, _MOST_CELLS = 10.0, 16, 28
+_CELLS, _FEWEST_CELLS, _MOST_CELLS = 13.5, 22, 38
 
 
 class Planner:
@@ -100,7 +100,7 @@ class Planner:
             its steps, with its observations.
         seed: of the search.
         horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
-            by default 40, and the whole episode sample by sample where the energy is limited. No more than 20 of the
+            by default 50, and the whole episode sample by sample where the energy is limited. No more than 24 of the
             last 48 of an episode.
         rounds: of steps and changed copies, two blocks of `estimator.lanes.LANES` each; of no effect on a plan of the
             whole episode.
@@ -125,7 +125,7 @@ class Planner:
         seed: int = 0,
         *,
         horizon: int | None = None,
-        rounds: int = 3,
+        rounds: int = 4,
         risk: float = RISK,
         goal: float = 0.0,
         goal_std: float | None = None,

@@ -27,13 +27,12 @@ from estimator.arrays import copy, fill, highest
 from estimator.lanes import LANES, kernel, part
 from estimator.models.model import Model
 
-#: After so many first moves, which are planned again before they are played, the map has so many cells in parts of the
-#: others. A plan that looks far on a coarse map is better than one that looks less far on a fine one, in less time.
-_NEAR, _FAR = 7, 0.6
+#: Ways through the map that are followed, at most.
+_WAYS = 3 * LANES
 
-#: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: the map is then
-#: finer everywhere by this factor, and plans look no further than so many moves.
-_LATE, _FINER, _LATE_HORIZON = 48, 1.7, 20
+#: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: so many ways are
+#: followed then, and plans look no further than so many moves.
+_LATE, _LATE_WAYS, _LATE_HORIZON = 48, 6 * LANES, 24
 
 #: For so many first moves all inputs are tried.
 _TRIED = 7
@@ -157,15 +156,14 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the samples of a move."""
         candidates, W = rivals.candidates, memory.ways[0]
         moves = min(len(best), _LATE_HORIZON)
-        cells, far = terms.cells, int(_FAR * terms.cells + 0.5)
+        ways = _WAYS
         pace = min(terms.pace, max(1, int(left / moves + 0.5)))
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
-            cells = far = int(_FINER * terms.cells)
-            steps = min(steps, _LATE_HORIZON)
+            ways, steps = _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
-        task = Task(record, left, steps, pace, terms, lasts, M, cells, _NEAR, far, _TRIED)
+        task = Task(record, left, steps, pace, terms, lasts, M, terms.cells, _TRIED, ways)
         turned = -best[0]
         for h in range(len(best) - 1):
             best[h] = best[h + 1]
@@ -199,7 +197,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
     @entry
     def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, held):
-        kept_memory, rivals = memory(horizon, int(_FINER * terms.cells)), rivals_for(horizon)
+        kept_memory, rivals = memory(horizon, max(_WAYS, _LATE_WAYS)), rivals_for(horizon)
         for i in range(len(records)):
             others = rounds, terms_of(terms, left[i]), lasts[i], plans[i], rates[i], words[i]
             held[i] = improve(kept_memory, rivals, records[i], max(1, left[i]), *others)
@@ -207,7 +205,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
     @entry
     def play(record, first, horizon, rounds, terms, u, words):
-        kept_memory, rivals = memory(horizon, int(_FINER * terms.cells)), rivals_for(horizon)
+        kept_memory, rivals = memory(horizon, max(_WAYS, _LATE_WAYS)), rivals_for(horizon)
         best, rate, W = np.zeros(horizon), np.zeros((k, k)), np.empty(size)
         lasts, held = np.zeros(2), 0
         for t in range(len(u)):
@@ -226,7 +224,8 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         for t in range(first):
             go_on(W, record, u[t], lasts, terms)
         left = len(u) - first
-        task = Task(record, left, left, 1, terms, lasts, M, cells, left, cells, left)
-        find_way(memory(left, cells), task, u[first:], words)
+        ways = -(-cells * cells // LANES) * LANES
+        task = Task(record, left, left, 1, terms, lasts, M, cells, left, ways)
+        find_way(memory(left, ways), task, u[first:], words)
 
     return Search(plan, play, through)
