@@ -238,7 +238,7 @@ def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track):
 
 
 def test_moves_become_shorter_towards_the_end():
-    envs = make("Pendulum-v1", 3, horizon=100)
+    envs = make("Pendulum-v1", 3, horizon=60)
     policy = make_policy("efe", envs, seed=0)
     observations, _ = envs.reset(seed=0)
     state, moves, left = None, [], np.zeros(3)
