@@ -119,9 +119,9 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
 
     @inner
     def gather(memory, h, most, found):
-        """Make the best of the continuations found the new ways, and note where they come from; gives their number.
+        """Make the best of the continuations the new ways, and note where they come from; gives their number.
 
-        The scores become those of the ways.
+        Into ``found`` cells leads any; the scores become those of the ways.
         """
         ways, continued, scores = memory.ways, memory.continued, memory.scores
         enough = enough_for(scores[:found], most)
@@ -171,9 +171,9 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
                         entered[cell] = reachable
                         visited[reachable], scores[reachable] = cell, -np.inf
                         reachable += 1
-                    i = entered[cell]
-                    if W[SCORE + j] > scores[i]:
-                        scores[i], ends[i] = W[SCORE + j], b * LANES + j
+                    at = entered[cell]
+                    if W[SCORE + j] > scores[at]:
+                        scores[at], ends[at] = W[SCORE + j], b * LANES + j
             for i in range(reachable):
                 entered[visited[i]] = -1
             count = gather(memory, h, task.ways, reachable)
@@ -203,7 +203,7 @@ def enough_for(scores, most):
 
 @jit
 def _reached(scores, enough):
-    """How many scores are as high."""
+    """How many scores are as high or higher."""
     count = 0
     for i in range(len(scores)):
         count += scores[i] >= enough

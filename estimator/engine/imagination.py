@@ -79,7 +79,7 @@ def imagination(model: Model, degree: int = 0, lag: int = 0) -> Imagination:
 
 
 def coarsened(model: Model) -> Model:
-    """The model with the steps of a plan that climbs by gradient."""
+    """The model with the steps of a plan that climbs by gradient, and of a glance at the motion."""
     return replace(model, substeps=min(SUBSTEPS, model.substeps)) if model.is_continuous else model
 
 

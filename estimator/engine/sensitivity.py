@@ -28,8 +28,8 @@ _STAGES = {"A": (sp.Rational(1, 6), sp.S.Half), "B": (sp.Rational(1, 3), sp.S.Ha
            "C": (sp.Rational(1, 3), sp.S.One), "D": (sp.Rational(1, 6), sp.S.Zero)}  # fmt: skip
 
 #: Steps of the state over a sample that is only imagined, of a model that takes as many, and of others. What is linear
-#: takes one step, whose stages are begin, middle and end of the sample. With half as many steps one output of an
-#: oscillator with 4.5 samples in a period was expected wrong by six standard deviations, and led beyond its limit.
+#: takes one step, whose stages are begin, middle and end of the sample. Two steps are wrong by more than the noise
+#: where a period has five samples (tests/agents/test_imagination.py), and peaks then lie beyond where they are planned.
 _STEPS, _FEWER = 4, 2
 
 #: Process noise that is held over a sample moves the state as one more coefficient would.

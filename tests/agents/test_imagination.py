@@ -221,6 +221,23 @@ def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
     assert others[0] > 0
 
 
+def test_an_output_of_a_fast_swing_is_imagined_within_the_noise():
+    """Four steps are; two are not, of a swing of 0.6 V with five samples in a period, and a usual noise of 0.5 mV."""
+    stiffness, cubic = 0.9, 3.5
+    p, x = np.array([stiffness, cubic, 0.08, 0.54]), np.linspace(-0.6, 0.6, 61)
+    v = np.sqrt(np.maximum(0.0, stiffness * (0.6**2 - x**2) + cubic / 2 * (0.6**4 - x**4)))
+
+    def output(state, steps):
+        return integrate(duffing_rates, state, p, (0.0, 0.0), steps)[0][0]
+
+    errors = {
+        steps: max(abs(output(state, steps) - output(state, 64)) for state in np.stack([x, v], axis=1))
+        for steps in (2, 4)
+    }
+    assert errors[4] < 0.25e-3
+    assert errors[2] > 1.5e-3
+
+
 @pytest.mark.parametrize("degree", [0, 1])
 def test_few_steps_are_enough_to_plan_with(degree):
     """The nats of plans of Eq. (1) are those of sixteen exact steps within 0.06, and their differences within 0.02."""
