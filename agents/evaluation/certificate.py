@@ -13,18 +13,20 @@ with equality for one V. Let v_t = Wᵀ f(x_t, x_{t-1}, x_{t-2}), with odd monom
 
 so that the worth of every input is at most ½ [tr(G Λ0) - log det G - 4 + the most that Σ |φ_t - (A V)_t|²_G / q +
 |v_t|²_G / r comes to]. Each term depends on five displacements in a row, and so the most is found by a dynamic
-programme (`agents.evaluation.state_grid`). Under a limit of energy it would need the energy that is left as one more
-state, and there is none yet: a price of energy instead bounds only mixtures of inputs, of which those of rest and much
-energy are worth much more.
+programme (`agents.evaluation.state_grid`). Under a limit of energy, the energy that is left is one more state: a price
+of energy instead would bound mixtures of inputs too, of which those of rest and much energy are worth much more.
 
 **G and W** are those of the best mixture of the paths that the programme has found so far; W is then a least squares
 fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), until bound and mixture meet. The bound
 holds for any G and W. A path keeps the displacements that it was found with, since rounding may lead its inputs
 elsewhere; between nodes it may come to where one cannot stay within the limit, and is cut there.
 
+Where energy is limited, the best inputs lie between the levels of the grid, and the path that the programme finds is
+only near the best. So it climbs by gradient; and what it then comes to is taken for the bound where the grid tells less.
+
 **The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on one
 of twice as many intervals, plus what they differ by. This allowance is no proof: on three and four times as many
-intervals, the bounds of two systems of Output-v0, on which the grid tells most, lay at most 0.002 nats above it.
+intervals, the bounds of two systems of Output-v0, on which the grid matters most, lay at most 0.002 nats above it.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from agents.cli import JsonOptions, run_script
+from agents.cli import JsonOptions, followed, run_script
+from agents.evaluation.mixture import Moments, Multipliers, mix
 from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.state_grid import StateGrid
 from estimator.free_run import free_run
@@ -48,44 +51,40 @@ _DEGREES = (1, 3, 5)
 #: Nodes along an axis of the displacements, and levels of the input.
 _NODES, _LEVELS = 33, 5
 
+#: Where energy is limited: nodes of what is left of it, levels of an action, and how many times more a path has.
+_ENERGIES, _INPUTS, _PATH = 33, 17, 8
+
+#: How a path climbs there: steps at most, the length of the first one in parts of the root of the energy, and by how
+#: much of the largest input each input is moved to see what it brings.
+_CLIMBS, _RATE, _MOVED = 30, 0.02, 1e-4
+
+#: Programmes end there where so many have brought bound and mixture less [nats] nearer to each other.
+_PATIENCE, _ENOUGH = 3, 2e-3
+
 #: Programmes, and the distance between bound and mixture [nats] at which they end.
 _ROUNDS, _CLOSE = 16, 0.01
-
-#: Steps that improve a mixture.
-_STEPS = 200
-
-
-@dataclass(frozen=True)
-class Multipliers:
-    """What a bound is taken with.
-
-    Attributes:
-        G: (4, 4), in units in which Λ0 is the identity.
-        W: (features, 4), likewise.
-    """
-
-    G: FloatArray
-    W: FloatArray
 
 
 class Certificate:
     """The bound of one system.
 
     Args:
-        systems: of a track with Eq. (2) as its plant, and no limit of energy.
+        systems: of a track with Eq. (2) as its plant.
         row: the system.
         n: nodes along an axis, an odd number.
 
     Raises:
-        ValueError: for another plant, or with a limit of energy.
+        ValueError: for another plant.
     """
 
     def __init__(self, systems: Systems, row: int, n: int = _NODES) -> None:
-        if systems.plant.model != difference() or np.isfinite(systems.limits.energy):
-            raise ValueError("systems must obey Eq. (2) without a limit of energy; no others have certificates yet")
+        if systems.plant.model != difference():
+            raise ValueError("systems must obey Eq. (2); no others have certificates yet")
         self.theta, self.samples, self.limits = systems.theta[row], systems.samples, systems.limits
         self.q, self.r = systems.variances[row]
-        self.grid = StateGrid(self.theta, self.limits.output, self.limits.amplitude, n, _LEVELS)
+        self.grid = StateGrid(self.theta, self.limits.output, self.limits.amplitude, n, _LEVELS, _LEVELS)
+        if np.isfinite(self.limits.energy):
+            self.grid = replace(self.grid, energy=self.limits.energy, energies=_ENERGIES, inputs=_INPUTS)
         self.powers = [c for d in _DEGREES for c in combinations_with_replacement(range(3), d)]
         self.units = np.linalg.cholesky(np.linalg.inv(systems.precision))
         self.base = 0.5 * float(np.linalg.slogdet(systems.precision)[1])
@@ -105,18 +104,54 @@ class Certificate:
         slope: FloatArray = self.theta[0] + 3 * self.theta[1] * x**2
         return slope
 
-    def moments(self, u: FloatArray, x: FloatArray | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """C (4, 4), N (f, 4) and M (f, f) of an input (T,), where the information is at most C - WᵀN - NᵀW + WᵀMW.
+    def along(self, u: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Φ (..., T, 4), and the features (..., T, f) that V is made of and A V is made of.
 
-        ``x`` (T,) are the displacements that follow each input; they are calculated where they are not given.
+        ``x`` (..., T) are the displacements that follow each of the inputs ``u`` (..., T).
         """
-        x = np.concatenate([np.zeros(4), free_run(difference(), self.theta, u) if x is None else x])
-        back = [x[4 - lag : len(x) - lag] for lag in range(5)]  # x_{t+1}, x_t, ...
-        phi = self.regressors(back[1], back[2], u)
+        x = np.concatenate([np.zeros((*x.shape[:-1], 4)), x], axis=-1)
+        back = [x[..., 4 - lag : x.shape[-1] - lag] for lag in range(5)]  # x_{t+1}, x_t, ...
         f, f1, f2 = (self.features(*back[lag : lag + 3]) for lag in range(3))
-        moved = f - self.slope(back[1])[:, None] * f1 - self.theta[2] * f2
-        C, N, M = phi.T @ phi / self.q, moved.T @ phi / self.q, moved.T @ moved / self.q + f.T @ f / self.r
-        return C, N, M
+        return self.regressors(back[1], back[2], u), f, f - self.slope(back[1])[..., None] * f1 - self.theta[2] * f2
+
+    def moments(self, u: FloatArray, x: FloatArray | None = None) -> Moments:
+        """Those of an input (T,); the displacements ``x`` (T,) are calculated where they are not given."""
+        phi, f, moved = self.along(u, free_run(difference(), self.theta, u) if x is None else x)
+        return phi.T @ phi / self.q, moved.T @ phi / self.q, moved.T @ moved / self.q + f.T @ f / self.r
+
+    def told(self, multipliers: Multipliers, u: FloatArray, x: FloatArray) -> FloatArray:
+        """(n,) the sum that the programme maximises, of inputs and displacements (n, T) from rest."""
+        root = np.linalg.cholesky(multipliers.G)
+        phi, f, moved = self.along(u, x)
+        missed, v = phi @ root - moved @ (multipliers.W @ root), f @ (multipliers.W @ root)
+        told: FloatArray = (missed**2).sum(axis=(-2, -1)) / self.q + (v**2).sum(axis=(-2, -1)) / self.r
+        return told
+
+    def climb(self, multipliers: Multipliers, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """An admissible input (T,) near ``u`` that tells more, by gradient; and the displacements (T,) that follow."""
+
+        def follow(inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+            x = np.stack([free_run(difference(), self.theta, one) for one in inputs])
+            return self.told(multipliers, inputs, x), x
+
+        limits, rate = self.limits, _RATE
+        moved = _MOVED * limits.amplitude
+        (best,), (x,) = follow(u[None])
+        for _ in range(_CLIMBS):
+            gradient = (follow(u + moved * np.eye(len(u)))[0] - best) / moved
+            gradient -= u * (gradient @ u) / (u @ u)
+            step = gradient * np.sqrt(limits.energy / (gradient @ gradient))
+            while rate > _RATE / 100:
+                tried = np.clip(u + rate * step, -limits.amplitude, limits.amplitude)
+                tried *= np.minimum(1.0, np.sqrt(limits.energy / (tried @ tried)))
+                (told,), (then,) = follow(tried[None])
+                if told > best and np.abs(then).max() <= limits.output:
+                    u, x, best, rate = tried, then, told, 1.5 * rate
+                    break
+                rate *= 0.4
+            else:
+                break
+        return u, x
 
     def bound(self, multipliers: Multipliers, grid: StateGrid, layers: int = 2) -> tuple[float, FloatArray]:
         """The bound [nats], and the values of the programme (`StateGrid.values`)."""
@@ -124,7 +159,7 @@ class Certificate:
         root = np.linalg.cholesky(multipliers.G)
         W = multipliers.W @ root
         u, after = (np.nan_to_num(found) for found in grid.actions(now[..., 0], last[..., 0]))
-        # v_{t+1} (n, n, actions, 4), and what the motion makes of v_t and v_{t-1} (n, n, levels, levels, 4)
+        # v_{t+1} (n, n, inputs + 2, 4), and what the motion makes of v_t and v_{t-1} (n, n, levels, levels, 4)
         next_v = self.features(after, now[..., 0], last[..., 0]) @ W
         wanted = self.regressors(now[..., 0], last[..., 0], u) @ root - next_v
         carried = self.slope(now)[..., None] * (self.features(now, last, second) @ W)
@@ -134,18 +169,20 @@ class Certificate:
             costs += (wanted[:, :, None, None, :, k] + carried[..., None, k]) ** 2 / self.q
         costs += ((next_v**2).sum(axis=-1) / self.r)[:, :, None, None]
         V = grid.values(costs, self.samples, layers)
-        most = V[0, grid.n // 2, grid.n // 2, grid.levels // 2, grid.levels // 2]
-        told = np.trace(multipliers.G) + most - np.linalg.slogdet(multipliers.G)[1] - 4.0
-        return self.base + 0.5 * float(told), V
+        most = V[0, grid.n // 2, grid.n // 2, grid.levels // 2, grid.levels // 2, -1]
+        return self._at_most(multipliers, most), V
 
     def path(self, multipliers: Multipliers, V: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The input (T,) that the programme holds for the best, from rest, and the displacements (T,) it leads to."""
         grid, root = self.grid, np.linalg.cholesky(multipliers.G)
+        if grid.energies > 1:
+            grid = replace(grid, inputs=_PATH * (grid.inputs - 1) + 1)
+        left = grid.energy
         W, u, x = multipliers.W @ root, np.zeros(self.samples), np.zeros(self.samples)
         now, last, older, v, v1 = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros((1, 4)), np.zeros((1, 4))
         for t in range(self.samples):
             inputs, after = grid.actions(now, last)
-            allowed = ~np.isnan(inputs)
+            allowed = inputs**2 <= left  # and not NaN
             if allowed.any():
                 inputs, after = inputs[allowed], after[allowed]
             else:
@@ -155,27 +192,11 @@ class Certificate:
             next_v = self.features(after, now, last) @ W
             missed = self.regressors(now, last, inputs) @ root - next_v + self.slope(now) * v + self.theta[2] * v1
             told = (missed**2).sum(-1) / self.q + (next_v**2).sum(-1) / self.r
-            best = int(np.argmax(told + self._between(V[t + 1], after, now, inputs, older)))
+            best = int(np.argmax(told + self.grid.between(V[t + 1], after, now, inputs, older, left - inputs**2)))
             u[t], x[t] = inputs[best], after[best]
+            left -= u[t] ** 2
             v1, v, last, now, older = v, next_v[best : best + 1], now, after[best : best + 1], inputs[best : best + 1]
         return u, x
-
-    def _between(self, V: FloatArray, *point: FloatArray) -> FloatArray:
-        """The value (actions,) at points between nodes; of those that cannot stay within the limit, far below."""
-        bounds = (self.limits.output,) * 2 + (self.limits.amplitude,) * 2
-        low, share = zip(
-            *(self.grid.place(x, b, n) for x, b, n in zip(point, bounds, V.shape, strict=True)), strict=True
-        )
-        total, weight = np.zeros(len(point[0])), np.zeros(len(point[0]))
-        for corner in np.ndindex(2, 2, 2, 2):
-            value = V[tuple(at + up for at, up in zip(low, corner, strict=True))]
-            part = np.ones(len(total))
-            for w, up in zip(share, corner, strict=True):
-                part = part * (w if up else 1.0 - w)
-            alive = np.isfinite(value)
-            total += np.where(alive, value, 0.0) * part
-            weight += alive * part
-        return np.where(weight > 1e-9, total / np.maximum(weight, 1e-9), -1e12)
 
     def find(self, inputs: FloatArray, rounds: int = _ROUNDS) -> float:
         """The bound [nats] of the worth ½ log det(Λ0 + F) of every admissible input.
@@ -186,55 +207,31 @@ class Certificate:
         """
         moments = [self.moments(u) for u in inputs]
         weights = np.full(len(moments), 1.0 / len(moments))
-        least, best = np.inf, None
+        least, best, progress = np.inf, None, []
         for _ in range(rounds):
-            weights, told, multipliers = self.mix(moments, weights)
+            weights, gained, multipliers = mix(moments, weights)
+            told = self.base + gained
             bound, V = self.bound(multipliers, self.grid, self.samples + 1)
+            u, x = self.path(multipliers, V)
+            if np.isfinite(self.limits.energy):
+                u, x = self.climb(multipliers, u)
+                bound = max(bound, self._at_most(multipliers, self.told(multipliers, u[None], x[None])[0]))
             if bound < least:
                 least, best = bound, multipliers
-            if least < told + _CLOSE:
+            progress.append(told - least)
+            stalls = len(progress) > _PATIENCE and progress[-1] < progress[-1 - _PATIENCE] + _ENOUGH
+            if least < told + _CLOSE or (stalls and np.isfinite(self.limits.energy)):
                 break
-            moments.append(self.moments(*self.path(multipliers, V)))
+            moments.append(self.moments(u, x))
             weights = np.append(0.9 * weights, 0.1)
         assert best is not None
-        fine = replace(self.grid, n=2 * self.grid.n - 1)
-        refined = self.bound(best, fine)[0]
+        refined = self.bound(best, self.grid.finer)[0]
         return max(refined, least) + abs(refined - least)
 
-    def mix(
-        self, moments: list[tuple[FloatArray, FloatArray, FloatArray]], weights: FloatArray
-    ) -> tuple[FloatArray, float, Multipliers]:
-        """Improve a mixture of inputs by exponentiated gradient.
-
-        Returns:
-            Its weights, its worth [nats], and the multipliers of its bound.
-        """
-        C, N, M = (np.array(part) for part in zip(*moments, strict=True))
-
-        def worth(p: FloatArray) -> tuple[float, FloatArray, Multipliers]:
-            mean_M, mean_N = np.tensordot(p, M, 1), np.tensordot(p, N, 1)
-            W = np.linalg.solve(mean_M + 1e-10 * np.diag(np.diag(mean_M)), mean_N)
-            total = np.eye(4) + np.tensordot(p, C, 1) - mean_N.T @ W
-            G = np.linalg.inv(total)
-            each = C - W.T @ N - np.swapaxes(W.T @ N, 1, 2) + W.T @ M @ W
-            told = self.base + 0.5 * float(np.linalg.slogdet(total)[1])
-            return told, np.einsum("ij,nji->n", G, each), Multipliers(G.astype(np.float64), W.astype(np.float64))
-
-        value, gains, found = worth(weights)
-        rate = 1.0
-        for _ in range(_STEPS):
-            # In parts of the step that changes weights by a factor e.
-            tried = weights * np.exp(rate * (gains - gains.max()) / (1e-12 + float(np.ptp(gains))))
-            tried /= tried.sum()
-            new = worth(tried)
-            if new[0] > value - 1e-12:
-                weights, (value, gains, found) = tried, new
-                rate *= 1.5
-            else:
-                rate *= 0.4
-            if rate < 1e-5:
-                break
-        return weights, value, found
+    def _at_most(self, multipliers: Multipliers, most: float) -> float:
+        """The bound [nats], with the most that the programme's sum comes to."""
+        more = np.trace(multipliers.G) + most - np.linalg.slogdet(multipliers.G)[1] - 4.0
+        return self.base + 0.5 * float(more)
 
 
 @dataclass(frozen=True)
@@ -255,7 +252,7 @@ def main(config: Config) -> None:
     systems = Systems.of(config.env, config.systems, config.options)
     oracle = Oracle.of(Systems.of(config.env, max(config.systems, Oracle.stored(systems)), config.options))
     count = min(config.systems, len(oracle.values))
-    for row in range(count):
+    for row in followed((f"system {row + 1} of {count}", row) for row in range(count)):
         oracle.bounds[row] = Certificate(oracle.systems, row).find(oracle.inputs[row : row + 1])
         oracle.save()
     share = np.exp((oracle.values - oracle.bounds)[:count] / 2.0)

@@ -1,19 +1,28 @@
 """The dynamic programme over the states of Eq. (2) that bounds an information (`agents.evaluation.certificate`).
 
 A node is (x_t, x_{t-1}, u_{t-1}, u_{t-2}), from which the equation gives x_{t-2} and x_{t-3}: displacements on a grid
-of the box within the limit, inputs on levels. An action is an input at a level, or one that leads to the very limit. It
-leads to (x_{t+1}, x_t, u_t, u_{t-1}), where the value is interpolated between neighbours; of two neighbours one of
-which cannot stay within the limit, the other counts.
+of the box within the limit, inputs on levels. Where energy is limited, what is left of it is a part of the node, too.
+An action is an input at a level, or one that leads to the very limit. It leads to (x_{t+1}, x_t, u_t, u_{t-1}), where
+the value is interpolated; of two neighbours one of which cannot stay within the limit, the other counts.
+
+A limit of energy calls for inputs that are small most of the time, and that lie between levels. So levels, and nodes of
+the energy that is left, are closer to each other near none, as squares are; and the best of the levels gains what a
+parabola through it and its neighbours has at its top.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import prod
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from estimator.lanes import kernel
+from agents.evaluation.state_programme import backward, cubic
 from estimator.parameters import FloatArray
+
+Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -25,7 +34,10 @@ class StateGrid:
         limit: of |x|.
         amplitude: of |u|.
         n: displacements along an axis, an odd number.
-        levels: of the input, an odd number.
+        levels: of the inputs that a node is told by, an odd number.
+        inputs: levels of an action, an odd number.
+        energy: the limit of Σ u²; infinite where there is none.
+        energies: nodes of what is left of it, 1 where there is no limit and at least 4 where there is.
     """
 
     theta: FloatArray
@@ -33,6 +45,16 @@ class StateGrid:
     amplitude: float
     n: int
     levels: int
+    inputs: int
+    energy: float = np.inf
+    energies: int = 1
+
+    @property
+    def finer(self) -> StateGrid:
+        """With twice as many intervals between displacements, and where energy is limited of energies and inputs."""
+        if self.energies == 1:
+            return replace(self, n=2 * self.n - 1)
+        return replace(self, n=2 * self.n - 1, energies=2 * self.energies - 1, inputs=2 * self.inputs - 1)
 
     @property
     def nodes(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -42,17 +64,17 @@ class StateGrid:
         """
         t1, t2, t3, eta = self.theta
         x = np.linspace(-self.limit, self.limit, self.n)
-        u = np.linspace(-self.amplitude, self.amplitude, self.levels)
+        u = self._spaced(self.levels)
         now, last = x[:, None, None, None], x[None, :, None, None]
         second = np.clip((now - t1 * last - t2 * last**3 - eta * u[:, None]) / t3, -self.limit, self.limit)
         third = np.clip((last - t1 * second - t2 * second**3 - eta * u) / t3, -self.limit, self.limit)
         return now, last, second, third
 
     def actions(self, now: FloatArray, last: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Inputs (..., levels + 2) from states (..., 1), and where they lead; NaN for those that are not admissible."""
+        """Inputs (..., inputs + 2) from states (..., 1), and where they lead; NaN for those that are not admissible."""
         t1, t2, t3, eta = self.theta
         free = t1 * now + t2 * now**3 + t3 * last
-        held = [np.broadcast_to(u, free.shape) for u in np.linspace(-self.amplitude, self.amplitude, self.levels)]
+        held = [np.broadcast_to(u, free.shape) for u in self._spaced(self.inputs)]
         u = np.concatenate([*held, (self.limit - free) / eta, (-self.limit - free) / eta], axis=-1)
         after = free + eta * u
         within = (np.abs(u) <= self.amplitude * (1 + 1e-12)) & (np.abs(after) <= self.limit * (1 + 1e-12))
@@ -60,76 +82,104 @@ class StateGrid:
         u, after = np.clip(u, -self.amplitude, self.amplitude), np.clip(after, -self.limit, self.limit)
         return u + nothing, after + nothing
 
-    def place(self, value: FloatArray, bound: float, count: int) -> tuple[np.ndarray, FloatArray]:
-        """The lower neighbour of values, among ``count`` from minus to plus a bound; and the share of the upper one."""
-        where = (value + bound) / (2 * bound) * (count - 1)
-        low = np.clip(np.floor(where + 1e-9), 0, count - 2).astype(np.int64)
-        return low, np.clip(where - low, 0.0, 1.0)
+    def _spaced(self, count: int) -> FloatArray:
+        even = np.linspace(-1.0, 1.0, count)
+        return self.amplitude * (even if self.energies == 1 else even * np.abs(even))
+
+    def at(self, x: FloatArray) -> tuple[Indices, FloatArray]:
+        """The lower neighbours of displacements, and the shares of the upper ones."""
+        return _place((x / self.limit + 1.0) / 2.0, self.n)
+
+    def level(self, u: FloatArray) -> tuple[Indices, FloatArray]:
+        """The first of the three levels next to inputs, and their weights (..., 3), of the parabola through them."""
+        nodes = self._spaced(self.levels)
+        first = np.clip(np.abs(u[..., None] - nodes).argmin(axis=-1) - 1, 0, self.levels - 3)
+        away = u[..., None] - nodes[first[..., None] + np.arange(3)]
+        span = nodes[first + 1] - nodes[first], nodes[first + 2] - nodes[first + 1]
+        weights = [
+            away[..., 1] * away[..., 2] / (span[0] * (span[0] + span[1])),
+            -away[..., 0] * away[..., 2] / (span[0] * span[1]),
+            away[..., 0] * away[..., 1] / (span[1] * (span[0] + span[1])),
+        ]
+        return first, np.stack(weights, axis=-1)
+
+    def left(self, energy: FloatArray) -> tuple[Indices, FloatArray]:
+        """The lower neighbours of energies that are left, and the shares of the upper ones."""
+        if self.energies == 1:
+            return np.zeros(energy.shape, dtype=np.int64), np.zeros(energy.shape)
+        return _place(np.sqrt(np.maximum(energy, 0.0) / self.energy), self.energies)
+
+    def between(
+        self, V: FloatArray, after: FloatArray, now: FloatArray, u: FloatArray, older: FloatArray, left: FloatArray
+    ) -> FloatArray:
+        """The values (points,) at points between nodes, x_{t+1}, x_t, u_t, u_{t-1} and the energy left; -1e12 for dead.
+
+        Through four nodes of displacements and energies, as in the programme; through two where one of them is dead. A
+        dead one of two does not count.
+        """
+        inputs = [(first[:, None] + np.arange(3), weights) for first, weights in (self.level(u), self.level(older))]
+        places = (*self.at(after), self.n), (*self.at(now), self.n), (*self.left(left), self.energies)
+
+        def weighed(k: int) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
+            one, two, three = (_nodes(*place, k) for place in places)
+            return _weigh(V, [one, two, *inputs, three])
+
+        (smooth, _, whole), (rough, weight, _) = weighed(4), weighed(2)
+        return np.where(whole, smooth, np.where(weight > 1e-9, rough / np.maximum(weight, 1e-9), -1e12))
 
     def values(self, costs: FloatArray, samples: int, layers: int) -> FloatArray:
         """The most that costs add up to from every node on.
 
         Args:
-            costs: (n, n, levels, levels, actions); whatever at actions that are not admissible.
+            costs: (n, n, levels, levels, inputs + 2); whatever at actions that are not admissible. They must be the
+                same where x and u are turned over.
             samples: of the path.
             layers: that are kept, 2 or samples + 1.
 
         Returns:
-            (layers, n, n, levels, levels), that of sample t in layer t modulo layers; -inf where no path stays within.
+            (layers, n, n, levels, levels, energies), that of sample t in layer t modulo layers; -inf where no path
+            stays within.
         """
         now, last, _, _ = self.nodes
         u, after = self.actions(now[..., 0], last[..., 0])
         dead = np.isnan(u)
-        low, share = self.place(np.nan_to_num(after), self.limit, self.n)
-        level, part = self.place(np.nan_to_num(u), self.amplitude, self.levels)
-        V = np.zeros((layers, self.n, self.n, self.levels, self.levels))
-        _backward(costs, np.where(dead, -1, low), share, level, part, samples, V)
+        low, share = self.at(np.nan_to_num(after))
+        level, parts = self.level(np.nan_to_num(u))
+        held = self._spaced(self.inputs)
+        spent = np.nan_to_num(u) ** 2 / self.energy
+        spent[..., : self.inputs] = held**2 / self.energy
+        V = np.zeros((layers, self.n, self.n, self.levels, self.levels, self.energies))
+        backward(costs, np.where(dead, -1, low), share, level, parts, spent, held, samples, V)
         return V
 
 
-@kernel
-def _backward(costs, low, share, level, part, samples, V):
-    n, levels, actions = costs.shape[0], costs.shape[2], costs.shape[4]
-    later = np.empty(actions)
-    V[samples % len(V), :, :, :, :] = 0.0
-    for t in range(samples - 1, -1, -1):
-        after, here = V[(t + 1) % len(V)], V[t % len(V)]
-        for i in range(n):
-            for j in range(n):
-                for a in range(levels):
-                    for m in range(actions):
-                        k = low[i, j, m]
-                        if k < 0:
-                            later[m] = -np.inf
-                            continue
-                        c, w = level[i, j, m], part[i, j, m]
-                        if w == 1.0:
-                            c, w = c + 1, 0.0
-                        down, up = after[k, i, c, a], after[k + 1, i, c, a]
-                        if w > 0.0:
-                            down = (1.0 - w) * down + w * after[k, i, c + 1, a]
-                            up = (1.0 - w) * up + w * after[k + 1, i, c + 1, a]
-                        if down == -np.inf:
-                            later[m] = up
-                        elif up == -np.inf:
-                            later[m] = down
-                        else:
-                            e = share[i, j, m]
-                            later[m] = down + e * (up - down)
-                            if e > 0.0 and k > 0 and k + 2 < n:
-                                first, fourth = after[k - 1, i, c, a], after[k + 2, i, c, a]
-                                if w > 0.0:
-                                    first = (1.0 - w) * first + w * after[k - 1, i, c + 1, a]
-                                    fourth = (1.0 - w) * fourth + w * after[k + 2, i, c + 1, a]
-                                if first > -np.inf and fourth > -np.inf:
-                                    later[m] = (
-                                        -e * (e - 1.0) * (e - 2.0) / 6.0 * first
-                                        + (e + 1.0) * (e - 1.0) * (e - 2.0) / 2.0 * down
-                                        - (e + 1.0) * e * (e - 2.0) / 2.0 * up
-                                        + (e + 1.0) * e * (e - 1.0) / 6.0 * fourth
-                                    )
-                    for b in range(levels):
-                        best = -np.inf
-                        for m in range(actions):
-                            best = max(best, costs[i, j, a, b, m] + later[m])
-                        here[i, j, a, b] = best
+def _place(where: FloatArray, count: int) -> tuple[Indices, FloatArray]:
+    """The lower neighbour, of ``count`` nodes between 0 and 1, and the share of the upper one."""
+    scaled = where * (count - 1)
+    low = np.clip(np.floor(scaled + 1e-9), 0, count - 2).astype(np.int64)
+    return low, np.clip(scaled - low, 0.0, 1.0)
+
+
+def _nodes(low: Indices, share: FloatArray, count: int, k: int) -> tuple[Indices, FloatArray]:
+    """The k nodes next to points, 4 or 2, and their weights, (points, k) each; one where there is but one."""
+    if count == 1:
+        return low[:, None], np.ones((len(low), 1))
+    if k == 2:
+        return low[:, None] + np.arange(2), np.stack([1.0 - share, share], axis=1)
+    first = np.clip(low - 1, 0, count - 4)
+    return first[:, None] + np.arange(4), np.stack(cubic(low - first + share), axis=1)
+
+
+def _weigh(
+    V: FloatArray, nodes: list[tuple[Indices, FloatArray]]
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
+    """Per point, the weighed sum over the nodes that are alive, the sum of their weights, and whether all are alive."""
+
+    def along(axis: int, part: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return part.reshape(len(part), *(-1 if axis == other else 1 for other in range(V.ndim)))
+
+    found = V[tuple(along(axis, index) for axis, (index, _) in enumerate(nodes))]
+    weights = prod(along(axis, weight) for axis, (_, weight) in enumerate(nodes))
+    alive, over = np.isfinite(found), tuple(range(1, found.ndim))
+    weights = np.broadcast_to(weights, found.shape)
+    return (np.where(alive, found, 0.0) * weights).sum(over), (alive * weights).sum(over), alive.all(over)
