@@ -22,7 +22,7 @@ holds for any G and W. A path keeps the displacements that it was found with, si
 elsewhere; between nodes it may come to where one cannot stay within the limit, and is cut there.
 
 Where energy is limited, the best inputs lie between the levels of the grid, and the path that the programme finds is
-only near the best. So it climbs by gradient; and what it then comes to is taken for the bound where the grid tells less.
+only near the best. So it climbs by gradient, and what it then comes to is the bound where that of the grid is smaller.
 
 **The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on one
 of twice as many intervals, plus what they differ by. This allowance is no proof: on three and four times as many

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Hyperparameters by what they may be; whole numbers that are not named here are at least 1.
 _FROM_ZERO = ("learning_starts", "exploration_noise", "dropped_quantiles", "levels", "entropy_bonus")
-_POSITIVE = ("learning_rate", "entropy_weight")
+_POSITIVE = ("learning_rate", "entropy_weight", "rule_logit")
 _SHARES = ("gamma", "gae_lambda", "tau")
 
 
@@ -106,6 +106,8 @@ class OnPolicySettings(AlgorithmSettings):
     """Weight of the action's entropy at the start; it falls linearly to 0."""
     levels: int = 0
     """Evenly spaced inputs from one limit to the other that the policy chooses from; 0 for all between."""
+    rule_logit: float = 1.0
+    """Logit, at the start, of the level that foresight holds for the best: the smaller, the more is explored."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

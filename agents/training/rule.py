@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 _UP, _NONE = (FEATURES.index(f"best_{way}_whole") for way in ("up", "none"))
 
-#: How sharply a layer tells the sign of what it is given, and the logit of what brings most: small enough to explore.
-_SHARP, _LOGIT = 3.0, 1.0
+#: How sharply a layer tells the sign of what it is given.
+_SHARP = 3.0
 
 
 def rule(features: npt.NDArray[np.float32], levels: int) -> npt.NDArray[np.int64]:
@@ -34,7 +34,7 @@ def rule(features: npt.NDArray[np.float32], levels: int) -> npt.NDArray[np.int64
     return np.where(features[:, _NONE] > 0.0, levels // 2, push) if levels % 2 else push
 
 
-def begin_with_rule(model: BaseAlgorithm, envs: Any) -> None:
+def begin_with_rule(model: BaseAlgorithm, envs: Any, logit: float) -> None:
     """Let a new model's actor choose as `rule` does: two units of every layer carry what it depends on.
 
     A model that does not choose from levels, or does not see the features of all oscillators, is left as it is.
@@ -42,6 +42,7 @@ def begin_with_rule(model: BaseAlgorithm, envs: Any) -> None:
     Args:
         model: of Stable-Baselines3.
         envs: as it sees them.
+        logit: of what brings most; the smaller, the more is explored.
     """
     import torch
 
@@ -60,6 +61,6 @@ def begin_with_rule(model: BaseAlgorithm, envs: Any) -> None:
             inputs = 0, 1
         last = policy.action_net.weight
         last[:, :2] = 0.0
-        last[-1, 0], last[0, 0] = _LOGIT, -_LOGIT
+        last[-1, 0], last[0, 0] = logit, -logit
         if len(last) % 2:
-            last[len(last) // 2, 1] = 2.0 * _LOGIT
+            last[len(last) // 2, 1] = 2.0 * logit

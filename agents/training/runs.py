@@ -20,6 +20,7 @@ from agents.policies.saving import save_policy
 from agents.results import write_json
 from agents.running.stopping import Stopped, Stopper
 from agents.training import family
+from agents.training.algorithms import OnPolicySettings
 from agents.training.checkpoints import (
     Progress,
     begin_with,
@@ -161,10 +162,10 @@ class _Training:
             restore(checkpoint, self._model)
         elif config.begin is not None:
             begin_with(config.begin, self._model)
-        else:
+        elif isinstance(config.hyperparameters, OnPolicySettings):
             from agents.training.rule import begin_with_rule
 
-            begin_with_rule(self._model, self._envs)
+            begin_with_rule(self._model, self._envs, config.hyperparameters.rule_logit)
         self._checkpoints = self._due_checkpoints()
         self._held_out = HeldOut(folder, config, begun)
         self._evaluated = on_evaluation

@@ -299,9 +299,10 @@ def test_on_a_rig_it_keeps_further_from_the_limit():
     assert terms.shaken > 0.0
 
 
-def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path):
+@pytest.mark.parametrize(("logit", "least", "most"), [(1.0, 0.7, 0.95), (3.0, 0.98, 1.0)])
+def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path, logit, least, most):
     settings = PPOSettings(foresight=True, levels=3, num_envs=512, n_steps=2, batch_size=512)
-    settings = replace(settings, learning_rate=1e-9)
+    settings = replace(settings, learning_rate=1e-9, rule_logit=logit)
     run = train(
         TrainConfig(env="duffing_env/Amplitude-v1", steps=1024, output=tmp_path / "r", hyperparameters=settings)
     )
@@ -312,5 +313,7 @@ def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path):
     expected = view.act(rule(view.features, 3) - 1)
     agrees = np.isclose(policy.predict(seen, deterministic=True)[0], expected)
     assert agrees.mean() > 0.9
+    explored = [np.isclose(policy.predict(seen, deterministic=False)[0], expected)[agrees].mean() for _ in range(16)]
+    assert least < np.mean(explored) <= most
     with pytest.raises(ValueError, match="another model than the policy was trained on"):
         make_policy(str(run.folder), make("duffing_env/Pendulum-v0", 1))
