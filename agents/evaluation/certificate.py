@@ -24,9 +24,8 @@ elsewhere; between nodes it may come to where one cannot stay within the limit, 
 Where energy is limited, the best inputs lie between the levels of the grid, and the path that the programme finds is
 only near the best. So it climbs by gradient, and what it then comes to is the bound where that of the grid is smaller.
 
-**The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on one
-of twice as many intervals, plus what they differ by. This allowance is no proof: on three and four times as many
-intervals, the bounds of two systems of Output-v0, on which the grid matters most, lay at most 0.002 nats above it.
+**The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on a finer
+one (`StateGrid.finer`), plus what they differ by. This allowance is no proof.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ _DEGREES = (1, 3, 5)
 _NODES, _LEVELS = 33, 5
 
 #: Where energy is limited: nodes of what is left of it, levels of an action, and how many times more a path has.
-_ENERGIES, _INPUTS, _PATH = 33, 17, 8
+_ENERGIES, _INPUTS, _PATH = 65, 17, 8
 
 #: How a path climbs there: steps at most, the length of the first one in parts of the root of the energy, and by how
 #: much of the largest input each input is moved to see what it brings.

@@ -51,10 +51,14 @@ class StateGrid:
 
     @property
     def finer(self) -> StateGrid:
-        """With twice as many intervals between displacements, and where energy is limited of energies and inputs."""
+        """With twice as many intervals of displacements; where energy is limited half as many more, of it as well.
+
+        There it has twice as many intervals of inputs, too.
+        """
         if self.energies == 1:
             return replace(self, n=2 * self.n - 1)
-        return replace(self, n=2 * self.n - 1, energies=2 * self.energies - 1, inputs=2 * self.inputs - 1)
+        n, energies = (nodes + (nodes - 1) // 2 for nodes in (self.n, self.energies))
+        return replace(self, n=n, energies=energies, inputs=2 * self.inputs - 1)
 
     @property
     def nodes(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
