@@ -25,7 +25,7 @@ from agents.planner.policy import Planner
 from agents.planner.search import search
 from estimator.arrays import copy, fill
 from estimator.belief import Belief
-from estimator.engine.imagination import coarsened
+from estimator.engine.motion import coarsened
 from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.parameters import FloatArray

@@ -48,7 +48,7 @@ from agents.planner.motion import View, is_of_rig, limit_of, places, shaken_of, 
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
 from estimator.checks import LARGEST, SMALLEST, number, numbers, shown, whole
-from estimator.engine.imagination import coarsened
+from estimator.engine.motion import coarsened
 from estimator.parameters import FloatArray
 
 

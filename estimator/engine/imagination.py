@@ -8,7 +8,7 @@ one sample teaches is not counted again by the next. The coefficients' means sta
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -18,11 +18,6 @@ from estimator.engine.rows import pairs
 from estimator.engine.tasks import NAMES
 from estimator.lanes import LANES, rows
 from estimator.models.model import Model
-
-#: Runge-Kutta steps per sample of a plan that climbs by gradient, and of a glance at the motion. A filter needs an
-#: integration error far below the posterior's standard deviation, because it adds up over a record. A plan does not: it
-#: compares inputs, all imagined alike, by what they teach.
-SUBSTEPS = 2
 
 #: What a belief that is no longer finite knows: less than any other, and still a number to compare with.
 LOST = -1e300
@@ -76,11 +71,6 @@ def imagination(model: Model, degree: int = 0, lag: int = 0) -> Imagination:
     key = repr((model.digest, degree, lag))
     code = stored.load(model.name, "imagination", key, lambda: _source(model, degree, lag, inputs, place), NAMES)
     return Imagination(code.advance, code.judge, place, len(kept))
-
-
-def coarsened(model: Model) -> Model:
-    """The model with the steps of a plan that climbs by gradient, and of a glance at the motion."""
-    return replace(model, substeps=min(SUBSTEPS, model.substeps)) if model.is_continuous else model
 
 
 def inputs_of(model: Model, degree: int, lag: int) -> list[str]:

@@ -13,17 +13,22 @@ Besides the motion itself these are four things that every model has, and that E
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from typing import Any
 
 from estimator.engine import cache as stored
-from estimator.engine.imagination import coarsened, fed, inputs_of
+from estimator.engine.imagination import fed, inputs_of
 from estimator.engine.rows import carried_names
 from estimator.engine.tasks import NAMES
 from estimator.lanes import rows
 from estimator.models.model import Model
+
+#: Runge-Kutta steps per sample of a plan that climbs by gradient, and of a glance at the motion. A filter needs an
+#: integration error far below the posterior's standard deviation, because it adds up over a record. A plan does not: it
+#: compares inputs, all imagined alike, by what they teach.
+_SUBSTEPS = 2
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,11 @@ class Motion:
     linearise: Any
     layout: Mapping[str, int]
     is_odd: bool
+
+
+def coarsened(model: Model) -> Model:
+    """The model with the steps of a plan that climbs by gradient, and of a glance at the motion."""
+    return replace(model, substeps=min(_SUBSTEPS, model.substeps)) if model.is_continuous else model
 
 
 @cache
