@@ -61,9 +61,9 @@ def _lines(V, alive, k, share, i, c, parts, a, line):
 
 @jit
 def _place_energies(spent, at, weights):
-    """Where an input leads from every energy: the first of four nodes (K,), -1 if it is not allowed; weights (K, 4).
+    """Where an input leads from every energy: the first of four nodes (K,), -1 if it is not allowed.
 
-    The last column tells the share of the upper one of the two nearest, should the first be dead.
+    ``weights`` (K, 5) are those of the four, and in the last column the place among all nodes.
     """
     last = len(at) - 1
     for k in range(last + 1):
@@ -74,7 +74,7 @@ def _place_energies(spent, at, weights):
             low = min(int(where + 1e-9), last - 1)
             at[k] = min(max(low - 1, 0), last - 3)
             weights[k, 0], weights[k, 1], weights[k, 2], weights[k, 3] = cubic(where - at[k])
-            weights[k, 4] = max(where - low, 0.0)
+            weights[k, 4] = where
 
 
 @jit
@@ -93,10 +93,9 @@ def _spend(line, at, weights, later):
                 + weights[k, 3] * line[first + 3]
             )
         else:  # with less energy more nodes are dead
-            share = weights[k, 4]
-            low = min(first + 1, last - 1)
+            low = min(int(weights[k, 4] + 1e-9), last - 1)
             down, up = line[low], line[low + 1]
-            later[k] = down + share * (up - down) if down > -np.inf else up
+            later[k] = down + (weights[k, 4] - low) * (up - down) if down > -np.inf else up
 
 
 @jit
