@@ -22,7 +22,8 @@ holds for any G and W. A path keeps the displacements that it was found with, si
 elsewhere; between nodes it may come to where one cannot stay within the limit, and is cut there.
 
 Where energy is limited, the best inputs lie between the levels of the grid, and the path that the programme finds is
-only near the best. So it climbs by gradient, and what it then comes to is the bound where that of the grid is smaller.
+only near the best. So it climbs by gradient; and what it, or the mixture, then comes to is the bound where that of the
+grid is smaller.
 
 **The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on a finer
 one (`StateGrid.finer`), plus what they differ by. This allowance is no proof.
@@ -214,7 +215,7 @@ class Certificate:
             u, x = self.path(multipliers, V)
             if np.isfinite(self.limits.energy):
                 u, x = self.climb(multipliers, u)
-                bound = max(bound, self._at_most(multipliers, self.told(multipliers, u[None], x[None])[0]))
+                bound = max(bound, told, self._at_most(multipliers, self.told(multipliers, u[None], x[None])[0]))
             if bound < least:
                 least, best = bound, multipliers
             progress.append(told - least)
