@@ -144,7 +144,8 @@ def test_a_path_keeps_its_displacements_where_rounding_leads_its_inputs_elsewher
 
 
 @pytest.mark.parametrize(
-    ("track", "count", "share"), [("Amplitude", 24, 0.88), ("Short", 24, 0.88), ("Output", 23, 0.85)]
+    ("track", "count", "share"),
+    [("Amplitude", 24, 0.88), ("Short", 24, 0.88), ("Output", 24, 0.85), ("Power", 24, 0.9)],
 )
 def test_stored_bounds_are_above_the_oracles(track, count, share):
     oracle = Oracle.of(Systems.of(f"duffing_env/{track}-v0", count))
@@ -160,7 +161,7 @@ def test_it_is_above_every_input_of_a_tiny_problem_with_little_energy():
     inputs = inputs.clip(-0.15, 0.15)
     worths = np.array([systems.worth(u[None])[0][0] for u in inputs])
     bound = Certificate(systems, 0).find(inputs[[worths.argmax()]], rounds=24)
-    assert worths.max() < bound < worths.max() + 2.5
+    assert worths.max() < bound < worths.max() + 4.0
 
 
 @pytest.mark.slow  # some programmes with energy left as a state
