@@ -26,7 +26,8 @@ only near the best. So it climbs by gradient; and what it, or the mixture, then 
 grid is smaller.
 
 **The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on a finer
-one (`StateGrid.finer`), plus what they differ by. This allowance is no proof.
+one (`StateGrid.finer`), plus what they differ by. This allowance is no proof, and where energy is limited it is a weak
+one: there the bound does not settle as intervals become more, and a finer grid can lie higher or lower.
 """
 
 from __future__ import annotations

@@ -51,9 +51,9 @@ class StateGrid:
 
     @property
     def finer(self) -> StateGrid:
-        """With twice as many intervals of displacements; where energy is limited half as many more, of it as well.
+        """With twice as many intervals of displacements.
 
-        There it has twice as many intervals of inputs, too.
+        Where energy is limited, with 1.5 times as many of displacements and of energies, and twice as many of inputs.
         """
         if self.energies == 1:
             return replace(self, n=2 * self.n - 1)
