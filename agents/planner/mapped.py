@@ -28,6 +28,9 @@ from estimator.models.model import Model
 #: Where not all inputs are tried, so many are.
 _COARSE_CHOICES = 2
 
+#: Sizes that are tried of a first input whose direction is given, in parts of the largest.
+_SIZES = (1.0, 0.75, 0.5, 0.25)
+
 #: A way this much [nats] worse than the best of its length is followed no further.
 _HOPELESS = 0.5
 
@@ -85,6 +88,8 @@ class Task(NamedTuple):
         cells: of the map along each axis.
         fine: moves for which all inputs are tried.
         ways: that are followed, at most.
+        first: where the first input goes: 1.0 up, -1.0 down, 0.0 there is none, NaN anywhere.
+        sign: -1.0 turns the map over.
     """
 
     record: Any
@@ -97,6 +102,8 @@ class Task(NamedTuple):
     cells: int
     fine: int
     ways: int
+    first: float = np.nan
+    sign: float = 1.0
 
 
 @cache
@@ -152,21 +159,24 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
         count = 1
         for h in range(task.steps):
             reachable = 0
+            is_given = h == 0 and task.first == task.first
             tried = len(CHOICES) if h < task.fine else _COARSE_CHOICES
+            if is_given:
+                tried = len(_SIZES) if task.first != 0.0 else 1
             for i in range(tried * (-(-count // LANES))):
                 block, choice = i // tried, i % tried
                 b = block * len(CHOICES) + choice
                 W = continued[b]
                 copy(W, 0, ways[block], kept)
                 for j in range(LANES):
-                    W[U + j] = choose(choice, W[U + j], terms)
+                    W[U + j] = sized(choice, task) if is_given else choose(choice, W[U + j], terms)
                 for _ in range(task.pace):
                     advance(W, task.record, terms)
                 appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
                 for j in range(min(LANES, count - block * LANES)):
-                    cell = place(W[j], terms.scales[0], task.cells, right)
+                    cell = place(task.sign * W[j], terms.scales[0], task.cells, right)
                     if is_plane:
-                        cell = cell * task.cells + place(W[LANES + j], terms.scales[1], task.cells, up)
+                        cell = cell * task.cells + place(task.sign * W[LANES + j], terms.scales[1], task.cells, up)
                     if entered[cell] < 0:
                         entered[cell] = reachable
                         visited[reachable], scores[reachable] = cell, -np.inf
@@ -183,6 +193,12 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
             way = memory.origins[h, way]
 
     return Map(memory, find)
+
+
+@jit
+def sized(choice, task):
+    """One of the first inputs in the direction that is given."""
+    return task.first * _SIZES[choice] * task.terms.amplitude
 
 
 @jit

@@ -28,7 +28,6 @@ from agents.policies.bursts import burster, drawn
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, Outlook, feature_names, look_at
 from agents.policies.sight import Sight
-from agents.policies.ways import BESIDE_BURSTS, ROUNDS
 from duffing_env.experiment import Experiment
 from estimator.models.difference import difference
 from estimator.models.model import Model
@@ -43,7 +42,7 @@ _USUAL = 0.1
 
 #: Chance that an episode on a simulated plant leaves the limit if every output were at the margin from it. The
 #: planner's is smaller, and so is that of policies on a rig: here an early end costs only what would have been learned.
-_RISK = 0.05
+_RISK = 0.02
 
 _HARDER, _AS_IT_IS = (FEATURES.index(f"best_{way}_whole") for way in ("up", "none"))
 
@@ -151,7 +150,7 @@ class CommonForesight:
     of the systems that a policy was trained on. So with that alone a policy plays any environment. Beside the
     observation itself it tells more of one model, and a policy plays environments of that. Outputs keep a margin
     (`agents.planner.imagination.margin`) from the planner's limit (`agents.planner.motion.limit_of`): on a rig the
-    planner's own, else one for a risk of 5 % in place of 0.2 %.
+    planner's own, else one for a risk of 2 % in place of 0.2 %.
 
     An action is a push. Where the energy is limited it is how much harder to push than the best burst, and the features
     of what is best tell what harder, as hard and softer ways bring, in place of a push up, none and a push down.
@@ -184,8 +183,7 @@ class CommonForesight:
         moves, most = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
         known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
         risk = RISK if is_of_rig(experiment) else _RISK
-        rounds = ROUNDS if np.isinf(setup.budget) else BESIDE_BURSTS
-        self._ahead = Ahead(push, moves, most, rounds, setup.horizon, setup.budget, rate, known)
+        self._ahead = Ahead(push, moves, most, setup.horizon, setup.budget, rate, known)
         self._terms = Terms(
             setup.max_input,
             np.inf,

@@ -5,8 +5,8 @@ says, or to the end of the episode. Where sensors are noisy and the oscillator i
 state together, and what a push teaches is known late: then ways are longer. A move lasts as many samples as
 `agents.planner.motion.Swing` says, and fewer where the end is near.
 
-Features are what the *best* way brings after small changes, if the first move is a push up, none, or a push down; what
-it brings to *brake* and to *rest*; and how near to the limit all of that leads. Where a move is one sample, a push is
+Features are what the *best* way brings, if the first move is a push up, none, or a push down; what it brings to *brake*
+and to *rest*; and how near to the limit all of that leads. Where a move is one sample, a push is
 as hard as the best way's first.
 """
 
@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner.design import factorise
-from agents.planner.imagination import mind, terms_of
+from agents.planner.imagination import Terms, mind, terms_of
 from agents.planner.motion import View, places
-from agents.policies.ways import FIRST, WAYS, Task, ways
-from estimator.arrays import copy, highest
+from agents.policies.ways import FIRST, SIMPLE, Task, ways
+from estimator.arrays import copy
 from estimator.engine.motion import motion
-from estimator.lanes import LANES, kernel, part
+from estimator.lanes import LANES, jit, kernel, part
 from estimator.parameters import FloatArray
 
 CONTINUATIONS = ("best", "brake", "rest")
@@ -64,7 +64,6 @@ class Ahead(NamedTuple):
         push: largest push; no more than what moves the first sensor by half of its limit in a move.
         moves: that are looked ahead, unless many outputs tell of a state together.
         most: of these, at most.
-        rounds: of changes of the best ways.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
         rate: (K, K) information about the coefficients that a sample usually brings.
@@ -74,7 +73,6 @@ class Ahead(NamedTuple):
     push: float
     moves: int
     most: int
-    rounds: int
     samples: float
     energy: float
     rate: FloatArray
@@ -102,6 +100,14 @@ def as_feature(nats: FloatArray) -> FloatArray:
     return np.clip(np.arcsinh(_NAT * nats), -BOUND, BOUND)
 
 
+@jit
+def pushed(terms, push):
+    """The same terms with another largest input."""
+    t = terms
+    judged = t.margin, t.walk, t.scales, t.pace, t.shaken, t.price, t.goal, t.goal_weight, t.firm, t.soon, t.cells
+    return Terms(push, t.slew, t.limit, *judged)
+
+
 @cache
 def imaginer(view: View) -> Any:
     """``look(records, observations, ahead, terms, features, safe, signs, shares, pushes)`` makes features of n beliefs.
@@ -119,30 +125,20 @@ def imaginer(view: View) -> Any:
     found = mind(*view)
     size, SCORE, begin, appraise, precision = found.size, found.score, found.fill, found.appraise, found.precision
     advance, SPREAD, NOISE = found.advance, found.spread, found.noise
-    explore, refine = ways(view)
+    best_of, follow, find = ways(view)
     at, width = places(model), len(motion(*view).layout)
     k, d = model.n_coefficients, model.n_states + model.n_coefficients
     kind = f"{model.name}_{model.digest}_{view.degree}_{view.lag}"
     inner, entry = part(kind), kernel(kind=kind)
 
     @inner
-    def best(values, first, group):
-        """The best of a first move's ways in a group of continuations, which are 0 best, 1 brake, 2 rest."""
-        begin_at = first * WAYS + (0 if group == 0 else WAYS - 3 + group)
-        found = values[begin_at]
-        for j in range(begin_at + 1, begin_at + (WAYS - 2 if group == 0 else 1)):
-            found = max(found, values[j])
-        return found
-
-    @inner
-    def brings(worths, known, h, first, group):
-        """What a first move's ways bring in a group of continuations, of the best after its changes."""
-        return known[first, h] if group == 0 else best(worths[h], first, group)
-
-    @inner
-    def nearest(heights, first):
-        """How near to the limit the way of a first move leads that stays furthest from it; heights are negative."""
-        return -max(best(heights, first, 0), best(heights, first, 1), best(heights, first, 2))
+    def gather(first, worths, peaks, best, nats, heights):
+        """What a first move's best way brings, braking, and resting, and how near to the limit each leads."""
+        for c in range(len(CONTINUATIONS)):
+            lane = first * len(SIMPLE) + c
+            heights[c, first] = best.known[2] if c == 0 else peaks[lane]
+            for h in range(len(PARTS)):
+                nats[c, h, first] = best.known[h] if c == 0 else worths[h, lane]
 
     @inner
     def learn_rate(W, ahead, elapsed, now, rate, M):
@@ -166,10 +162,10 @@ def imaginer(view: View) -> Any:
 
     @entry
     def look(records, observations, ahead, whole, features, safe, signs, shares, pushes):
-        W, still = np.zeros(size), np.zeros(width)
-        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(len(FIRST) * WAYS)
-        worths, plans = np.empty((len(PARTS), len(peaks))), np.empty((len(peaks), ahead.most))
-        candidates, known = np.empty((LANES, ahead.most)), np.empty((len(FIRST), 3))
+        W, still, best = np.zeros(size), np.zeros(width), best_of(ahead.most)
+        M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(LANES)
+        worths, plans = np.empty((len(PARTS), LANES)), np.empty((LANES, ahead.most))
+        nats, heights = np.empty((3, len(PARTS), len(FIRST))), np.empty((3, len(FIRST)))
         shared, free, now, rate = np.empty(len(FIRST)), np.empty((3, 3)), np.empty((k, k)), np.empty((k, k))
         for i in range(len(observations)):
             record, seen, told = records[i], observations[i], features[i]
@@ -188,23 +184,24 @@ def imaginer(view: View) -> Any:
             appraise(W, none, 0.0)
             so_far = W[SCORE]
             appraise(W, M, np.sqrt(share * ahead.samples))
-            to_come = W[SCORE]
+            at_rate = W[SCORE]
             moves, wanted = ahead.moves, _TOGETHER * together(W, record, lasts, terms) / terms.pace
             if wanted > moves:
                 moves = int(min(wanted, ahead.most))
             pace = min(terms.pace, max(1, int(left / moves + 0.5)))
             moves = max(_SHORTEST, min(moves, -(-int(left + 0.5) // pace)))
-            task = Task(record, lasts, push, moves, ahead.rounds, pace, left, share * ahead.samples, M, terms)
-            explore(W, still, task, worths, peaks, plans, free)
+            has_bursts, to_come = ahead.energy < np.inf, share * ahead.samples
+            task = Task(record, lasts, moves, has_bursts, pace, left, to_come, M, pushed(terms, push))
+            follow(W, still, task, worths, peaks, plans, free)
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
             signs[i] = sign
             up, down = (0, 2) if sign > 0.0 else (2, 0)
             most = -np.inf
             for first in range(len(FIRST)):
-                way = first * WAYS + highest(worths[1, first * WAYS : (first + 1) * WAYS], WAYS - 2)
-                refine(W, task, plans[way], FIRST[first], sign, candidates, known[first])
-                shared[first] = abs(plans[way, 0]) / push if push > 0.0 else 1.0
-                most = max(most, known[first, 1])
+                find(W, task, first, sign, plans[first * len(SIMPLE) :], best)
+                gather(first, worths, peaks, best, nats, heights)
+                shared[first] = abs(best.plan[0]) / push if push > 0.0 else 1.0
+                most = max(most, best.known[1])
             mean = widest = seen[at.log_std]
             for a in range(1, k):
                 mean += seen[at.log_std + a]
@@ -214,34 +211,29 @@ def imaginer(view: View) -> Any:
             told[4], told[5] = seen[at.noise], seen[at.noise + 1]
             told[6], told[7] = seen[at.time_left], thrift
             to = 8
-            for group in range(3):
+            for c in range(len(CONTINUATIONS)):
                 for h in range(len(PARTS)):
-                    rise = brings(worths, known, h, up, group)
-                    fall = brings(worths, known, h, down, group)
-                    calm = brings(worths, known, h, 1, group)
+                    rise, calm, fall = nats[c, h, up], nats[c, h, 1], nats[c, h, down]
                     told[to] = np.arcsinh(_NAT * (rise - fall))
                     told[to + 1] = np.arcsinh(_NAT * (calm - max(rise, fall)))
                     to += 2
-            for j in range(len(peaks)):
-                peaks[j] = -peaks[j]
-            for group in range(3):
+            for c in range(len(CONTINUATIONS)):
                 for first in (up, 1, down):
-                    told[to] = -best(peaks, first, group) / terms.limit
+                    told[to] = heights[c, first] / terms.limit
                     to += 1
             for t in range(3):
                 told[to + t] = sign * free[t, 1] / terms.limit
             for t in range(2):
                 told[to + 3 + t] = (free[t, 0] - free[t, 2]) / terms.limit
-            told[to + 5] = np.arcsinh(_NAT * (most - to_come))
-            told[to + 6] = to_come - so_far
-            lowest = np.inf
+            told[to + 5] = np.arcsinh(_NAT * (most - at_rate))
+            told[to + 6] = at_rate - so_far
+            lowest = min(heights[0, 0], heights[0, 1], heights[0, 2])
             for first in range(len(FIRST)):
-                lowest = min(lowest, -best(peaks, first, 0))
-            for first in range(len(FIRST)):
-                peak, place_at = nearest(peaks, first), first if sign > 0.0 else 2 - first
+                place_at = first if sign > 0.0 else 2 - first
+                nearest = min(heights[0, first], heights[1, first], heights[2, first])
                 # A longer move is chosen anew before it is played in full, and of a softer push no more is known then.
-                is_eased = first != 1 and pace == 1 and known[first, 2] <= terms.limit
-                safe[i, place_at] = is_eased or peak <= max(lowest, terms.limit)
+                is_eased = first != 1 and pace == 1 and heights[0, first] <= terms.limit
+                safe[i, place_at] = is_eased or nearest <= max(lowest, terms.limit)
                 if first != 1:
                     shares[i, place_at // 2] = shared[first] if is_eased else 1.0
             for j in range(len(told)):

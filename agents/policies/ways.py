@@ -1,17 +1,18 @@
-"""Ways to go on, imagined from a belief: simple ones, and the best of them with small changes.
+"""Ways to go on, imagined from a belief: three simple ones of every first move, and the best that is found.
 
 A *push* is an input as large as is allowed. A *move* is an input that is held for as many samples as
 `agents.planner.motion.Swing` says. A *way* is a sequence of moves, as long as `agents.policies.imagined.look_ahead`
 says, or to the end of the episode. Ways are imagined side by side, one in a lane.
 
-There are 64 ways of each first move: a push up, none, or a push down. Thirty of them try the next five pushes with
-mixed signs, and go on with pushes along the motion, but against it where these would lead beyond the limit. Thirty more
-try the same signs, and then rest. Two make the next five pushes all up, or all down, and go on along the motion. All of
-these compete. The last two tell of themselves: *brake* pushes against the motion, *rest* does nothing.
+The first move is a push up, none, or a push down. Then *pump* pushes along the motion, but against it where that would
+lead beyond the limit; *brake* pushes against the motion, and *rest* does nothing.
 
-What the best way teaches depends on how hard it pushes where it turns. So it is changed a little in some rounds, as the
-planner changes its plans: some pushes are turned over, or one or two become harder or softer, the first ones more often
-than those far ahead. The first push keeps its direction.
+The best way of a first move begins as the best through the map of the state (`agents.planner.mapped`), or as one of
+these. On the map several sizes of the first push are tried, each with what then follows best: near the limit a push
+that is right together with the next ones is not found by changing it alone. The best of all is changed a little in some
+rounds: some pushes are turned over, or one or two become harder or softer, the first ones more often than those far
+ahead. The first push keeps its direction. Where bursts (`agents.policies.bursts`) say how hard to push, there is
+no map.
 
 What a way is worth is in nats, as the planner imagines it: by belief propagation (`agents.planner.imagination`), so
 that what one sample teaches is not counted again by the next, with what the rest of the episode will bring anyway. It
@@ -27,6 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agents.planner import mapped
 from agents.planner.imagination import mind
 from agents.planner.motion import View
 from estimator.arrays import copy, fill
@@ -38,12 +40,8 @@ from estimator.parameters import FloatArray
 #: The first moves, in parts of a push: up, none, down.
 FIRST = (1.0, 0.0, -1.0)
 
-#: Blocks of ways for a first move, and all of its ways.
-_BLOCKS = 2
-WAYS = _BLOCKS * LANES
-
-#: The last of the ways of a first move: two whose next pushes are all alike, brake, and rest.
-_LAST = 4
+#: How simple ways go on; that of first move f is in lane ``len(SIMPLE) f`` and the next ones.
+SIMPLE = ("pump", "brake", "rest")
 
 #: Parts of a way after which it counts what is known; the first is what is known when half of it has been followed.
 _MARKS = (0.5, 0.75, 1.0)
@@ -53,7 +51,10 @@ _IN_REACH = 8
 
 #: Rounds of changes of a way that begins with a push, and fewer where bursts say how hard to push. One that begins with
 #: none has one round.
-ROUNDS, BESIDE_BURSTS = 12, 2
+ROUNDS, _BESIDE_BURSTS = 8, 2
+
+#: Cells of the map along each axis, moves for which all inputs are tried, and ways that are followed.
+_CELLS, _FINE, _FOLLOWED = 35, 7, LANES
 
 #: The part of the changes that turn pushes over, and how many pushes at most.
 _TURN, _MOST_TURNED = 0.5, 3
@@ -71,21 +72,19 @@ class Task(NamedTuple):
     Attributes:
         record: the belief.
         lasts: (2,) the inputs that were applied last, newest first.
-        push: how hard pushes are.
         moves: of a way.
-        rounds: of changes.
+        has_bursts: whether these say how hard to push (`agents.policies.bursts`).
         pace: samples of a move.
         left: samples left in the episode.
         to_come: samples that bring information at the usual rate from now on.
         M: (K, K) factor of that rate.
-        terms: `agents.planner.imagination.Terms`.
+        terms: `agents.planner.imagination.Terms`, whose amplitude is how hard pushes are.
     """
 
     record: Any
     lasts: Any
-    push: float
     moves: int
-    rounds: int
+    has_bursts: bool
     pace: int
     left: float
     to_come: float
@@ -94,7 +93,9 @@ class Task(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """Changes of ways, (ROUNDS, LANES) each; in every round the first lane is left as it is.
+    """Changes of ways, (ROUNDS, LANES) each.
+
+    In every round the first lane is left as it is, and in the first one the simple ways are, too.
 
     Attributes:
         where: the first move that is changed, in parts of a way.
@@ -116,34 +117,58 @@ def _draw_changes() -> Changes:
     moved = _BY * rng.uniform(-1.0, 1.0, (*turns.shape, 2)) * ~turns[..., None]
     moved[..., 1] *= rng.random(turns.shape) < 0.5
     turned[:, 0], moved[:, 0] = 0, 0.0
+    turned[0, : len(SIMPLE) + 1], moved[0, : len(SIMPLE) + 1] = 0, 0.0
     return Changes(where, turned, moved)
 
 
 CHANGES = _draw_changes()
+
+#: The stream by which the map is laid: always the same.
+WORDS = np.random.SFC64(5).state["state"]["state"]
+
+
+class Best(NamedTuple):
+    """The best way of a first move, and what finds it writes on.
+
+    Attributes:
+        memory: `agents.planner.mapped.Memory`.
+        words: (4,) a stream of random numbers.
+        candidates: (LANES, moves) changed ways.
+        plan: (moves,) inputs of the best one.
+        known: (3,) what that is worth when half was followed, and all in all; and how near to the limit it leads.
+    """
+
+    memory: Any
+    words: Any
+    candidates: Any
+    plan: Any
+    known: Any
 
 
 class Ways(NamedTuple):
     """Compiled functions of one model.
 
     Attributes:
-        explore: ``explore(W, still, task, worths, peaks, plans, free)``: the simple ways.
+        best: ``best(moves)``: a `Best` for ways of so many moves.
+        follow: ``follow(W, still, task, worths, peaks, plans, free)``: the simple ways.
 
             - ``W``, ``still``: to write on, as `agents.planner.imagination` and `estimator.engine.motion` lay them out;
-            - ``worths`` (2, 3 WAYS): receives what they are worth when half was followed, and all in all;
-            - ``peaks`` (3 WAYS,): receives how near to the limit they lead, margin and all;
-            - ``plans`` (3 WAYS, moves): receives their inputs;
+            - ``worths`` (2, LANES): receives what they are worth when half was followed, and all in all;
+            - ``peaks`` (LANES,): receives how near to the limit they lead, margin and all;
+            - ``plans`` (LANES, moves): receives their inputs;
             - ``free`` (3, 3): receives what the first sensor shows after the first three moves of those that rest.
-        refine: ``refine(W, task, plan, direction, sign, candidates, known)``: the changes of one.
+        find: ``find(W, task, first, sign, simple, best)``: the best way of a first move.
 
-            - ``plan`` (moves,): its inputs; becomes the best;
-            - ``direction``: 1.0, 0.0 or -1.0, what its first push keeps to;
-            - ``sign``: 1.0 if the motion is upwards without input, or -1.0, so that changes are turned over with it;
-            - ``candidates`` (LANES, moves): to write on;
-            - ``known`` (3,): receives the two worths, and how near to the limit it leads.
+            - ``first``: which of `FIRST`;
+            - ``sign``: 1.0 if the motion is upwards without input, or -1.0, so that map and changes are turned over
+              with it;
+            - ``simple`` (len(`SIMPLE`), moves): inputs of the simple ones;
+            - ``best``: receives it.
     """
 
-    explore: Any
-    refine: Any
+    best: Any
+    follow: Any
+    find: Any
 
 
 @cache
@@ -161,6 +186,12 @@ def ways(view: View) -> Ways:
     olders = np.array([place[x] * LANES for x in ("LAST_INPUT", "OLDER_INPUT") if x in place], dtype=np.int64)
     inner = part(f"{model.name}_{model.digest}_{view.degree}_{view.lag}")
     where, turned, moved = CHANGES
+    map_memory, find_way = mapped.mapped(*view)
+
+    @inner
+    def best(moves):
+        kept, words = map_memory(moves, _FOLLOWED), np.empty(4, np.uint64)
+        return Best(kept, words, np.empty((LANES, moves)), np.empty(moves), np.empty(3))
 
     @inner
     def along(W, j, still, task):
@@ -170,36 +201,12 @@ def ways(view: View) -> Ways:
         for a in range(len(olders)):
             still[last_input + a] = W[olders[a] + j]
         sense(still)
-        way = task.push if still[velocity] >= 0.0 else -task.push
+        push = task.terms.amplitude
+        way = push if still[velocity] >= 0.0 else -push
         still[u] = way
         glance(still)
         ahead = still[later] + (task.pace - 1) * (still[later] - still[now])
         return way, -way if abs(ahead) > task.terms.limit - W[MARGIN + j] else way
-
-    @inner
-    def choose(W, c, first, t, still, task):
-        """Put the inputs of move t into all lanes of block c, whose first move is ``first``.
-
-        The signs of pushes are the digits of a way's number plus one: ways then go on along the motion, or rest.
-        """
-        half = WAYS // 2 - _LAST // 2
-        is_tried = WAYS // 2 >> t > 0
-        for j in range(LANES):
-            way = c * LANES + j
-            last = way - 2 * half
-            if t == 0:
-                W[U + j] = FIRST[first] * task.push
-            elif last == 3:
-                W[U + j] = 0.0
-            elif last < 0 and is_tried:
-                W[U + j] = task.push if ((way % half + 1) >> (t - 1)) & 1 else -task.push
-            elif 0 <= last < 2 and is_tried:
-                W[U + j] = task.push if last == 0 else -task.push
-            elif half <= way < 2 * half:
-                W[U + j] = 0.0
-            else:
-                onward, pump = along(W, j, still, task)
-                W[U + j] = pump if last < 2 else -onward
 
     @inner
     def go_on(W, t, task, worths, peaks):
@@ -223,19 +230,21 @@ def ways(view: View) -> Ways:
                         worths[0, j] = W[SCORE + j]
 
     @inner
-    def explore(W, still, task, worths, peaks, plans, free):
-        for first in range(len(FIRST)):
-            for c in range(_BLOCKS):
-                lane = first * WAYS + c * LANES
-                lanes = slice(lane, lane + LANES)
-                begin(W, task.record, task.lasts)
-                for t in range(task.moves):
-                    choose(W, c, first, t, still, task)
-                    for j in range(LANES):
-                        plans[lane + j, t] = W[U + j]
-                    go_on(W, t, task, worths[:, lanes], peaks[lanes])
-                    if t < 3:
-                        free[t, first] = W[shown + LANES - 1]  # at last that of rest
+    def follow(W, still, task, worths, peaks, plans, free):
+        begin(W, task.record, task.lasts)
+        for t in range(task.moves):
+            for j in range(LANES):
+                # Lanes beyond the last way do the same as those before.
+                first, simple = j // len(SIMPLE) % len(FIRST), j % len(SIMPLE)
+                W[U + j] = FIRST[first] * task.terms.amplitude if t == 0 else 0.0
+                if t > 0 and simple < 2:
+                    onward, pump = along(W, j, still, task)
+                    W[U + j] = pump if simple == 0 else -onward
+                plans[j, t] = W[U + j]
+            go_on(W, t, task, worths, peaks)
+            for first in range(len(FIRST)):
+                if t < len(free):
+                    free[t, first] = W[shown + (first + 1) * len(SIMPLE) - 1]
 
     @inner
     def change(plan, r, j, push):
@@ -247,22 +256,34 @@ def ways(view: View) -> Ways:
             plan[t] = max(-size, min(plan[t] + push * moved[r, j, t - h], size))
 
     @inner
-    def refine(W, task, plan, direction, sign, candidates, known):
-        least, worths, peaks = _LEAST * task.push, np.empty((2, LANES)), np.empty(LANES)
+    def find(W, task, first, sign, simple, best):
+        _, words, candidates, plan, known = best
+        t, direction, push = task, FIRST[first], task.terms.amplitude
+        for a in range(4):
+            words[a] = WORDS[a]
+        copy(plan, 0, simple[0], t.moves)
+        if not t.has_bursts:
+            to_come, sizes = int(t.to_come + 0.5), (_CELLS, _FINE, _FOLLOWED, direction, sign)
+            through = mapped.Task(t.record, to_come, t.moves, t.pace, t.terms, t.lasts, t.M, *sizes)
+            find_way(best.memory, through, plan[: t.moves], words)
+        rounds = 1 if direction == 0.0 else _BESIDE_BURSTS if t.has_bursts else ROUNDS
+        least, worths, peaks = _LEAST * push, np.empty((2, LANES)), np.empty(LANES)
         known[1] = -np.inf
-        for r in range(task.rounds if direction != 0.0 else 1):
+        for r in range(rounds):
             for j in range(LANES):
-                copy(candidates[j], 0, plan, task.moves)
-                change(candidates[j, : task.moves], r, j, sign * task.push)
+                copy(candidates[j], 0, plan, t.moves)
+                if r == 0 and 0 < j <= len(SIMPLE):
+                    copy(candidates[j], 0, simple[j - 1], t.moves)
+                change(candidates[j, : t.moves], r, j, sign * push)
                 candidates[j, 0] = direction * max(least, direction * candidates[j, 0])
-            begin(W, task.record, task.lasts)
-            for t in range(task.moves):
+            begin(W, t.record, t.lasts)
+            for h in range(t.moves):
                 for j in range(LANES):
-                    W[U + j] = candidates[j, t]
-                go_on(W, t, task, worths, peaks)
+                    W[U + j] = candidates[j, h]
+                go_on(W, h, t, worths, peaks)
             for j in range(LANES):
                 if worths[1, j] > known[1]:
                     known[0], known[1], known[2] = worths[0, j], worths[1, j], peaks[j]
-                    copy(plan, 0, candidates[j], task.moves)
+                    copy(plan, 0, candidates[j], t.moves)
 
-    return Ways(explore, refine)
+    return Ways(best, follow, find)

@@ -57,6 +57,11 @@ class HeldOut:
             self._best = json.loads((folder / BEST / CARD).read_text())["evaluation"][SCORE]
 
     @property
+    def has_begun(self) -> bool:
+        """Whether there was an evaluation."""
+        return bool(self._rows)
+
+    @property
     def steps(self) -> int:
         """Samples at the last evaluation."""
         return int(self._rows[-1]["steps"]) if self._rows else 0

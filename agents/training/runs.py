@@ -75,8 +75,8 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     - ``policy.safetensors``, ``policy.json``: the policy,
     - ``checkpoints/STEPS/``: the policy on the way, after the update that these samples were for,
     - ``progress.csv``: Stable-Baselines3's log,
-    - ``evaluations.csv``, ``best/``: where ``eval_every`` is given, the policy's worth on held-out systems on the
-      way, and the policy that was best by its log posterior gain,
+    - ``evaluations.csv``, ``best/``: where ``eval_every`` is given, the policy's worth on held-out systems before the
+      first update and on the way, and the policy that was best by its log posterior gain,
     - ``events.out.tfevents.*``: both logs for TensorBoard, where ``tensorboard`` is set,
     - ``learning_curve.png``, where an episode ended.
 
@@ -187,6 +187,8 @@ class _Training:
             logs.append(self._board)
         with closing(Logger(str(self._folder), logs)) as logger:
             self._model.set_logger(logger)
+            if self._config.eval_every > 0 and not self._held_out.has_begun:
+                self._evaluate()
             self._learn()
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
         if not all(math.isnan(mean) for *_, mean in curve):
@@ -233,14 +235,18 @@ class _Training:
     def _on_update(self) -> None:
         """Evaluate, and write a checkpoint, where one is due; the last one is not gone on from."""
         if self._due_evaluation():
-            found = self._held_out.evaluate(self._model, self._card())
-            if self._board is not None:
-                for name in METRICS:
-                    self._board.writer.add_scalar(f"evaluation/{name}", found[name], self._model.num_timesteps)
-            self._evaluated(self._model.num_timesteps, found)
+            self._evaluate()
         if self._due_checkpoints() > self._checkpoints:
             self._checkpoints = self._due_checkpoints()
             self._save()
+
+    def _evaluate(self) -> None:
+        """Evaluate, and tell what was found to all who want to know."""
+        found = self._held_out.evaluate(self._model, self._card())
+        if self._board is not None:
+            for name in METRICS:
+                self._board.writer.add_scalar(f"evaluation/{name}", found[name], self._model.num_timesteps)
+        self._evaluated(self._model.num_timesteps, found)
 
     def _save(self) -> None:
         """Write a checkpoint."""

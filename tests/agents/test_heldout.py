@@ -35,7 +35,7 @@ def run(tmp_path_factory):
 
 def test_evaluations_are_told_and_written(run):
     made, told = run
-    assert [steps for steps, _ in told] == [256, 512]  # the first updates after 200 and 400 samples; 512 is the end
+    assert [steps for steps, _ in told] == [0, 256, 512]  # before all updates, and the first after 200 and 400 samples
     assert rows(made.folder) == [{"steps": steps, **found} for steps, found in told]
     assert set(told[0][1]) == set(METRICS)
     assert told[0] != told[1]
@@ -81,7 +81,7 @@ def test_tensorboard_holds_both_logs(tmp_path):
     accumulator = EventAccumulator(str(events)).Reload()
     for name in METRICS:
         scalars = accumulator.Scalars(f"evaluation/{name}")
-        assert [scalar.step for scalar in scalars] == [256, 512]
+        assert [scalar.step for scalar in scalars] == [0, 256, 512]
         np.testing.assert_allclose([s.value for s in scalars], [row[name] for row in rows(made.folder)], rtol=1e-6)
     assert [scalar.step for scalar in accumulator.Scalars("train/learning_rate")] == [256, 384, 512]
 

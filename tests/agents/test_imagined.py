@@ -8,11 +8,13 @@ import pytest
 from scipy.stats import t as student_t
 
 from agents.evaluation.batch import make
+from agents.planner.candidates import uniform
+from agents.planner.mapped import enough_for
 from agents.planner.motion import View
 from agents.policies import make_policy
 from agents.policies.foresight import CommonForesight
 from agents.policies.imagined import BOUND, FEATURES, imaginer
-from agents.policies.ways import CHANGES
+from agents.policies.ways import CHANGES, ROUNDS, WORDS
 from agents.studies.universal import play, unseen
 from agents.training import PPOSettings, TrainConfig, train
 from agents.training.family import draw_member
@@ -29,6 +31,10 @@ def observations_of(envs, samples, seed=0):
         actions = rng.choice([-0.6, 0.0, 0.6], (envs.num_envs, 1)).astype(np.float32)
         observations, *_ = envs.step(actions)
     return observations
+
+
+#: Of the first moves.
+DIRECTIONS = (1.0, 0.0, -1.0)
 
 
 def beside(envs, records):
@@ -69,7 +75,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
     moves = max(4, min(moves, int(np.ceil(round(left) / pace))))
     marks = [int(part * moves + 0.5) for part in (0.5, 0.75, 1.0)]
     weights = [1 / 3, 1 / 3, 1 / 3] if left > moves * pace else [0.0, 0.0, 1.0]
-    number, half, tried = 64, 30, 5
+    names = ("pump", "brake", "rest")
 
     def worth(P, left):
         return 0.5 * np.linalg.slogdet(np.linalg.inv(P[2:, 2:]) + left * rate)[1]
@@ -91,55 +97,78 @@ def reference(belief, seen, ahead, terms, least=0.0):
                 told.append(worth(C, max(0.0, to_come - (t + 1) * pace)) - cost)
         return [told[0], np.dot(weights, told)], peak, seen_at, inputs
 
-    def way(first, code):
+    def simple(first, name):
         def push(t, x, margin):
             if t == 0:
-                return (1.0, 0.0, -1.0)[first] * A
-            if code == number - 1:
-                return 0.0
-            if code < 2 * half and t <= tried:
-                return A if (code % half + 1 >> (t - 1)) & 1 else -A
-            if code < number - 2 and t <= tried:
-                return A if code == 2 * half else -A
-            if half <= code < 2 * half:
-                return 0.0
+                return DIRECTIONS[first] * A
             along = A if x[0] - x[1] >= 0 else -A
             then = theta[0] * x[0] + theta[1] * x[0] ** 3 + theta[2] * x[1] + theta[3] * along
             pump = -along if abs(then + (pace - 1) * (then - x[0])) > L - margin else along
-            return pump if code < number - 2 else -along
+            return {"pump": pump, "brake": -along, "rest": 0.0}[name]
 
         return follow(push)
 
+    def mapped(first, sign):
+        """The inputs of the best way through the map of the state."""
+        words, cells = np.array(WORDS), 35
+        offsets = uniform(words), uniform(words)
+
+        def cell(x):
+            where = [(sign * x[i] / terms.scales[i] + 1) / 2 * (cells - 1) + offsets[i] for i in range(2)]
+            return tuple(int(np.clip(w, 0, cells - 1)) for w in where)
+
+        # Of a way: its state, joint covariance, gain and variance of the last output, cost, and inputs.
+        followed = [(z, P, np.zeros(6), 0.0, 0.0, [])]
+        for t in range(moves):
+            sizes = (1.0, -1.0, 0.0, 0.5, -0.5) if t < 7 else (1.0, -1.0)
+            if t == 0:
+                sizes = DIRECTIONS[first] * np.array([1.0, 0.75, 0.5, 0.25] if first != 1 else [1.0])
+            entered = {}
+            for x, C, gain, variance, cost, inputs in followed:
+                for size in sizes:
+                    to, D, told, spread, price = x, C, gain, variance, cost
+                    for _ in range(pace):
+                        to, D, told, spread, margin = sample(to, D, size * A, told, spread)
+                        price += 1e4 / L * max(0.0, abs(to[0]) + margin - L)
+                    score = worth(D, max(0, int(to_come + 0.5) - (t + 1) * pace)) - price
+                    if score > entered.get(cell(to), (-np.inf,))[0]:
+                        entered[cell(to)] = score, (to, D, told, spread, price, [*inputs, size * A])
+            enough = enough_for(np.array([score for score, _ in entered.values()]), 32)
+            kept = [found for found in entered.values() if found[0] >= enough][:32]
+            followed = [way for _, way in kept]
+        return followed[int(np.argmax([score for score, _ in kept]))][-1]
+
     def refined(first, sign):
         """The best way of a first move after its changes."""
-        best = max((ways[first, code] for code in range(number - 2)), key=lambda found: found[0][1])
-        for r in range(ahead.rounds if first != 1 else 1):
+        ways = [simples[first, name][3] for name in names]
+        has_bursts = ahead.energy < np.inf
+        start = ways[0] if has_bursts else mapped(first, sign)
+        best = None
+        for r in range(1 if first == 1 else 2 if has_bursts else ROUNDS):
             tries = []
             for j in range(32):
-                plan = np.array(best[3])
+                plan = np.array(ways[j - 1] if r == 0 and 0 < j <= 3 else start if r == 0 else best[3])
                 h = int(CHANGES.where[r, j] * moves)
                 turned = slice(max(1, h), h + CHANGES.turned[r, j])
                 plan[turned] = np.where(plan[turned] != 0, -plan[turned], sign * A)
                 size = len(plan[h : h + 2])
                 plan[h : h + 2] = np.clip(plan[h : h + 2] + sign * A * CHANGES.moved[r, j, :size], -A, A)
-                direction = (1.0, 0.0, -1.0)[first]
-                plan[0] = direction * max(0.02 * A, direction * plan[0])
+                plan[0] = DIRECTIONS[first] * max(0.02 * A, DIRECTIONS[first] * plan[0])
                 tries.append(follow(lambda t, x, margin, plan=plan: plan[t]))
-            best = max([best, *tries], key=lambda found: found[0][1])
+            best = max([best, *tries] if best else tries, key=lambda found: found[0][1])
         return best
 
-    ways = {(first, code): way(first, code) for first in range(3) for code in range(number)}
-    free = np.array([[ways[first, number - 1][2][t] for first in range(3)] for t in range(3)])
+    simples = {(first, name): simple(first, name) for first in range(3) for name in names}
+    free = np.array([[simples[first, "rest"][2][t] for first in range(3)] for t in range(3)])
     sign = 1.0 if free[0, 1] >= 0 else -1.0
     up, down = (0, 2) if sign > 0 else (2, 0)
-    groups = [range(number - 2), [number - 2], [number - 1]]
     best = [refined(first, sign) for first in range(3)]
-    peaks = np.array([[min(ways[f, c][1] for c in codes) for f in range(3)] for codes in groups])
+    groups = [best, *([simples[first, name] for first in range(3)] for name in ("brake", "rest"))]
+    peaks = np.array([[found[1] for found in group] for group in groups])
     told = [seen[4:8].mean(), seen[4:8].max(), sign * last_u, sign * seen[19], *seen[14:16], time_left, thrift]
-    for group in range(3):
+    for group in groups:
         for h in range(2):
-            found = best if group == 0 else [ways[f, groups[group][0]] for f in range(3)]
-            rise, calm, fall = (found[f][0][h] for f in (up, 1, down))
+            rise, calm, fall = (group[f][0][h] for f in (up, 1, down))
             told += [np.arcsinh(20 * (rise - fall)), np.arcsinh(20 * (calm - max(rise, fall)))]
     told += [peaks[group, first] / L for group in range(3) for first in (up, 1, down)]
     told += [*(sign * free[:, 1] / L), *((free[:2, 0] - free[:2, 2]) / L)]
@@ -287,11 +316,11 @@ def test_beside_the_observation_it_is_turned_upright():
 
 
 def test_on_a_rig_it_keeps_further_from_the_limit():
-    # Of 256 outputs at the margin one is beyond the limit in one episode of twenty, on a rig in one of five hundred.
+    # Of 256 outputs at the margin one is beyond the limit in one episode of fifty, on a rig in one of five hundred.
     freedom = 8 + np.arange(256) / 4
     for track in ("Amplitude-v0", "Amplitude-v1"):
         simulated = CommonForesight(make(f"duffing_env/{track}", 1))._terms
-        np.testing.assert_allclose(256 * student_t(freedom).sf(simulated.margin), 0.05, rtol=1e-6)
+        np.testing.assert_allclose(256 * student_t(freedom).sf(simulated.margin), 0.02, rtol=1e-6)
         assert simulated.shaken == 0.0
     rig = make("duffing_env/Rig-v0", 1, {"rig": draw_member(np.random.default_rng(1)).options["rig"], "horizon": 256})
     terms = CommonForesight(rig)._terms
@@ -306,14 +335,14 @@ def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path, log
     run = train(
         TrainConfig(env="duffing_env/Amplitude-v1", steps=1024, output=tmp_path / "r", hyperparameters=settings)
     )
-    envs = make("duffing_env/Amplitude-v1", 32)
+    envs = make("duffing_env/Amplitude-v1", 256)  # of a few beliefs two ways are worth about the same
     policy = make_policy(str(run.folder), envs)
     seen = observations_of(envs, 30)
     view = CommonForesight(envs).look(seen)
     expected = view.act(rule(view.features, 3) - 1)
     agrees = np.isclose(policy.predict(seen, deterministic=True)[0], expected)
     assert agrees.mean() > 0.9
-    explored = [np.isclose(policy.predict(seen, deterministic=False)[0], expected)[agrees].mean() for _ in range(16)]
+    explored = [np.isclose(policy.predict(seen, deterministic=False)[0], expected)[agrees].mean() for _ in range(4)]
     assert least < np.mean(explored) <= most
     with pytest.raises(ValueError, match="another model than the policy was trained on"):
         make_policy(str(run.folder), make("duffing_env/Pendulum-v0", 1))

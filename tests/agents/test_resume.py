@@ -145,7 +145,7 @@ def test_every_algorithm_is_resumed(tmp_path, algo):
     assert make_policy(str(folder)).card["steps"] == STEPS
     assert [point[:2] for point in run.curve[: len(before.curve)]] == [point[:2] for point in before.curve]
     rows = (folder / "evaluations.csv").read_text().splitlines()
-    assert [int(row.split(",")[0]) for row in rows[1:]] == list(range(128, STEPS + 1, 128))
+    assert [int(row.split(",")[0]) for row in rows[1:]] == list(range(0, STEPS + 1, 128))
 
 
 @pytest.mark.parametrize(
