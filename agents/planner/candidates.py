@@ -7,8 +7,8 @@ import numpy as np
 from duffing_env.noise import draw, to_unit
 from estimator.lanes import jit
 
-#: Inputs to choose from, in parts of the largest. Of a plan that is far off, the first two will do.
-CHOICES = (1.0, -1.0, 0.0, 0.5, -0.5)
+#: Inputs to choose from, in parts of the largest. Of what is further off in a plan, the first five will do, then two.
+CHOICES = (1.0, -1.0, 0.0, 0.5, -0.5, 0.75, -0.75, 0.25, -0.25)
 
 #: Of small changes, so many move an input by up to so much of the largest; the higher the power, the sooner in a plan.
 _MOVED, _BY, _SOON = 0.5, 0.3, 3

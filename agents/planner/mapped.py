@@ -3,7 +3,8 @@
 As by dynamic programming, of all ways that lead into the same cell of the plane of the first two states only the best
 is followed; and of these, so many of the best. So a long plan is found in the time of a short one. A way goes on with
 the highest input, the lowest, none, and half of either, since near its limit a signal may be led too far by a whole
-push and not far enough by none. Far ahead, where the plan will be made anew, only the highest and the lowest are tried.
+push and not far enough by none. In its first moves, which will be played, quarters are tried, too. Far ahead, where the
+plan will be made anew, only the highest and the lowest are.
 A way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of the
 last plans. Without the latter a way would be praised for what every way teaches sooner or later.
 
@@ -25,8 +26,8 @@ from estimator.arrays import copy, highest
 from estimator.lanes import LANES, jit, part
 from estimator.models.model import Model
 
-#: Where not all inputs are tried, so many are.
-_COARSE_CHOICES = 2
+#: Where not all inputs are tried, so many are, and far ahead so many.
+_SOME, _FEW = 5, 2
 
 #: Sizes that are tried of a first input whose direction is given, in parts of the largest.
 _SIZES = (1.0, 0.75, 0.5, 0.25)
@@ -86,7 +87,8 @@ class Task(NamedTuple):
         lasts: (2,) the inputs that were applied last, newest first.
         M: (K, K) factor of the information per sample that is to come.
         cells: of the map along each axis.
-        fine: moves for which all inputs are tried.
+        finest: moves for which all inputs are tried.
+        fine: moves up to which whole and half ones are; then the highest and the lowest alone.
         ways: that are followed, at most.
         first: where the first input goes: 1.0 up, -1.0 down, 0.0 there is none, NaN anywhere.
         sign: -1.0 turns the map over.
@@ -100,10 +102,11 @@ class Task(NamedTuple):
     lasts: Any
     M: Any
     cells: int
+    finest: int
     fine: int
     ways: int
-    first: float = np.nan
-    sign: float = 1.0
+    first: float
+    sign: float
 
 
 @cache
@@ -160,7 +163,7 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
         for h in range(task.steps):
             reachable = 0
             is_given = h == 0 and task.first == task.first
-            tried = len(CHOICES) if h < task.fine else _COARSE_CHOICES
+            tried = len(CHOICES) if h < task.finest else _SOME if h < task.fine else _FEW
             if is_given:
                 tried = len(_SIZES) if task.first != 0.0 else 1
             for i in range(tried * (-(-count // LANES))):

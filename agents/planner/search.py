@@ -34,8 +34,8 @@ _WAYS = 3 * LANES
 #: followed then, and plans look no further than so many moves.
 _LATE, _LATE_WAYS, _LATE_HORIZON = 48, 6 * LANES, 24
 
-#: For so many first moves all inputs are tried.
-_TRIED = 7
+#: For so many first moves all inputs are tried, and up to so many some of them.
+_FINEST, _FINE = 3, 7
 
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
@@ -163,7 +163,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             ways, steps = _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
-        task = Task(record, left, steps, pace, terms, lasts, M, terms.cells, _TRIED, ways)
+        task = Task(record, left, steps, pace, terms, lasts, M, terms.cells, _FINEST, _FINE, ways, np.nan, 1.0)
         turned = -best[0]
         for h in range(len(best) - 1):
             best[h] = best[h + 1]
@@ -225,7 +225,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             go_on(W, record, u[t], lasts, terms)
         left = len(u) - first
         ways = -(-cells * cells // LANES) * LANES
-        task = Task(record, left, left, 1, terms, lasts, M, cells, left, ways)
+        task = Task(record, left, left, 1, terms, lasts, M, cells, 0, left, ways, np.nan, 1.0)
         find_way(memory(left, ways), task, u[first:], words)
 
     return Search(plan, play, through)

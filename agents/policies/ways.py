@@ -53,7 +53,7 @@ _IN_REACH = 8
 #: none has one round.
 ROUNDS, _BESIDE_BURSTS = 8, 2
 
-#: Cells of the map along each axis, moves for which all inputs are tried, and ways that are followed.
+#: Cells of the map along each axis, moves for which half pushes are tried, and ways that are followed.
 _CELLS, _FINE, _FOLLOWED = 35, 7, LANES
 
 #: The part of the changes that turn pushes over, and how many pushes at most.
@@ -263,7 +263,7 @@ def ways(view: View) -> Ways:
             words[a] = WORDS[a]
         copy(plan, 0, simple[0], t.moves)
         if not t.has_bursts:
-            to_come, sizes = int(t.to_come + 0.5), (_CELLS, _FINE, _FOLLOWED, direction, sign)
+            to_come, sizes = int(t.to_come + 0.5), (_CELLS, 0, _FINE, _FOLLOWED, direction, sign)
             through = mapped.Task(t.record, to_come, t.moves, t.pace, t.terms, t.lasts, t.M, *sizes)
             find_way(best.memory, through, plan[: t.moves], words)
         rounds = 1 if direction == 0.0 else _BESIDE_BURSTS if t.has_bursts else ROUNDS
