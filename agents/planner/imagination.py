@@ -119,7 +119,7 @@ class Mind(NamedTuple):
             are those of a record.
         appraise: ``appraise(W, M, scale)``: the scores, minus the expected free energy up to a constant, with (scale M)
             (scale M)ᵀ (K, K) of information still to come.
-        precision: ``precision(W, inverse)``: inverse (K, K) of the coefficients' covariance in the first lane.
+        precision: ``precision(W, lane, inverse)``: inverse (K, K) of the coefficients' covariance in a lane.
     """
 
     size: int
@@ -209,9 +209,9 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
         weigh(W)
 
     @inner
-    def precision(W, inverse):
+    def precision(W, lane, inverse):
         work = np.empty((k, k))
-        place = covariance
+        place = covariance + lane
         for j in range(k):
             for i in range(j, k):
                 work[i, j] = W[place]

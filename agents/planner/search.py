@@ -115,8 +115,11 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             weights[h] += weights[h + 1]
 
     @inner
-    def compete(W, task, rivals, first, best, score, words):
-        """Weigh the rivals, from lane ``first`` on changed copies of the best; gives the score of the winner."""
+    def compete(W, task, rivals, first, best, score, after, words):
+        """Weigh the rivals, from lane ``first`` on changed copies of the best; gives the score of the winner.
+
+        A new winner's precision (K, K) at the end of its plan comes into ``after``.
+        """
         candidates, terms = rivals.candidates, task.terms
         for j in range(LANES):
             if j >= first:
@@ -128,20 +131,15 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         if not rivals.worths[winner] > score:
             return score
         copy(best, 0, candidates[winner], len(best))
+        precision(W, winner, after)
         return rivals.worths[winner]
 
     @inner
-    def refresh(W, task, best, rate):
+    def refresh(W, task, after, rate):
         """Let the information per sample of a plan into the running mean; the first one is taken as it is."""
-        before, after = np.empty((k, k)), np.empty((k, k))
+        before = np.empty((k, k))
         begin(W, task.record, task.lasts)
-        precision(W, before)
-        for h in range(task.steps):
-            for j in range(LANES):
-                W[U + j] = best[h]
-            for _ in range(task.pace):
-                advance(W, task.record, task.terms)
-        precision(W, after)
+        precision(W, 0, before)
         share, is_finite = _REFRESHED if rate[0, 0] > 0.0 else 1.0, True
         for a in range(k):
             for b in range(k):
@@ -174,15 +172,16 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         for j in range(3, LANES):
             copy(candidates[j], 0, candidates[2 * (j % 2)], len(best))
             change(candidates[j], steps, terms.amplitude, words)
-        score = compete(W, task, rivals, LANES, best, -np.inf, words)
+        after = np.zeros((k, k))
+        score = compete(W, task, rivals, LANES, best, -np.inf, after, words)
         for _ in range(rounds):
             first = nudge(rivals, best, steps, terms.amplitude)
-            score = compete(W, task, rivals, first, best, score, words)
+            score = compete(W, task, rivals, first, best, score, after, words)
             first = step(rivals, steps, terms.amplitude)
-            score = compete(W, task, rivals, first, best, score, words)
+            score = compete(W, task, rivals, first, best, score, after, words)
         # Where the coefficients walk, what is learned later does not add to what is learned now.
         if not (terms.walk > 0.0).any():
-            refresh(W, task, best, rate)
+            refresh(W, task, after, rate)
         return pace
 
     @inner

@@ -143,7 +143,7 @@ def imaginer(view: View) -> Any:
     @inner
     def learn_rate(W, ahead, elapsed, now, rate, M):
         """The factor M of the information per sample, of the usual one and of what the episode has told so far."""
-        precision(W, now)
+        precision(W, 0, now)
         for a in range(k):
             for b in range(k):
                 told = now[a, b] - ahead.known[a, b]
