@@ -11,7 +11,7 @@ from llvmlite import binding, ir
 from numba.core import cgutils, types
 from numba.core.extending import _Intrinsic
 
-from estimator.straight.translation import EXTERNAL, Kinds, Source, Translated, Translation, leaves
+from estimator.straight.translation import EXTERNAL, Kinds, Source, Translated, Translation, leaves, vectorised
 
 _TYPES = {"double": types.float64, "i1": types.boolean, "i64": types.int64, "word": types.uint64}
 _LLVM = {"double": ir.DoubleType(), "i1": ir.IntType(1), "i64": ir.IntType(64), "word": ir.IntType(64)}
@@ -68,7 +68,8 @@ class Straight(_Intrinsic):  # type: ignore[misc]
         """Generate a call."""
         text = self.translated(kinds)
         if kinds not in self._libraries:
-            self._libraries[kinds] = _Library(text, builder.module)
+            features = context.codegen().magic_tuple()[-1]
+            self._libraries[kinds] = _Library(text, builder.module, "+avx512f" in features)
         context.active_code_library.add_linking_library(self._libraries[kinds])
         given = [
             value
@@ -116,12 +117,19 @@ def straight_within(source: str) -> Callable[[Callable[..., Any]], Any]:
 
 
 class _Library:
-    """A translated function as Numba links it: with the data layout of the module that calls it."""
+    """A translated function as Numba links it: with the data layout of the module that calls it.
 
-    def __init__(self, text: Translated, caller: Any) -> None:
+    Args:
+        text: of the function.
+        caller: the module.
+        is_wide: whether the processor has AVX-512.
+    """
+
+    def __init__(self, text: Translated, caller: Any, is_wide: bool) -> None:
         head = f'target datalayout = "{caller.data_layout}"\ntarget triple = "{caller.triple}"\n'
         declared = "".join(f"declare double @{name}(double)\n" for name in EXTERNAL)
-        self._module = binding.parse_assembly(head + declared + "".join(text.definitions.values()))
+        definitions = vectorised("".join(text.definitions.values()), is_wide)
+        self._module = binding.parse_assembly(head + declared + definitions)
         self._reload_init: set[str] = set()
 
     def _ensure_finalized(self) -> None:

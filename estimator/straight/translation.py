@@ -102,7 +102,25 @@ _FUNCTIONS: dict[Callable[..., Any], str] = {
 #: What every text must declare.
 EXTERNAL = tuple(sorted(set(_FUNCTIONS.values())))
 
+#: Doubles in a register of AVX-512, and what marks loops over the lanes of a block, whose turns are a multiple of that
+#: (`vectorised`).
+VECTOR, OF_LANES = 8, ", !llvm.loop !of_lanes"
+
 _CONVERSIONS: dict[Any, str] = {np.float64: "double", np.int64: "i64", np.uint64: "word"}
+
+
+def vectorised(text: str, is_wide: bool) -> str:
+    """The text of a module whose loops over lanes use registers of AVX-512, where there are any.
+
+    LLVM by itself takes half of them on Intel's processors, for the sake of code that needs wide ones here and there.
+    Loops over lanes are little else, and take a half to a quarter of the time with them.
+    """
+    head, *rest = text.split(OF_LANES)
+    if not rest or not is_wide:
+        return head + "".join(rest)
+    marked = (f", !llvm.loop !{i}{part}" for i, part in enumerate(rest, 1))
+    loops = (f"!{i} = distinct !{{!{i}, !0}}\n" for i in range(1, len(rest) + 1))
+    return f'{head}{"".join(marked)}!0 = !{{!"llvm.loop.vectorize.width", i32 {VECTOR}}}\n{"".join(loops)}'
 
 
 def leaves(kinds: Any) -> list[str]:
@@ -222,7 +240,9 @@ class Translation(Arithmetic):
             raise self._error(loop.iter, f"keeps {kept}, which must go into a block")
         self.lines[at + 2] = f"%i{n} = phi i64 [ 0, %{before} ], [ %n{n}, %{self._block} ]"
         self.lines += [f"%n{n} = add nsw i64 %i{n}, 1", f"%c{n} = icmp slt i64 %n{n}, {end}"]
-        self.lines += [f"br i1 %c{n}, label %loop{n}, label %done{n}", f"done{n}:"]
+        is_of_lanes = is_number(count) and count % VECTOR == 0 and not any("call void" in line for line in self.lines[at:])
+        marked = OF_LANES if is_of_lanes else ""
+        self.lines += [f"br i1 %c{n}, label %loop{n}, label %done{n}{marked}", f"done{n}:"]
         self._block = f"done{n}"
 
     def _value(self, node: Any, names: Mapping[str, Any]) -> Any:
