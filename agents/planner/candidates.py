@@ -22,7 +22,9 @@ def choose(choice, last, terms):
 
 @jit
 def bound(candidate, steps, last, terms):
-    """Cut changes of the input beyond the slew limit, as the environment does."""
+    """Cut changes of the input beyond the slew limit, where there is one, as the environment does."""
+    if terms.slew == np.inf:
+        return
     for h in range(steps):
         candidate[h] = max(last - terms.slew, min(candidate[h], last + terms.slew))
         last = candidate[h]

@@ -64,6 +64,7 @@ class Memory(NamedTuple):
         scores: (len(`CHOICES`) ways,) of the best continuations into the cells that any leads into.
         ends: (len(`CHOICES`) ways,) which these are.
         visited: (len(`CHOICES`) ways,) which cells.
+        sources: (ways,) where the continuations begin that become ways.
     """
 
     ways: Any
@@ -73,6 +74,7 @@ class Memory(NamedTuple):
     scores: Any
     ends: Any
     visited: Any
+    sources: Any
 
 
 class Task(NamedTuple):
@@ -113,8 +115,8 @@ class Task(NamedTuple):
 def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
     """The ways through the map of a model; arguments as `estimator.engine.imagination.imagination`."""
     imagined = mind(model, degree, lag)
-    size, kept, U, SCORE = imagined.size, imagined.kept, imagined.u, imagined.score
-    begin, advance, appraise = imagined.fill, imagined.advance, imagined.appraise
+    size, kept, U, SCORE, CELL = imagined.size, imagined.kept, imagined.u, imagined.score, imagined.cell
+    begin, advance, find_cells, appraise = imagined.fill, imagined.advance, imagined.find_cells, imagined.appraise
     is_plane = model.n_states > 1
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
 
@@ -125,7 +127,7 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
         origins, inputs = np.empty((horizon, ways), np.int64), np.empty((horizon, ways))
         most = len(CHOICES) * ways
         scores, ends, visited = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
-        return Memory(followed, continued, origins, inputs, scores, ends, visited)
+        return Memory(followed, continued, origins, inputs, scores, ends, visited, np.empty(ways, np.int64))
 
     @inner
     def gather(memory, h, most, found):
@@ -133,32 +135,34 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
 
         Into ``found`` cells leads any; the scores become those of the ways.
         """
-        ways, continued, scores = memory.ways, memory.continued, memory.scores
+        ways, continued, origins, inputs, scores, ends, _, sources = memory
         enough = enough_for(scores[:found], most)
         count = 0
         for i in range(found):
             if scores[i] >= enough and count < most:
-                b, j = memory.ends[i] // LANES, memory.ends[i] % LANES
-                memory.origins[h, count] = b // len(CHOICES) * LANES + j
-                memory.inputs[h, count] = continued[b, U + j]
-                scores[count] = scores[i]
-                way, lane = ways[count // LANES], count % LANES
-                for row in range(0, kept, LANES):
-                    way[row + lane] = continued[b, row + j]
+                b, j = ends[i] // LANES, ends[i] % LANES
+                origins[h, count] = b // len(CHOICES) * LANES + j
+                inputs[h, count] = continued[b, U + j]
+                scores[count], sources[count] = scores[i], b * size + j
                 count += 1
         # Lanes beyond the last way do the same work as the others, so that none of them runs wild.
         for lane in range(count, -(-count // LANES) * LANES):
+            sources[lane] = sources[lane // LANES * LANES]
+        numbers = continued.reshape(-1)
+        for block in range(-(-count // LANES)):
             for row in range(0, kept, LANES):
-                ways[lane // LANES, row + lane % LANES] = ways[lane // LANES, row]
+                for lane in range(LANES):
+                    ways[block, row + lane] = numbers[sources[block * LANES + lane] + row]
         return count
 
     @inner
     def find(memory, task, found, words):
         """Build a plan by the best ways into the cells of the map, which is laid anew at random every time."""
-        ways, continued, _, _, scores, ends, visited = memory
-        terms, entered = task.terms, np.full(task.cells * task.cells if is_plane else task.cells, -1)
+        ways, continued, origins, inputs, scores, ends, visited, _ = memory
+        record, terms, M, pace = task.record, task.terms, task.M, task.pace  # once: each time they would be counted
+        entered = np.full(task.cells * task.cells if is_plane else task.cells, -1)
         right, up = uniform(words), uniform(words)
-        begin(ways[0], task.record, task.lasts)
+        begin(ways[0], record, task.lasts)
         count = 1
         for h in range(task.steps):
             reachable = 0
@@ -173,13 +177,12 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
                 copy(W, 0, ways[block], kept)
                 for j in range(LANES):
                     W[U + j] = sized(choice, task) if is_given else choose(choice, W[U + j], terms)
-                for _ in range(task.pace):
-                    advance(W, task.record, terms)
-                appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
+                for _ in range(pace):
+                    advance(W, record, terms)
+                appraise(W, M, np.sqrt(max(0, task.left - (h + 1) * pace)))
+                find_cells(W, task.sign, terms.scales, task.cells, right, up)
                 for j in range(min(LANES, count - block * LANES)):
-                    cell = place(task.sign * W[j], terms.scales[0], task.cells, right)
-                    if is_plane:
-                        cell = cell * task.cells + place(task.sign * W[LANES + j], terms.scales[1], task.cells, up)
+                    cell = np.int64(W[CELL + j])
                     if entered[cell] < 0:
                         entered[cell] = reachable
                         visited[reachable], scores[reachable] = cell, -np.inf
@@ -192,8 +195,8 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
             count = gather(memory, h, task.ways, reachable)
         way = highest(scores, count)
         for h in range(task.steps - 1, -1, -1):
-            found[h] = memory.inputs[h, way]
-            way = memory.origins[h, way]
+            found[h] = inputs[h, way]
+            way = origins[h, way]
 
     return Map(memory, find)
 
@@ -227,12 +230,3 @@ def _reached(scores, enough):
     for i in range(len(scores)):
         count += scores[i] >= enough
     return count
-
-
-@jit
-def place(x, scale, cells, offset):
-    """The cell of a state along one axis; the first for one that is not a number."""
-    where = (x / scale + 1.0) * 0.5 * (cells - 1) + offset
-    if not where > 0.0:
-        return 0
-    return np.int64(min(where, cells - 1.0))

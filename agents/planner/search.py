@@ -93,22 +93,23 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         ``terms.soon`` moves, or half of them, after twice as many, and so on, and at the end.
         """
         steps, (candidates, worths, near, weights, _, _) = task.steps, rivals
-        mark = steps if task.left <= steps * task.pace else max(1, min(task.terms.soon, steps // 2))
-        begin(W, task.record, task.lasts)
+        record, terms, M, pace = task.record, task.terms, task.M, task.pace  # once: each time they would be counted
+        mark = steps if task.left <= steps * pace else max(1, min(terms.soon, steps // 2))
+        begin(W, record, task.lasts)
         fill(worths, 0.0)
         for h in range(steps):
             weights[h] = 0.0
             for j in range(LANES):
                 W[U + j] = candidates[j, h]
                 near[h, j] = -np.inf
-            for _ in range(task.pace):
-                advance(W, task.record, task.terms)
+            for _ in range(pace):
+                advance(W, record, terms)
                 for j in range(LANES):
                     near[h, j] = max(near[h, j], W[NEAR + j])
             if h + 1 == mark or h + 1 == steps:
                 mark *= 2
                 weights[h] = 1.0
-                appraise(W, task.M, np.sqrt(max(0, task.left - (h + 1) * task.pace)))
+                appraise(W, M, np.sqrt(max(0, task.left - (h + 1) * pace)))
                 for j in range(LANES):
                     worths[j] += W[SCORE + j]
         for h in range(steps - 2, -1, -1):

@@ -41,7 +41,7 @@ class Imagination:
             covariance any more.
         layout: rows of the block. The first are all that stands for a plan between two samples: the states, their joint
             covariance with the coefficients (``P_i_j``), the inputs, ``COST``, and ``BEGUN``, which is 0 before the
-            first sample. ``COST``, ``SCORE``, ``MARGIN`` and ``NEAR`` are the caller's.
+            first sample. ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` are the caller's.
         kept: number of these first rows.
     """
 
@@ -67,7 +67,7 @@ def imagination(model: Model, degree: int = 0, lag: int = 0) -> Imagination:
         raise ValueError(f"degree and lag must be 0 or 1, and lag 0 for a differential equation: {degree}, {lag}")
     inputs = inputs_of(model, degree, lag)
     kept = [*model.states, *pairs("P", model.names), *inputs, "COST", "BEGUN"]
-    place = rows(*kept, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "MARGIN", "NEAR")
+    place = rows(*kept, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "MARGIN", "NEAR", "CELL")
     key = repr((model.digest, degree, lag))
     code = stored.load(model.name, "imagination", key, lambda: _source(model, degree, lag, inputs, place), NAMES)
     return Imagination(code.advance, code.judge, place, len(kept))

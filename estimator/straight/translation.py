@@ -240,7 +240,8 @@ class Translation(Arithmetic):
             raise self._error(loop.iter, f"keeps {kept}, which must go into a block")
         self.lines[at + 2] = f"%i{n} = phi i64 [ 0, %{before} ], [ %n{n}, %{self._block} ]"
         self.lines += [f"%n{n} = add nsw i64 %i{n}, 1", f"%c{n} = icmp slt i64 %n{n}, {end}"]
-        is_of_lanes = is_number(count) and count % VECTOR == 0 and not any("call void" in line for line in self.lines[at:])
+        calls = any("call void" in line for line in self.lines[at:])
+        is_of_lanes = is_number(count) and count % VECTOR == 0 and not calls
         marked = OF_LANES if is_of_lanes else ""
         self.lines += [f"br i1 %c{n}, label %loop{n}, label %done{n}{marked}", f"done{n}:"]
         self._block = f"done{n}"

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from llvmlite import binding
 
 from estimator.straight import straight, straight_within
+from estimator.straight.translation import vectorised
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
 
@@ -246,6 +248,22 @@ def asks(W):
 
 def gives_too_much(a):
     return swapped((a, a), (a, a), a)
+
+
+def over_lanes(W):
+    for j in range(16):
+        W[16 + j] = W[j] * W[j] + 1.0
+    for j in range(3):
+        W[j] = 0.0
+
+
+@pytest.mark.parametrize("is_wide", [False, True])
+def test_loops_over_lanes_are_of_eight_where_registers_are_wide(is_wide):
+    module = vectorised(next(iter(straight(over_lanes).translated(("ptr",)).definitions.values())), is_wide)
+    text = str(binding.parse_assembly(module))
+    assert text.count("llvm.loop.vectorize.width") == is_wide
+    assert text.count("br i1") == 2
+    assert len(re.findall(r"br i1 .*!llvm\.loop", text)) == is_wide
 
 
 @pytest.mark.parametrize(
