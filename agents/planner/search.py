@@ -27,7 +27,7 @@ from estimator.arrays import copy, fill, highest
 from estimator.lanes import LANES, kernel, part
 from estimator.models.model import Model
 
-#: Ways through the map that are followed, at most.
+#: Ways through the map that are followed, at most, of which a third is dropped far ahead.
 _WAYS = 3 * LANES
 
 #: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: so many ways are
@@ -162,7 +162,8 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             ways, steps = _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
-        task = Task(record, left, steps, pace, terms, lasts, M, terms.cells, _FINEST, _FINE, ways, np.nan, 1.0)
+        sizes = terms.cells, _FINEST, _FINE, ways, ways - ways // 3
+        task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         turned = -best[0]
         for h in range(len(best) - 1):
             best[h] = best[h + 1]
@@ -225,7 +226,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             go_on(W, record, u[t], lasts, terms)
         left = len(u) - first
         ways = -(-cells * cells // LANES) * LANES
-        task = Task(record, left, left, 1, terms, lasts, M, cells, 0, left, ways, np.nan, 1.0)
+        task = Task(record, left, left, 1, terms, lasts, M, cells, 0, left, ways, ways, np.nan, 1.0)
         find_way(memory(left, ways), task, u[first:], words)
 
     return Search(plan, play, through)
