@@ -1,12 +1,19 @@
-"""How many ways through the map are followed."""
+"""The best way through the map of the state, and how many are followed."""
 
+import numba
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agents.planner.imagination import LOST
-from agents.planner.mapped import _HALVINGS, _HOPELESS, enough_for
+from agents.evaluation.batch import make
+from agents.planner.candidates import CHOICES, uniform
+from agents.planner.imagination import LOST, terms_of
+from agents.planner.mapped import _HALVINGS, _HOPELESS, Task, enough_for, mapped
+from agents.policies import make_policy
+from estimator.belief import covariance_places
+from estimator.lanes import LANES
 
 
 @settings(deadline=None)
@@ -28,3 +35,75 @@ def test_ways_that_are_lost_are_followed_when_there_are_no_others():
 def test_the_best_of_many_are_followed():
     scores = np.random.default_rng(0).permutation(np.arange(400) * 1e-3)
     np.testing.assert_array_equal(np.sort(scores[scores >= enough_for(scores, 96)])[-90:], np.arange(310, 400) * 1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_best_way_is_that_of_plain_numpy(seed):
+    envs = make("duffing_env/Output-v0", 1, {})
+    actions = np.random.default_rng(seed).choice([-0.4, 0.4], (24, 1, 1)).astype(np.float32)
+    envs.reset(seed=seed)
+    for action in actions:
+        envs.step(action)
+    planner = make_policy("efe", envs)
+    terms, belief = terms_of(planner.terms, 60), envs.belief(0)
+    rate = 1e-3 * np.linalg.inv(belief.coefficients_cov)
+    lasts = terms.amplitude * actions[:-3:-1, 0, 0].astype(float)
+    task = Task(
+        belief.record, 60, 14, 1, terms, lasts, np.linalg.cholesky(rate), 30, 3, 5, 2 * LANES, LANES, np.nan, 1.0
+    )
+    stream = np.random.SFC64(seed).state["state"]["state"]
+    found = np.zeros(14)
+    best_way(planner.view)(task, found, stream.copy())
+    np.testing.assert_allclose(found, reference(belief, task, stream.copy()), atol=1e-15)
+
+
+def best_way(view):
+    """The search through the map, for callers in Python."""
+    memory, find = mapped(*view)
+    return numba.njit(lambda task, found, words: find(memory(task.steps, task.ways), task, found, words))
+
+
+def reference(belief, task, words):
+    """The best way through the map of the state of Eq. (2), from matrices and way by way."""
+    terms, L = task.terms, task.terms.limit
+    theta, offsets = belief.coefficients_mean, (uniform(words), uniform(words))
+    q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
+
+    def sample(z, P, u, gain, variance):
+        moved = np.array([theta @ [z[0], z[0] ** 3, z[1], u], z[0]])
+        S = np.eye(6)
+        S[0] = [theta[0] + 3 * theta[1] * z[0] ** 2, theta[2], z[0], z[0] ** 3, z[1], u]
+        S[1] = [1, 0, 0, 0, 0, 0]
+        P = S @ P @ S.T
+        P[0, 0] += q
+        shaken = max((S @ gain)[0] ** 2 * variance, terms.shaken * q)
+        variance = P[0, 0] + r
+        gain, deviation = P[:, 0] / variance, np.sqrt(variance + shaken)
+        near = max(0.0, abs(moved[0]) + min(terms.margin * deviation, 0.5 * L) - L) / deviation
+        cost = 1e4 / L * max(0.0, abs(moved[0]) - L) + 0.05 * near**4
+        return moved, P - np.outer(gain, P[0]), gain, variance, cost
+
+    def cell(z):
+        where = [(z[i] / terms.scales[i] + 1) / 2 * (task.cells - 1) + offsets[i] for i in range(2)]
+        return tuple(int(np.clip(w, 0, task.cells - 1)) for w in where)
+
+    P = belief.record[covariance_places(belief.model)]
+    followed = [(belief.state_mean, P, np.zeros(6), 0.0, 0.0, [])]
+    for h in range(task.steps):
+        tried = CHOICES if h < task.finest else CHOICES[:5] if h < task.fine else CHOICES[:2]
+        most, entered = task.ways if h < task.fine else task.fewer, {}
+        # In the order of the blocks, of which the first that leads into a cell and the first of equal ways count.
+        for block in range(0, len(followed), LANES):
+            for part in tried:
+                for z, C, gain, variance, cost, inputs in followed[block : block + LANES]:
+                    u = part * terms.amplitude
+                    to, D, told, spread, price = sample(z, C, u, gain, variance)
+                    to_come = max(0, task.left - h - 1) * task.M @ task.M.T
+                    known = 0.5 * np.linalg.slogdet(np.linalg.inv(D[2:, 2:]) + to_come)[1]
+                    score = known - cost - price
+                    if score > entered.get(cell(to), (-np.inf,))[0]:
+                        entered[cell(to)] = score, (to, D, told, spread, cost + price, [*inputs, u])
+        enough = enough_for(np.array([score for score, _ in entered.values()]), most)
+        kept = [found for found in entered.values() if found[0] >= enough][:most]
+        followed = [way for _, way in kept]
+    return followed[int(np.argmax([score for score, _ in kept]))][-1]
