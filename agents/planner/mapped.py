@@ -29,7 +29,8 @@ from estimator.models.model import Model
 #: Where not all inputs are tried, so many are, and far ahead so many.
 _SOME, _FEW = 5, 2
 
-#: Sizes that are tried of a first input whose direction is given, in parts of the largest.
+#: Sizes that are tried of a first input whose direction is given and that is held for one sample, in parts of the
+#: largest.
 _SIZES = (1.0, 0.75, 0.5, 0.25)
 
 #: A way this much [nats] worse than the best of its length is followed no further.
@@ -171,7 +172,7 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
             is_given = h == 0 and task.first == task.first
             tried = len(CHOICES) if h < task.finest else _SOME if h < task.fine else _FEW
             if is_given:
-                tried = len(_SIZES) if task.first != 0.0 else 1
+                tried = len(_SIZES) if task.first != 0.0 and pace == 1 else 1
             for i in range(tried * (-(-count // LANES))):
                 block, choice = i // tried, i % tried
                 b = block * len(CHOICES) + choice

@@ -11,8 +11,8 @@ The best way of a first move begins as the best through the map of the state (`a
 these. On the map several sizes of the first push are tried, each with what then follows best: near the limit a push
 that is right together with the next ones is not found by changing it alone. The best of all is changed a little in some
 rounds: some pushes are turned over, or one or two become harder or softer, the first ones more often than those far
-ahead. The first push keeps its direction. Where bursts (`agents.policies.bursts`) say how hard to push, there is
-no map.
+ahead. The first push keeps its direction; where a move lasts several samples it is played in full, and stays so. Where
+bursts (`agents.policies.bursts`) say how hard to push, there is no map.
 
 What a way is worth is in nats, as the planner imagines it: by belief propagation (`agents.planner.imagination`), so
 that what one sample teaches is not counted again by the next, with what the rest of the episode will bring anyway. It
@@ -62,7 +62,7 @@ _TURN, _MOST_TURNED = 0.5, 3
 #: By how much of a push the others change it at most, and the power of a uniform number that says where in the way.
 _BY, _SOON = 0.3, 3
 
-#: The least part of a push that is one.
+#: The least part of a push that is one. A first push that is held for several samples is played in full.
 _LEAST = 0.02
 
 
@@ -267,7 +267,7 @@ def ways(view: View) -> Ways:
             through = mapped.Task(t.record, to_come, t.moves, t.pace, t.terms, t.lasts, t.M, *sizes)
             find_way(best.memory, through, plan[: t.moves], words)
         rounds = 1 if direction == 0.0 else _BESIDE_BURSTS if t.has_bursts else ROUNDS
-        least, worths, peaks = _LEAST * push, np.empty((2, LANES)), np.empty(LANES)
+        least, worths, peaks = _LEAST * push if t.pace == 1 else push, np.empty((2, LANES)), np.empty(LANES)
         known[1] = -np.inf
         for r in range(rounds):
             for j in range(LANES):

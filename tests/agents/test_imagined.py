@@ -122,7 +122,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
         for t in range(moves):
             sizes = (1.0, -1.0, 0.0, 0.5, -0.5) if t < 7 else (1.0, -1.0)
             if t == 0:
-                sizes = DIRECTIONS[first] * np.array([1.0, 0.75, 0.5, 0.25] if first != 1 else [1.0])
+                sizes = DIRECTIONS[first] * np.array([1.0, 0.75, 0.5, 0.25] if first != 1 and pace == 1 else [1.0])
             entered = {}
             for x, C, gain, variance, cost, inputs in followed:
                 for size in sizes:
@@ -153,7 +153,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
                 plan[turned] = np.where(plan[turned] != 0, -plan[turned], sign * A)
                 size = len(plan[h : h + 2])
                 plan[h : h + 2] = np.clip(plan[h : h + 2] + sign * A * CHANGES.moved[r, j, :size], -A, A)
-                plan[0] = DIRECTIONS[first] * max(0.02 * A, DIRECTIONS[first] * plan[0])
+                plan[0] = DIRECTIONS[first] * max(0.02 * A if pace == 1 else A, DIRECTIONS[first] * plan[0])
                 tries.append(follow(lambda t, x, margin, plan=plan: plan[t]))
             best = max([best, *tries] if best else tries, key=lambda found: found[0][1])
         return best
