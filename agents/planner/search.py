@@ -27,8 +27,8 @@ from estimator.arrays import copy, fill, highest
 from estimator.lanes import LANES, kernel, part
 from estimator.models.model import Model
 
-#: Ways through the map that are followed, at most, and far ahead.
-_WAYS, _FEWER = 3 * LANES, 2 * LANES
+#: Ways through the map that are followed, at most; for how many moves as many are, and how many then.
+_WAYS, _NEAR, _FEWER = 3 * LANES, 20, LANES
 
 #: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: so many ways are
 #: followed then, and plans look no further than so many moves.
@@ -162,7 +162,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
-        sizes = terms.cells, _FINEST, _FINE, ways, fewer
+        sizes = terms.cells, _FINEST, _FINE, ways, _NEAR, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         turned = -best[0]
         for h in range(len(best) - 1):
@@ -226,7 +226,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             go_on(W, record, u[t], lasts, terms)
         left = len(u) - first
         ways = -(-cells * cells // LANES) * LANES
-        task = Task(record, left, left, 1, terms, lasts, M, cells, 0, left, ways, ways, np.nan, 1.0)
+        task = Task(record, left, left, 1, terms, lasts, M, cells, 0, left, ways, left, ways, np.nan, 1.0)
         find_way(memory(left, ways), task, u[first:], words)
 
     return Search(plan, play, through)

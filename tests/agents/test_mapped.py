@@ -49,7 +49,7 @@ def test_the_best_way_is_that_of_plain_numpy(seed):
     rate = 1e-3 * np.linalg.inv(belief.coefficients_cov)
     lasts = terms.amplitude * actions[:-3:-1, 0, 0].astype(float)
     task = Task(
-        belief.record, 60, 14, 1, terms, lasts, np.linalg.cholesky(rate), 30, 3, 5, 2 * LANES, LANES, np.nan, 1.0
+        belief.record, 60, 14, 1, terms, lasts, np.linalg.cholesky(rate), 30, 3, 5, 2 * LANES, 6, LANES, np.nan, 1.0
     )
     stream = np.random.SFC64(seed).state["state"]["state"]
     found = np.zeros(14)
@@ -91,7 +91,7 @@ def reference(belief, task, words):
     followed = [(belief.state_mean, P, np.zeros(6), 0.0, 0.0, [])]
     for h in range(task.steps):
         tried = CHOICES if h < task.finest else CHOICES[:5] if h < task.fine else CHOICES[:2]
-        most, entered = task.ways if h < task.fine else task.fewer, {}
+        most, entered = task.ways if h < task.near else task.fewer, {}
         # In the order of the blocks, of which the first that leads into a cell and the first of equal ways count.
         for block in range(0, len(followed), LANES):
             for part in tried:
