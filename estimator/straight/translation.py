@@ -113,7 +113,7 @@ def vectorised(text: str, is_wide: bool) -> str:
     """The text of a module whose loops over lanes use registers of AVX-512, where there are any.
 
     LLVM by itself takes half of them on Intel's processors, for the sake of code that needs wide ones here and there.
-    Loops over lanes are little else, and take a half to a quarter of the time with them.
+    Loops over lanes are little else, and take less time with them.
     """
     head, *rest = text.split(OF_LANES)
     if not rest or not is_wide:
