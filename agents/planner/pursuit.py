@@ -56,7 +56,7 @@ class Pursuit(NamedTuple):
             - ``words`` (n, 4): streams of random numbers; overwritten.
             - ``actions`` (n,) receives the first input of each plan.
         begin: ``begin(record, precision, start)``: of a belief the inverse (K, K) of the coefficients' covariance, and
-            what a path starts with (`agents.planner.design`).
+            the rows of a path's start (`agents.planner.design`); the older inputs in it are left as they are.
         swings: ``swings(known, limit, energy, inputs, words)``: fill inputs (k, T) with bursts from rest, which push as
             the system moves.
     """

@@ -197,7 +197,7 @@ def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
     model = difference()
     belief = random_belief(model, np.random.default_rng(2))
     found = designer(model)
-    precision, start = np.empty((4, 4)), np.empty(found.start_size)
+    precision, start = np.empty((4, 4)), np.zeros(found.start_size)
     pursuit(model).begin(belief.record.copy(), precision, start)
     known = Known(belief.coefficients_mean, precision, (0.01**2, 0.02**2))
     u = np.random.default_rng(3).normal(0.0, 0.05, 8)
@@ -246,7 +246,7 @@ def test_few_steps_are_enough_to_plan_with(degree):
     W, found = block_after(duffing(), degree, belief, u, terms(duffing()))
     found.appraise(W.reshape(-1), np.zeros((4, 4)), 1.0)
     exact, precision = designer(fine, degree), np.empty((4, 4))
-    start, (shape, rate, xi_shape, xi_rate) = np.empty(exact.start_size), belief.record[-4:]
+    start, (shape, rate, xi_shape, xi_rate) = np.zeros(exact.start_size), belief.record[-4:]
     pursuit(fine, degree).begin(belief.record.copy(), precision, start)
     known = Known(belief.coefficients_mean, precision, (rate / shape, xi_rate / xi_shape))
     nats = [exact.worth(known, 1e3, 0.0, start, u[:, j].copy(), exact.memory(24))[0] for j in range(LANES)]
