@@ -6,7 +6,6 @@ plan is judged by besides. Plans lie in the lanes of a block, so that the compil
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -19,7 +18,6 @@ from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, jit, lanewise, part
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.straight import straight
 
 #: Nats that an output beyond its limit costs, per limit that it is beyond: more than any plan can teach.
 _BEYOND = 1e4
@@ -113,15 +111,12 @@ class Mind(NamedTuple):
         score: where the row of the scores begins.
         margin: where the row begins of what an output should keep from the limit.
         near: where the row begins of how many standard deviations it is within that; 0 where the margin is firm.
-        cell: where the row begins of the cells of the map of the state.
         spread: where the row begins of the predictive variance of what the first sensor shows.
         noise: where a record has the shape of the first sensor's precision; its rate is the next number.
         fill: ``fill(W, record, lasts)``: put a belief into every lane, and the last inputs, newest first (2,).
         collect: ``collect(W, record)``: take the belief of the first lane.
         advance: ``advance(W, record, terms)``: one expected sample in every lane, and its cost; coefficients and noises
             are those of a record.
-        find_cells: ``find_cells(W, sign, scales, cells, right, up)``: the cells of the states, times a sign, of a map
-            with so many cells along each axis, which is laid by so much of a cell to the right and up.
         appraise: ``appraise(W, M, scale)``: the scores, minus the expected free energy up to a constant, with (scale M)
             (scale M)ᵀ (K, K) of information still to come.
         precision: ``precision(W, lane, inverse)``: inverse (K, K) of the coefficients' covariance in a lane.
@@ -133,13 +128,11 @@ class Mind(NamedTuple):
     score: int
     margin: int
     near: int
-    cell: int
     spread: int
     noise: int
     fill: Any
     collect: Any
     advance: Any
-    find_cells: Any
     appraise: Any
     precision: Any
 
@@ -154,23 +147,6 @@ def _charge(INPUT, SHOWN, SPREAD, SURPRISE, COST, noise, shaken, limit, margin, 
     off = SHOWN - goal
     kept = COST + _BEYOND / limit * over + NEAR_COST * square * square
     return kept + price * INPUT * INPUT + goal_weight * (off * off + SPREAD - noise), wide, near
-
-
-@straight
-def _along(x, scale, cells, offset):
-    """The cell along one axis; the first for a state that is not a number."""
-    where = (x / scale + 1.0) * 0.5 * (cells - 1) + offset
-    return math.floor(min(where, cells - 1.0)) if where > 0.0 else 0.0
-
-
-def _cell_of_line(FIRST, sign, right, cells, scale):
-    """The cell of a state of one number."""
-    return _along(sign * FIRST, scale, cells, right)
-
-
-def _cell_of_plane(FIRST, SECOND, sign, right, up, cells, scale, other):
-    """The cell of a state, of which the first two numbers count."""
-    return _along(sign * FIRST, scale, cells, right) * cells + _along(sign * SECOND, other, cells, up)
 
 
 def _weigh(KNOWN, COST):
@@ -191,8 +167,7 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     n_loaded = n_states + sum(name.startswith("P_") for name in names)
     inputs = tuple(place[name] * LANES for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT") if name in place)
     u, cost, score = inputs[0], place["COST"] * LANES, place["SCORE"] * LANES
-    begun, kept_off, near = place["BEGUN"] * LANES, place["MARGIN"] * LANES, place["NEAR"] * LANES
-    cell, spread = place["CELL"] * LANES, place["SPREAD"] * LANES
+    begun, kept_off, near, spread = (place[name] * LANES for name in ("BEGUN", "MARGIN", "NEAR", "SPREAD"))
     first = next(iter(model.coefficients))
     covariance = place[f"P_{first}_{first}"] * LANES
     noise = names.index("GAMMA_SHAPE") + 2
@@ -200,9 +175,6 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     uniform = "noise shaken limit margin firm price goal goal_weight"
     charge = lanewise(place, "COST MARGIN NEAR", uniform=uniform)(_charge)
     weigh = lanewise(place, "SCORE")(_weigh)
-    states = {"FIRST": 0, "SECOND": 1, "CELL": place["CELL"]}
-    in_line = lanewise(states, "CELL", uniform="sign right cells scale")(_cell_of_line)
-    in_plane = lanewise(states, "CELL", uniform="sign right up cells scale other")(_cell_of_plane)
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
 
     @inner
@@ -232,13 +204,6 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
         charge(W, r, terms.shaken * q, terms.limit, terms.margin, terms.firm, *told)
 
     @inner
-    def find_cells(W, sign, scales, cells, right, up):
-        if n_states > 1:
-            in_plane(W, sign, right, up, cells, scales[0], scales[1])
-        else:
-            in_line(W, sign, right, cells, scales[0])
-
-    @inner
     def appraise(W, M, scale):
         judge(W, M, scale)
         weigh(W)
@@ -254,5 +219,5 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
         half_log_det(work)
         invert(work, inverse)
 
-    rows = size, kept, u, score, kept_off, near, cell, spread, noise
-    return Mind(*rows, fill, collect, advance, find_cells, appraise, precision)
+    rows = size, kept, u, score, kept_off, near, spread, noise
+    return Mind(*rows, fill, collect, advance, appraise, precision)

@@ -15,6 +15,7 @@ states, and older inputs, are followed with their way, and do not tell ways apar
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -23,8 +24,10 @@ import numpy as np
 from agents.planner.candidates import CHOICES, choose, uniform
 from agents.planner.imagination import mind
 from estimator.arrays import copy, highest
-from estimator.lanes import LANES, jit, part
+from estimator.engine.imagination import imagination
+from estimator.lanes import LANES, jit, lanewise, part
 from estimator.models.model import Model
+from estimator.straight import straight
 
 #: Where not all inputs are tried, so many are, and far ahead so many.
 _SOME, _FEW = 5, 2
@@ -116,8 +119,12 @@ class Task(NamedTuple):
 def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
     """The ways through the map of a model; arguments as `estimator.engine.imagination.imagination`."""
     imagined = mind(model, degree, lag)
-    size, kept, U, SCORE, CELL = imagined.size, imagined.kept, imagined.u, imagined.score, imagined.cell
-    begin, advance, find_cells, appraise = imagined.fill, imagined.advance, imagined.find_cells, imagined.appraise
+    size, kept, U, SCORE = imagined.size, imagined.kept, imagined.u, imagined.score
+    begin, advance, appraise = imagined.fill, imagined.advance, imagined.appraise
+    states = {"FIRST": 0, "SECOND": 1, "CELL": imagination(model, degree, lag).layout["CELL"]}
+    CELL = states["CELL"] * LANES
+    in_line = lanewise(states, "CELL", uniform="sign right cells scale")(_cell_of_line)
+    in_plane = lanewise(states, "CELL", uniform="sign right up cells scale other")(_cell_of_plane)
     is_plane = model.n_states > 1
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
 
@@ -181,7 +188,10 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
                 for _ in range(pace):
                     advance(W, record, terms)
                 appraise(W, M, np.sqrt(max(0, task.left - (h + 1) * pace)))
-                find_cells(W, task.sign, terms.scales, task.cells, right, up)
+                if is_plane:
+                    in_plane(W, task.sign, right, up, task.cells, terms.scales[0], terms.scales[1])
+                else:
+                    in_line(W, task.sign, right, task.cells, terms.scales[0])
                 for j in range(min(LANES, count - block * LANES)):
                     cell = np.int64(W[CELL + j])
                     if entered[cell] < 0:
@@ -231,3 +241,20 @@ def _reached(scores, enough):
     for i in range(len(scores)):
         count += scores[i] >= enough
     return count
+
+
+@straight
+def _along(x, scale, cells, offset):
+    """The cell along one axis; the first for a state that is not a number."""
+    where = (x / scale + 1.0) * 0.5 * (cells - 1) + offset
+    return math.floor(min(where, cells - 1.0)) if where > 0.0 else 0.0
+
+
+def _cell_of_line(FIRST, sign, right, cells, scale):
+    """The cell of a state of one number."""
+    return _along(sign * FIRST, scale, cells, right)
+
+
+def _cell_of_plane(FIRST, SECOND, sign, right, up, cells, scale, other):
+    """The cell of a state, of which the first two numbers count."""
+    return _along(sign * FIRST, scale, cells, right) * cells + _along(sign * SECOND, other, cells, up)
