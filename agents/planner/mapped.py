@@ -4,7 +4,7 @@ As by dynamic programming, of all ways that lead into the same cell of the plane
 is followed; and of these, so many of the best. So a long plan is found in the time of a short one. A way goes on with
 the highest input, the lowest, none, and half of either, since near its limit a signal may be led too far by a whole
 push and not far enough by none. In its first moves, which will be played, quarters are tried, too. Far ahead, where the
-plan will be made anew, only the highest and the lowest are.
+plan will be made anew, only the highest and the lowest are, and fewer ways are followed.
 A way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of the
 last plans. Without the latter a way would be praised for what every way teaches sooner or later.
 
@@ -96,6 +96,7 @@ class Task(NamedTuple):
         finest: moves for which all inputs are tried.
         fine: moves up to which whole and half ones are; then the highest and the lowest alone.
         ways: that are followed, at most.
+        fewer: of these, beyond ``fine`` moves.
         first: where the first input goes: 1.0 up, -1.0 down, 0.0 there is none, NaN anywhere.
         sign: -1.0 turns the map over.
     """
@@ -111,6 +112,7 @@ class Task(NamedTuple):
     finest: int
     fine: int
     ways: int
+    fewer: int
     first: float
     sign: float
 
@@ -203,7 +205,7 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
                         scores[at], ends[at] = W[SCORE + j], b * LANES + j
             for i in range(reachable):
                 entered[visited[i]] = -1
-            count = gather(memory, h, task.ways, reachable)
+            count = gather(memory, h, task.ways if h < task.fine else task.fewer, reachable)
         way = highest(scores, count)
         for h in range(task.steps - 1, -1, -1):
             found[h] = inputs[h, way]

@@ -27,8 +27,8 @@ from estimator.arrays import copy, fill, highest
 from estimator.lanes import LANES, kernel, part
 from estimator.models.model import Model
 
-#: Ways through the map that are followed, at most.
-_WAYS = 3 * LANES
+#: Ways through the map that are followed, at most, and far ahead.
+_WAYS, _FEWER = 3 * LANES, 2 * LANES
 
 #: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: so many ways are
 #: followed then, and plans look no further than so many moves.
@@ -155,14 +155,15 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the samples of a move."""
         candidates, W = rivals.candidates, memory.ways[0]
         moves = min(len(best), _LATE_HORIZON)
-        ways = _WAYS
+        ways, fewer = _WAYS, _FEWER
         pace = min(terms.pace, max(1, int(left / moves + 0.5)))
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
-            ways, steps = _LATE_WAYS, min(steps, _LATE_HORIZON)
+            ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
-        task = Task(record, left, steps, pace, terms, lasts, M, terms.cells, _FINEST, _FINE, ways, np.nan, 1.0)
+        sizes = terms.cells, _FINEST, _FINE, ways, fewer
+        task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         turned = -best[0]
         for h in range(len(best) - 1):
             best[h] = best[h + 1]
@@ -225,7 +226,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             go_on(W, record, u[t], lasts, terms)
         left = len(u) - first
         ways = -(-cells * cells // LANES) * LANES
-        task = Task(record, left, left, 1, terms, lasts, M, cells, 0, left, ways, np.nan, 1.0)
+        task = Task(record, left, left, 1, terms, lasts, M, cells, 0, left, ways, ways, np.nan, 1.0)
         find_way(memory(left, ways), task, u[first:], words)
 
     return Search(plan, play, through)

@@ -263,7 +263,7 @@ def ways(view: View) -> Ways:
             words[a] = WORDS[a]
         copy(plan, 0, simple[0], t.moves)
         if not t.has_bursts:
-            to_come, sizes = int(t.to_come + 0.5), (_CELLS, 0, _FINE, _FOLLOWED, direction, sign)
+            to_come, sizes = int(t.to_come + 0.5), (_CELLS, 0, _FINE, _FOLLOWED, _FOLLOWED, direction, sign)
             through = mapped.Task(t.record, to_come, t.moves, t.pace, t.terms, t.lasts, t.M, *sizes)
             find_way(best.memory, through, plan[: t.moves], words)
         rounds = 1 if direction == 0.0 else _BESIDE_BURSTS if t.has_bursts else ROUNDS

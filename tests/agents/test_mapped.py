@@ -48,7 +48,8 @@ def test_the_best_way_is_that_of_plain_numpy(seed):
     terms, belief = terms_of(planner.terms, 60), envs.belief(0)
     rate = 1e-3 * np.linalg.inv(belief.coefficients_cov)
     lasts = terms.amplitude * actions[:-3:-1, 0, 0].astype(float)
-    task = Task(belief.record, 60, 14, 1, terms, lasts, np.linalg.cholesky(rate), 30, 3, 5, LANES, np.nan, 1.0)
+    sizes = 30, 3, 5, LANES, LANES // 4
+    task = Task(belief.record, 60, 14, 1, terms, lasts, np.linalg.cholesky(rate), *sizes, np.nan, 1.0)
     stream = np.random.SFC64(seed).state["state"]["state"]
     found = np.zeros(14)
     best_way(planner.view)(task, found, stream.copy())
@@ -101,7 +102,8 @@ def reference(belief, task, words):
                     score = known - cost - price
                     if score > entered.get(cell(to), (-np.inf,))[0]:
                         entered[cell(to)] = score, (to, D, told, spread, cost + price, [*inputs, u])
-        enough = enough_for(np.array([score for score, _ in entered.values()]), task.ways)
-        kept = [found for found in entered.values() if found[0] >= enough][: task.ways]
+        most = task.ways if h < task.fine else task.fewer
+        enough = enough_for(np.array([score for score, _ in entered.values()]), most)
+        kept = [found for found in entered.values() if found[0] >= enough][:most]
         followed = [way for _, way in kept]
     return followed[int(np.argmax([score for score, _ in kept]))][-1]
