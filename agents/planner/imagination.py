@@ -30,16 +30,16 @@ NEAR_COST = 0.05
 #: A margin is no wider than this part of the limit: where noise alone leads beyond it, no plan is safe.
 MOST_MARGIN = 0.5
 
-#: Chance that an episode leaves the limit if every output were at the margin from it. It was chosen on the branch
-#: `validation`, and is smaller on a rig, where leaving it may cost more than information.
-RISK, RISK_OF_RIG = 0.005, 0.002
+#: Chance that an episode leaves the limit if every output were at the margin from it.
+RISK = 0.002
+
 
 #: Degrees of freedom of Student's t at the first sample, and how many more there are with every sample: chosen on the
 #: branch `validation` of the tracks whose noises are not known.
 _FREEDOM, _LEARNED = 8.0, 0.25
 
 
-def margin(samples: int, risk: float) -> FloatArray:
+def margin(samples: int, risk: float = RISK) -> FloatArray:
     """Predictive standard deviations to keep from the limit at each sample of an episode, (samples,).
 
     Outputs that are all at this margin leave the limit with the chance ``risk``, as Student's t: coefficients that are
@@ -47,8 +47,8 @@ def margin(samples: int, risk: float) -> FloatArray:
     They become known, so its degrees of freedom grow.
 
     Example:
-        >>> margin(256, RISK)[[0, 32, 255]].round(1)
-        array([8.1, 5.6, 4.4])
+        >>> margin(256)[[0, 32, 255]].round(1)
+        array([9.2, 6.1, 4.6])
     """
     return np.asarray(-stdtrit(_FREEDOM + _LEARNED * np.arange(samples), risk / samples))
 

@@ -43,7 +43,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.asked import check_rows, starts
-from agents.planner.imagination import RISK, RISK_OF_RIG, Terms, margin
+from agents.planner.imagination import RISK, Terms, margin
 from agents.planner.motion import View, is_of_rig, limit_of, places, shaken_of, swing_of
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
@@ -104,8 +104,7 @@ class Planner:
             last 48 of an episode.
         rounds: of steps and changed copies, two blocks of `estimator.lanes.LANES` each; of no effect on a plan of the
             whole episode.
-        risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1);
-            by default 0.005, and 0.002 on a rig.
+        risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
         goal: mean of the goal prior of the displacement [V].
         goal_std: its standard deviation [V]; no goal where it is None.
         input_cost: nats for a V² of input energy.
@@ -127,7 +126,7 @@ class Planner:
         *,
         horizon: int | None = None,
         rounds: int = 4,
-        risk: float | None = None,
+        risk: float = RISK,
         goal: float = 0.0,
         goal_std: float | None = None,
         input_cost: float = 0.0,
@@ -139,8 +138,7 @@ class Planner:
             )
         whole("horizon", _HORIZON if horizon is None else horizon, _MOST_MOVES)
         whole("rounds", rounds, 1000)
-        if risk is not None:
-            number("risk", risk, SMALLEST, 1 - SMALLEST)
+        number("risk", risk, SMALLEST, 1 - SMALLEST)
         number("input_cost", input_cost, 0)
         number("goal", goal, -LARGEST)
         if goal_std is not None:
@@ -172,8 +170,6 @@ class Planner:
         self.horizon, self.rounds = int(horizon), int(rounds)
         means = experiment.believed.coefficients_mean
         swing = swing_of(self.view, means, setup.max_input, setup.max_output)
-        if risk is None:
-            risk = RISK_OF_RIG if is_of_rig(experiment) else RISK
         self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.planner.imagination import RISK_OF_RIG, Terms, margin
+from agents.planner.imagination import RISK, Terms, margin
 from agents.planner.motion import View, is_of_rig, limit_of, places, shaken_of, survey, swing_of
 from agents.policies.bursts import burster, drawn
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
@@ -150,7 +150,7 @@ class CommonForesight:
     of the systems that a policy was trained on. So with that alone a policy plays any environment. Beside the
     observation itself it tells more of one model, and a policy plays environments of that. Outputs keep a margin
     (`agents.planner.imagination.margin`) from the planner's limit (`agents.planner.motion.limit_of`): on a rig the
-    planner's own, else one for a risk of 2 % in place of 0.5 %.
+    planner's own, else one for a risk of 2 % in place of 0.2 %.
 
     An action is a push. Where the energy is limited it is how much harder to push than the best burst, and the features
     of what is best tell what harder, as hard and softer ways bring, in place of a push up, none and a push down.
@@ -182,7 +182,7 @@ class CommonForesight:
         slow = swing if lasting == setup.max_input else swing_of(self._view, center, lasting, setup.max_output)
         moves, most = look_ahead(slow.built / swing.pace, setup.horizon / swing.pace)
         known = np.asarray(np.linalg.inv(prior.coefficients_cov), dtype=np.float64)
-        risk = RISK_OF_RIG if is_of_rig(experiment) else _RISK
+        risk = RISK if is_of_rig(experiment) else _RISK
         self._ahead = Ahead(push, moves, most, setup.horizon, setup.budget, rate, known)
         self._terms = Terms(
             setup.max_input,
