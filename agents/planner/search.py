@@ -27,8 +27,7 @@ from estimator.arrays import copy, fill, highest
 from estimator.lanes import LANES, kernel, part
 from estimator.models.model import Model
 
-#: Ways through the map that are followed, at most, and far ahead where the margin yields. A firm one, as on rigs, leaves
-#: fewer ways that are worth anything, and following a third less of them cost information.
+#: Ways through the map that are followed, at most, and far ahead: there fewer tell as much, but not on rigs.
 _WAYS, _FEWER = 3 * LANES, 2 * LANES
 
 #: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: so many ways are
