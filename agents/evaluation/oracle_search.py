@@ -71,7 +71,7 @@ def search(
     words = rng.integers(0, 2**64, 4, dtype=np.uint64)
     best, best_value, anew = np.zeros(systems.samples), -np.inf, np.full(_AGREED, -np.inf)
     for k in range(len(given) + _LONGER * tries):
-        if k >= len(given) + tries and best_value - anew[0] < _SAME:
+        if k >= len(given) + tries and anew[0] > best_value - _SAME:
             break
         keeps = k % 2 == 1 and bool(np.isfinite(best_value)) and not np.isfinite(limits.energy)
         if k < len(given):
