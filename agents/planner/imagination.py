@@ -34,9 +34,10 @@ MOST_MARGIN = 0.5
 RISK = 0.002
 
 
-#: Degrees of freedom of Student's t at the first sample, and how many more there are with every sample: chosen on the
-#: branch `validation` of the tracks whose noises are not known.
-_FREEDOM, _LEARNED = 8.0, 0.25
+#: What the degrees of freedom of Student's t at a sample are made of: the relative variance of the noises' variance is
+#: 2/(`_VAGUE` + t/`_LEARNED`)², about as beliefs have it on tracks whose noises are not known. Chosen on the branch
+#: `validation` of these.
+_VAGUE, _LEARNED = 2.0, 16.0
 
 
 def margin(samples: int, risk: float = RISK) -> FloatArray:
@@ -44,13 +45,15 @@ def margin(samples: int, risk: float = RISK) -> FloatArray:
 
     Outputs that are all at this margin leave the limit with the chance ``risk``, as Student's t: coefficients that are
     not known well, and noises that are not known at all, make outputs far off more frequent than a Gaussian has them.
-    They become known, so its degrees of freedom grow.
+    They become known, so its degrees of freedom grow: 4 + 2/w at samples where the variance of an output is known with
+    the relative variance w.
 
     Example:
         >>> margin(256)[[0, 32, 255]].round(1)
-        array([9.2, 6.1, 4.6])
+        array([9.2, 5.7, 4.4])
     """
-    return np.asarray(-stdtrit(_FREEDOM + _LEARNED * np.arange(samples), risk / samples))
+    known = _VAGUE + np.arange(samples) / _LEARNED
+    return np.asarray(-stdtrit(4.0 + known**2, risk / samples))
 
 
 class Terms(NamedTuple):
