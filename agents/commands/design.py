@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -51,6 +52,7 @@ def show(found: Any) -> None:
     """Print the intervals before and after, and how safe the signal is."""
     from agents.results import show as print_all
     from agents.results import table
+    from estimator.identification.checks import SLOWEST
 
     # A mean that differs from 0 by rounding alone is 0.
     rows = [
@@ -70,3 +72,9 @@ def show(found: Any) -> None:
         table(("", "mean", "90 % interval now", "expected after", "times narrower", "unit"), rows),
         f"{made}; {found.gain:.1f} nats more; out of the range with a probability of at most {found.probability:.1g}.",
     )
+    if found.samples_in_period < SLOWEST:
+        print(
+            f"duffing-env: warning: step must be at most a sixth of a period, but is {found.rig.step:g} s: as believed now, "
+            f"there are {found.samples_in_period:.1f} samples in a period; sample faster",
+            file=sys.stderr,
+        )

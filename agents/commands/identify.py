@@ -49,17 +49,19 @@ class Identify:
         if not self.data:
             raise ValueError("data must name at least one CSV or MAT file; add it after the rig file")
         result = identify(self.rig, list(self.data), progress=sys.stderr.isatty())
-        # What is printed needs no file, and is told first.
-        if self.json:
-            print(json.dumps(described(result), indent=1))
-        else:
-            show(result)
-        if self.report is not None:
-            result.report(self.report, [shlex.join(["duffing-env", *sys.argv[1:]])])
-        if self.save is not None:
-            from estimator.saving import save_estimator
+        # What is printed needs no file, and is told first; a pipe that closes early must not cost the files.
+        try:
+            if self.json:
+                print(json.dumps(described(result), indent=1))
+            else:
+                show(result)
+        finally:
+            if self.save is not None:
+                from estimator.saving import save_estimator
 
-            save_estimator(result.estimator, self.save)
+                save_estimator(result.estimator, self.save)
+            if self.report is not None:
+                result.report(self.report, [shlex.join(["duffing-env", *sys.argv[1:]])])
         if self.report is not None and not self.json:
             print(f"The page is {self.report}")
 

@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from agents.planner.blocks import MOST_PLANNED, Systems, best_block, drafts, expected, systems_of
 from agents.planner.futures import Futures, drawn_at_rest, draws_for, rests
-from agents.planner.motion import View
+from agents.planner.motion import View, frequency
 from agents.planner.policy import Planner
 from agents.policies import make_policy
 from agents.policies.signals import SignalPolicy
@@ -50,6 +50,7 @@ class Designed:
         gain: nats that the coefficients are expected to gain.
         share: of what the policy chose that is safe.
         probability: at most that of leaving the range, under the belief (`agents.planner.futures.Futures.chance`).
+        samples_in_period: samples in a period of small motions, as they are believed.
     """
 
     rig: Rig
@@ -60,6 +61,7 @@ class Designed:
     gain: float
     share: float
     probability: float
+    samples_in_period: float
 
     def rows(self, level: float = 0.9) -> list[tuple[str, float, tuple[float, float], float, str]]:
         """Of each parameter: name, mean, its interval now, the half width of that to be expected, and the unit."""
@@ -142,7 +144,9 @@ def design(
     worth, covs = expected(view, systems, limit, u)
     gain = worth + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1])
     after = _expected_deviations(belief, systems, covs)
-    return Designed(rig, policy, u * belief.scales.input, belief, after, gain, share, probability)
+    return Designed(
+        rig, policy, u * belief.scales.input, belief, after, gain, share, probability, 1 / frequency(belief)
+    )
 
 
 def _expected_deviations(belief: Belief, systems: Systems, covs: FloatArray) -> dict[str, float]:

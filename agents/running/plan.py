@@ -13,7 +13,7 @@ class Plan:
     """What a run is to do.
 
     Attributes:
-        policy: the name of a signal, or ``efe`` (`agents.make_policy`); without ``block`` also of any other policy.
+        policy: efe, the planner, or the name of a signal; without a block also that of any other policy.
         samples: number of inputs to play, in all.
         block: number of inputs that are chosen and played at once; where None, each input is chosen by itself, against
             the clock.

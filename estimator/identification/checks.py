@@ -55,7 +55,7 @@ _FAR = 5.0
 _FINEST = 1e-6
 
 #: Fewest samples in a period.
-_SLOWEST = 5.0
+SLOWEST = 5.0
 
 _TERMS = {
     "cubic_damping": "a damping that grows with the cube of the velocity",
@@ -122,7 +122,7 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Warning]:
     if sink.range and widest > sink.range * (1 + 1e-6):
         message = f"outputs of {widest:.3g} {sink.unit} leave the rig's range of {sink.range:g} {sink.unit}"
         warnings.append(Warning("range", message))
-    if 2 * np.pi / problem.frequency < _SLOWEST:
+    if 2 * np.pi / problem.frequency < SLOWEST:
         message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, 6 at least"
         warnings.append(Warning("sampling_too_slow", message))
     return warnings

@@ -79,6 +79,34 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
     np.testing.assert_allclose(table.columns[table.u], found.u, rtol=1e-9)
 
 
+def test_too_few_samples_in_a_period_are_told(tmp_path, capsys):
+    (tmp_path / "fast.toml").write_text(RIG_FILE)
+    (tmp_path / "slow.toml").write_text(RIG_FILE.replace("step = 0.02", "step = 0.3"))
+    for name in ("fast", "slow"):
+        main(["design", str(tmp_path / f"{name}.toml"), "--policy", "prbs", "--samples", "16"])
+        told = capsys.readouterr().err
+        assert ("there are 1.7 samples in a period; sample faster" in told) == (name == "slow")
+    # a = 110 to 180 N/m on about 1 kg: a period of 0.5 s.
+    assert design(RIG, policy="prbs", samples=16).samples_in_period == pytest.approx(26, abs=1)
+
+
+def test_what_identify_saves_outlives_a_pipe_that_closes_early(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text(RIG_FILE)
+    plant = SimulatedPlant(RIG, TRUTH, clock=JumpingClock())
+    plant.arm(None)
+    u, y = plant.play(np.repeat(np.random.default_rng(0).choice([-3.0, 3.0], 16), 8))
+    np.savetxt("record.csv", np.column_stack([u, y]), delimiter=",", header="u,y", comments="")
+
+    def show(result):
+        raise BrokenPipeError
+
+    monkeypatch.setattr("agents.commands.identify.show", show)
+    with pytest.raises((BrokenPipeError, SystemExit)):
+        main(["identify", "rig.toml", "record.csv", "--save", "posterior.npz"])
+    assert load_estimator("posterior.npz").belief.model is not None
+
+
 def test_a_run_goes_on_from_a_posterior(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.toml").write_text(RIG_FILE.partition("[guess]")[0])
