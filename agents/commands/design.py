@@ -74,7 +74,7 @@ def show(found: Any) -> None:
     )
     if found.samples_in_period < SLOWEST:
         print(
-            f"duffing-env: warning: step must be at most a sixth of a period, but is {found.rig.step:g} s: as believed now, "
-            f"there are {found.samples_in_period:.1f} samples in a period; sample faster",
+            f"duffing-env: warning: step must be at most a sixth of a period, but is {found.rig.step:g} s: as believed "
+            f"now, there are {found.samples_in_period:.1f} samples in a period; sample faster",
             file=sys.stderr,
         )

@@ -317,7 +317,7 @@ def test_beside_the_observation_it_is_turned_upright():
 
 def test_on_a_rig_it_keeps_further_from_the_limit():
     # Of 256 outputs at the margin one is beyond the limit in one episode of fifty, on a rig in one of five hundred.
-    freedom = 8 + np.arange(256) / 4 + (np.arange(256) / 16) ** 2
+    freedom = 4 + (2 + np.arange(256) / 16) ** 2
     for track in ("Amplitude-v0", "Amplitude-v1"):
         simulated = CommonForesight(make(f"duffing_env/{track}", 1))._terms
         np.testing.assert_allclose(256 * student_t(freedom).sf(simulated.margin), 0.02, rtol=1e-6)

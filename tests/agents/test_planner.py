@@ -231,10 +231,10 @@ def test_under_a_budget_plans_follow_the_differential_equation_too():
 @pytest.mark.parametrize("track", ["Short-v0", "Short-v1"])
 def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track):
     """As the module says: exceeded with probability ``risk`` by outputs that all are at the margin."""
-    env = gym.make(f"duffing_env/{track}")
+    env, freedom = gym.make(f"duffing_env/{track}"), 4 + (2 + np.arange(48) / 16) ** 2
     for risk in (0.05, 0.5):
         margin = make_policy("efe", env, risk=risk).terms.margin
-        np.testing.assert_allclose(margin, t(8 + np.arange(48) / 4 + (np.arange(48) / 16) ** 2).isf(risk / 48), rtol=1e-12)
+        np.testing.assert_allclose(margin, t(freedom).isf(risk / 48), rtol=1e-12)
 
 
 def test_moves_become_shorter_towards_the_end():
