@@ -34,9 +34,8 @@ MOST_MARGIN = 0.5
 RISK = 0.002
 
 
-#: What the degrees of freedom of Student's t at a sample are made of: the relative variance of the noises' variance is
-#: 2/(`_VAGUE` + t/`_LEARNED`)², about as beliefs have it on tracks whose noises are not known. Chosen on the branch
-#: `validation` of these.
+#: What the degrees of freedom of Student's t at sample t are made of: the variance of an output is taken as known with
+#: the relative variance 2/(`_VAGUE` + t/`_LEARNED`)². Chosen on the branch `validation` of tracks with unknown noises.
 _VAGUE, _LEARNED = 2.0, 16.0
 
 
