@@ -81,7 +81,8 @@ def search(
         else:
             start = _way(one, limits, sizes, best, keeps, rng, words)
         start = as_stored(np.clip(start / limits.amplitude, -1.0, 1.0)) * limits.amplitude
-        u, _ = polish(model, systems.degree, one.known(0), limits, sizes, start, limits.amplitude / LEVELS)
+        goal, unit = best_value - _SAME, limits.amplitude / LEVELS
+        u, _ = polish(model, systems.degree, one.known(0), limits, sizes, start, unit, goal=goal)
         u = as_stored(u / limits.amplitude) * limits.amplitude
         value, peak = (float(found[0]) for found in one.worth(u[None]))
         if not (peak <= exact.output and u @ u <= exact.energy):

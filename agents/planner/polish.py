@@ -17,11 +17,10 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import sparse
-from scipy.optimize import linprog
 
 from agents.planner.ascent import Limits
 from agents.planner.design import Known, designer
+from agents.planner.programme import Programme
 from estimator.arrays import copy, fill
 from estimator.lanes import kernel
 from estimator.models.model import Model
@@ -32,6 +31,9 @@ _RADIUS, _LEAST = 0.1, 1e-5
 
 #: A search ends where a step gains less [nats].
 _ENOUGH = 1e-5
+
+#: Linear programmes over which the pace of a search is measured. It becomes slower, so what is given up is far off.
+_PACED = 8
 
 #: Worth [nats] of a signal beyond its limit, per part of it and sample, and of energy, where steps are compared.
 _PENALTY, _OVERSPENT = 5.0, 20.0
@@ -154,6 +156,7 @@ def polish(
     u: FloatArray,
     unit: float,
     rounds: int = 80,
+    goal: float = -np.inf,
 ) -> tuple[FloatArray, float]:
     """Improve an input from rest until no small change does.
 
@@ -167,6 +170,8 @@ def polish(
         unit: that inputs are multiples of, and the amplitude too. Rounding them afterwards would lead far away: of a
             hard oscillator errors grow by several powers of ten over an episode.
         rounds: linear programmes at most.
+        goal: worth [nats] that is looked for. Where it is out of reach at the pace of the last programmes, an input is
+            given up as it is.
 
     Returns:
         The input and its worth [nats]; -inf where it does not keep the limits.
@@ -188,9 +193,10 @@ def polish(
     value, peak, merit = judge(best, here)
     if not np.isfinite(merit):
         return best, -np.inf
-    radius = _RADIUS
-    for _ in range(rounds):
-        change = _programme(best, here, limits, radius * limits.amplitude, shown)
+    programme = Programme(len(u), model.n_states, shown, limits)
+    radius, merits = _RADIUS, [merit]
+    for k in range(rounds):
+        change = programme.best(best, here.gradient, here.shown, here.slopes, radius * limits.amplitude)
         if change is None:  # no small change leads within the limits
             radius *= 2.0
             if radius > 2.0:
@@ -211,7 +217,9 @@ def polish(
                 break
         else:
             radius *= 0.35
-        if radius < _LEAST:
+        merits.append(merit)
+        pace = (merit - merits[max(0, len(merits) - 1 - _PACED)]) / _PACED
+        if radius < _LEAST or (len(merits) > _PACED and merit + pace * (rounds - 1 - k) < goal):
             break
     return best, value if peak <= limits.output else -np.inf
 
@@ -220,47 +228,3 @@ def _within(u: FloatArray, limits: Limits) -> FloatArray:
     """Inputs shrunk to their energy."""
     energy = float(u @ u)
     return u if energy <= limits.energy else u * np.sqrt(limits.energy / energy) * (1.0 - 1e-12)
-
-
-def _programme(
-    u: FloatArray, line: Line, limits: Limits, radius: float, shown: int
-) -> tuple[FloatArray, FloatArray] | None:
-    """The best change (T,) of the inputs to first order, and that of the states (T, n) before every sample.
-
-    None where no change of at most ``radius`` keeps the limits. ``shown``: the state that the sensor shows, or n.
-    """
-    samples, n = line.states.shape
-    t, width = np.arange(samples), max(n, shown + 1)  # of what a sample leads to: states, and what is shown
-    rows, columns, values = [], [], []
-    for i in range(width):
-        rows.append(t * width + i)
-        columns.append(samples + t * width + i)
-        values.append(np.full(samples, -1.0))
-        for j in range(n):
-            rows.append(t[1:] * width + i)
-            columns.append(samples + t[:-1] * width + j)
-            values.append(line.slopes[1:, i, j])
-        for lag in range(3):
-            rows.append(t[lag:] * width + i)
-            columns.append(t[: samples - lag])
-            values.append(line.slopes[lag:, i, n + lag])
-    places = np.concatenate(rows), np.concatenate(columns)
-    shape = (samples * width, samples * (1 + width))
-    motion = sparse.csr_array((np.concatenate(values), places), shape=shape)
-    motion.eliminate_zeros()
-    bounds = np.full((shape[1], 2), [-np.inf, np.inf])
-    bounds[:samples, 0] = np.maximum(-limits.amplitude - u, -radius)
-    bounds[:samples, 1] = np.minimum(limits.amplitude - u, radius)
-    if np.isfinite(limits.aim):
-        bounds[samples + shown :: width] = np.stack([-limits.aim - line.shown, limits.aim - line.shown], axis=1)
-    price = np.concatenate([-line.gradient, np.zeros(samples * width)])
-    energy: dict[str, Any] = {}
-    if np.isfinite(limits.energy):
-        spent = np.concatenate([2.0 * u, np.zeros(samples * width)])[None]
-        energy = {"A_ub": spent, "b_ub": [limits.energy - float(u @ u)]}
-    found = linprog(price, A_eq=motion, b_eq=np.zeros(shape[0]), bounds=bounds, method="highs-ds", **energy)
-    if found.status != 0:
-        return None
-    states = np.zeros((samples, n))
-    states[1:] = found.x[samples:].reshape(samples, width)[:-1, :n]
-    return found.x[:samples], states

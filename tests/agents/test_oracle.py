@@ -9,6 +9,7 @@ from agents.evaluation.oracle import Oracle, Systems, as_stored
 from agents.evaluation.oracle_search import Config, main, search
 from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
+from agents.planner.programme import Programme
 
 SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Amplitude-v1"
 STORED = [f"duffing_env/{name}-v{version}" for name in ("Amplitude", "Short", "Power", "Output") for version in (0, 1)]
@@ -68,7 +69,9 @@ def test_the_search_keeps_the_limits_and_beats_a_random_signal():
 def test_the_search_goes_on_until_three_starts_agree(same, tried, monkeypatch):
     found = []
     monkeypatch.setattr(oracle_search, "_SAME", same)
-    monkeypatch.setattr(oracle_search, "polish", lambda *given: found.append(polish(*given)) or found[-1])
+    monkeypatch.setattr(
+        oracle_search, "polish", lambda *given, **told: found.append(polish(*given, **told)) or found[-1]
+    )
     short = Systems.of(SHORT, 1, {"horizon": 32})
     _, value, apart = search(short, 0, np.empty((0, 32)), np.random.default_rng(0), 6)
     assert len(found) == tried
@@ -162,6 +165,28 @@ def test_polishing_ends_at_a_summit_within_the_limits():
     again, more = polish(model, 0, systems.known(0), aimed, sizes, u, unit)
     assert more <= value + 0.01
     assert np.abs(again - u).max() < 0.1 * limits.amplitude
+
+
+@pytest.mark.slow  # as above
+def test_what_does_not_come_near_its_goal_is_given_up(monkeypatch):
+    systems = Systems.of(SHORT, 1)
+    model, limits = systems.plant.model, systems.limits
+    sizes = swing_of(View(model), systems.theta[0], limits.amplitude, limits.output).scales
+    start = 0.05 * np.random.default_rng(0).choice([-1.0, 1.0], 48)
+    solved, best = [], Programme.best
+    monkeypatch.setattr(Programme, "best", lambda *given: solved.append(None) or best(*given))
+
+    def polished(goal):
+        solved.clear()
+        aimed = limits._replace(aim=0.9999 * limits.output)
+        _, value = polish(model, 0, systems.known(0), aimed, sizes, start, limits.amplitude / 32767, goal=goal)
+        return value, len(solved)
+
+    value, programmes = polished(-np.inf)
+    assert polished(value - 0.001) == (value, programmes)
+    less, fewer = polished(value + 5.0)
+    assert less <= value
+    assert 8 <= fewer < programmes
 
 
 def test_efficiency_is_one_for_the_oracle_itself_and_counts_until_the_end():

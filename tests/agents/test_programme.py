@@ -1,0 +1,62 @@
+"""The linear programme of a polishing, against SciPy's, which is solved from nothing and has dense matrices."""
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from agents.planner.ascent import Limits
+from agents.planner.programme import Programme
+
+SAMPLES, STATES, RADIUS = 12, 2, 0.05
+
+
+def line(rng):
+    """Inputs, a gradient, what is shown, and slopes of a system that is damped."""
+    slopes = rng.normal(size=(SAMPLES, STATES + 1, STATES + 3)) * 0.4
+    return rng.uniform(-0.1, 0.1, SAMPLES), rng.normal(size=SAMPLES), rng.uniform(-0.51, 0.51, SAMPLES), slopes
+
+
+def reference(u, gradient, shown_now, slopes, limits, shown):
+    """The best change by the equations: the states are written as matrices times the inputs' changes."""
+    states, outputs, change = np.zeros((STATES, SAMPLES)), [], np.eye(SAMPLES)
+    for t in range(SAMPLES):
+        inputs = [change[t - lag] if t >= lag else np.zeros(SAMPLES) for lag in range(3)]
+        after = slopes[t, :, :STATES] @ states + slopes[t, :, STATES:] @ np.array(inputs)
+        states = after[:STATES]
+        outputs.append(after[shown])
+    G = np.array(outputs)
+    rows = np.concatenate([G, -G])
+    room = np.concatenate([limits.aim - shown_now, limits.aim + shown_now])
+    if np.isfinite(limits.energy):
+        rows, room = np.vstack([rows, 2 * u]), np.append(room, limits.energy - u @ u)
+    low = np.maximum(-RADIUS, -limits.amplitude - u)
+    high = np.minimum(RADIUS, limits.amplitude - u)
+    return linprog(-gradient, A_ub=rows, b_ub=room, bounds=np.stack([low, high], axis=1)), G
+
+
+@pytest.mark.parametrize("energy", [np.inf, 0.05])
+@pytest.mark.parametrize("shown", [0, STATES])  # a state, or another output
+def test_the_change_is_the_best_one_each_time(energy, shown):
+    rng = np.random.default_rng(0)
+    limits = Limits(0.52, 0.51, 0.1, energy)
+    programme, held = Programme(SAMPLES, STATES, shown, limits), 0
+    for _ in range(5):
+        given = line(rng)
+        delta, states = programme.best(*given, RADIUS)
+        wanted, G = reference(*given, limits, shown)
+        assert given[1] @ delta == pytest.approx(-wanted.fun, rel=1e-6)
+        assert np.abs(delta).max() <= RADIUS + 1e-9
+        assert np.abs(given[2] + G @ delta).max() <= limits.aim + 1e-7
+        held += np.isclose(np.abs(given[2] + G @ delta), limits.aim).sum()
+        if shown == 0:
+            np.testing.assert_allclose(states[1:, 0], (G @ delta)[:-1], atol=1e-9)
+    assert held  # the limit is felt
+
+
+def test_what_no_small_change_leads_within_the_limits_has_no_solution_and_the_next_has():
+    rng = np.random.default_rng(1)
+    limits = Limits(0.52, 0.51, 0.1, np.inf)
+    programme = Programme(SAMPLES, STATES, 0, limits)
+    u, gradient, shown, slopes = line(rng)
+    assert programme.best(u, gradient, shown + 5.0, slopes, RADIUS) is None
+    assert programme.best(u, gradient, shown, slopes, RADIUS) is not None
