@@ -1,4 +1,4 @@
-"""Inputs that the search tries: chosen, changed at random, and kept within their limits."""
+"""Inputs that the search tries: of the last plan, chosen, changed at random, and kept within their limits."""
 
 from __future__ import annotations
 
@@ -12,6 +12,51 @@ CHOICES = (1.0, -1.0, 0.0, 0.5, -0.5, 0.75, -0.75, 0.25, -0.25)
 
 #: Of small changes, so many move an input by up to so much of the largest; the higher the power, the sooner in a plan.
 _MOVED, _BY, _SOON = 0.5, 0.3, 3
+
+
+@jit
+def pace_for(left, moves, longest):
+    """Samples of a move, where so many are left in an episode of which the rest should take so many moves.
+
+    Each is a divisor of the longer one before it.
+
+    Example:
+        >>> [pace_for(left, 24, 6) for left in (256, 84, 83, 36, 35)]
+        [6, 6, 3, 3, 1]
+    """
+    wanted, pace, factor = int(left / moves + 0.5), longest, 2
+    while pace > 1:
+        while pace % factor:
+            factor += 1
+        if wanted > pace // factor:
+            break
+        pace //= factor
+    return pace
+
+
+@jit
+def follow_up(plan, steps, before, pace):
+    """Take off the first move of a plan, which was played, and divide the others where moves are shorter than before.
+
+    A plan of so many steps that is not divided ends with what was taken off, turned over.
+
+    Example:
+        >>> plan = np.array([1.0, 0.5, -1.0, 0.0])
+        >>> follow_up(plan, 4, 6, 3)
+        >>> plan
+        array([ 0.5,  0.5, -1. , -1. ])
+        >>> follow_up(plan, 4, 3, 3)
+        >>> plan
+        array([ 0.5, -1. , -1. , -0.5])
+    """
+    turned = -plan[0]
+    for h in range(len(plan) - 1):
+        plan[h] = plan[h + 1]
+    if before > pace:
+        for h in range(len(plan) - 1, -1, -1):
+            plan[h] = plan[h * pace // before]
+    else:
+        plan[steps - 1] = turned
 
 
 @jit

@@ -62,6 +62,7 @@ class PlannerState(NamedTuple):
         last: (n,) the last inputs [V].
         chosen: (n,) the inputs that were chosen last [V].
         held: (n,) samples that these are still to be held for.
+        paces: (n,) samples of a move of the plans.
     """
 
     plans: FloatArray
@@ -70,6 +71,7 @@ class PlannerState(NamedTuple):
     last: FloatArray
     chosen: FloatArray
     held: npt.NDArray[np.int64]
+    paces: npt.NDArray[np.int64]
 
 
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
@@ -209,9 +211,9 @@ class Planner:
             streams = map(np.random.SFC64, np.random.SeedSequence(self.seed).spawn(n))
             words = np.array([stream.state["state"]["state"] for stream in streams])
             plans, rates, held = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n, dtype=np.int64)
-            state = PlannerState(plans, rates, words, np.zeros(n), np.zeros(n), held)
+            state = PlannerState(plans, rates, words, np.zeros(n), np.zeros(n), held, np.ones_like(held))
         plans, rates, words = state.plans.copy(), state.rates.copy(), state.words.copy()
-        before, chosen, held = state.last.copy(), state.chosen.copy(), state.held.copy()
+        before, chosen, held, paces = (kept.copy() for kept in state[3:])
         plans[begun], rates[begun], before[begun], held[begun] = 0.0, 0.0, 0.0, 0
         at = places(self.view.model)
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
@@ -224,16 +226,17 @@ class Planner:
             self._pursue(records, left, energies, terms, last, *searched[::2], inputs)
         else:
             lasts = np.stack([last, before], axis=1)[due]
-            moved = np.empty_like(due)
+            moved = paces[due]
             search(*self.view).plan(
                 records[due], left[due], self.horizon, self.rounds, terms, lasts, *searched, inputs, moved
             )
-            held[due] = moved
+            held[due] = paces[due] = moved
             held -= 1
         plans[due], rates[due], words[due] = searched
         chosen[due] = inputs
         actions = (chosen / terms.amplitude).astype(np.float32)
-        return actions.reshape(*np.shape(observation)[:-1], 1), PlannerState(plans, rates, words, last, chosen, held)
+        state = PlannerState(plans, rates, words, last, chosen, held, paces)
+        return actions.reshape(*np.shape(observation)[:-1], 1), state
 
     def asked(
         self, observation: npt.ArrayLike, state: Any, kind: type[tuple[Any, ...]], episode_start: npt.ArrayLike | None

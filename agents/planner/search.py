@@ -3,7 +3,7 @@
 The teaching of a plan has many summits, and changing a long plan here and there finds a poor one, even of a system that
 is known. So the plan is built move by move, as the best way through the map of the model's state
 (`agents.planner.mapped`). An input is held for `agents.planner.imagination.Terms.pace` samples, a *move*. Towards the
-end of an episode moves become shorter: a plan comes near to the end then, too, and is as fine as it can be.
+end of an episode moves become shorter, by whole numbers: so the last plan, which kept the limit, can go on as it was.
 
 The best way is then compared with the last plan, begun one sample ago. The better one is improved in rounds, by steps
 that change all of it (`agents.planner.steps`), and by small changes at random. Plans are compared by what is known, on
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.planner.candidates import bound, change
+from agents.planner.candidates import bound, change, follow_up, pace_for
 from agents.planner.design import factorise
 from agents.planner.imagination import mind, terms_of
 from agents.planner.mapped import Task, mapped
@@ -45,7 +45,7 @@ class Search(NamedTuple):
     """The search for a model, compiled.
 
     Attributes:
-        plan: ``plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, held)`` searches the
+        plan: ``plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, paces)`` searches the
             best next inputs of n environments:
 
             - ``records`` (n, size): their beliefs;
@@ -59,7 +59,7 @@ class Search(NamedTuple):
               none yet; overwritten;
             - ``words`` (n, 4): streams of random numbers; overwritten;
             - ``actions`` (n,): receives the first input of the best plan;
-            - ``held`` (n,): receives the samples of its first move.
+            - ``paces`` (n,): samples of a move of the last plans; overwritten by those of the new ones.
         play: ``play(record, first, horizon, rounds, terms, u, words)`` plans the inputs u (T,) from sample ``first``
             on, where the means of the belief are the truth. The inputs before it are followed as they are. Arguments as
             of ``plan``, but the terms are of all samples alike; ``words`` is (4,), and the record is overwritten.
@@ -151,12 +151,12 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                     rate[a, b] += share * ((after[a, b] - before[a, b]) / (task.steps * task.pace) - rate[a, b])
 
     @inner
-    def improve(memory, rivals, record, left, rounds, terms, lasts, best, rate, words):
-        """Improve the plan ``best`` (horizon,), begun one move ago, and ``rate``; gives the samples of a move."""
+    def improve(memory, rivals, record, left, rounds, terms, lasts, best, rate, words, before):
+        """Improve the plan ``best`` (horizon,), begun one move of so many samples ago, and ``rate``; gives its pace."""
         candidates, W = rivals.candidates, memory.ways[0]
         moves = min(len(best), _LATE_HORIZON)
         ways, fewer = _WAYS, _WAYS if terms.firm > 0.0 else _FEWER
-        pace = min(terms.pace, max(1, int(left / moves + 0.5)))
+        pace = pace_for(left, moves, terms.pace)
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
             ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
@@ -164,10 +164,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         factorise(rate, M)
         sizes = terms.cells, _FINEST, _FINE, ways, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
-        turned = -best[0]
-        for h in range(len(best) - 1):
-            best[h] = best[h + 1]
-        best[steps - 1] = turned
+        follow_up(best, steps, before, pace)
         copy(candidates[0], 0, best, len(best))
         fill(candidates[1], 0.0)
         find_way(memory, task, candidates[2], words)
@@ -197,23 +194,23 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         lasts[1], lasts[0] = lasts[0], u
 
     @entry
-    def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, held):
+    def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, paces):
         kept_memory, rivals = memory(horizon, max(_WAYS, _LATE_WAYS)), rivals_for(horizon)
         for i in range(len(records)):
-            others = rounds, terms_of(terms, left[i]), lasts[i], plans[i], rates[i], words[i]
-            held[i] = improve(kept_memory, rivals, records[i], max(1, left[i]), *others)
+            others = rounds, terms_of(terms, left[i]), lasts[i], plans[i], rates[i], words[i], paces[i]
+            paces[i] = improve(kept_memory, rivals, records[i], max(1, left[i]), *others)
             actions[i] = plans[i, 0]
 
     @entry
     def play(record, first, horizon, rounds, terms, u, words):
         kept_memory, rivals = memory(horizon, max(_WAYS, _LATE_WAYS)), rivals_for(horizon)
         best, rate, W = np.zeros(horizon), np.zeros((k, k)), np.empty(size)
-        lasts, held = np.zeros(2), 0
+        lasts, held, pace = np.zeros(2), 0, 1
         for t in range(len(u)):
             if t >= first:
                 if held == 0:
-                    others = rounds, terms, lasts, best, rate, words
-                    held = improve(kept_memory, rivals, record, len(u) - t, *others)
+                    others = rounds, terms, lasts, best, rate, words, pace
+                    held = pace = improve(kept_memory, rivals, record, len(u) - t, *others)
                 u[t] = best[0]
                 held -= 1
             go_on(W, record, u[t], lasts, terms)

@@ -46,7 +46,7 @@ SIMPLE = ("pump", "brake", "rest")
 #: Parts of a way after which it counts what is known; the first is what is known when half of it has been followed.
 _MARKS = (0.5, 0.75, 1.0)
 
-#: Moves in which an output can still be kept within the limit: nearly a period.
+#: Moves of the longest pace in which an output can still be kept within the limit: nearly a period.
 _IN_REACH = 8
 
 #: Rounds of changes of a way that begins with a push, and fewer where bursts say how hard to push. One that begins with
@@ -154,7 +154,7 @@ class Ways(NamedTuple):
 
             - ``W``, ``still``: to write on, as `agents.planner.imagination` and `estimator.engine.motion` lay them out;
             - ``worths`` (2, LANES): receives what they are worth when half was followed, and all in all;
-            - ``peaks`` (LANES,): receives how near to the limit they lead, margin and all;
+            - ``peaks`` (LANES,): receives how near to the limit they lead until the episode ends, margin and all;
             - ``plans`` (LANES, moves): receives their inputs;
             - ``free`` (3, 3): receives what the first sensor shows after the first three moves of those that rest.
         find: ``find(W, task, first, sign, simple, best)``: the best way of a first move.
@@ -214,9 +214,9 @@ def ways(view: View) -> Ways:
         if t == 0:
             fill(worths[1], 0.0)
             fill(peaks, 0.0)
-        for _ in range(task.pace):
+        for sample in range(t * task.pace, (t + 1) * task.pace):
             advance(W, task.record, task.terms)
-            if t < _IN_REACH:
+            if sample < min(task.left, _IN_REACH * task.terms.pace):
                 for j in range(LANES):
                     peaks[j] = max(peaks[j], abs(W[shown + j]) + W[MARGIN + j])
         for mark in range(len(_MARKS)):

@@ -87,11 +87,11 @@ def reference(belief, seen, ahead, terms, least=0.0):
         for t in range(moves):
             u = push(t, x, margin)
             inputs.append(u)
-            for _ in range(pace):
+            for s in range(t * pace, (t + 1) * pace):
                 x, C, gain, variance, margin = sample(x, C, u, gain, variance)
                 reach = abs(x[0]) + margin
                 cost += 1e4 / L * max(0.0, reach - L)
-                peak = max(peak, reach) if t < 8 else peak
+                peak = max(peak, reach) if s < min(left, 8 * terms.pace) else peak
             seen_at.append(x[0])
             if t + 1 in marks:
                 told.append(worth(C, max(0.0, to_come - (t + 1) * pace)) - cost)
@@ -189,6 +189,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
         ("Amplitude", 1, 0.0, {}),
         ("Amplitude", 2, 0.0, {}),
         ("Amplitude", 1, 0.0, {"horizon": 46}),  # the end is near
+        ("Amplitude", 1, 0.0, {"horizon": 43}),  # nearer than the shortest way
         ("Amplitude", 3, 0.0, {"horizon": 58}),
         ("Amplitude", 1, 0.0, {"process_noise": 5e-5, "measurement_noise": 5e-3}),  # many outputs tell of a state
         ("Power", 1, 0.0, {}),
