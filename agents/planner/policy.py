@@ -213,7 +213,8 @@ class Planner:
             plans, rates, held = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n, dtype=np.int64)
             state = PlannerState(plans, rates, words, np.zeros(n), np.zeros(n), held, np.ones_like(held))
         plans, rates, words = state.plans.copy(), state.rates.copy(), state.words.copy()
-        before, chosen, held, paces = (kept.copy() for kept in state[3:])
+        before, chosen = state.last.copy(), state.chosen.copy()
+        held, paces = state.held.copy(), state.paces.copy()
         plans[begun], rates[begun], before[begun], held[begun] = 0.0, 0.0, 0.0, 0
         at = places(self.view.model)
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
@@ -226,11 +227,11 @@ class Planner:
             self._pursue(records, left, energies, terms, last, *searched[::2], inputs)
         else:
             lasts = np.stack([last, before], axis=1)[due]
-            moved = paces[due]
+            moves = paces[due]
             search(*self.view).plan(
-                records[due], left[due], self.horizon, self.rounds, terms, lasts, *searched, inputs, moved
+                records[due], left[due], self.horizon, self.rounds, terms, lasts, *searched, inputs, moves
             )
-            held[due] = paces[due] = moved
+            held[due] = paces[due] = moves
             held -= 1
         plans[due], rates[due], words[due] = searched
         chosen[due] = inputs
