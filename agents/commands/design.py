@@ -15,7 +15,7 @@ class Design:
     """Design the next experiment: a signal within the rig's limits, and the intervals to be expected after it.
 
     $ duffing-env design rig.toml
-    $ duffing-env design rig.toml posterior.npz --policy efe --samples 256 -o next.csv
+    $ duffing-env design rig.toml posterior.npz --policy efe --samples 256 -o next.csv --figure next.png
     $ duffing-env design rig.toml posterior.npz --policy prbs -o next.csv
     """
 
@@ -33,19 +33,32 @@ class Design:
     """Of the policy, and of the systems that are drawn from what is believed."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
     """CSV file for the signal, in the rig's units."""
+    figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Picture (PNG) of the signal, and of what the sensor is expected to show."""
 
     def run(self) -> None:
         """Design, print what is to be expected, and write the signal."""
+        from agents.results import spinner
         from agents.running.experiment import design
+        from estimator.extras import need
         from estimator.saving import load_estimator
 
+        if self.figure is not None:
+            need("matplotlib")
         prior = None if self.posterior is None else load_estimator(self.posterior).belief
-        found = design(self.rig, prior, self.policy, self.samples, self.bound, self.seed)
+        with spinner(f"Designing {self.samples} samples by {self.policy}"):
+            found = design(self.rig, prior, self.policy, self.samples, self.bound, self.seed)
         if self.output is not None:
             found.write(self.output)
+        if self.figure is not None:
+            from agents.evaluation.figures import figure_of_experiment, save
+
+            save(figure_of_experiment(found), self.figure)
         show(found)
         if self.output is not None:
             print(f"The signal is {self.output}")
+        if self.figure is not None:
+            print(f"The picture is {self.figure}")
 
 
 def show(found: Any) -> None:

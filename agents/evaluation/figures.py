@@ -1,4 +1,4 @@
-"""Figures of trainings and evaluations. No display is needed."""
+"""Figures of trainings, evaluations and experiments to come. No display is needed."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from agents.evaluation.rollout import Evaluation
+    from agents.running.experiment import Designed
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
 _STROKES = ("-", "--", ":")
@@ -145,4 +146,23 @@ def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("intervals that hold the truth / %")
     panels[0].legend(fontsize=7)
+    return figure
+
+
+def figure_of_experiment(designed: Designed) -> Figure:
+    """The signal of an experiment to come, and what the sensor is expected to show, both with their limits."""
+    figure, rig = new_figure(9, 5), designed.rig
+    above, below = figure.subplots(2, 1, sharex=True)
+    time = rig.step * np.arange(len(designed.u))
+    low, median, high = designed.shown
+    above.plot(time, designed.u, color=_COLOURS[0], linewidth=0.8, drawstyle="steps-post")
+    above.set(ylabel=f"input / {rig.input.unit}", title=f"{len(designed.u)} samples by {designed.policy}")
+    below.fill_between(time, low, high, color=_COLOURS[1], alpha=0.3, linewidth=0, label="expected, 90 %")
+    below.plot(time, median, color=_COLOURS[1], linewidth=0.8, label="expected, median")
+    below.set(xlabel="time / s", ylabel=f"output / {rig.output.unit}")
+    for axes, limit in ((above, rig.input.limit), (below, rig.output.range)):
+        both = limit * np.array([-1.0, 1.0])
+        axes.hlines(both, *time[[0, -1]], color="black", linestyle="--", linewidth=0.8, label="limits")
+        axes.grid(alpha=0.3)
+    figure.legend(*below.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure

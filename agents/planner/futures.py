@@ -129,21 +129,21 @@ class Futures:
             most: see there.
             planned: draws that the inputs were planned for, and which therefore do not tell how safe they are.
         """
+        found: list[int] = []
+        for i in range(len(self.states)):
+            if i not in planned and not bool((np.abs(self.shown(u, i)) <= self.limit).all()):
+                found.append(i)
+                if len(found) >= most:
+                    break
+        return found
+
+    def shown(self, u: FloatArray, draw: int) -> FloatArray:
+        """(N,) what the sensor of one of the draws shows with inputs (N,), in the belief's scale."""
         acting = np.concatenate([np.zeros(self.delay), u])[: len(u)]
         process, sensor = self.disturbances(len(u))
-        found: list[int] = []
+        shaken, coefficients, state = acting + process[draw], self.coefficients[draw], self.states[draw]
         with np.errstate(over="ignore", invalid="ignore"):
-            for i, (state, coefficients, w, v) in enumerate(
-                zip(self.states, self.coefficients, process, sensor, strict=True)
-            ):
-                if i in planned:
-                    continue
-                y = free_run(self.model, coefficients, acting + w, state, self.interpolation) + v
-                if not bool((np.abs(y) <= self.limit).all()):
-                    found.append(i)
-                    if len(found) >= most:
-                        break
-        return found
+            return free_run(self.model, coefficients, shaken, state, self.interpolation) + sensor[draw]
 
     def probability(self, u: FloatArray, bound: float = 1.0) -> float:
         """That inputs (N,), in the belief's scale, take the output out of its limit at any of the samples: `chance`.

@@ -33,6 +33,9 @@ _MOST = 2**16
 #: Systems on which a policy that answers to outputs is played.
 _PLAYED = 4
 
+#: Systems whose outputs are looked at beforehand, and which of their quantiles: a band of 90 %, and its middle.
+_SHOWN, _QUANTILES = 200, (0.05, 0.5, 0.95)
+
 #: Standard deviation of a state at rest, where the planner's plan for the belief's means begins, in parts of its scale.
 _STILL = 1e-3
 
@@ -45,6 +48,8 @@ class Designed:
         rig: it is for.
         policy: that chose it.
         u: (T,) inputs in the rig's unit.
+        shown: (3, T) what the sensor is expected to show, in its unit: the 5 %, 50 % and 95 % quantiles over the
+            belief, cut at twice the range.
         before: what is believed now.
         after: parameter to the standard deviation that is to be expected after it: the median over the belief.
         gain: nats that the coefficients are expected to gain.
@@ -56,6 +61,7 @@ class Designed:
     rig: Rig
     policy: str
     u: FloatArray
+    shown: FloatArray
     before: Belief
     after: Mapping[str, float]
     gain: float
@@ -144,8 +150,11 @@ def design(
     worth, covs = expected(view, systems, limit, u)
     gain = worth + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1])
     after = _expected_deviations(belief, systems, covs)
+    outputs = np.array([futures.shown(u, draw) for draw in range(_SHOWN)])
+    outputs = np.clip(np.nan_to_num(outputs, nan=2 * limit), -2 * limit, 2 * limit)  # a system may run away
+    shown = belief.scales.output * np.quantile(outputs, _QUANTILES, axis=0)
     return Designed(
-        rig, policy, u * belief.scales.input, belief, after, gain, share, probability, 1 / frequency(belief)
+        rig, policy, u * belief.scales.input, shown, belief, after, gain, share, probability, 1 / frequency(belief)
     )
 
 

@@ -29,6 +29,11 @@ def test_what_is_stated_after_an_experiment_is_what_was_expected(policy):
     plant.arm(None)
     _, y = plant.play(found.u)
     assert np.abs(y).max() < RIG.output.range
+    low, median, high = found.shown
+    assert (low < median).all()
+    assert (median < high).all()
+    assert max(-low.min(), high.max()) < RIG.output.range
+    assert 0.6 < np.mean((low < y) & (y < high)) < 1.0
     told = identify(RIG, (found.u, y)).parameters
     for name in "mcab":
         # The systems that are drawn differ by some tens of percent in what an input tells of each of their parameters.
@@ -69,10 +74,26 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
     write_bench(tmp_path)
     main(["identify", "rig.toml", "record.csv", "--save", "posterior.npz"])
     capsys.readouterr()
-    main(["design", "rig.toml", "posterior.npz", "--policy", "prbs", "--samples", "64", "-o", "next.csv"])
+    main(
+        [
+            "design",
+            "rig.toml",
+            "posterior.npz",
+            "--policy",
+            "prbs",
+            "--samples",
+            "64",
+            "-o",
+            "next.csv",
+            "--figure",
+            "next.png",
+        ]
+    )
     told = capsys.readouterr().out
     assert "narrower" in told
     assert "kg" in told
+    assert "The picture is next.png" in told
+    assert (tmp_path / "next.png").read_bytes().startswith(b"\x89PNG")
     found = design(RIG, load_estimator("posterior.npz").belief, "prbs", 64)
     written = np.loadtxt("next.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(written[:, 1], found.u, rtol=1e-9)
