@@ -65,6 +65,7 @@ def show(found: Any) -> None:
     """Print the intervals before and after, and how safe the signal is."""
     from agents.results import show as print_all
     from agents.results import table
+    from agents.running.experiment import too_slow
     from estimator.identification.checks import SLOWEST
 
     # A mean that differs from 0 by rounding alone is 0.
@@ -86,8 +87,4 @@ def show(found: Any) -> None:
         f"{made}; {found.gain:.1f} nats more; out of the range with a probability of at most {found.probability:.1g}.",
     )
     if found.samples_in_period < SLOWEST:
-        print(
-            f"duffing-env: warning: step must be at most a sixth of a period, but is {found.rig.step:g} s: as believed "
-            f"now, there are {found.samples_in_period:.1f} samples in a period; sample faster",
-            file=sys.stderr,
-        )
+        print(f"duffing-env: warning: {too_slow(found.rig.step, found.samples_in_period)}", file=sys.stderr)

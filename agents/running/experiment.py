@@ -22,6 +22,7 @@ from estimator.belief import Belief, covariance_places
 from estimator.checks import SMALLEST, number, whole
 from estimator.files import write_atomically
 from estimator.free_run import free_run
+from estimator.identification.checks import SLOWEST
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
 from estimator.rig import Rig
@@ -108,7 +109,8 @@ def design(
 
     Raises:
         ValueError: for a rig without limit or range, or without guess where there is no prior; a prior in other
-            scales; samples below 8 or above 65,536; a bound that is not a probability; or where even no input is safe.
+            scales; samples below 8 or above 65,536; a bound that is not a probability; where even no input is safe; or
+            a step that is too long for the motion to be followed.
 
     Example:
         >>> from agents.running.experiment import design
@@ -141,20 +143,30 @@ def design(
         found = [_played(policy, observed, futures, k, bound, seed) for k in range(_PLAYED)]
         told = [expected(view, systems, limit, u)[0] for u, *_ in found]
         u, share, probability = found[int(np.argmax(told))]
+    in_period = 1 / frequency(belief)
     if share == 0.0 and probability >= bound:
         raise ValueError(
+            too_slow(rig.step, in_period) if in_period < SLOWEST else
             f"rig must be known well enough to stay in its range, but even without input it leaves it with probability "
             f"{probability:.2g}, and at most {bound:.2g} is allowed; give a narrower guess or a wider range"
-        )
+        )  # fmt: skip
     u = np.clip(u, -observed.max_input, observed.max_input)
     worth, covs = expected(view, systems, limit, u)
+    if not (np.isfinite(worth) and np.isfinite(covs).all()):
+        raise ValueError(too_slow(rig.step, in_period))
     gain = worth + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1])
     after = _expected_deviations(belief, systems, covs)
     outputs = np.array([futures.shown(u, draw) for draw in range(_SHOWN)])
     outputs = np.clip(np.nan_to_num(outputs, nan=2 * limit), -2 * limit, 2 * limit)  # a system may run away
     shown = belief.scales.output * np.quantile(outputs, _QUANTILES, axis=0)
-    return Designed(
-        rig, policy, u * belief.scales.input, shown, belief, after, gain, share, probability, 1 / frequency(belief)
+    return Designed(rig, policy, u * belief.scales.input, shown, belief, after, gain, share, probability, in_period)
+
+
+def too_slow(step: float, in_period: float) -> str:
+    """What to say of a step [s] at which there are so many samples in a period."""
+    return (
+        f"step must be at most a sixth of a period, but is {step:g} s: as believed now, there are {in_period:.1f} "
+        "samples in a period; sample faster"
     )
 
 

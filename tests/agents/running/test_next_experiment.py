@@ -116,6 +116,12 @@ def test_too_few_samples_in_a_period_are_told(tmp_path, capsys):
     assert design(RIG, policy="prbs", samples=16).samples_in_period == pytest.approx(26, abs=1)
 
 
+@pytest.mark.parametrize("step", [1.0, 3.0])
+def test_a_step_that_is_too_long_for_the_motion_is_refused(step):
+    with pytest.raises(ValueError, match="samples in a period; sample faster"):
+        design(replace(RIG, step=step), policy="prbs", samples=64)
+
+
 def test_what_identify_saves_outlives_a_pipe_that_closes_early(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_bench(tmp_path)
