@@ -58,9 +58,9 @@ def near_truth(parameters, share):
 def test_a_run_by_samples(scpi, tmp_path):
     result = play(scpi, tmp_path / "run", samples=80)
     assert (result.ended, result.exit_status) == ("complete", 0)
+    wait_for(lambda: scpi.lines[-1] == "OUTP OFF", 5.0)  # the instrument reads when it comes to it
     assert scpi.applied == 0.0
     assert scpi.lines.index("WDOG 2.0") < scpi.lines.index("OUTP ON")
-    wait_for(lambda: scpi.lines[-1] == "OUTP OFF", 5.0)
     assert scpi.lines.index("MEAS?") < scpi.lines.index("OUTP ON"), "the output is looked at before arming"
     # How near depends on how punctual a busy machine is; tests/agents/running/test_running.py judges the intervals.
     assert near_truth(result.parameters, 0.4)
@@ -70,7 +70,7 @@ def test_a_run_by_samples(scpi, tmp_path):
 def test_a_run_by_blocks(scpi, tmp_path):
     result = play(scpi, tmp_path / "run", samples=128, block=64)
     assert result.ended == "complete"
-    assert scpi.applied == 0.0
+    wait_for(lambda: scpi.applied == 0.0, 5.0)
     assert [row["u"] for row in rows(tmp_path / "run")].count("") == 3, "a pause after each block, the silent one too"
     assert near_truth(result.parameters, 0.02)
     assert near_truth(identify(RIG, tmp_path / "run" / "samples.csv").parameters, 0.02)
