@@ -59,4 +59,6 @@ def test_what_no_small_change_leads_within_the_limits_has_no_solution_and_the_ne
     programme = Programme(SAMPLES, STATES, 0, limits)
     u, gradient, shown, slopes = line(rng)
     assert programme.best(u, gradient, shown + 5.0, slopes, RADIUS) is None
-    assert programme.best(u, gradient, shown, slopes, RADIUS) is not None
+    delta, _ = programme.best(u, gradient, shown, slopes, RADIUS)
+    wanted, _ = reference(u, gradient, shown, slopes, limits, 0)
+    assert gradient @ delta == pytest.approx(-wanted.fun, rel=1e-6)
