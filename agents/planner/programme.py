@@ -1,7 +1,7 @@
 """The linear programme of a step of `agents.planner.polish`: the best small change of an input, within exact limits.
 
 HiGHS solves it once for every step. From one step to the next its numbers change and its shape does not, so each
-solution starts from the basis of the last, and takes some ten pivots where from nothing it takes some hundreds.
+solution starts from the basis of the last, and takes far fewer pivots than from nothing.
 """
 
 from __future__ import annotations
