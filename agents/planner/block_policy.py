@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.planner.blocks import MOST_PLANNED, best_block, drafts, systems_of
-from agents.planner.futures import Futures, drawn_from_records, draws_for
+from agents.planner.futures import Futures, drawn_from_records, draws_for, force_of_noise
 from agents.planner.motion import places
 from agents.planner.policy import Planner
 from estimator.checks import whole
@@ -46,10 +46,12 @@ class BlockPlanner:
         env: as of `agents.planner.policy.Planner`.
         seed: of the search, and of the systems that are drawn.
         block: samples of a block.
-        risk: upper bound of the probability that an episode leaves its range; each block has its share of it.
+        risk: upper bound of the probability that an episode leaves its range. Each block takes half of what is left of
+            it, for the first ones know least, and the last one all.
 
     Raises:
-        ValueError: as `Planner`; for a block below 1; or where the input's energy is limited.
+        ValueError: as `Planner`; for a block below 1 or above 4,096; where the input's energy is limited; or for a
+            model whose process noise acts on another state than its input does.
     """
 
     def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 0.004) -> None:
@@ -58,7 +60,8 @@ class BlockPlanner:
         setup = env.experiment.setup
         if np.isfinite(setup.budget):
             raise ValueError(f"env must have no limit of energy for blocks, but has max_rms={env.experiment.max_rms!r}")
-        self._env, self.block, self._bound = env, int(block), risk / env.horizon
+        force_of_noise(self._planner.view.model)  # refuses what cannot be simulated
+        self._env, self.block, self._risk = env, int(block), risk
         self._limit = float(setup.max_output)
 
     def predict(
@@ -83,6 +86,11 @@ class BlockPlanner:
         actions = (plans[np.arange(n), played] / self._planner.terms.amplitude).astype(np.float32)
         return actions.reshape(*np.shape(observation)[:-1], 1), BlockState(plans, played + 1)
 
+    def bound(self, left: int) -> float:
+        """The part of the risk that the block takes which begins so many samples before the end."""
+        begun, blocks = (self._env.horizon - left) // self.block, -(-self._env.horizon // self.block)
+        return max(_FINEST, self._risk * 0.5 ** min(begun + 1, blocks - 1))
+
     def _plan(self, record: FloatArray, left: int, last: float, i: int) -> FloatArray:
         """A block (block,), zeros beyond the end of the episode."""
         planner, samples = self._planner, min(self.block, left)
@@ -90,7 +98,7 @@ class BlockPlanner:
         seen = min(left, samples + _AFTER * terms.pace)
         rng = np.random.default_rng([planner.seed, i, left])
         (belief,) = self._env.experiment.believed.with_records(record[None])
-        bound = max(_FINEST, self._bound * samples)
+        bound = self.bound(left)
         records, weights = self._env.mixture(i)
         drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound, MOST_PLANNED))
         futures = Futures(view.model, drawn, self._limit, rng, degree=view.degree)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from functools import cache
 
 import numpy as np
 from scipy.special import betaincinv
@@ -23,10 +24,10 @@ _CONFIDENCE = 0.95
 #: An input that is too large is tried again at this share, so often: down to a thousandth.
 _LESS, _TRIALS = 0.8, 31
 
-#: From the standard deviation of the process noise to that of a force that is held over a sample.
-_HELD = np.sqrt(3.0)
+#: What noise of unit strength adds to the input at most: a drawn system may have hardly any gain.
+_STRONGEST = 1e12
 
-#: States and coefficients (draws, d), and standard deviations of both noises (draws, 2).
+#: States and coefficients (draws, d), and deviations of the process noise and each sensor's (draws, 1 + sensors).
 Drawn = tuple[FloatArray, FloatArray]
 
 
@@ -46,8 +47,8 @@ def drawn_from_records(
     for record, count in zip(records, counts.tolist(), strict=True):
         if count:
             drawn.append(rng.multivariate_normal(record[:d], record[places], count, method="eigh"))
-            shapes, rates = record[-4::2], record[-3::2]
-            noises.append(1.0 / np.sqrt(rng.gamma(shapes, 1.0 / rates, (count, 2))))
+            shapes, rates = record[-2 * (1 + model.n_outputs) :].reshape(-1, 2).T
+            noises.append(1.0 / np.sqrt(rng.gamma(shapes, 1.0 / rates, (count, len(shapes)))))
     return np.concatenate(drawn), np.concatenate(noises)
 
 
@@ -81,6 +82,30 @@ def rests(model: Model, coefficients: FloatArray) -> list[float]:
     return [float(value + shift) for value in stable] or [0.0]
 
 
+@cache
+def force_of_noise(model: Model) -> Callable[..., FloatArray]:
+    """What process noise of unit strength adds to the input, held over a sample: a function of (draws,) coefficients.
+
+    Raises:
+        ValueError: for a model whose noise acts on another state than its input does.
+    """
+    import sympy as sp
+
+    from estimator.engine.derive import calculus, symbol
+
+    told, u = calculus(model), symbol("u")
+    moved = {name: sp.diff(move, u) for name, move in zip(model.states, told.moves, strict=True)}
+    forces = [noise / moved[name] for name, noise in zip(model.states, told.noise, strict=True) if noise != 0]
+    coefficients = [symbol(name) for name in model.coefficients]
+    if len(forces) != 1 or not forces[0].free_symbols <= set(coefficients) or forces[0].has(sp.zoo):
+        raise ValueError(
+            f"model must have its process noise where its input acts, to be planned in blocks, but {model.name!r} has "
+            f"noise {list(model.noise)} for {list(model.moves)}; plan sample by sample"
+        )
+    force: Callable[..., FloatArray] = sp.lambdify(coefficients, forces[0])
+    return force
+
+
 class Futures:
     """What drawn systems do with inputs, in their noises, which stay the same from input to input.
 
@@ -95,7 +120,7 @@ class Futures:
     Attributes:
         states: (draws, n).
         coefficients: (draws, K).
-        noises: (draws, 2) standard deviations of process and sensor noise.
+        noises: (draws, 1 + sensors) standard deviations of the process noise and of each sensor's.
     """
 
     def __init__(
@@ -109,15 +134,14 @@ class Futures:
         self._disturbed: tuple[FloatArray, FloatArray] | None = None
 
     def disturbances(self, samples: int) -> tuple[FloatArray, FloatArray]:
-        """(draws, samples) what process noise adds to the input, and what the sensor adds to the output."""
+        """(draws, samples) what process noise adds to the input, and what the first sensor adds to its output."""
         if self._disturbed is None or self._disturbed[0].shape[1] < samples:
             rng = np.random.default_rng(self._seed)
             process, sensor = rng.standard_normal((2, samples, len(self.noises))).swapaxes(1, 2)
-            names = list(self.model.coefficients)
-            gain = self.coefficients[:, names.index("gain" if "gain" in names else "eta")]
-            held = _HELD if self.model.is_continuous else 1.0
-            force = held * self.noises[:, 0] / np.maximum(np.abs(gain), 1e-12)
-            self._disturbed = force[:, None] * process, self.noises[:, 1:] * sensor
+            with np.errstate(divide="ignore"):
+                force = np.abs(force_of_noise(self.model)(*self.coefficients.T))
+            force = self.noises[:, 0] * np.minimum(force, _STRONGEST)
+            self._disturbed = force[:, None] * process, self.noises[:, 1:2] * sensor
         process, sensor = self._disturbed
         return process[:, :samples], sensor[:, :samples]
 
@@ -126,7 +150,7 @@ class Futures:
 
         Args:
             u: the inputs.
-            most: see there.
+            most: draws that are returned at most.
             planned: draws that the inputs were planned for, and which therefore do not tell how safe they are.
         """
         found: list[int] = []

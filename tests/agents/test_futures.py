@@ -1,0 +1,64 @@
+"""Systems drawn from a belief have its noises, and blocks are planned for the models that they can be simulated of."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.planner.block_policy import BlockPlanner
+from agents.planner.futures import drawn_from_records, force_of_noise
+from agents.policies import make_policy
+from estimator import Belief
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.models.pendulum import PENDULUM
+
+
+def test_every_sensor_has_its_own_noise():
+    shape = 1e6  # nearly known
+    stds = np.array([1e-3, 2e-2, 3e-1])
+    gamma, *xi = [(shape, shape * std**2) for std in stds]
+    record = Belief.of(PENDULUM, np.ones(5), 0.01 * np.eye(5), gamma, xi).record
+    systems, noises = drawn_from_records(PENDULUM, record[None], np.ones(1), np.random.default_rng(0), 200)
+    assert systems.shape == (200, 5)
+    np.testing.assert_allclose(noises, np.tile(stds, (200, 1)), rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "unit"),
+    [(duffing(), "gain", np.sqrt(3)), (duffing(offsets=True), "gain", np.sqrt(3)), (difference(), "eta", 1.0),
+     (PENDULUM, "torque", np.sqrt(3))],
+)  # fmt: skip
+def test_process_noise_is_a_force(model, name, unit):
+    coefficients = np.random.default_rng(0).uniform(0.5, 2.0, (3, model.n_coefficients))
+    gain = coefficients[:, list(model.coefficients).index(name)]
+    np.testing.assert_allclose(force_of_noise(model)(*coefficients.T), unit / gain)
+
+
+def test_noise_that_is_no_force_is_refused():
+    env = gym.make("duffing_env/WienerHammerstein-v0")
+    with pytest.raises(ValueError, match="model must have its process noise where its input acts"):
+        make_policy("efe-block-16", env)
+
+
+def test_blocks_play_a_model_of_two_sensors():
+    env = gym.make("duffing_env/Pendulum-v0", horizon=32)
+    policy = make_policy("efe-block-16", env)
+    observation, _ = env.reset(seed=0)
+    state, done, total = None, False, 0.0
+    while not done:
+        action, state = policy.predict(observation, state)
+        observation, reward, terminated, done, _ = env.step(action)
+        total += reward
+        assert not terminated
+    assert total > 2.0
+
+
+@pytest.mark.parametrize(
+    ("block", "parts"), [(256, [1]), (64, [1 / 2, 1 / 4, 1 / 8, 1 / 8]), (100, [1 / 2, 1 / 4, 1 / 4])]
+)
+def test_blocks_share_the_risk_of_an_episode(block, parts):
+    env = gym.make("duffing_env/Amplitude-v1").unwrapped
+    policy = BlockPlanner(env, block=block)
+    shares = [policy.bound(left) / 0.004 for left in range(256, 0, -block)]
+    assert shares == pytest.approx(parts)
+    assert sum(shares) == pytest.approx(1.0)
