@@ -153,7 +153,11 @@ def design(
     u = np.clip(u, -observed.max_input, observed.max_input)
     worth, covs = expected(view, systems, limit, u)
     if not (np.isfinite(worth) and np.isfinite(covs).all()):
-        raise ValueError(too_slow(rig.step, in_period))
+        raise ValueError(
+            too_slow(rig.step, in_period) if in_period < SLOWEST else
+            "rig must be known well enough for its motion to be followed, but some systems that its guess allows run "
+            f"away between two samples; give a narrower guess or a shorter step than {rig.step!r} s"
+        )  # fmt: skip
     gain = worth + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1])
     after = _expected_deviations(belief, systems, covs)
     outputs = np.array([futures.shown(u, draw) for draw in range(_SHOWN)])
