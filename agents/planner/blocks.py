@@ -4,15 +4,18 @@ A block is planned for systems that are drawn from the belief, not for its means
 
     J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / aim - 1)²],
 
-by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. A block
-is played only when so few of some hundred further draws leave the limit that the probability is below a bound, with a
-confidence of 95 % (`agents.planner.futures`). Of those that leave, some are then planned for, too, and tell no longer
-how safe a block is; and the *aim* is a bit lower. It begins as the planner's own plan for the belief's means.
+by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. Several
+hundred further draws tell whether a block is safe: whether so few of them leave the limit that the probability is below
+a bound, with a confidence of 95 % (`agents.planner.futures`). Until then, some of those that leave join the systems
+that are planned for, and no longer count; and the *aim* falls a bit. There are many summits, up to 1 nat apart. So
+several candidates climb, among them the planner's own plan for the belief's means; the best of what is safe is taken.
 """
 
 from __future__ import annotations
 
-from functools import cache
+import math
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,8 +55,8 @@ MOST_PLANNED = SYSTEMS + _AIMS * _ADDED
 #: Penalty [nats] of what goes beyond the aim: one system of all must not leave it far for what the others tell.
 _PENALTY = 3e4
 
-#: The second candidate in parts of the first.
-_WEAKER = 0.6
+#: The second candidate in parts of the first; how many candidates are noise, and its deviation in parts of the limit.
+_WEAKER, _RANDOM, _WEAK = 0.6, 2, 0.3
 
 
 class Systems(NamedTuple):
@@ -155,7 +158,7 @@ def best_block(
     view: View, systems: Systems, futures: Futures, candidates: FloatArray, amplitude: float, bound: float,
     played: int | None = None,
 ) -> tuple[FloatArray, float, float]:  # fmt: skip
-    """The best input that is safe enough.
+    """The best input that is safe enough: what tells most on average, of the summits that candidates lead to.
 
     Args:
         view: of the model.
@@ -170,12 +173,21 @@ def best_block(
         Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and
         `Futures.chance` of leaving the limit.
     """
+    futures.disturbances(candidates.shape[1])  # drawn before the threads share them
+    climb = partial(_summit, view, systems, futures, amplitude, bound, played)
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(climb, candidates.copy()))
+    told = [expected(view, systems, futures.limit, u)[0] for u, *_ in found]
+    return found[int(np.argmax(told))]
+
+
+def _summit(
+    view: View, systems: Systems, futures: Futures, amplitude: float, bound: float, played: int | None, u: FloatArray
+) -> tuple[FloatArray, float, float]:
+    """As `best_block`, from one candidate (T,), which is overwritten."""
     ascend = _climber(coarsened(view.model), view.degree)  # how safe a block is, is judged with all steps
-    steps = min(_MOST_STEPS, _STEPS + candidates.shape[1])
     limits = Limits(futures.limit, _AIM * futures.limit, amplitude, np.inf)
-    climbed = [np.array(candidate) for candidate in candidates]
-    values = [ascend(systems, limits, steps, u) for u in climbed]
-    u = climbed[int(np.argmax(values))]
+    ascend(systems, limits, min(_MOST_STEPS, _STEPS + len(u)), u)
     planned = set(range(SYSTEMS))
     for k in range(_AIMS):
         enough = futures.enough(bound, len(planned))
@@ -192,17 +204,18 @@ def best_block(
 
 
 def drafts(planner: Planner, record: FloatArray, samples: int, seed: int) -> FloatArray:
-    """(2, samples) inputs to begin from: the planner's plan where a belief's means are the truth, and a weaker one.
+    """(n, samples) inputs to begin from: the planner's plan, were the belief's means true, a weaker one, and noise.
 
-    Their margin is the least of an episode's: the limits that a block must keep are `best_block`'s.
+    The plan's margin is the least of an episode's: the limits that a block must keep are `best_block`'s.
     """
-    u = np.zeros(samples)
+    plan = np.zeros(samples)
     terms = planner.terms._replace(margin=float(np.min(planner.terms.margin)))
     words = np.random.SFC64(seed).state["state"]["state"]
     horizon = min(planner.horizon, samples)
-    search(*planner.view).play(record.copy(), 0, horizon, planner.rounds, terms, u, words)
-    u = np.clip(u, -terms.amplitude, terms.amplitude)
-    return np.stack([u, _WEAKER * u])
+    search(*planner.view).play(record.copy(), 0, horizon, planner.rounds, terms, plan, words)
+    moves = np.random.default_rng(seed).standard_normal((_RANDOM, math.ceil(samples / terms.pace)))
+    noise = _WEAK * terms.amplitude * np.repeat(moves, terms.pace, axis=1)[:, :samples]
+    return np.clip(np.stack([plan, _WEAKER * plan, *noise]), -terms.amplitude, terms.amplitude)
 
 
 def expected(view: View, systems: Systems, limit: float, u: FloatArray) -> tuple[float, FloatArray]:
