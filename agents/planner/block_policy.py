@@ -50,13 +50,19 @@ class BlockPlanner:
             it, for the first ones know least, and the last one all.
 
     Raises:
-        ValueError: as `Planner`; for a block below 1 or above 4,096; where the input's energy is limited; or for a
-            model whose process noise acts on another state than its input does.
+        ValueError: as `Planner`; for a design or a run, which plan blocks of ``efe``; for a block below 1 or above
+            4,096; where the input's energy is limited; or for a model whose process noise acts on another state than
+            its input does.
     """
 
     def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 0.004) -> None:
         self._planner = Planner(env, seed, risk=risk)
         whole("block", block, _MOST)
+        if not hasattr(env, "mixture"):
+            raise ValueError(
+                f"policy must be 'efe' here, but is 'efe-block-{block}': a design is one block anyway, and a run takes "
+                f"efe with --block {block}"
+            )
         setup = env.experiment.setup
         if np.isfinite(setup.budget):
             raise ValueError(f"env must have no limit of energy for blocks, but has max_rms={env.experiment.max_rms!r}")

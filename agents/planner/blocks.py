@@ -55,8 +55,8 @@ MOST_PLANNED = SYSTEMS + _AIMS * _ADDED
 #: Penalty [nats] of what goes beyond the aim: one system of all must not leave it far for what the others tell.
 _PENALTY = 3e4
 
-#: The second candidate in parts of the first; how many candidates are noise, and its deviation in parts of the limit.
-_WEAKER, _RANDOM, _WEAK = 0.6, 2, 0.3
+#: The second candidate in parts of the first, and the standard deviation of candidates of noise in parts of the limit.
+_WEAKER, _WEAK = 0.6, 0.3
 
 
 class Systems(NamedTuple):
@@ -203,8 +203,8 @@ def _summit(
     return share * u, share, probability
 
 
-def drafts(planner: Planner, record: FloatArray, samples: int, seed: int) -> FloatArray:
-    """(n, samples) inputs to begin from: the planner's plan, were the belief's means true, a weaker one, and noise.
+def drafts(planner: Planner, record: FloatArray, samples: int, seed: int, noises: int = 2) -> FloatArray:
+    """(2 + noises, samples) to begin from: the planner's plan, were the belief's means true, a weaker one, and noise.
 
     The plan's margin is the least of an episode's: the limits that a block must keep are `best_block`'s.
     """
@@ -213,7 +213,7 @@ def drafts(planner: Planner, record: FloatArray, samples: int, seed: int) -> Flo
     words = np.random.SFC64(seed).state["state"]["state"]
     horizon = min(planner.horizon, samples)
     search(*planner.view).play(record.copy(), 0, horizon, planner.rounds, terms, plan, words)
-    moves = np.random.default_rng(seed).standard_normal((_RANDOM, math.ceil(samples / terms.pace)))
+    moves = np.random.default_rng(seed).standard_normal((noises, math.ceil(samples / terms.pace)))
     noise = _WEAK * terms.amplitude * np.repeat(moves, terms.pace, axis=1)[:, :samples]
     return np.clip(np.stack([plan, _WEAKER * plan, *noise]), -terms.amplitude, terms.amplitude)
 

@@ -31,6 +31,10 @@ from estimator.rig_prior import rig_prior
 #: Samples of an experiment, which is planned as a whole.
 _MOST = 2**16
 
+#: Candidates of noise from which the planner climbs: under a wide belief, summits are nats apart. Long signals have
+#: fewer, because each takes long to climb: so many samples in all, and between these numbers.
+_NOISE_SAMPLES, _FEWEST_NOISES, _MOST_NOISES = 4096, 2, 14
+
 #: Systems on which a policy that answers to outputs is played.
 _PLAYED = 4
 
@@ -81,7 +85,7 @@ class Designed:
     def write(self, path: Path) -> None:
         """A CSV file with time [s] and the input, as `identify` reads them beside an output."""
         lines = [f"time [s],{self.rig.input.column or f'u [{self.rig.input.unit}]'}"]
-        lines += [f"{k * self.rig.step:.9g},{value:.12g}" for k, value in enumerate(self.u.tolist())]
+        lines += [f"{k * self.rig.step:.9g},{value:.12g}" for k, value in enumerate((self.u + 0.0).tolist())]
         write_atomically(path, "\n".join(lines) + "\n")
 
 
@@ -135,7 +139,8 @@ def design(
     systems = systems_of(view, belief, futures, int(samples))
     chooser = make_policy(policy, observed, seed=seed)  # type: ignore[arg-type]
     if isinstance(chooser, Planner):
-        begun = drafts(chooser, _at_rest(belief), int(samples), seed)
+        noises = min(max(_NOISE_SAMPLES // int(samples), _FEWEST_NOISES), _MOST_NOISES)
+        begun = drafts(chooser, _at_rest(belief), int(samples), seed, noises)
         u, share, probability = best_block(view, systems, futures, begun, observed.max_input, bound)
     elif isinstance(chooser, SignalPolicy):
         u, share, probability = SignalDesign(chooser, observed).block(int(samples), futures, bound)
