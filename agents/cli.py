@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from signal import SIGINT
@@ -84,6 +83,26 @@ def followed(tasks: Iterable[tuple[str, Task]]) -> Iterator[Task]:
             bar.advance(shown)
 
 
+def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[str | Path]) -> None:
+    """Refuse to write over what a command reads, or two things into one file.
+
+    Args:
+        outputs: option to the file that it names, or None.
+        inputs: files that the command reads; names of rigs that ship do no harm.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    taken = {Path(path).resolve(): "it is read" for path in inputs}
+    for name, path in outputs.items():
+        if path is not None:
+            if path.resolve() in taken:
+                raise ValueError(
+                    f"{name} must be a file of its own, but is {path}, and {taken[path.resolve()]}; name another"
+                )
+            taken[path.resolve()] = f"so is {name}"
+
+
 def check_track(env_id: str) -> None:
     """Refuse an environment that has no vector environment of duffing_env, on which everything here is run.
 
@@ -96,7 +115,7 @@ def check_track(env_id: str) -> None:
 
     from duffing_env import TRACKS
     from duffing_env.vector_env import DuffingVectorEnv
-    from estimator.checks import shown
+    from estimator.checks import hint, shown
 
     if not isinstance(env_id, str):
         raise ValueError(f"env must be the id of a track such as duffing_env/Short-v0, but is {shown(env_id)}")
@@ -108,10 +127,9 @@ def check_track(env_id: str) -> None:
             f"env must be the id of a track such as duffing_env/Short-v0, but is {env_id}: {error}"
         ) from error
     except gym.error.Error as error:
-        near = [] if "/" in env_id else difflib.get_close_matches(f"duffing_env/{env_id}", TRACKS, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        remedy = "" if "/" in env_id else hint(f"duffing_env/{env_id}", TRACKS)
         raise type(error)(
-            f"env must be the id of a track such as duffing_env/Short-v0: {str(error).rstrip('.')}{hint}"
+            f"env must be the id of a track such as duffing_env/Short-v0: {str(error).rstrip('.')}{remedy}"
         ) from error
     if entry is None or (isinstance(entry, type) and not issubclass(entry, DuffingVectorEnv)):
         raise ValueError(

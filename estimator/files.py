@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import tempfile
@@ -10,6 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from estimator.checks import shown
+
+#: Errors of a disk, or a share of one, that has no room.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -20,7 +24,8 @@ def writing(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno is None:
             raise
-        raise OSError(error.errno, f"{error.strerror}; make room, or name another place", str(path)) from error
+        remedy = "make room, or name another place" if error.errno in _FULL else "name another place"
+        raise OSError(error.errno, f"{error.strerror}; {remedy}", str(path)) from error
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:

@@ -38,23 +38,30 @@ class Design:
 
     def run(self) -> None:
         """Design, print what is to be expected, and write the signal."""
+        from agents.cli import check_outputs
         from agents.results import spinner
         from agents.running.experiment import design
         from estimator.extras import need
         from estimator.saving import load_estimator
 
+        check_outputs({"output": self.output, "figure": self.figure}, [self.rig, *filter(None, [self.posterior])])
         if self.figure is not None:
             need("matplotlib")
+            if self.figure.suffix.lower() != ".png":
+                raise ValueError(f"figure must end in .png, which it will be, but is {self.figure}; rename it")
         prior = None if self.posterior is None else load_estimator(self.posterior).belief
         with spinner(f"Designing {self.samples} samples by {self.policy}"):
             found = design(self.rig, prior, self.policy, self.samples, self.bound, self.seed)
-        if self.output is not None:
-            found.write(self.output)
-        if self.figure is not None:
-            from agents.evaluation.figures import figure_of_experiment, save
+        # What is printed needs no file, and is told first; a pipe that closes early must not cost the files.
+        try:
+            show(found)
+        finally:
+            if self.output is not None:
+                found.write(self.output)
+            if self.figure is not None:
+                from agents.evaluation.figures import figure_of_experiment, save
 
-            save(figure_of_experiment(found), self.figure)
-        show(found)
+                save(figure_of_experiment(found), self.figure)
         if self.output is not None:
             print(f"The signal is {self.output}")
         if self.figure is not None:
@@ -67,18 +74,20 @@ def show(found: Any) -> None:
     from agents.results import table
     from agents.running.experiment import too_slow
     from estimator.identification.checks import SLOWEST
+    from estimator.units import digits_of
 
     # A mean that differs from 0 by rounding alone is 0.
     rows = [
         [
             name,
-            f"{mean if abs(mean) > 1e-9 * (high - low) else 0.0:.5g}",
-            f"{low:.5g} to {high:.5g}",
+            f"{mean if abs(mean) > 1e-9 * (high - low) else 0.0:.{digits}g}",
+            f"{low:.{digits}g} to {high:.{digits}g}",
             f"± {half:.2g}",
             f"{(high - low) / 2 / half:.3g}",
             unit,
         ]
         for name, mean, (low, high), half, unit in found.rows()
+        for digits in [digits_of(low, high, 5)]
     ]
     made = f"{len(found.u)} samples by {found.policy}, up to {abs(found.u).max():.3g} {found.rig.input.unit}"
     made += f", made smaller to {found.share:.2g} of it" if found.share < 1 else ""
@@ -86,5 +95,8 @@ def show(found: Any) -> None:
         table(("", "mean", "90 % interval now", "expected after", "times narrower", "unit"), rows),
         f"{made}; {found.gain:.1f} nats more; out of the range with a probability of at most {found.probability:.1g}.",
     )
+    if len(set(found.u.tolist())) == 1 and found.share > 0:
+        said = f"every input is the same: {found.policy} holds its values for longer than {len(found.u)} samples here"
+        print(f"duffing-env: warning: {said}; choose another signal, or more samples", file=sys.stderr)
     if found.samples_in_period < SLOWEST:
         print(f"duffing-env: warning: {too_slow(found.rig.step, found.samples_in_period)}", file=sys.stderr)

@@ -40,6 +40,7 @@ class Identify:
 
     def run(self) -> None:
         """Identify, print, and write the page."""
+        from agents.cli import check_outputs
         from estimator import identify
 
         if Path(self.rig).suffix.lower() in (".csv", ".mat"):
@@ -48,6 +49,7 @@ class Identify:
             )
         if not self.data:
             raise ValueError("data must name at least one CSV or MAT file; add it after the rig file")
+        check_outputs({"save": self.save, "report": self.report}, [self.rig, *self.data])
         result = identify(self.rig, list(self.data), progress=sys.stderr.isatty())
         # What is printed needs no file, and is told first; a pipe that closes early must not cost the files.
         try:

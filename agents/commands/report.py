@@ -21,9 +21,11 @@ class Report:
 
     def run(self) -> None:
         """Print the tables, and write the page."""
+        from agents.cli import check_outputs
         from agents.evaluation import board
         from agents.results import show, table
 
+        check_outputs({"output": self.output}, [self.board or board.OWN])
         own = self.board if self.board is not None else board.OWN if board.OWN.is_file() else None
         entries = {(e["track"], e["name"]): e for path in (board.SHIPPED, own) if path for e in board.read(path)}
         for track, rows in board.tables(list(entries.values())).items():

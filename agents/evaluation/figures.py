@@ -155,14 +155,14 @@ def figure_of_experiment(designed: Designed) -> Figure:
     above, below = figure.subplots(2, 1, sharex=True)
     time = rig.step * np.arange(len(designed.u))
     low, median, high = designed.shown
-    above.plot(time, designed.u, color=_COLOURS[0], linewidth=0.8, drawstyle="steps-post")
+    above.plot(time, designed.u, color=_COLOURS[0], linewidth=1.0, zorder=3, drawstyle="steps-post")
     above.set(ylabel=f"input / {rig.input.unit}", title=f"{len(designed.u)} samples by {designed.policy}")
     below.fill_between(time, low, high, color=_COLOURS[1], alpha=0.3, linewidth=0, label="expected, 90 %")
     below.plot(time, median, color=_COLOURS[1], linewidth=0.8, label="expected, median")
     below.set(xlabel="time / s", ylabel=f"output / {rig.output.unit}")
     for axes, limit in ((above, rig.input.limit), (below, rig.output.range)):
         both = limit * np.array([-1.0, 1.0])
-        axes.hlines(both, *time[[0, -1]], color="black", linestyle="--", linewidth=0.8, label="limits")
+        axes.hlines(both, *time[[0, -1]], color="black", linestyle="--", linewidth=0.8, zorder=1, label="limits")
         axes.grid(alpha=0.3)
     figure.legend(*below.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure

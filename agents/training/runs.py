@@ -305,8 +305,11 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
 def _run_folder(config: TrainConfig) -> Path:
     """The folder to write to; one that is named must not hold a run already."""
     if config.output is not None:
-        if (config.output / CONFIG).exists():
-            raise ValueError(f"output must be a new folder, but {config.output} holds a run; remove it or name another")
+        for kept, name in (("run", CONFIG), ("policy", CARD)):
+            if (config.output / name).exists():
+                raise ValueError(
+                    f"output must be a new folder, but {config.output} holds a {kept}; remove it or name another"
+                )
         return config.output
     base = Path("runs") / f"{config.algo}-{track_of(config.env).lower()}-{config.seed}"
     folder, number = base, 1

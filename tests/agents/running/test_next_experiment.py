@@ -1,6 +1,7 @@
 """The next experiment as a signal: within the limits, worth what is said of it, and readable again."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -103,6 +104,47 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
     table = read_table(tmp_path / "answer.csv")
     assert (table.step(), table.unit(table.u)) == (pytest.approx(RIG.step), "N")
     np.testing.assert_allclose(table.columns[table.u], found.u, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["design", "rig.toml", "-o", "rig.toml"], "output must be a file of its own, but is rig.toml, and it is read"),
+        (
+            ["design", "rig.toml", "-o", "a.png", "--figure", "./a.png"],
+            "figure must be .* and so is output; name another",
+        ),
+        (["design", "rig.toml", "--figure", "a.pdf"], "figure must end in .png"),
+        (["design", "rig.toml", "--policy", "efe-block-16"], "policy must be 'efe' here, but is 'efe-block-16'"),
+        (
+            ["identify", "rig.toml", "record.csv", "--save", "record.csv"],
+            "save must be .* is record.csv, and it is read",
+        ),
+        (["identify", "rig.toml", "record.csv", "--save", "a", "--report", "a"], "report must be .* and so is save"),
+        (
+            ["rig", "init", "new.toml", "--from", "timed.csv", "--step", "0.1"],
+            "step must be that of the times in timed",
+        ),
+    ],
+)
+def test_no_file_is_lost(tmp_path, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(tmp_path)
+    write_bench(tmp_path)
+    times = "".join(f"{0.02 * k:.2f},1,2\n" for k in range(9))
+    (tmp_path / "timed.csv").write_text(f"time [s],u,y\n{times}")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(SystemExit) as left:
+        main(words)
+    assert left.value.code == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_signal_that_never_changes_is_told(tmp_path, capsys):
+    (tmp_path / "rig.toml").write_text(RIG_FILE)
+    for policy in ("prbs-8", "prbs"):
+        main(["design", str(tmp_path / "rig.toml"), "--policy", policy, "--samples", "16"])
+        assert ("every input is the same: prbs-8 holds" in capsys.readouterr().err) == (policy == "prbs-8")
 
 
 def test_too_few_samples_in_a_period_are_told(tmp_path, capsys):
