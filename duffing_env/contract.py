@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 from collections.abc import Callable
 from dataclasses import fields
 from functools import wraps
@@ -16,6 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 from duffing_env.batch import Batch
 from duffing_env.experiment import Experiment
 from duffing_env.own import Own, bounds_of
+from estimator.checks import hint
 from estimator.parameters import FloatArray
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -104,10 +104,9 @@ def make_experiment(kind: type[Experiment], options: dict[str, Any]) -> Experime
     known = [field.name for field in fields(kind)]
     for name in options:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
             raise UnknownOption(
-                f"got an unexpected keyword argument {name!r}: the options of this environment are {known}{hint}"
+                f"got an unexpected keyword argument {name!r}: the options of this environment are {known}"
+                f"{hint(name, known)}"
             )
     return kind(**options)
 

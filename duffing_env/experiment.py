@@ -299,10 +299,13 @@ def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None
         raise ValueError(f"prior must be an estimator.Belief or None, but is {shown(prior)}")
     if prior.scales != scales:
         pairs = {name: (getattr(scales, name), getattr(prior.scales, name)) for name in asdict(scales)}
-        other = ", ".join(f"{name} {own!r}, not {its!r}" for name, (own, its) in pairs.items() if own != its)
+        words = {"input": "limit", "output": "range"}
+        other = ", ".join(
+            f"{words.get(name, name)} {its!r} in place of {own!r}" for name, (own, its) in pairs.items() if own != its
+        )
         raise ValueError(
-            f"prior must have the rig's scales, but differs: {other}; input and output stand for its limit and range: "
-            f"identify once more with the rig as it is now"
+            f"prior must have the rig's scales, limit and range, but has {other}; identify once more with the rig as "
+            f"it is now, and save that"
         )
     if model is not None and prior.model != model:
         raise ValueError(f"prior must be of the model {model.name!r}, but is of {prior.model.name!r}")

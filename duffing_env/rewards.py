@@ -54,12 +54,12 @@ tests/duffing_env/test_blow_up.py.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, NamedTuple
 
+from estimator.checks import hint
 from estimator.lanes import jit
 
 
@@ -134,6 +134,4 @@ def rewarding(reward: str | Callable[..., Any]) -> Reward:
 def check_reward(name: str | Callable[..., Any]) -> None:
     """ValueError for an unknown name."""
     if not callable(name) and not (isinstance(name, str) and name in REWARDS):
-        near = difflib.get_close_matches(str(name), REWARDS, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"reward must be one of {list(REWARDS)} or a function, but is {name!r}{hint}")
+        raise ValueError(f"reward must be one of {list(REWARDS)} or a function, but is {name!r}{hint(name, REWARDS)}")

@@ -59,9 +59,10 @@ def one_of(name: str, value: object, known: Collection[str]) -> None:
 
 
 def hint(value: object, known: Collection[str]) -> str:
-    """The end of a message: what name may have been meant, where one is near."""
-    near = difflib.get_close_matches(value, known, 1) if isinstance(value, str) else []
-    return f"; did you mean {near[0]!r}?" if near else ""
+    """The end of a message: what name may have been meant, where one is near; capitals do not count."""
+    names = {name.lower(): name for name in known}
+    near = difflib.get_close_matches(value.lower(), names, 1) if isinstance(value, str) else []
+    return f"; did you mean {names[near[0]]!r}?" if near else ""
 
 
 def mapping(name: str, value: object, kind: type = object) -> None:
@@ -80,14 +81,16 @@ def scalar(name: str, value: npt.ArrayLike) -> float:
 
 def series(name: str, values: npt.ArrayLike, missing: bool = False) -> FloatArray:
     """A finite series (T,), copied; with ``missing`` it may hold NaN."""
-    checked = numbers(name, values)
+    checked, short = numbers(name, values), name.split(" of ")[0]  # of "u of record 0", u
     if checked.ndim != 1:
-        raise ValueError(f"{name} must have shape (T,), but has {checked.shape}; pass one channel, e.g. {name}.ravel()")
+        raise ValueError(
+            f"{name} must have shape (T,), but has {checked.shape}; pass one channel, e.g. {short}.ravel()"
+        )
     finite = np.isfinite(checked) | (missing & np.isnan(checked))
     if not finite.all():
         bad = int(np.argmin(finite))
         raise ValueError(
-            f"{name} must be finite, but {name}[{bad}] is {checked[bad]}; remove or interpolate the sample"
+            f"{name} must be finite, but {short}[{bad}] is {checked[bad]}; remove or interpolate the sample"
         )
     return checked
 

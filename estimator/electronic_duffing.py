@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from estimator.checks import SMALLEST, number, one_of, whole
 from estimator.rig import Rig
 
 #: Relative half widths of the guess: capacitors are within 5 %, and the integrators add to the damping.
@@ -35,12 +36,9 @@ def electronic_duffing(
         [-6.0, -4.0]
     """
     for name, ratio in (("p1", p1), ("p2", p2), ("p3", p3)):
-        if not 0 < ratio <= 1:
-            raise ValueError(f"{name} must be above 0 and at most 1, but is {ratio!r}; give its division ratio")
-    if wells not in (1, 2):
-        raise ValueError(f"wells must be 1 or 2, but is {wells!r}; see the board's switch")
-    if kind not in ("displacement", "velocity"):
-        raise ValueError(f"kind must be displacement or velocity, but is {kind!r}; the board shows these")
+        number(name, ratio, SMALLEST, 1.0, "give the potentiometer's division ratio")
+    whole("wells", wells, 2)
+    one_of("kind", kind, ("displacement", "velocity"))
     centers = {"m": 1e-4, "c": 1e-3 * p1, "a": (10 if wells == 1 else -10) * p2, "b": p3}
     ends = {name: (center * (1 - _SPREADS[name]), center * (1 + _SPREADS[name])) for name, center in centers.items()}
     base = Rig.shipped("electronic-duffing" if kind == "displacement" else "electronic-duffing-velocity")

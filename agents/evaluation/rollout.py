@@ -111,6 +111,8 @@ def evaluate(
         ValueError: for no policies, an unknown one, a pattern that less than two policies match, fewer than two
             systems, or options that the track does not take.
     """
+    if isinstance(policies, str):
+        raise ValueError(f"policies must be a list of policies, but is {policies!r:.60}; pass [{policies!r:.60}]")
     if not policies:
         raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
     whole("systems", systems, _MOST_SYSTEMS, 2)  # intervals need more than one

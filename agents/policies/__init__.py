@@ -4,7 +4,6 @@
 function of the unwrapped environment (or None), the seed and its options, and name it in `POLICIES`.
 """
 
-import difflib
 import inspect
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +21,7 @@ from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.own import own_policy
 from agents.policies.signals import make_signal
-from estimator.checks import shown, whole
+from estimator.checks import hint, shown, whole
 
 
 class Policy(Protocol):
@@ -122,9 +121,8 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
         if env is not None:
             policy.move_to(env.unwrapped)
         return policy
-    nearest = difflib.get_close_matches(name, [*POLICIES, *trained_policies()], n=1)
-    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+    known = [*POLICIES, *trained_policies()]
     raise ValueError(
-        f"name must be one of {', '.join([*POLICIES, *trained_policies()])}, the path of a trained policy, or "
-        f"module:name of your own, but it is {shown(name)}{hint}"
+        f"policy must be one that is known, the path of a trained one, or module:name of your own, but is {shown(name)}"
+        f"{hint(name, known)}; known are {', '.join(known)}"
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from agents.asked import MOST_SAMPLES
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_MAX_INPUT, DEFAULT_SAMPLES, Limits
-from estimator.checks import shown, whole
+from estimator.checks import hint, shown, whole
 from estimator.files import write_atomically
 from estimator.parameters import SAMPLING_STEP
 
@@ -45,11 +44,10 @@ def draw_signal(
         ValueError: An argument is out of its range, or there is no excitation of this name.
     """
     if not isinstance(name, str) or name not in EXCITATIONS:
-        nearest = difflib.get_close_matches(str(name), EXCITATIONS, n=1)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        remedy = hint(name, EXCITATIONS)
         if str(name) in FEEDBACK:
-            hint = "; it answers to what an oscillator does, so it must be played: use agents.make_policy"
-        raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {shown(name)}{hint}")
+            remedy = "; it answers to what an oscillator does, so it must be played: use agents.make_policy"
+        raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {shown(name)}{remedy}")
     whole("samples", samples, MOST_SAMPLES)
     whole("seed", seed, 2**128, 0)
     limits = Limits(max_input, max_rms)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
-from estimator.checks import one_of, printable
+from estimator.checks import hint, one_of, printable
 from estimator.files import whole_file, write_atomically
 
 #: Folder of the files that come with the package, ``ALGORITHM.toml``.
@@ -69,7 +68,7 @@ def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
     values: dict[str, Any] = {}
     for name, value in entries.items():
         if name not in defaults:
-            raise ValueError(f"{name} is no hyperparameter of {kind.__name__}{_hint(name, defaults)}")
+            raise ValueError(f"{name} is no hyperparameter of {kind.__name__}{hint(name, defaults)}")
         wanted = type(defaults[name])
         if wanted is float and type(value) is int:
             value = float(value)
@@ -99,14 +98,9 @@ def _check_table(table: str, entries: Any, kind: type[AlgorithmSettings], path: 
     if table not in [DEFAULT, FAMILY, *map(table_of, registry)]:
         ours = [DEFAULT, *dict.fromkeys(table_of(name) for name in registry if name.startswith("duffing_env/"))]
         raise ValueError(
-            f"settings must have tables [{DEFAULT}] or of tracks, but {path} has [{table}]{_hint(table, ours)}"
+            f"settings must have tables [{DEFAULT}] or of tracks, but {path} has [{table}]{hint(table, ours)}"
         )
     try:
         settings_of(kind, entries)
     except ValueError as error:
         raise ValueError(f"{error}; mend [{table}] of {path}") from error
-
-
-def _hint(name: str, known: Iterable[str]) -> str:
-    nearest = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {nearest[0]!r}?" if nearest else ""

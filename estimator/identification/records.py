@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -76,10 +76,9 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
     """
     if isinstance(given, str | Path) or _is_pair(given):
         given = [given]
-    try:
-        listed = list(given)
-    except TypeError as error:
-        raise ValueError(f"records must be a list of pairs (u, y) or file names, but are {given!r:.60}") from error
+    if isinstance(given, Mapping) or not isinstance(given, Iterable):
+        raise ValueError(f"records must be a list of pairs (u, y) or file names, but are {given!r:.60}; pass [(u, y)]")
+    listed = list(given)
     if not listed:
         raise ValueError("records must hold at least one pair (u, y) or file name, but are empty")
     found, names = list[Record](), dict[int, str]()

@@ -513,6 +513,8 @@ def test_one_system_is_too_few(systems):
 
 
 def test_senseless_arguments_are_refused():
+    with pytest.raises(ValueError, match=r"policies must be a list of policies, but is .prbs.; pass"):
+        evaluate("prbs")
     with pytest.raises(ValueError, match="policies must name at least one"):
         evaluate([], systems=2)
     with pytest.raises(ValueError, match="did you mean 'uniform'"):

@@ -217,7 +217,7 @@ def test_nobody_knows_the_truth():
         (
             Difference(),
             {"prior": rig_prior(replace(VOLTS, step=1.0, guess=GUESS))},
-            "prior must have the rig's scales, but differs: ",
+            "prior must have the rig's scales, limit and range, but has ",
         ),
         (Difference(), {"prior": None}, "rig must have guess to be played, but has none"),
     ],

@@ -164,6 +164,7 @@ def test_errors_of_files_name_the_line(tmp_path, text, message):
     [
         ([], "records must hold at least one pair"),
         (3, "records must be a list of pairs"),
+        ({"u": [1.0], "y": [2.0]}, "records must be a list of pairs"),
         ([3], "record 0 must be a pair (u, y) or a file name, but is 3; pass (u, y) as one tuple"),
         ([(np.ones(100), np.ones(99))], "u and y of record 0 must have one length, but have 100 and 99"),
         ([(np.ones(20), np.arange(20.0))], "must have at least 50 outputs in all, but have 20"),

@@ -155,10 +155,12 @@ def test_the_board_s_files_are_those_of_its_potentiometers(name, settings):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"p1": 0.0}, "p1 must be above 0 and at most 1, but is 0.0"),
-        ({"p3": 2}, "p3 must be above 0 and at most 1, but is 2"),
-        ({"wells": 3}, "wells must be 1 or 2, but is 3"),
-        ({"kind": "acceleration"}, "kind must be displacement or velocity, but is 'acceleration'"),
+        ({"p1": 0.0}, "to 1, but is 0.0; give the potentiometer's division ratio"),
+        ({"p3": 2}, "to 1, but is 2; give the potentiometer's division ratio"),
+        ({"p2": None}, "p2 must be a number from "),
+        ({"wells": 3}, "wells must be a whole number from 1 to 2, but is 3"),
+        ({"wells": True}, "wells must be a whole number from 1 to 2, but is True"),
+        ({"kind": "acceleration"}, "kind must be one of ['displacement', 'velocity'], but is 'acceleration'"),
     ],
 )
 def test_potentiometers_are_checked(change, message):
