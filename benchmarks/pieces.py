@@ -18,7 +18,7 @@ from duffing_env.sources import parts
 from duffing_env.stages import noise_drawer
 from estimator.engine.tasks import structured
 from estimator.inference import mean_field
-from estimator.lanes import LANES, kernel, part
+from estimator.lanes import LANES, kernel
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
 
@@ -37,13 +37,10 @@ _PLACE = layout_of(_EXPERIMENT.kind)
 
 @cache
 def plant_mover() -> Any:
-    """``move_all(blocks, inputs)``: move the plants of all blocks by one sample, noise drawn within.
-
-    Not cached on disk: the cache's stamp does not know the sources of duffing_env (see `estimator.lanes.kernel`).
-    """
+    """``move_all(blocks, inputs)``: move the plants of all blocks by one sample, noise drawn within."""
     draw_noise, plant, u = noise_drawer(_PLACE), parts(_EXPERIMENT.kind).plant, _PLACE["U_0"] * LANES
 
-    @part(_EXPERIMENT.kind.name)
+    @kernel(kind=_EXPERIMENT.kind.name)
     def move_all(blocks, inputs):
         for b in range(len(blocks)):
             W = blocks[b]

@@ -80,7 +80,7 @@ MADE: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "log_uniform_moments": (log_uniform_moments, {"model": difference(), "center": _TWIN, "spread": 0.3}),
     "gaussian_moments": (gaussian_moments, {"model": difference(), "mean": _TWIN, "std": {"m": 1e-7}}),
     "Model": (Model, _DECAY),
-    "difference": (difference, {"terms": "paper"}),
+    "difference": (difference, {"preset": "paper"}),
     "duffing": (duffing, {"offsets": True, "sensor": "velocity"}),
     "fisher_information": (
         fisher_information,

@@ -79,8 +79,8 @@ def calls() -> st.SearchStrategy[Call]:
     #: Kind to the file's name, its content, what reads it, words of clear messages, and JSON to change in places.
     others: dict[str, tuple[str, bytes, Callable[[Path], Any], tuple[str, ...], str]] = {
         "rig": ("file", text_of(RIG, "").encode(), Rig.from_file, (), ""),
-        "csv": ("record.csv", _RECORD, lambda path: read(path, 1e-3), (), ""),
-        "mat": ("record.mat", matlab.getvalue(), lambda path: read(path, 1e-3), (), ""),
+        "csv": ("record.csv", _RECORD, lambda path: read(path, RIG), (), ""),
+        "mat": ("record.mat", matlab.getvalue(), lambda path: read(path, RIG), (), ""),
         "run": ("config.json", config.encode(), lambda path: read_config(path.parent), fields, config),
         "checkpoint": (STATE, progress.encode(), lambda path: load_progress(path.parent), ("checkpoint",), progress),
         "settings": (

@@ -22,7 +22,7 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     "held, but taken as linear": ("interpolation",),
     "linear, but taken as held": ("interpolation",),
     "output clipped": ("clipped",),
-    "input noise of 5 %": ("input_noise", "process_noise"),
+    "input noise of 5 %": ("process_noise",),
     "step twice too long": ("step",),
     "step half as long": ("step",),
     "quintic stiffness": ("quintic",),
