@@ -58,8 +58,8 @@ def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: boo
         below = "\n".join(cell for row in cells for cell in row[place : place + 1]).splitlines()
         width = max([10, *map(len, below)])
         broken = (textwrap.fill(line, width, break_long_words=False) for line in text.splitlines())
-        title = text if markdown else "\n".join(broken)
-        made.add_column(title, justify="left" if markdown or place == 0 else "right", no_wrap=markdown)
+        heading = text if markdown else "\n".join(broken)
+        made.add_column(heading, justify="left" if markdown or place == 0 else "right", no_wrap=markdown)
     for row in cells:
         made.add_row(*row)
     return made

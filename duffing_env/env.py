@@ -132,17 +132,17 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     | ``max_input`` | 0.15 | input limit [V] |
     | ``max_output`` | 0.6 | displacement limit [V] |
     | ``horizon`` | 256 | samples of an episode |
-    | ``hold`` | 1 | samples that an action is applied for; see below |
+    | ``hold`` | 1 | samples that an action is applied for; see above |
     | ``terminal`` | False | pay the episode's whole reward in its last step, and 0 before |
     | ``terminated_return`` | None | return of an episode that is terminated, whatever it gained; None keeps that |
     | ``process_noise`` | 5e-4 | standard deviation of w̃ [V] |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
     | ``spread`` | 0.3 | half width of the parameters' range, relative, in (0, 1) |
-    | ``noise_range`` | 1 | both noises are drawn for every episode; see below |
+    | ``noise_range`` | 1 | both noises are drawn for every episode; see above |
     | ``process_noise_guess`` | None | where the prior of γ is centred [V]; None: at ``process_noise`` |
     | ``measurement_noise_guess`` | None | where that of ξ is centred [V]; None: at ``measurement_noise`` |
     | ``noise_shape`` | 2 | shape of these Gamma priors; 2 is weak |
-    | ``noise_hypotheses`` | 1 | ratios of the noises to weigh by their evidence; see below |
+    | ``noise_hypotheses`` | 1 | ratios of the noises to weigh by their evidence; see above |
     | ``plant_spread`` | ``spread`` | the same for the plant alone, not for its prior; 0: all are the twin |
     | ``mean`` | None | parameter to the middle of its range, of some or all; the twin's where None |
     | ``prior`` | None | a `estimator.Belief` to start from; None: the one that fits plants and noises |

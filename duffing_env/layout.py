@@ -83,7 +83,7 @@ class Setup(NamedTuple):
         weights: (4,) of the reward (`duffing_env.rewards.Reward`).
         terminal: whether a reward is paid at the end.
         forfeits: whether an episode that is terminated returns ``terminated_return``.
-        terminated_return: see there.
+        terminated_return: return of an episode that is terminated, where it forfeits.
         prior: (size,) record that episodes start from.
         inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
         log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].

@@ -76,8 +76,8 @@ class DriftEnv(DuffingEnv):
     As `DuffingEnv`, but over a ``horizon`` of 512 samples, and at a sample that is uniform over the middle half of the
     episode the mass is multiplied by a factor that is log-uniform on 1 ± ``jump`` (0.3; below 1). The estimator
     expects change: before every sample each coefficient's standard deviation is widened as by a random walk, ``drift``
-    (0.01) of that of the prior, so it forgets in some hundred samples. Its intervals are those of a walk; a jump is a
-    large step of it.
+    (0.01) of that of the prior, so it forgets in several hundred samples. Its intervals are those of a walk; a jump
+    is a large step of it.
 
     The agent is not told of the jump; it shows in the outputs. At the end ``env.unwrapped.truth`` is the oscillator
     after it. All that is not said here is as in `DuffingEnv`.

@@ -23,8 +23,8 @@ from estimator.rig_prior import HALF_WIDTH, NOISE, OFFSET, rig_prior
 class RigExperiment(RigNumbers, SimulatedExperiment):
     """An experiment on oscillators that are drawn from a rig's guess. All numbers are in parts of its limit and range.
 
-    `RigEnv` says what its options are; ``spread``, ``plant_spread`` and ``jump`` are not used, because the guess says
-    what may be.
+    `RigEnv` says what its options are; ``spread``, ``plant_spread``, ``jump``, ``mean`` and ``prior`` are refused,
+    because the guess says what may be.
     """
 
     rig: AnyRig | None = None
@@ -160,7 +160,7 @@ class RigEnv(DuffingEnv):
 
     ## Arguments
 
-    Those of `DuffingEnv` but for ``spread``, ``plant_spread`` and ``jump``, and:
+    Those of `DuffingEnv` but for ``spread``, ``plant_spread``, ``jump``, ``mean`` and ``prior``, and:
 
     | Argument | Default | Meaning |
     |----------|---------|---------|

@@ -44,7 +44,7 @@ class OnlineEstimator:
         iterations: variational iterations per sample, 1 to 100; 3 structured, 10 mean field where it is None.
         as_published: mean field with the two departures of the published run, to reproduce its numbers.
         drift: lets the coefficients walk at random, to follow a system that changes: standard deviation of a
-            coefficient's step per sample, in parts of that of its prior. 0.01 forgets in some hundred samples.
+            coefficient's step per sample, in parts of that of its prior. 0.01 forgets in several hundred samples.
         expectations: what a step does to the Gaussian belief: ``first_order``, by the derivative at its mean; or
             ``sigma_points``, by points that spread as the belief does, for beliefs that are wide. By default the
             former, or the latter with a rig that brings the prior.

@@ -58,7 +58,8 @@ def main(words: list[str] | None = None) -> None:
         words: of the command line; those of this process where they are None.
 
     Raises:
-        SystemExit: with status 2 where a value or a file is bad, and 130 after Ctrl-C.
+        SystemExit: with status 2 where a value or a file is bad, 130 after Ctrl-C, 143 after SIGTERM, and 1 where a run
+            ended early.
     """
     words = sys.argv[1:] if words is None else words
     name, *rest = words or [""]

@@ -27,7 +27,7 @@ much again, and no input makes up for it: the margin is then twice as wide.
 Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
 nothing helps: on a rig the limit is lower by what a swing at it can hide.
 
-The search (`agents.planner.search`) builds a plan sample by sample, by the best ways through the plane of the
+The search (`agents.planner.search`) builds a plan move by move, by the best ways through the plane of the
 model's first two states, and improves it by steps of the whole plan and by small changes. Horizon 1 is myopic.
 
 Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
@@ -117,8 +117,8 @@ class Planner:
 
     Raises:
         ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
-            samples, a number is out of range, or a plan of the whole episode is asked to have a goal or cost, or to be
-            of another model than Eq. (2).
+            samples, a number is out of range, a plan of the whole episode is asked to have a goal or cost, or where the
+            energy of a long episode is limited and no horizon is given.
     """
 
     def __init__(

@@ -26,8 +26,8 @@ from estimator.lanes import LANES, jit
 #: Inputs of a plan that are changed together; later ones are planned again before they are played.
 _CHANGED = 20
 
-#: Steps; how much smaller λ becomes from step to step; and the last λ, as the largest input that g alone would ask for,
-#: in parts of the largest that there is.
+#: Steps; how much smaller λ becomes from step to step; and the last λ: with it g alone asks for at most this many times
+#: the largest input that there is.
 _STEPS, _LONGER, _LONGEST = 16, 1.6, 2.0
 
 #: How far an input is nudged, in parts of the largest.

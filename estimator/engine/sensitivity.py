@@ -27,9 +27,10 @@ from estimator.models.model import Model
 _STAGES = {"A": (sp.Rational(1, 6), sp.S.Half), "B": (sp.Rational(1, 3), sp.S.Half),
            "C": (sp.Rational(1, 3), sp.S.One), "D": (sp.Rational(1, 6), sp.S.Zero)}  # fmt: skip
 
-#: Steps of the state over a sample that is only imagined, of a model that takes as many, and of others. What is linear
-#: takes one step, whose stages are begin, middle and end of the sample. Two steps are wrong by more than the noise
-#: where a period has five samples (tests/agents/test_imagination.py), and peaks then lie beyond where they are planned.
+#: Runge-Kutta steps of the state over a sample that is only imagined: the first number where the model takes as many or
+#: more, else the second. What is linear takes one step, whose stages are begin, middle and end of the sample. Two steps
+#: are wrong by more than the noise where a period has five samples (tests/agents/test_imagination.py), and peaks then
+#: lie beyond where they are planned.
 _STEPS, _FEWER = 4, 2
 
 #: Process noise that is held over a sample moves the state as one more coefficient would.

@@ -1,4 +1,4 @@
-"""The tasks that the engine compiles for a model: update, imagination, plant, path, free run.
+"""Two of the tasks that the engine compiles for a model: the update of a belief, and the path of the states.
 
 Each gives compiled functions over a block ``W`` (`estimator.lanes`), and the layout of its rows. What stands in a block
 of ``lanes`` systems is what `layout` lists; whoever needs more rows adds them behind.

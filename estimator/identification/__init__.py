@@ -35,9 +35,9 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     Args:
         rig: a `Rig`, a dictionary, or the name of a rig file.
         records: pairs (u, y) of arrays (T,) in the rig's units, paired by index, or names of CSV or MAT files; one or a
-            list. Before its first sample a record may have been in any motion; its first outputs, three and as many as
-            the input is late, are left out, because inputs before the record may still act. An output that is NaN is
-            missing; a record is cut where an input is.
+            list. Before its first sample a record may have been in any motion; its first outputs, three, as many as the
+            input is late, and one more of an accelerometer, are left out, because inputs before the record may still
+            act. An output that is NaN is missing; a record is cut where an input is.
         progress: tell on stderr what is being done.
 
     Returns:

@@ -23,8 +23,8 @@ _EVIDENCE = 7.0
 #: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
 _RATIOS = (1.0, 0.1, 0.01)
 
-#: Samples by which the input may be earlier or later than is thought, and many by which it may be later: from the
-#: nearest of these the way leads on, step by step.
+#: Samples by which the input may be earlier or later than is thought, and many by which it may be later: these are
+#: coarse, and lead to the right one when records are identified again.
 _DELAYS, _LATE = range(-LATEST, LATEST + 1), (5, 8, 12, 16, 20, 25, 30, 40)
 
 #: Steps of a fit of another hypothesis, at most.
