@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,7 +62,7 @@ def figure_of_learning(curve: list[tuple[int, float, float]], reward: str) -> Fi
 
 def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Figure:
     """Gain of log posterior of the truth over the samples: median over systems, band from 25 to 75 %."""
-    figure = new_figure(7.5, 4.5)
+    figure = new_figure(7.5, 4.28 + 0.22 * math.ceil(len(evaluations) / 3))
     axes = figure.add_subplot()
     lowest = 0.0  # an over-confident posterior may lose
     looks = product(_STROKES, _COLOURS)
@@ -74,11 +75,7 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
     axes.set(xlabel="samples", ylabel="log posterior gain of the truth / nat", title=title)
     axes.set(xlim=(0, None), ylim=(lowest, None))
     axes.grid(alpha=0.3)
-    if len(evaluations) > len(_COLOURS):  # so many names would cover the curves
-        figure.set_figwidth(10)
-        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)
-    else:
-        axes.legend(loc="lower right")
+    figure.legend(loc="outside lower center", ncols=min(3, len(evaluations)))  # within, it would cover curves
     return figure
 
 
@@ -101,7 +98,7 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
             (f"|U| / {small}", frequencies, spectrum),
         )
         for axes, (label, x, y) in zip(row, lines, strict=True):
-            axes.plot(x, y, color=colour, linewidth=0.8)
+            axes.plot(x, y, color=colour, linewidth=0.8, drawstyle="steps-post" if axes is row[0] else "default")
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
         row[0].set_title(plain(evaluation.title), loc="left", fontsize=9)

@@ -77,7 +77,7 @@ def test_a_policy_in_pages_and_figures(name, evaluation, tmp_path):
         write_report(tmp_path / "report.html", [named, other], settings, ["evaluate.py", name])
         for figure in (figure_of_contraction([named, other]), figure_of_inputs([named, other])):
             save(figure, tmp_path / "figure.png")
-        legend = figure_of_contraction([named, other]).axes[0].get_legend()
+        (legend,) = figure_of_contraction([named, other]).legends
     assert len(legend.get_texts()) == 2
     page = Elements((tmp_path / "report.html").read_text())
     assert not page.found & {"script", "img", "b", "onerror"}

@@ -330,10 +330,11 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
 @pytest.mark.parametrize("policies", [1, 10])
 def test_contraction_shows_the_quartiles_of_every_policy(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
-    (axes,) = figure_of_contraction(evaluations, "title").axes
+    figure = figure_of_contraction(evaluations, "title")
+    (axes,), (legend,) = figure.axes, figure.legends
     assert axes.get_title() == "title"
     assert "nat" in axes.get_ylabel()
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == [str(i) for i in range(policies)]
+    assert [text.get_text() for text in legend.get_texts()] == [str(i) for i in range(policies)]
     for line, band, evaluation in zip(axes.lines, axes.collections, evaluations, strict=True):
         ordered = np.sort(evaluation.curve, axis=1)
         np.testing.assert_array_equal(line.get_xdata(), np.arange(21))
@@ -386,6 +387,6 @@ def test_pictures_are_written(tmp_path):
     check_picture(tmp_path / "curve.png", 840, 480)
     evaluations = [make_evaluation(str(i), seed=i, shift=3.0 * i) for i in range(4)]
     save(figure_of_contraction(evaluations, "title"), tmp_path / "contraction.png")
-    check_picture(tmp_path / "contraction.png", 900, 540, colours=4)
+    check_picture(tmp_path / "contraction.png", 900, 566, colours=4)  # two lines of names
     save(figure_of_inputs(evaluations), tmp_path / "excitations.png")
     check_picture(tmp_path / "excitations.png", 1440, 864, colours=4)
