@@ -43,7 +43,8 @@ def number(name: str, value: object, low: float = SMALLEST, high: float = LARGES
 def whole(name: str, value: object, most: int, least: int = 1) -> None:
     """Refuse what is not a whole number from ``least`` to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
-        raise ValueError(f"{name} must be a whole number from {least} to {most}, but is {shown(value)}")
+        high = f"2**{most.bit_length() - 1}" if most > 2**53 and most & (most - 1) == 0 else str(most)
+        raise ValueError(f"{name} must be a whole number from {least} to {high}, but is {shown(value)}")
 
 
 def flag(name: str, value: object) -> None:

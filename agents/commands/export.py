@@ -21,7 +21,7 @@ class Export:
 
     name: Annotated[str, tyro.conf.Positional]
     """Name of the excitation."""
-    output: Path
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")]
     """The file that is written."""
     samples: int = 1024
     """Its length."""

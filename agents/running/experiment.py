@@ -84,7 +84,8 @@ class Designed:
 
     def write(self, path: Path) -> None:
         """A CSV file with time [s] and the input, as `identify` reads them beside an output."""
-        lines = [f"time [s],{self.rig.input.column or f'u [{self.rig.input.unit}]'}"]
+        name = self.rig.input.column or "u"
+        lines = [f"time [s],{name if name.endswith((']', ')')) else f'{name} [{self.rig.input.unit}]'}"]
         lines += [f"{k * self.rig.step:.9g},{value:.12g}" for k, value in enumerate((self.u + 0.0).tolist())]
         write_atomically(path, "\n".join(lines) + "\n")
 

@@ -140,6 +140,17 @@ def test_no_file_is_lost(tmp_path, monkeypatch, capsys, words, message):
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_a_column_that_the_rig_names_has_its_unit(tmp_path):
+    rig = replace(RIG, input=replace(RIG.input, column="Kraft"))
+    path = tmp_path / "next.csv"
+    design(rig, policy="prbs", samples=16).write(path)
+    head, *rows = path.read_text().splitlines()
+    assert head == "time [s],Kraft [N]"
+    path.write_text("\n".join([f"{head},displacement [m]", *(f"{row},0" for row in rows)]))
+    table = read_table(path, "Kraft")
+    assert table.unit(table.u) == "N"
+
+
 def test_a_signal_that_never_changes_is_told(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text(RIG_FILE)
     for policy in ("prbs-8", "prbs"):
