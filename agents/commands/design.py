@@ -48,7 +48,7 @@ class Design:
         if self.figure is not None:
             need("matplotlib")
             if self.figure.suffix.lower() != ".png":
-                raise ValueError(f"figure must end in .png, which it will be, but is {self.figure}; rename it")
+                raise ValueError(f"figure must be a PNG file, but is {self.figure}; let its name end in .png")
         prior = None if self.posterior is None else load_estimator(self.posterior).belief
         with spinner(f"Designing {self.samples} samples by {self.policy}"):
             found = design(self.rig, prior, self.policy, self.samples, self.bound, self.seed)
