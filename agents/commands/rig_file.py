@@ -51,13 +51,12 @@ def from_record(path: Path, step: float | None = None, source: str | None = None
             f"{path} must have a column of times, such as 'time [s]', but has {list(table.names)}; rename one, or add "
             f"--step SECONDS"
         )
-    if step is not None and own is not None and abs(own / step - 1) > 0.01:
-        raise ValueError(f"step must be that of the times in {path}, {own:.6g} s, but is {step:.6g}; leave --step out")
     if step is None:
         # Times are written with some digits, and their mean difference is off by the last of them.
         step = float(f"{own:.6g}")
     output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement", column=sink)
     rig = Rig(step, input=Channel(table.unit(table.u) or "1", column=source), output=output)
+    table.check_step(rig.step)
     told = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
     return text_of(rig, f", from {printable(path.name)}{told}")
 

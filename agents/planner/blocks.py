@@ -7,8 +7,8 @@ A block is planned for systems that are drawn from the belief, not for its means
 by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. Several
 hundred further draws tell whether a block is safe: whether so few of them leave the limit that the probability is below
 a bound, with a confidence of 95 % (`agents.planner.futures`). Until then, some of those that leave join the systems
-that are planned for, and no longer count; and the *aim* falls a bit. There are many summits. So
-several candidates climb, among them the planner's own plan for the belief's means; the best of what is safe is taken.
+that are planned for, and no longer count; and the *aim* falls a bit. There are many summits. So several candidates
+climb, among them the planner's own plan for the belief's means; the best of what is safe is taken.
 """
 
 from __future__ import annotations

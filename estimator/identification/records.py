@@ -203,11 +203,7 @@ def _read_mat(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
 
 def _read_csv(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
     table = read_table(path, rig.input.column, rig.output.column)
-    own = table.step()
-    if own is not None and abs(own / rig.step - 1) > 0.01:
-        raise ValueError(
-            f"{path}: times are {own:.6g} s apart, but the rig's step is {rig.step:.6g} s; mend one of them"
-        )
+    table.check_step(rig.step)
     table.check(rig.input, rig.output)
     return table.columns[table.u], table.columns[table.y]
 

@@ -48,6 +48,14 @@ class Table:
     u: int
     y: int
 
+    def check_step(self, step: float) -> None:
+        """Refuse times that are not a sampling step [s] apart, to 1 %; `step` says what else."""
+        own = self.step()
+        if own is not None and abs(own / step - 1) > 0.01:
+            raise ValueError(
+                f"{self.path}: times are {own:.6g} s apart, but the step is {step:.6g} s; mend one of them"
+            )
+
     def step(self) -> float | None:
         """Sampling step [s], of the time column; None where there is none.
 

@@ -136,7 +136,7 @@ def test_times_are_even_between_missing_inputs_only(tmp_path):
         ("t,u [N],y\n[s],[kN],[m]\n0,1,2\n", "'u [N]' must have one unit, but 'kN' stands below"),
         ("a_column,b_column\n1,2", "must have one column of inputs and one of outputs"),
         ("1,2,3,4\n1,2,3,4", "must have two columns, u and y"),
-        ("t,u,y\n0,1,2\n0.5,1,3\n1.0,2,3\n", "times are 0.5 s apart, but the rig's step is 0.01 s"),
+        ("t,u,y\n0,1,2\n0.5,1,3\n1.0,2,3\n", "times are 0.5 s apart, but the step is 0.01 s"),
         (
             "t,u,y\n0,1,2\n0.01,1,3\n0.02,1,3\n0.03,1,3\n0.05,2,3\n",
             "line 6: samples must be evenly spaced, by 0.01 s, but this one comes 0.02 s after the last",
@@ -205,5 +205,5 @@ def test_units_in_another_way_of_writing_and_times_of_another_name_are_taken(tmp
     (tmp_path / "r.csv").write_text("Zeit [ms];u [μN];a [m/s^2]\n0;1;2\n2;3;4\n")
     np.testing.assert_array_equal(read(tmp_path / "r.csv", rig), [[1, 3], [2, 4]])
     (tmp_path / "r.csv").write_text("Zeit [ms];u [μN];a [m/s^2]\n0;1;2\n3;3;4\n")
-    with pytest.raises(ValueError, match=re.escape("times are 0.003 s apart, but the rig's step is 0.002 s")):
+    with pytest.raises(ValueError, match=re.escape("times are 0.003 s apart, but the step is 0.002 s")):
         read(tmp_path / "r.csv", rig)
