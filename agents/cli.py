@@ -103,6 +103,18 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[str | Pat
             taken[path.resolve()] = f"so is {name}"
 
 
+def full_id(env: Any) -> Any:
+    """The id of a track by its name; anything else as it is.
+
+    Example:
+        >>> full_id("Short-v0"), full_id("duffing_env/Short-v0"), full_id("CartPole-v1")
+        ('duffing_env/Short-v0', 'duffing_env/Short-v0', 'CartPole-v1')
+    """
+    from duffing_env import TRACKS
+
+    return f"duffing_env/{env}" if f"duffing_env/{env}" in TRACKS else env
+
+
 def check_track(env_id: str) -> None:
     """Refuse an environment that has no vector environment of duffing_env, on which everything here is run.
 

@@ -93,6 +93,17 @@ def check_file(name: str, path: Path | None) -> None:
         raise IsADirectoryError(f"{name} must be a file, but is the folder {path}; name a file in it")
 
 
+def check_folder(name: str, path: Path) -> None:
+    """Refuse a file where a folder is to be, before the work begins.
+
+    Raises:
+        NotADirectoryError: naming the argument.
+    """
+    for place in (path, *path.parents):
+        if place.exists() and not place.is_dir():
+            raise NotADirectoryError(f"{name} must be a folder, but {place} is a file; name another place")
+
+
 #: What the numbers of a result depend on.
 PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy")
 

@@ -19,6 +19,8 @@ from estimator.belief import covariance_places
 from estimator.checks import shown, whole
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
+from estimator.physical import propagate
+from estimator.units import VOLTS, Scales
 
 if TYPE_CHECKING:
     from duffing_env.batch import Batch
@@ -43,10 +45,12 @@ class Beliefs:
     Attributes:
         model: whose states and coefficients these are.
         records: (n, size) their records.
+        scales: what one inside is worth outside, for physical parameters.
     """
 
     model: Model
     records: FloatArray
+    scales: Scales = VOLTS
 
     @property
     def mean(self) -> FloatArray:
@@ -74,6 +78,10 @@ class Beliefs:
         """(n, 2 + 2 sensors) shape and rate of γ, then of each ξ."""
         return self.records[:, -2 - 2 * self.model.n_outputs :]
 
+    def physical(self) -> tuple[FloatArray, FloatArray]:
+        """Means (n, p) and covariances (n, p, p) of the physical parameters, as `estimator.Belief.physical`."""
+        return propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
+
 
 def check_observation(chosen: Any, history: int) -> None:
     """Refuse what is no observation, or no number of steps."""
@@ -94,12 +102,12 @@ def bounds_of(experiment: Experiment) -> FloatArray:
         last = posterior[-3 - model.n_outputs : -2]
         told = last * experiment.history + posterior[-2:]
     else:
-        told = [(-BOUND, BOUND)] * _called(chosen, model, experiment.believed.record[None]).shape[1]
+        told = [(-BOUND, BOUND)] * _called(chosen, experiment.believed.record[None], experiment).shape[1]
     return np.array(told)
 
 
-def _called(function: Any, model: Model, records: FloatArray) -> FloatArray:
-    seen = np.asarray(function(Beliefs(model, records)), dtype=np.float64)
+def _called(function: Any, records: FloatArray, experiment: Experiment) -> FloatArray:
+    seen = np.asarray(function(Beliefs(experiment.model, records, experiment.scales)), dtype=np.float64)
     if seen.ndim != 2 or len(seen) != len(records) or not np.isfinite(seen).all():
         raise ValueError(
             f"observation must give finite numbers of shape (n, entries) for the beliefs of n environments, but gave "
@@ -189,8 +197,9 @@ class Own:
         batch, n = self._batch, self._batch.size
         if not callable(self._reward):
             return np.zeros(n)
-        before, after = (Beliefs(self._model, records) for records in (self._before, batch.records(ended)))
-        scales, first = batch.experiment.scales, next(iter(batch.experiment.truth_model.outputs))
+        scales = batch.experiment.scales
+        before, after = (Beliefs(self._model, records, scales) for records in (self._before, batch.records(ended)))
+        first = next(iter(batch.experiment.truth_model.outputs))
         u, y = (batch.rows(["INPUT", f"Y_{first}"], ended) * (scales.input, scales.output)).T
         truth = batch.truth(ended) if batch.experiment.knows_truth else None
         if hasattr(self._reward, "py_func"):  # compiled by Numba
@@ -232,5 +241,5 @@ class Own:
             true = (self._batch.rows(self._true, ended) - self._prior) * self._inverse_std
             seen = np.concatenate([observations, true], axis=1)
         else:
-            seen = _called(self._chosen, self._model, self._batch.records(ended))
+            seen = _called(self._chosen, self._batch.records(ended), self._batch.experiment)
         return np.clip(seen, self._low, self._high).astype(np.float32)

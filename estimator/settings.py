@@ -72,7 +72,9 @@ def checked_hypotheses(given: object, factorisation: str, model: Model, most: in
     Raises:
         ValueError: naming the option, the value and the remedy.
     """
-    counts: list[Any] = list(given) if isinstance(given, tuple | list) and len(given) == 2 else [given]
+    if isinstance(given, tuple | list) and len(given) != 2:
+        raise ValueError(f"noise_hypotheses must be a number, or two such as (5, 5), but is {given!r:.60}")
+    counts: list[Any] = list(given) if isinstance(given, tuple | list) else [given]
     for count in counts:
         whole("noise_hypotheses", count, min(most, _MOST_VALUES) if len(counts) == 2 else most)
     if math.prod(counts) > most:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from agents.cli import RIG_TRACK, JsonOptions, check_track, with_rig
+from agents.cli import RIG_TRACK, JsonOptions, check_track, full_id, with_rig
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Evaluate:
     policies: tuple[str, ...] = ()
     """Names, run folders, module:name, TITLE=PATTERN for folders of seeds; what ships and the planner if none."""
     env: str = "duffing_env/Amplitude-v0"
-    """Id of the track."""
+    """Track, such as Short-v0."""
     rig: str | None = None
     """Rig file; the track is then Rig-v0."""
     options: JsonOptions = field(default_factory=dict)
@@ -48,8 +48,7 @@ class Evaluate:
     """File of the board."""
 
     def __post_init__(self) -> None:
-        if self.rig is not None:
-            object.__setattr__(self, "env", RIG_TRACK)
+        object.__setattr__(self, "env", RIG_TRACK if self.rig is not None else full_id(self.env))
         check_track(self.env)
         if self.protocol is not None and len(self.policies) != 1:
             raise ValueError(f"policies must name one for the protocol, but are {list(self.policies)}; name one")
@@ -76,7 +75,7 @@ class Evaluate:
         from agents.results import show, spinner, table
 
         (policy,) = self.policies
-        track = protocol if "/" in protocol else f"duffing_env/{protocol}"
+        track = full_id(protocol)
         with spinner("Measuring") as say:
             name = policy.partition("=")[0] if self.submit is None else self.submit
             entry = measure(policy, track, name, self.samples, say)

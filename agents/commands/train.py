@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from agents.cli import told_in_one_line
+from agents.running.stopping import telling
 from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, train_seeds, tune
 from agents.training.family import FAMILY
 from agents.training.runs import LEARNING
@@ -24,6 +25,9 @@ $ duffing-env train --algo td3 --tune 50               search hyperparameters
 $ duffing-env train --seeds 5 --ray                    five seeds, on a cluster
 $ duffing-env train --resume runs/ppo-amplitude-v0-0   go on after a stop
 """
+
+#: How several trainings go on: each of them alone would be finished without the others.
+_THE_SAME = "the same command goes on with what is left"
 
 
 @dataclass(frozen=True)
@@ -58,12 +62,15 @@ class Config(TrainConfig):
             each = self.hyperparameters.samples_per_update
             print(f"An update takes {each:,} samples, so {self.samples:,} will be learned from, not {self.steps:,}.")
         if self.tune:
-            best = tune(self, self.tune, on_ray=self.ray)
-            print(f"The best hyperparameters are in {best}: duffing-env train --algo {self.algo} --settings {best}")
+            with telling(lambda said: _THE_SAME):
+                best = tune(self, self.tune, on_ray=self.ray)
+            print(f"The best hyperparameters are in {best}")
+            print(f"To train with them: the same command, with --settings {best} in place of --tune and --output")
             return
         if self.seeds > 1:
-            for folder in train_seeds(self, self.seeds, on_ray=self.ray):
-                print(f"The run is in {folder}", flush=True)
+            with telling(lambda said: _THE_SAME):
+                for folder in train_seeds(self, self.seeds, on_ray=self.ray):
+                    print(f"The run is in {folder}", flush=True)
             self._compare(f"{self.algo}={folder.parent}/[0-9]*", self, folder.parent)
             return
         if self.resume is None:
@@ -97,13 +104,13 @@ def default_config(words: list[str] | None) -> Config:
     kind, name = ALGORITHMS[subject.algo], tyro.conf.arg(name=subject.algo.replace("_", "-"))
 
     @dataclass(frozen=True)
-    class AlgorithmConfig(Config):
+    class Train(Config):
         """Train a policy, and compare it."""
 
         hyperparameters: Annotated[kind, name] = field(default=None)  # type: ignore[valid-type]
         """Hyperparameters of the algorithm; their defaults are those that the file has for the track."""
 
-    return AlgorithmConfig(**asdict(subject))
+    return Train(**asdict(subject))
 
 
 def main(name: str, words: list[str] | None = None) -> None:

@@ -9,11 +9,12 @@ from typing import Any
 
 import gymnasium as gym
 
+from agents.cli import RIG_TRACK
 from agents.evaluation.leaderboard import print_estimators, print_table, write_evaluations
 from agents.evaluation.rollout import Evaluation, evaluate
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import load_policy
-from agents.results import spinner
+from agents.results import check_folder, spinner
 from duffing_env.silverbox import record_available
 from estimator.extras import how_to_get, is_missing, need
 
@@ -48,15 +49,17 @@ def compare(
 
     Raises:
         ModuleNotFoundError: for a report without matplotlib. Figures are left out without it.
+        NotADirectoryError: where the folder is a file.
     """
     if report:
         need("matplotlib")
+    check_folder("report" if report else "output", folder)
     with spinner("Evaluating") as say:
         evaluations = evaluate(policies, env_id, systems, seed, options, lambda name: say(f"Evaluating {name}"))
     title = f"{env_id}, {systems} systems"
     print_table(evaluations, title)
     print_estimators(evaluations)
-    if not record_available():
+    if not record_available() and env_id != RIG_TRACK and "error_m" in evaluations[0].metrics:
         print("What is measured by the Silverbox record is left out: the Silverbox record is not on this machine.")
     settings = {"env": env_id, "systems": systems, "seed": seed, "options": options}
     write_evaluations(folder / "evaluation.json", evaluations, settings)

@@ -78,6 +78,19 @@ METRICS = {
 }
 
 
+#: What the less known of them are, where they are in a table.
+TERMS = {
+    "nees": "NEES: squared error in units of the believed covariance; 1 where beliefs are right",
+    "efficiency": "D-efficiency: information per coefficient, in parts of the best input that a search found which "
+    "knows the system",
+    "certified": "at least: the same, in parts of an upper bound of what any input tells",
+    "silverbox_equivalent": "Silverbox equivalent: samples of the benchmark's multisine that tell as much",
+}
+
+#: What the auditor of the second table is.
+AUDITOR_IS = "the auditor: an offline maximum a posteriori fit that knows the noises"
+
+
 def metrics_of(found: Iterable[str], unit: str = "V") -> dict[str, Metric]:
     """The columns of the metrics that were found, in their order; errors of other parameters than m, c, a, b first.
 
@@ -212,7 +225,8 @@ def print_estimators(evaluations: list[Evaluation]) -> None:
     """Print the two-way table, where there is something in it."""
     heads, rows = two_way_table(evaluations)
     if rows:
-        show(table(heads, rows, title="what other estimators make of the same inputs and outputs"), width=130)
+        title = "what other estimators make of the same inputs and outputs"
+        show(table(heads, rows, title=title), AUDITOR_IS, width=130)
 
 
 def in_order(evaluations: list[Evaluation]) -> list[Evaluation]:
@@ -221,10 +235,12 @@ def in_order(evaluations: list[Evaluation]) -> list[Evaluation]:
 
 
 def caption_of(evaluations: list[Evaluation]) -> str:
-    """What the figures of a table are."""
+    """What the figures of a table are, and what its less known metrics mean, a line each."""
     several = any(evaluation.seeds > 1 for evaluation in evaluations)
     over = "of several seeds interquartile means, shares as means, and the median seed; " if several else ""
-    return f"means, errors as medians; {over}[95 % bootstrap intervals over systems]"
+    found = {name for evaluation in evaluations for name in evaluation.metrics}
+    terms = [meaning for name, meaning in TERMS.items() if name in found]
+    return "\n".join([f"means, errors as medians; {over}[95 % bootstrap intervals over systems]", *terms])
 
 
 def cell_of(metric: Metric, entry: dict[str, Any] | None) -> str:

@@ -14,7 +14,7 @@ from agents.evaluation.figures import (
     figure_of_information,
     figure_of_inputs,
 )
-from agents.evaluation.leaderboard import caption_of, leaderboard, two_way_table
+from agents.evaluation.leaderboard import AUDITOR_IS, caption_of, leaderboard, two_way_table
 from agents.evaluation.rollout import Evaluation
 from agents.results import versions
 from estimator.files import write_atomically
@@ -62,8 +62,8 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
         f"options <code>{html.escape(json.dumps(settings['options']))}</code>.</p>",
         "<h2>Leaderboard</h2>",
         table(heads, [[title, *map(_with_interval, cells)] for title, *cells in rows]),
-        f"<p><small>{caption_of(evaluations).capitalize()}. An episode that a limit ends counts with what was known by "
-        "then.</small></p>",
+        f"<p><small>{'; '.join(caption_of(evaluations).splitlines()).capitalize()}. An episode that a limit ends "
+        "counts with what was known by then.</small></p>",
         _estimators(evaluations),
     ]
     for heading, figure, caption in figures:
@@ -92,6 +92,6 @@ def _estimators(evaluations: list[Evaluation]) -> str:
         return ""
     return (
         "<h2>What other estimators make of the same inputs and outputs</h2>"
-        "<p>The auditor, an offline maximum a posteriori fit that knows the noises, ranks the inputs; the rows of one "
-        "policy rank the estimators.</p>" + table(heads, [[html.escape(cell) for cell in row] for row in rows])
+        f"<p>{AUDITOR_IS.capitalize()}. It ranks the inputs; the rows of one policy rank the estimators.</p>"
+        + table(heads, [[html.escape(cell) for cell in row] for row in rows])
     )

@@ -117,14 +117,15 @@ def evaluate(
         raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
     whole("systems", systems, _MOST_SYSTEMS, 2)  # intervals need more than one
     whole("seed", seed, 2**128, 0)
-    own = [title_of(policy) for policy in policies if not isinstance(policy, str)]
-    if len(set(own)) < len(own):
-        raise ValueError(f"policies must differ by their names, but are called {own}; give each a name of its own")
     options = TESTED | (options or {})
+    groups = [members_of(name) for name in policies]
+    called = [title_of(members[0]) if title is None else title for title, members in groups]
+    if len(set(called)) < len(called):
+        raise ValueError(f"policies must differ by their names, but are called {called}; give each a name of its own")
+    _check_policies([member for _, members in groups for member in members], env_id, options, seed)
     evaluations = []
     told: dict[str, FloatArray] = {}
-    for name in policies:
-        title, members = members_of(name)
+    for title, members in groups:
         each = []
         for member in members:
             if on_policy is not None:
@@ -132,6 +133,18 @@ def evaluate(
             each.append(_evaluate(member, env_id, systems, seed, options, told))
         evaluations.append(each[0] if title is None else pooled(title, each))
     return evaluations
+
+
+def _check_policies(policies: Sequence[Any], env_id: str, options: dict[str, Any], seed: int) -> None:
+    """Refuse policies that cannot be made for an environment, before the first of them plays: that takes a while."""
+    envs = make(env_id, 2, options)
+    for policy in policies:
+        if isinstance(policy, str):
+            try:
+                make_policy(policy, envs, seed=seed)
+            except ValueError as error:
+                raise ValueError(f"{policy}: {error}") from error
+    envs.close()
 
 
 def title_of(policy: Any) -> str:

@@ -47,7 +47,7 @@ from agents.planner.imagination import RISK, Terms, margin
 from agents.planner.motion import View, is_of_rig, limit_of, places, shaken_of, swing_of
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
-from estimator.checks import LARGEST, SMALLEST, number, numbers, shown, whole
+from estimator.checks import SMALLEST, number, numbers, shown, whole
 from estimator.engine.motion import coarsened
 from estimator.parameters import FloatArray
 
@@ -107,9 +107,9 @@ class Planner:
         rounds: of steps and changed copies, two blocks of `estimator.lanes.LANES` each; of no effect on a plan of the
             whole episode.
         risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
-        goal: mean of the goal prior of the displacement [V].
-        goal_std: its standard deviation [V]; no goal where it is None.
-        input_cost: nats for a V² of input energy.
+        goal: mean of the goal prior of what the first sensor shows, within its limit.
+        goal_std: its standard deviation; no goal where it is None.
+        input_cost: nats for the square of an input. Like the goal, it is in the belief's scale: in V on the tracks.
 
     Attributes:
         view: of the model that is planned on.
@@ -117,8 +117,8 @@ class Planner:
 
     Raises:
         ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
-            samples, a number is out of range, a plan of the whole episode is asked to have a goal or cost, or where the
-            energy of a long episode is limited and no horizon is given.
+            samples, a number is out of range, a goal has no ``goal_std``, a plan of the whole episode is asked to have
+            a goal or cost, or where the energy of a long episode is limited and no horizon is given.
     """
 
     def __init__(
@@ -142,9 +142,6 @@ class Planner:
         whole("rounds", rounds, 1000)
         number("risk", risk, SMALLEST, 1 - SMALLEST)
         number("input_cost", input_cost, 0)
-        number("goal", goal, -LARGEST)
-        if goal_std is not None:
-            number("goal_std", goal_std, remedy="None is no goal")
         experiment = env.experiment
         if experiment.hold != 1:
             raise ValueError(
@@ -152,6 +149,11 @@ class Planner:
                 "make it with hold=1, or choose a signal or a feedback law"
             )
         setup, self.view = experiment.setup, View.of(experiment)
+        number("goal", goal, -float(setup.max_output), float(setup.max_output), "a goal lies within the limit")
+        if goal_std is not None:
+            number("goal_std", goal_std, remedy="None is no goal")
+        elif goal:
+            raise ValueError(f"goal_std must be given with a goal, but is None for goal={goal!r}; add goal_std=0.05")
         all_of_it = bool(np.isfinite(setup.budget)) and horizon is None
         if all_of_it and env.horizon > _MOST_MOVES:
             raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -82,6 +82,16 @@ class Stopper:
     def _calm(self) -> None:
         if self._former and hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+@contextmanager
+def telling(left: Callable[[str], str]) -> Iterator[None]:
+    """Let a signal that ends the work within say what is left of it: ``left`` makes that of what is said already."""
+    try:
+        yield
+    except (KeyboardInterrupt, Stopped) as stopped:
+        signum, said = (stopped.signum, stopped.left) if isinstance(stopped, Stopped) else (signal.SIGINT, "")
+        raise Stopped(signum, left(said)) from stopped
 
 
 @contextmanager

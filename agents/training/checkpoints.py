@@ -115,7 +115,9 @@ def begin_with(folder: Path, model: BaseAlgorithm) -> None:
     try:
         tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(folder / WEIGHTS).items()}
         model.policy.load_state_dict({name: t for name, t in tensors.items() if name != "foresight"})
-    except (OSError, RuntimeError) as error:
+    except OSError as error:
+        raise ValueError(f"begin must be the folder of a policy, but {folder} has no {WEIGHTS}; name one") from error
+    except RuntimeError as error:
         raise ValueError(f"begin must be a policy with the network of the training, but {folder} is not") from error
 
 

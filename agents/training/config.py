@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from agents.cli import RIG_TRACK, JsonOptions, check_track, with_rig
+from agents.cli import RIG_TRACK, JsonOptions, check_track, full_id, with_rig
 from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
@@ -32,15 +32,14 @@ class Subject:
     algo: Literal["ppo", "sac", "td3", "tqc", "recurrent_ppo"] = "ppo"
     """Algorithm."""
     env: str = "duffing_env/Amplitude-v0"
-    """Id of the track; or family, the oscillators of all kinds that ppo/universal is trained on."""
+    """Track, such as Short-v0; or family, the oscillators of all kinds that ppo/universal is trained on."""
     rig: str | None = None
     """Rig file; the track is then Rig-v0."""
     settings: Path | None = None
     """File of hyperparameters, TOML; the one that comes with the package where it is not given."""
 
     def __post_init__(self) -> None:
-        if self.rig is not None:
-            object.__setattr__(self, "env", RIG_TRACK)
+        object.__setattr__(self, "env", RIG_TRACK if self.rig is not None else full_id(self.env))
 
 
 @dataclass(frozen=True)

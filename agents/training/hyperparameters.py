@@ -44,17 +44,23 @@ def read_settings(algo: str, env_id: str, path: Path | None = None) -> Algorithm
         path: of the file; the package's where it is not given.
 
     Raises:
-        ValueError: for an unknown algorithm, or a file that is not TOML, or has an entry that is no hyperparameter.
+        ValueError: for an unknown algorithm, or a file that is not TOML, or has an entry that is no hyperparameter, or,
+            but for the package's, no table for the track.
         OSError: where the file cannot be read.
     """
     one_of("algo", algo, ALGORITHMS)
-    path = FILES / f"{algo}.toml" if path is None else path
+    file = FILES / f"{algo}.toml" if path is None else path
     try:
-        tables = tomllib.loads(whole_file(path, "settings must be a TOML file", 2**20).read_text())
+        tables = tomllib.loads(whole_file(file, "settings must be a TOML file", 2**20).read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"settings must be a TOML file, but {path} is not: {error}") from error
+        raise ValueError(f"settings must be a TOML file, but {file} is not: {error}") from error
     for table, entries in tables.items():
-        _check_table(table, entries, ALGORITHMS[algo], path)
+        _check_table(table, entries, ALGORITHMS[algo], file)
+    if path is not None and not {DEFAULT, table_of(env_id)} & set(tables):
+        raise ValueError(
+            f"settings must have a table [{table_of(env_id)}] or [{DEFAULT}] for {env_id}, but {path} has "
+            f"{', '.join(f'[{table}]' for table in tables) or 'none'}; name the track with --env, or add one"
+        )
     return settings_of(ALGORITHMS[algo], tables.get(DEFAULT, {}) | tables.get(table_of(env_id), {}))
 
 

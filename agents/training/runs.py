@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from signal import SIGINT
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from agents.policies.learned import CARD
 from agents.policies.saving import save_policy
 from agents.results import write_json
-from agents.running.stopping import Stopped, Stopper
+from agents.running.stopping import Stopper, telling
 from agents.training import family
 from agents.training.algorithms import OnPolicySettings
 from agents.training.checkpoints import (
@@ -89,7 +88,7 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     """
     need("torch", "stable_baselines3", "matplotlib", *contrib(config))
     folder = _run_folder(config)
-    with _saying_what_is_left(folder):
+    with telling(lambda said: said or _left(folder)):
         return _Training(config, folder, on_evaluation).run()
 
 
@@ -111,7 +110,7 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
         raise ValueError(f"resume must be a run folder, which holds {CONFIG}, but {folder} is not one; name a run's")
     if (folder / CARD).exists():
         raise ValueError(f"resume must be a run that was stopped, but {folder} is finished; it holds its policy")
-    with _saying_what_is_left(folder):
+    with telling(lambda said: said or _left(folder)):
         return _Training(read_config(folder), folder, on_evaluation).run()
 
 
@@ -122,16 +121,6 @@ def carry_on(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, fo
         train(config, on_evaluation)
     elif not (config.output / CARD).exists():
         resume(config.output, on_evaluation)
-
-
-@contextmanager
-def _saying_what_is_left(folder: Path) -> Iterator[None]:
-    """Let a signal that ends a training say what is left of it, whenever it comes."""
-    try:
-        yield
-    except (KeyboardInterrupt, Stopped) as stopped:
-        signum, left = (stopped.signum, stopped.left) if isinstance(stopped, Stopped) else (SIGINT, "")
-        raise Stopped(signum, left or _left(folder)) from stopped
 
 
 def _left(folder: Path) -> str:

@@ -517,9 +517,21 @@ def test_senseless_arguments_are_refused():
         evaluate("prbs")
     with pytest.raises(ValueError, match="policies must name at least one"):
         evaluate([], systems=2)
-    with pytest.raises(ValueError, match="did you mean 'uniform'"):
-        evaluate(["unifrom"], systems=2)
+    with pytest.raises(ValueError, match=r"policies must differ by their names, but are called .*; give each a name"):
+        evaluate(["prbs", "prbs"], systems=2)
+    played = []
+    for name, words in (("unifrom", "did you mean 'uniform'"), ("ppo/short", "ppo/short: env must have 58 features")):
+        with pytest.raises(ValueError, match=words):
+            evaluate(["prbs", name], "duffing_env/Pendulum-v0", systems=2, on_policy=played.append)
+    assert not played, "all are made before the first one plays"
     with pytest.raises(ValueError, match="did you mean 'horizon'"):
         evaluate(["uniform"], systems=2, options={"horizn": 3})
     with pytest.raises(gym.error.NameNotFound):
         evaluate(["uniform"], "duffing_env/Ampltude-v0", systems=2)
+
+
+def test_a_file_in_place_of_the_folder_is_found_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("kept")
+    with pytest.raises(NotADirectoryError, match="output must be a folder, but .*file is a file; name another place"):
+        compare(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "file" / "below")
+    assert (tmp_path / "file").read_text() == "kept"

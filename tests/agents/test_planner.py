@@ -115,6 +115,8 @@ def test_single_environments_are_planned_for_as_rows_are():
         ({"risk": 0.0}, "risk must be a number from 1e-12"),
         ({"input_cost": float("inf")}, "input_cost must be a number from 0"),
         ({"goal_std": 0.0}, "goal_std must be a number from 1e-12"),
+        ({"goal": 0.2}, "goal_std must be given with a goal, but is None for goal=0.2"),
+        ({"goal": 0.7, "goal_std": 0.1}, "goal must be a number from -0.6 to 0.6, but is 0.7; a goal lies within"),
         ({"horizn": 3}, "horizn=3 is no option of policy 'efe'"),
     ],
 )

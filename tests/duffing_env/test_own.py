@@ -191,7 +191,11 @@ def test_oscillators_are_drawn_about_a_mean_of_ones_own():
         middle = {"b": 1.0, "m": 1e-5}.get(name, usual.experiment.center[name])
         assert 0.7 * middle <= low < 0.72 * middle
         assert 1.28 * middle < high <= 1.3 * middle
-    assert isinstance(Beliefs(difference(), moved.records).mean, np.ndarray)
+    means, covs = Beliefs(difference(), moved.records).physical()
+    for row in (0, 7):
+        mean, cov = moved.belief(row).physical()
+        np.testing.assert_allclose(means[row], mean)
+        np.testing.assert_allclose(covs[row], cov)
     assert moved.belief(0) != usual.belief(0)
 
 
