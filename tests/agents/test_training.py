@@ -177,7 +177,7 @@ def test_a_training_can_begin_with_the_network_of_a_policy(runs, tmp_path):
         np.testing.assert_allclose(after[name], tensor, atol=1e-6)
     with pytest.raises(ValueError, match="begin must be a policy with the network of the training"):
         tiny(tmp_path / "other", begin=runs["first"].folder)
-    with pytest.raises(ValueError, match="begin must be the folder of a policy, but .*nowhere has no policy"):
+    with pytest.raises(ValueError, match=r"begin must be the folder of a policy, but .*nowhere has no policy"):
         tiny(tmp_path / "another", begin=tmp_path / "nowhere")
 
 
