@@ -18,6 +18,7 @@ from estimator.checks import number, one_of, shown
 from estimator.models import MODELS
 from estimator.models.model import Model
 from estimator.priors import gaussian_moments, weak_prior
+from estimator.units import Scales
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,12 @@ class ModelExperiment(SimulatedExperiment):
     def step(self) -> float:
         """The sampling step."""
         return float(self.sampling_step)
+
+    @property
+    def scales(self) -> Scales:
+        """Outputs in the unit of the first state; inputs, where that is not a voltage, are counted as they are."""
+        unit = next(iter(self.plant.states.values()))
+        return Scales(self.step, input_unit="V" if unit == "V" else "1", output_unit=unit)
 
     @property
     def center(self) -> dict[str, float]:

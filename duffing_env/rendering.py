@@ -1,9 +1,12 @@
-"""The environment as a picture: input and output on the left, what is believed of m, c, a and b on the right."""
+"""The environment as a picture: input and output on the left, what is believed of the parameters on the right.
+
+Those are m, c, a and b of a Duffing oscillator, and of another model its first four.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +15,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.extras import need
-from estimator.models.duffing import DIMENSIONS
+from estimator.models.model import Model
 from estimator.parameters import FloatArray, Parameters
 from estimator.physical import propagate
 from estimator.rig_prior import HALF_WIDTH
@@ -26,12 +29,18 @@ WIDTH, HEIGHT = 960, 540
 SPAN = 256
 """Samples on the time axes. Longer episodes scroll: more samples would hide the single periods."""
 
-NAMES = ("m", "c", "a", "b")
-_WORDS = ("mass m", "damping c", "stiffness a", "cubic b")
+_WORDS = {"m": "mass m", "c": "damping c", "a": "stiffness a", "b": "cubic b"}
+_MOST = 4
 
 INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
 SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"
 _TITLE: dict[str, Any] = {"fontsize": 9, "pad": 4}
+#: An episode of so many seconds is drawn in seconds.
+_LONG = 10.0
+
+#: The part of the height that the parameters' panels share.
+_PARAMETERS = 0.82
+
 # A curve ends in a dot. What is "animated" Matplotlib leaves out of the background.
 _CURVE: dict[str, Any] = {"marker": "o", "markersize": 3.5, "markevery": [-1], "animated": True}
 
@@ -60,11 +69,13 @@ class Screen:
 
     def start(self, truth: Parameters, belief: Belief, horizon: int) -> None:
         """Begin an episode of at most ``horizon`` samples; ``belief`` is the prior."""
-        self._truth = np.array([getattr(truth, name, np.nan) for name in NAMES])
+        names = named(belief.model)
+        self._truth = np.array([getattr(truth, name, np.nan) for name in names])
+        self._labels = _labels(belief)
+        self._model = "Duffing oscillator" if tuple(names) == tuple(_WORDS) else belief.model.name.replace("_", " ")
         self._horizon = horizon
         self._samples = 0
         self._prior_entropy = belief.entropy()
-        self._believed = _physical_moments([belief])[0][:, 0]
         # Input, output and the belief after them; nothing was applied before the prior.
         self._history: deque[tuple[float, float, Belief]] = deque([(np.nan, np.nan, belief)], maxlen=SPAN + 1)
         self._show()
@@ -78,7 +89,7 @@ class Screen:
     def frame(self) -> Frame:
         """The episode so far (of a long one the last `SPAN` samples) as a new RGB array (HEIGHT, WIDTH, 3)."""
         if self._picture is None:
-            self._picture = _Picture(*self._limits, self._scales, self._believed)
+            self._picture = _Picture(*self._limits, self._scales, self._model, self._labels)
         inputs, outputs, beliefs = zip(*self._history, strict=True)
         means, stds = _physical_moments(beliefs)
         gained = self._prior_entropy - beliefs[-1].entropy()
@@ -106,11 +117,22 @@ class Screen:
         return {**self.__dict__, "_picture": None, "_window": None}
 
 
-def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray]:
-    """(4, n) means and standard deviations of m, c, a and b, first order.
+def named(model: Model) -> list[str]:
+    """The parameters that are shown: m, c, a and b of what has them, else the first ones.
 
-    NaN where a model has no such parameter, or a belief none: the map divides by the gain (η), whose mean is about 0.4
-    but may pass 0 on the way.
+    Example:
+        >>> from estimator.models import MODELS
+        >>> [named(MODELS[name]()) for name in ("duffing", "pendulum", "wiener_hammerstein")]
+        [['m', 'c', 'a', 'b'], ['p1', 'p2', 'p3'], ['stiffness', 'damping', 'cubic', 'decay']]
+    """
+    all_of_them = list(model.physical or model.coefficients)
+    return list(_WORDS) if set(_WORDS) <= set(all_of_them) else all_of_them[:_MOST]
+
+
+def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray]:
+    """(parameters, n) means and standard deviations of what is shown, first order.
+
+    NaN where a belief has none: the map may divide by the gain (η), whose mean is about 0.4 but may pass 0 on the way.
     """
     model, scales = beliefs[0].model, beliefs[0].scales
     names = list(model.coefficients)
@@ -118,14 +140,14 @@ def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray
     mean = np.array([belief.coefficients_mean for belief in beliefs])
     cov = np.array([belief.coefficients_cov for belief in beliefs])
     known = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2)) & (np.abs(mean[:, gain]) > 1e-12)
-    means, stds = np.full((2, len(NAMES), len(beliefs)), np.nan)
+    shown, parameters = named(model), list(model.physical or model.coefficients)
+    means, stds = np.full((2, len(shown), len(beliefs)), np.nan)
     with np.errstate(all="ignore"):
         physical, physical_cov = propagate(model, mean[known], cov[known], scales)
         variances = np.diagonal(physical_cov, axis1=-2, axis2=-1)
-    for place, name in enumerate(model.physical):
-        if name in NAMES:
-            means[NAMES.index(name), known] = physical[:, place]
-            stds[NAMES.index(name), known] = np.sqrt(variances[:, place])
+    for row, place in enumerate(map(parameters.index, shown)):
+        means[row, known] = physical[:, place]
+        stds[row, known] = np.sqrt(variances[:, place])
     return means, stds
 
 
@@ -135,31 +157,36 @@ class _Picture:
     Axes and labels are drawn when the time axes change, and kept as a background; a frame adds curves and numbers.
     """
 
-    def __init__(self, max_input: float, max_output: float, scales: Scales, believed: FloatArray) -> None:
+    def __init__(
+        self, max_input: float, max_output: float, scales: Scales, title: str, labels: Mapping[str, float]
+    ) -> None:
         need("matplotlib")
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         self._figure = Figure((WIDTH / 100, HEIGHT / 100), dpi=100, facecolor="white")
         self._canvas = FigureCanvasAgg(self._figure)
-        self._milliseconds = 1e3 * scales.step
+        # What the time axes count in: an episode takes a fraction of a second, or minutes.
+        self._unit, factor = ("ms", 1e3) if SPAN * scales.step < _LONG else ("s", 1.0)
+        self._sample = factor * scales.step
         self._background: Any = None
         self._extent: tuple[int, int] | None = None
 
         left, right = (0.06, 0.41), (0.575, 0.405)
-        u, y = f"input u [{scales.input_unit}]", f"output y [{scales.output_unit}]"
+        u, y = _with_unit("input u", scales.input_unit), _with_unit("output y", scales.output_unit)
+        height = _PARAMETERS / len(labels)
         self._signals = (
             _SignalPanel(self._add_axes(*left, 0.52, 0.34), u, scales.input * max_input, "steps-pre"),
             _SignalPanel(self._add_axes(*left, 0.10, 0.34), y, scales.output * max_output, "default"),
         )
         self._parameters = [
-            _ParameterPanel(self._add_axes(*right, 0.10 + 0.205 * row, 0.145), name, unit)
-            for row, (name, unit) in zip((3, 2, 1, 0), _labels(scales, believed), strict=True)
+            _ParameterPanel(self._add_axes(*right, 0.10 + height * row, height - 0.06), name, unit)
+            for row, (name, unit) in zip(reversed(range(len(labels))), labels.items(), strict=True)
         ]
         self._panels: tuple[_SignalPanel | _ParameterPanel, ...] = (*self._signals, *self._parameters)
         style: dict[str, Any] = {"color": INK, "verticalalignment": "center_baseline"}
-        self._figure.text(0.06, 0.945, "Duffing oscillator", fontsize=12, weight="bold", **style)
-        self._status = self._figure.text(0.245, 0.945, "", fontsize=9, animated=True, **style)
+        self._figure.text(0.06, 0.945, title, fontsize=12, weight="bold", **style)
+        self._status = self._figure.text(0.47, 0.945, "", fontsize=9, ha="right", animated=True, **style)
         self._figure.text(0.505, 0.48, "deviation from the truth [%]", color=INK, fontsize=9, rotation=90, va="center")
         self._add_legend()
 
@@ -173,13 +200,13 @@ class _Picture:
             status: the line beside the title.
             extent: first and last sample of the time axes. The arrays begin with the first.
             signals: (2, n) inputs and outputs [V].
-            means: (4, n) of m, c, a, b.
-            stds: (4, n) their standard deviations.
-            truth: (4,) true m, c, a, b.
+            means: (parameters, n) of what is shown.
+            stds: (parameters, n) their standard deviations.
+            truth: (parameters,) the true ones.
         """
         if extent != self._extent:
             self._draw_background(extent)
-        times = self._milliseconds * np.arange(extent[0], extent[0] + signals.shape[1])
+        times = self._sample * np.arange(extent[0], extent[0] + signals.shape[1])
         self._status.set_text(status)
         for signal_panel, values in zip(self._signals, signals, strict=True):
             signal_panel.update(times, values)
@@ -196,7 +223,7 @@ class _Picture:
     def _draw_background(self, extent: tuple[int, int]) -> None:
         margin = 0.01 * (extent[1] - extent[0])  # for the dots
         for panel in self._panels:
-            panel.axes.set_xlim(self._milliseconds * (extent[0] - margin), self._milliseconds * (extent[1] + margin))
+            panel.axes.set_xlim(self._sample * (extent[0] - margin), self._sample * (extent[1] + margin))
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
         self._extent = extent
@@ -209,7 +236,7 @@ class _Picture:
         axes.grid(axis="y", color=RULE, linewidth=0.6)
         axes.set_axisbelow(True)
         if bottom == 0.10:
-            axes.set_xlabel("time [ms]", fontsize=9, color=INK)
+            axes.set_xlabel(f"time [{self._unit}]", fontsize=9, color=INK)
         else:
             axes.tick_params(labelbottom=False)
         return axes
@@ -236,16 +263,21 @@ class _Picture:
         )
 
 
-def _labels(scales: Scales, believed: FloatArray) -> list[tuple[str, float]]:
-    """Label of m, c, a and b, and the power of ten that its numbers are in, from what is believed at the start."""
-    named = []
-    for name, word, value in zip(NAMES, _WORDS, believed, strict=True):
-        unit = scales.unit(DIMENSIONS[name])
-        power = int(np.floor(np.log10(abs(value)))) if np.isfinite(value) and value != 0 else 0
+def _labels(belief: Belief) -> dict[str, float]:
+    """What the parameters that are shown are called, and the power of ten that their numbers are in, by a prior."""
+    model, labels = belief.model, {}
+    units = {name: belief.scales.unit(d) for name, d in model.dimensions.items()} or model.coefficients
+    means, stds = _physical_moments([belief])
+    for name, size in zip(named(model), np.maximum(np.abs(means), stds)[:, 0], strict=True):
+        power = int(np.floor(np.log10(size))) if np.isfinite(size) and size != 0 else 0
         power = 0 if -1 <= power <= 1 else power
-        words = [f"10{str(power).translate(SUPERSCRIPTS)}"] * (power != 0) + [unit] * (unit != "1")
-        named.append((f"{word} [{' '.join(words)}]" if words else word, 10.0**power))
-    return named
+        parts = [f"10{str(power).translate(SUPERSCRIPTS)}"] * (power != 0) + [units[name]] * (units[name] != "1")
+        labels[_with_unit(_WORDS.get(name, name), " ".join(parts) or "1")] = 10.0**power
+    return labels
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return name if unit == "1" else f"{name} [{unit}]"
 
 
 class _SignalPanel:
@@ -264,7 +296,7 @@ class _SignalPanel:
         self.moving = (self._curve,)
 
     def update(self, times: FloatArray, values: FloatArray) -> None:
-        """Show values (n,) over times (n,) [ms]."""
+        """Show values (n,) over times (n,), in the unit of the axis."""
         self._curve.set_data(times, np.clip(values, -self._edge, self._edge))
 
 
@@ -279,13 +311,16 @@ class _ParameterPanel:
         axes.set_title(name, loc="left", color=INK, **_TITLE)
         # Linear near the truth and logarithmic away from it: a belief contracts by a factor of a hundred and more.
         axes.set_yscale("asinh", linear_width=0.3)
-        axes.set_ylim(-self._EDGE, self._EDGE)
+        axes.set_ylim(-1.2 * self._EDGE, 1.2 * self._EDGE)
         axes.set_yticks([-100, -10, -1, 0, 1, 10, 100], ["−100", "−10", "−1", "", "1", "10", "100"])
         axes.yaxis.minorticks_off()
         self.truth = axes.axhline(0, color=TRUTH, linewidth=1, linestyle=(0, (4, 2)))
         self.band = axes.fill_between([], [], color=POSTERIOR, alpha=0.22, linewidth=0, animated=True)
         (self.mean,) = axes.plot([], color=POSTERIOR, linewidth=1.3, **_CURVE)
-        self._true_value = axes.set_title("", loc="center", color=TRUTH, animated=True, **_TITLE)
+        self._true_value = axes.annotate(
+            "", (0.6, 1.0), (0, _TITLE["pad"]), "axes fraction", "offset points", ha="center", color=TRUTH,
+            fontsize=_TITLE["fontsize"], animated=True, annotation_clip=False,
+        )  # fmt: skip
         self._estimate = axes.set_title("", loc="right", color=POSTERIOR, animated=True, **_TITLE)
         self.moving = (self.band, self.mean, self._true_value, self._estimate)
 
@@ -297,7 +332,7 @@ class _ParameterPanel:
         known = np.isfinite(low) & np.isfinite(high)
         there, back = (times[known], low[known]), (times[known][::-1], high[known][::-1])
         self.band.set_verts([np.hstack([there, back]).T])
-        self._true_value.set_text(f"true {true / self._unit:.3f}")
+        self._true_value.set_text(f"true {true / self._unit:.3f}".replace("-", "−"))
         in_sight = half[-1] < 10 * abs(true)
         numbers = f"{mean[-1] / self._unit:z.3f} ± {half[-1] / self._unit:.3f}".replace("-", "−")
         self._estimate.set_text(numbers if in_sight else "not known yet")
@@ -316,7 +351,7 @@ class _Window:
         self._pygame = pygame
         self._fps = fps
         pygame.display.init()
-        pygame.display.set_caption("Duffing oscillator")
+        pygame.display.set_caption("duffing-env")
         self._surface = pygame.display.set_mode((WIDTH, HEIGHT))
         self._clock = pygame.time.Clock()
 

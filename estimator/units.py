@@ -102,6 +102,18 @@ def written(powers: Mapping[str, int]) -> str:
     return " ".join([*above, *(f"{atom}{_power(-power)}" for atom, power in below.items())]) or "1"
 
 
+def labelled(name: str, unit: str) -> str:
+    """What an axis or a column is called.
+
+    Example:
+        >>> labelled("u", "V"), labelled("u", "m/s"), labelled("u", "1")
+        ('u / V', 'u / (m/s)', 'u')
+    """
+    if unit == "1":
+        return name
+    return f"{name} / {unit}" if unit.isalpha() else f"{name} / ({unit})"
+
+
 def _power(power: int) -> str:
     return "" if power == 1 else str(power).translate(SUPERSCRIPTS)
 

@@ -13,6 +13,7 @@ import numpy as np
 from estimator.extras import need
 from estimator.files import write_atomically
 from estimator.page import plain
+from estimator.units import labelled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,7 +81,10 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
 
 
 def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
-    """Input and output of one system in time, and the spectrum of the inputs: root of the mean power over systems."""
+    """Input and output of one system in time, and the spectrum of the inputs: root of the mean power over systems.
+
+    Of several sensors the first is shown.
+    """
     figure = new_figure(12, 1.6 * len(evaluations) + 0.8)
     grid = figure.subplots(len(evaluations), 3, sharex="col", sharey="col", squeeze=False)
     scales = evaluations[0].scales
@@ -92,10 +96,11 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
         inputs = np.nan_to_num(evaluation.inputs)  # an episode that ended is silent
         spectrum = factor * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         frequencies = np.fft.rfftfreq(len(inputs), scales.step)
+        shown = evaluation.outputs[:, system].reshape(len(time), -1)[:, 0]
         lines = (
-            (f"u / {unit}", time, scales.input * evaluation.inputs[:, system]),
-            (f"y / {scales.output_unit}", time, scales.output * evaluation.outputs[:, system]),
-            (f"|U| / {small}", frequencies, spectrum),
+            (labelled("u", unit), time, scales.input * evaluation.inputs[:, system]),
+            (labelled("y", scales.output_unit), time, scales.output * shown),
+            (labelled("|U|", small), frequencies, spectrum),
         )
         for axes, (label, x, y) in zip(row, lines, strict=True):
             axes.plot(x, y, color=colour, linewidth=0.8, drawstyle="steps-post" if axes is row[0] else "default")

@@ -14,6 +14,7 @@ from scipy import stats
 from agents.evaluation.rollout import Evaluation
 from agents.results import show, table, write_json
 from estimator.parameters import FloatArray
+from estimator.units import labelled
 
 _RESAMPLES = 2000
 
@@ -102,10 +103,8 @@ def metrics_of(found: Iterable[str], unit: str = "V") -> dict[str, Metric]:
     errors = {name: Metric(f"error of {name.removeprefix('error_')} / %", 2, 100, MEDIAN) for name in sorted(others)}
     known = METRICS
     if unit != "V":
-        powers = {
-            "input_power": f"input power / {unit}²" if unit.isalpha() else f"input power / ({unit})²",
-            "input_peak": f"input peak / {unit}",
-        }
+        power = labelled("input power", unit)
+        powers = {"input_power": power if unit == "1" else f"{power}²", "input_peak": labelled("input peak", unit)}
         known = METRICS | {name: Metric(title, -4) for name, title in powers.items()}
     return errors | {name: metric for name, metric in known.items() if name in found}
 

@@ -125,6 +125,33 @@ def test_curves_and_numbers_are_those_of_the_episode():
     assert screen._picture._status.get_text() == f"sample 20 of 256, {gained:.1f} nats gained"
 
 
+@pytest.mark.parametrize(
+    ("track", "title", "labels", "signals"),
+    [
+        ("Pendulum-v1", "pendulum map", ["p1 [s⁻²]", "p2 [s⁻¹]", "p3 [rad/s²]"], ["input u", "output y [rad]"]),
+        (
+            "WienerHammerstein-v0",
+            "wiener hammerstein",
+            ["stiffness", "damping", "cubic [V⁻²]", "decay"],
+            ["input u [V]", "output y [V]"],
+        ),
+    ],
+)
+def test_other_models_are_drawn_with_their_own_names_units_and_truth(track, title, labels, signals):
+    env = gym.make(f"duffing_env/{track}", render_mode="rgb_array").unwrapped
+    env.reset(seed=1)
+    for action in np.sin(np.arange(20), dtype=np.float32):
+        env.step(action[np.newaxis])
+    assert env.render().shape == (HEIGHT, WIDTH, 3)
+    picture, names = env._screen._picture, rendering.named(env.belief.model)
+    assert picture._figure.texts[0].get_text() == title
+    assert [panel.axes.get_title("left") for panel in picture._parameters] == labels
+    assert [panel.axes.get_title("left") for panel in picture._signals] == signals
+    for panel, name in zip(picture._parameters, names, strict=True):
+        assert panel._true_value.get_text() == f"true {env.truth[name]:.3f}".replace("-", "−")
+        assert np.isfinite(panel.mean.get_ydata()).all()
+
+
 def test_moments_are_those_of_each_belief():
     beliefs = [
         changed(eta=0.3, theta1=1.5),
