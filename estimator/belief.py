@@ -103,6 +103,11 @@ class Belief:
         record.flags.writeable = False
         object.__setattr__(self, "record", record)
 
+    def __repr__(self) -> str:
+        """On one line: the model, and what is believed of its coefficients."""
+        told = (f"{name} = {mean:.4g} ± {std:.2g}" for name, (mean, std) in self.coefficients().items())
+        return f"Belief({self.model.name}: {', '.join(told)})"
+
     @classmethod
     def of(
         cls,

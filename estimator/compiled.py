@@ -131,7 +131,8 @@ class Compilation(event.Listener):
         place = folder()
         kept = "again in every process, because no folder can be written" if place is None else f"once, into {place}"
         what = f"{function.__module__}.{function.__name__}"
-        print(f"duffing-env is compiling {what}, which takes some seconds ({kept})", file=sys.stderr, flush=True)
+        said = f"duffing-env is compiling {what} and what else it needs, which takes seconds to minutes ({kept})"
+        print(said, file=sys.stderr, flush=True)
 
 
 @cache

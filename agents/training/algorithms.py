@@ -35,7 +35,7 @@ class AlgorithmSettings(ABC):
     """Samples of a gradient step."""
     learning_rate: float = _searched(1e-3, 2e-4, 5e-3, log=True)
     """Step size at the start; it falls linearly to 0."""
-    gamma: float = _searched(0.99, 0.95, 0.999)
+    gamma: float = _searched(0.99, 0.95, 1.0)
     """Discount factor."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""

@@ -40,6 +40,12 @@ def fixed(index):
     return belief(cov=cov)
 
 
+def test_it_is_told_on_one_line():
+    damping, cubic = np.sqrt(np.diag(covariance())[3:])
+    told = f"stiffness = 1.8e+05 ± 0, damping = 42 ± {damping:.2g}, cubic = 7e+05 ± {cubic:.2g}"
+    assert repr(fixed(2)) == f"Belief(oscillator: {told})"
+
+
 def test_parts_and_moments():
     cov = covariance()
     one = belief()
