@@ -205,7 +205,13 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
 
     @property
     def truth(self) -> Parameters:
-        """The oscillator that is to be identified."""
+        """The oscillator that is to be identified.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset, which draws it.
+        """
+        if self._streamed is None:
+            raise ResetNeeded("no system is drawn yet: call reset() before you ask for the truth")
         return self._batch.true_of(0)
 
     @in_turn

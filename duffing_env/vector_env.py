@@ -138,7 +138,13 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
 
     @property
     def truth(self) -> Parameters:
-        """The oscillators that are to be identified, a batch of ``num_envs``."""
+        """The oscillators that are to be identified, a batch of ``num_envs``.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset, which draws them.
+        """
+        if not self._seeded.any():
+            raise ResetNeeded("no systems are drawn yet: call reset() before you ask for the truth")
         return self._batch.truth()
 
     def belief(self, index: int) -> Belief:

@@ -167,6 +167,8 @@ def test_copies_made_within_an_episode_continue_alike_and_apart(copied):
 
 def test_steps_outside_an_episode_are_refused():
     env = DuffingEnv(**SHORT)
+    with pytest.raises(ResetNeeded, match=r"no system is drawn yet: call reset\(\)"):
+        _ = env.truth
     with pytest.raises(ResetNeeded, match=r"call reset\(\)"):
         env.step([0.0])
     play(env, random_actions(0), seed=0)

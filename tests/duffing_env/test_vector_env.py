@@ -231,6 +231,8 @@ def test_seeds():
 def test_every_row_must_have_begun(mode):
     envs = DuffingVectorEnv(3, autoreset_mode=mode)
     actions = random_actions(1, 3)[0]
+    with pytest.raises(ResetNeeded, match=r"no systems are drawn yet: call reset\(\)"):
+        _ = envs.truth
     with pytest.raises(ResetNeeded, match=r"rows \[0, 1, 2\]"):
         envs.step(actions)
     envs.reset(seed=4, options={"reset_mask": np.array([True, False, True])})
