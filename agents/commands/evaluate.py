@@ -79,7 +79,7 @@ class Evaluate:
         with spinner("Measuring") as say:
             name = policy.partition("=")[0] if self.submit is None else self.submit
             entry = measure(policy, track, name, self.samples, say)
-        show(track, table(TITLES, [cells(entry)]), CAPTION, width=130)
+        show(track, table(TITLES, [cells(entry)]), CAPTION, width=136)
         if self.submit is not None:
             append(self.board, entry)
             print(f"{self.submit} is on the board {self.board}: duffing-env report")

@@ -29,7 +29,7 @@ class Report:
         own = self.board if self.board is not None else board.OWN if board.OWN.is_file() else None
         entries = {(e["track"], e["name"]): e for path in (board.SHIPPED, own) if path for e in board.read(path)}
         for track, rows in board.tables(list(entries.values())).items():
-            show(f"\n{track}", table(board.TITLES, rows), width=130)
+            show(f"\n{track}", table(board.TITLES, rows), width=136)
         show(board.CAPTION)
         if self.output is not None:
             board.write_page(self.output, list(entries.values()))

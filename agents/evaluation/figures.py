@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
 _STROKES = ("-", "--", ":")
 
+#: Of fewer points each is marked.
+_FEW = 20
+
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, in one piece."""
@@ -45,16 +48,17 @@ def figure_of_learning(curve: list[tuple[int, float, float]], reward: str) -> Fi
     figure = new_figure(7, 4)
     axes = figure.add_subplot()
     steps, seconds, returns = np.array(curve, dtype=float).reshape(-1, 3).T
-    axes.plot(steps / 1e6, returns, color=_COLOURS[0])
+    axes.plot(steps / 1e6, returns, color=_COLOURS[0], marker="." if len(steps) < _FEW else None)
     axes.set(xlabel="samples / 10⁶", ylabel=f"mean return: {reward.replace('_', ' ')}")
     axes.grid(alpha=0.3)
     if len(steps) > 1:
-        axes.set_xlim(steps[0] / 1e6, steps[-1] / 1e6)
+        axes.set_xlim(0, steps[-1] / 1e6)
+        samples_at, seconds_at = np.append(0.0, steps / 1e6), np.append(0.0, seconds)
         above = axes.secondary_xaxis(
             "top",
             functions=(
-                lambda samples: np.interp(np.asarray(samples), steps / 1e6, seconds),
-                lambda time: np.interp(np.asarray(time), seconds, steps / 1e6),
+                lambda samples: np.interp(np.asarray(samples), samples_at, seconds_at),
+                lambda time: np.interp(np.asarray(time), seconds_at, samples_at),
             ),
         )
         above.set_xlabel("wall time / s")
@@ -63,7 +67,7 @@ def figure_of_learning(curve: list[tuple[int, float, float]], reward: str) -> Fi
 
 def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Figure:
     """Gain of log posterior of the truth over the samples: median over systems, band from 25 to 75 %."""
-    figure = new_figure(7.5, 4.28 + 0.22 * math.ceil(len(evaluations) / 3))
+    figure = new_figure(7.5, 4.5 + 0.22 * math.ceil(len(evaluations) / 3))
     axes = figure.add_subplot()
     lowest = 0.0  # an over-confident posterior may lose
     looks = product(_STROKES, _COLOURS)
@@ -76,7 +80,9 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
     axes.set(xlabel="samples", ylabel="log posterior gain of the truth / nat", title=title)
     axes.set(xlim=(0, None), ylim=(lowest, None))
     axes.grid(alpha=0.3)
-    figure.legend(loc="outside lower center", ncols=min(3, len(evaluations)))  # within, it would cover curves
+    # Within the axes it would cover curves.
+    what = "medians, and bands from 25 to 75 % of the systems"
+    figure.legend(loc="outside lower center", ncols=min(3, len(evaluations)), title=what, title_fontsize=9)
     return figure
 
 
@@ -107,6 +113,9 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
         row[0].set_title(plain(evaluation.title), loc="left", fontsize=9)
+    for axes in grid[0, :2]:
+        axes.set_title(f"system {system}", loc="right", fontsize=9, color=_COLOURS[6])
+    grid[0, 2].set_title("all systems", loc="right", fontsize=9, color=_COLOURS[6])
     for axes, label in zip(grid[-1], ("time / ms", "time / ms", "frequency / Hz"), strict=True):
         axes.set_xlabel(label)
     return figure
