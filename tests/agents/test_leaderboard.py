@@ -323,7 +323,7 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
     for evaluation, repeated in zip(evaluations, again, strict=True):
         timed = {"estimators": ANY, "decision_time": ANY}
         assert written["policies"][evaluation.policy] == {**summarise(repeated), **timed}
-    check_picture(folder / "contraction.png", 900, 540, colours=2)
+    check_picture(folder / "contraction.png", 900, 566, colours=2)
     check_picture(folder / "excitations.png", 1440, 480, colours=2)
 
 
@@ -387,6 +387,6 @@ def test_pictures_are_written(tmp_path):
     check_picture(tmp_path / "curve.png", 840, 480)
     evaluations = [make_evaluation(str(i), seed=i, shift=3.0 * i) for i in range(4)]
     save(figure_of_contraction(evaluations, "title"), tmp_path / "contraction.png")
-    check_picture(tmp_path / "contraction.png", 900, 566, colours=4)  # two lines of names
+    check_picture(tmp_path / "contraction.png", 900, 592, colours=4)  # two lines of names
     save(figure_of_inputs(evaluations), tmp_path / "excitations.png")
     check_picture(tmp_path / "excitations.png", 1440, 864, colours=4)
