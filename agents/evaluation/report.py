@@ -62,8 +62,8 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
         f"options <code>{html.escape(json.dumps(settings['options']))}</code>.</p>",
         "<h2>Leaderboard</h2>",
         table(heads, [[title, *map(_with_interval, cells)] for title, *cells in rows]),
-        f"<p><small>{'; '.join(caption_of(evaluations).splitlines()).capitalize()}. An episode that a limit ends "
-        "counts with what was known by then.</small></p>",
+        f"<p><small>{_sentences(caption_of(evaluations))} An episode that a limit ends counts with what was known by "
+        "then.</small></p>",
         _estimators(evaluations),
     ]
     for heading, figure, caption in figures:
@@ -79,6 +79,11 @@ def write_report(path: Path, evaluations: list[Evaluation], settings: dict[str, 
     write_atomically(path, page(title, parts))
 
 
+def _sentences(lines: str) -> str:
+    """Lines as sentences."""
+    return " ".join(f"{html.escape(line[:1].upper() + line[1:])}." for line in lines.splitlines())
+
+
 def _with_interval(cell: str) -> str:
     """A cell of the leaderboard, whose interval stands smaller below the centre."""
     center, _, below = cell.partition("\n")
@@ -92,6 +97,6 @@ def _estimators(evaluations: list[Evaluation]) -> str:
         return ""
     return (
         "<h2>What other estimators make of the same inputs and outputs</h2>"
-        f"<p>{AUDITOR_IS.capitalize()}. It ranks the inputs; the rows of one policy rank the estimators.</p>"
+        f"<p>{_sentences(AUDITOR_IS)} It ranks the inputs; the rows of one policy rank the estimators.</p>"
         + table(heads, [[html.escape(cell) for cell in row] for row in rows])
     )
