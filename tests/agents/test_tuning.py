@@ -3,9 +3,13 @@
 import csv
 import json
 import re
+import signal
 
 import pytest
 
+import agents.commands.train
+from agents.commands.train import main
+from agents.running.stopping import Stopped
 from agents.training import PPOSettings, TrainConfig, train, tune
 from agents.training.hyperparameters import read_settings
 
@@ -110,3 +114,23 @@ def test_optuna_is_asked_for_before_anything_is_written(tmp_path, monkeypatch):
     with pytest.raises(ModuleNotFoundError, match=r"optuna is not installed; get it with: pip install .*\[tune\]"):
         tune(tiny(tmp_path / "search"), 2)
     assert not (tmp_path / "search").exists()
+
+
+@pytest.mark.parametrize(("words", "work"), [(["--tune", "3"], "tune"), (["--seeds", "2"], "train_seeds")])
+def test_several_trainings_that_are_stopped_go_on_by_the_same_command(words, work, monkeypatch, capsys):
+    def stopped(*arguments, **options):
+        raise Stopped(signal.SIGTERM, "go on with: duffing-env train --resume one of them")
+
+    monkeypatch.setattr(agents.commands.train, work, stopped)
+    with pytest.raises(SystemExit) as caught:
+        main("duffing-env train", ["--env", "Short-v0", *words])
+    assert caught.value.code == 128 + signal.SIGTERM
+    told = capsys.readouterr().err
+    assert told == "duffing-env train: stopped; the same command goes on with what is left\n"
+
+
+def test_a_search_says_how_its_best_is_trained_with(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(agents.commands.train, "tune", lambda *arguments, **options: tmp_path / "best.toml")
+    main("duffing-env train", ["--env", "Short-v0", "--tune", "3"])
+    *_, told = capsys.readouterr().out.splitlines()
+    assert told.endswith(f"the same command, with --settings {tmp_path / 'best.toml'} in place of --tune and --output")
