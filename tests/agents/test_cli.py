@@ -96,7 +96,7 @@ def test_help_explains_every_option(name):
         ("train.py", ["--options", '{"reward": "log_posterior"}'], "options must not hold reward"),
         ("train.py", ["--options", '{"horizon": 0}'], "horizon must be a whole number from 1 to 1000000000, but is 0"),
         ("train.py", ["--env", "duffing_env/Amplitud-v0"], "Amplitud"),
-        ("train.py", ["--env", "Short-v1"], "`Short` doesn't exist; did you mean 'duffing_env/Short-v1'?"),
+        ("train.py", ["--env", "Shrt-v1"], "`Shrt` doesn't exist; did you mean 'duffing_env/Short-v1'?"),
         ("train.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
         ("train.py", ["--algo", "sacc"], "invalid choice 'sacc'"),
         ("train.py", ["--algo", "sac", "--sac.tau", "2"], "tau must be in [0, 1], but is 2.0"),
