@@ -29,6 +29,7 @@ WIDTH, HEIGHT = 960, 540
 SPAN = 256
 """Samples on the time axes. Longer episodes scroll: more samples would hide the single periods."""
 
+#: What m, c, a and b are called, and how many parameters of another model are shown.
 _WORDS = {"m": "mass m", "c": "damping c", "a": "stiffness a", "b": "cubic b"}
 _MOST = 4
 
@@ -139,7 +140,9 @@ def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray
     gain = names.index("gain") if "gain" in names else -1
     mean = np.array([belief.coefficients_mean for belief in beliefs])
     cov = np.array([belief.coefficients_cov for belief in beliefs])
-    known = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2)) & (np.abs(mean[:, gain]) > 1e-12)
+    known = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2))
+    if model.physical:  # what has no map divides by nothing
+        known &= np.abs(mean[:, gain]) > 1e-12
     shown, parameters = named(model), list(model.physical or model.coefficients)
     means, stds = np.full((2, len(shown), len(beliefs)), np.nan)
     with np.errstate(all="ignore"):
