@@ -253,12 +253,15 @@ class SimulatedExperiment(Experiment):
 
     def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
         """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
+        noises = *self.noise_guesses, self.noise_shape
+        return weak_prior(model, *self.moments_of(model), *noises, scales=self.scales).factorised(factorisation)
+
+    def moments_of(self, model: Model) -> tuple[FloatArray, FloatArray]:
+        """Mean (K,) and covariance (K, K) of the coefficients of plants so drawn."""
         for name, value in self.center.items():
             if value == 0:
                 raise ValueError(f"mean[{name!r}] must not be 0, for it is known up to a factor; give a prior as well")
-        mean, cov = log_uniform_moments(model, self.center, self.spread, self.scales)
-        noises = *self.noise_guesses, self.noise_shape
-        return weak_prior(model, mean, cov, *noises, scales=self.scales).factorised(factorisation)
+        return log_uniform_moments(model, self.center, self.spread, self.scales)
 
     @property
     def noise_guesses(self) -> tuple[float, float]:

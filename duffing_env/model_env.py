@@ -99,12 +99,15 @@ class ModelExperiment(SimulatedExperiment):
 
     def prior_of(self, model: Model, factorisation: str = "structured") -> Belief:
         """The prior of plants so drawn."""
-        if self.std is None and model.n_outputs == 1:
-            return super().prior_of(model, factorisation)
-        moments = gaussian_moments(model, self.center, dict(self.std or {}), self.scales)
         process, first = self.noise_guesses
         sensors = [first / self.measurement_noise * std for std in self.noises]  # all as far off as the first
-        return weak_prior(model, *moments, process, sensors, self.noise_shape, scales=self.scales)
+        return weak_prior(model, *self.moments_of(model), process, sensors, self.noise_shape, scales=self.scales)
+
+    def moments_of(self, model: Model) -> tuple[FloatArray, FloatArray]:
+        """Mean (K,) and covariance (K, K) of the coefficients of plants so drawn."""
+        if self.std is None:
+            return super().moments_of(model)
+        return gaussian_moments(model, self.center, self.std, self.scales)
 
     @property
     def plant_setup(self) -> dict[str, Any]:

@@ -13,6 +13,9 @@ from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.units import VOLTS, Scales
 
+#: Parameters that are turned into coefficients and back differ by no more than this part of their terms.
+_ROUNDED = 1e-6
+
 
 def to_physical(model: Model, coefficients: FloatArray, scales: Scales = VOLTS) -> FloatArray:
     """Physical parameters (..., p) of coefficients (..., K); the coefficients themselves, for a model without any.
@@ -54,7 +57,8 @@ def coefficients_of(model: Model, parameters: Mapping[str, Any], scales: Scales 
         scales: what one inside is worth.
 
     Raises:
-        ValueError: for a parameter that is missing.
+        ValueError: for a parameter that is missing; or where the model's two maps contradict each other, which the first
+            of the parameters tells.
     """
     names = list(model.physical if Model.checked(model).inverse else model.coefficients)
     mapping("parameters", parameters)
@@ -65,7 +69,24 @@ def coefficients_of(model: Model, parameters: Mapping[str, Any], scales: Scales 
     points = np.stack(np.broadcast_arrays(*columns), axis=-1)
     if not model.inverse:
         return points
-    return _evaluate(_code(model, "inverse")[0], points / _worth(model, scales), scales.step)
+    inside = points / _worth(model, scales)
+    found = _evaluate(_code(model, "inverse")[0], inside, scales.step)
+    _check_inverse(model, inside.reshape(-1, len(names))[0], found.reshape(-1, model.n_coefficients)[0], scales.step)
+    return found
+
+
+def _check_inverse(model: Model, parameters: FloatArray, coefficients: FloatArray, step: float) -> None:
+    """Refuse a model whose ``physical`` does not turn back (K,) coefficients into the (p,) parameters they are of."""
+    values, slopes = (_evaluate(function, coefficients, step) for function in _code(model, "physical"))
+    # A parameter rounds by parts of the terms that it is the sum of.
+    terms = np.abs(slopes.reshape(-1, len(coefficients))) @ np.abs(coefficients)
+    for name, was, became, size in zip(model.physical, parameters, values, terms, strict=True):
+        if abs(became - was) > _ROUNDED * (abs(was) + size):
+            given = ", ".join(f"{c}={value:.6g}" for c, value in zip(model.coefficients, coefficients, strict=True))
+            raise ValueError(
+                f"inverse must undo physical, but by that of {model.name!r} {name}={was:.6g} is {given}, and by "
+                f"physical these are {name}={became:.6g} again, where a step is {step:g} s; mend one of the two"
+            )
 
 
 @cache

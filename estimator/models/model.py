@@ -125,6 +125,10 @@ class Model:
                 f"physical and inverse go together, and inverse must give {list(self.coefficients)}, but gives "
                 f"{list(self.inverse)}"
             )
+        # By name, in whatever order they are written.
+        object.__setattr__(self, "dimensions", {name: self.dimensions[name] for name in self.physical})
+        if self.inverse:
+            object.__setattr__(self, "inverse", {name: self.inverse[name] for name in self.coefficients})
 
     @property
     def is_continuous(self) -> bool:

@@ -10,10 +10,12 @@ from test_vector_env import play_beside_singles, random_actions
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
+from duffing_env.model_env import ModelEnv
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.models.pendulum import PENDULUM, STEP
 from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
+from estimator.priors import log_uniform_moments
 from estimator.units import Scales
 
 # Random inputs end some such episodes at the limit, the others at the horizon.
@@ -87,3 +89,13 @@ def test_its_beliefs_are_calibrated():
         shrunk.append(start.entropy() - belief.entropy())
     assert 2.3 < np.mean(distances) < 3.8
     assert np.mean(shrunk) > 3
+
+
+def test_the_prior_of_a_range_is_as_wide_as_the_range_for_several_sensors_too():
+    center = {"p1": 14.7, "p2": 0.5, "p3": 3.0}
+    env = ModelEnv(system="pendulum", mean=center, spread=0.2, sampling_step=STEP, sensor_noise=[0.01])
+    belief = env.belief
+    mean, cov = log_uniform_moments(PENDULUM, center, 0.2, Scales(STEP))
+    np.testing.assert_array_equal(belief.coefficients_mean, mean)
+    np.testing.assert_array_equal(belief.coefficients_cov, cov)
+    assert belief.noises[2:] == pytest.approx([2.0, 2.0 * 5e-4**2, 2.0, 2.0 * 0.01**2])

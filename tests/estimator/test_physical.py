@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
+from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, Parameters
 from estimator.physical import coefficients_of, physical_slopes, propagate, to_physical
@@ -186,3 +187,32 @@ def test_parameters_are_a_mapping_with_attributes():
     assert twin != Parameters(c=2e-4, m=5e-6)
     with pytest.raises(AttributeError, match="there is no parameter 'a'"):
         _ = twin.a
+
+
+HEAT = {
+    "states": {"x": "K"}, "noise": ("1",), "outputs": {"y": "x"}, "rates": ("gain*u - loss*x",),
+    "coefficients": {"loss": "1", "gain": "K/W"}, "physical": {"cap": "step/gain", "cond": "loss/gain"},
+}  # fmt: skip
+DIMENSIONS = {"cap": (1, -1, 1), "cond": (1, -1, 0)}
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_maps_are_read_by_name_in_whatever_order_they_are_written(order):
+    inverse = {"gain": "step/cap", "loss": "step*cond/cap"}
+    written = {"inverse": inverse, "dimensions": DIMENSIONS}
+    heat = Model("heat", **HEAT, **{key: dict(list(value.items())[::order]) for key, value in written.items()})
+    scales = Scales(2.0, input=3.0, output=5.0, input_unit="W", output_unit="K")
+    found = coefficients_of(heat, {"cap": 50.0, "cond": 0.25}, scales)
+    # In units of 3 W and 5 K: cap = 50/(3/5) and cond = 0.25/(3/5).
+    np.testing.assert_allclose(found, [2.0 * 0.25 / 50.0, 2.0 / 50.0 * 3.0 / 5.0], rtol=1e-14)
+    np.testing.assert_allclose(to_physical(heat, found, scales), [50.0, 0.25], rtol=1e-14)
+    assert heat == Model("heat", **HEAT, **written)
+
+
+def test_an_inverse_that_undoes_nothing_is_refused():
+    # At a step of a second nobody would see it.
+    heat = Model("heat", **HEAT, dimensions=DIMENSIONS, inverse={"gain": "step/cap", "loss": "cond/cap"})
+    coefficients_of(heat, {"cap": 50.0, "cond": 2.0}, Scales(1.0))
+    message = "by that of 'heat' cond=2 is loss=0.04, gain=0.04, and by physical these are cond=1 again"
+    with pytest.raises(ValueError, match=message):
+        coefficients_of(heat, {"cap": 50.0, "cond": 2.0}, Scales(2.0))
