@@ -6,9 +6,10 @@ is known. So the plan is built move by move, as the best way through the map of 
 end of an episode moves become shorter, by whole numbers: so the last plan, which kept the limit, can go on as it was.
 
 The best way is then compared with the last plan, begun one sample ago. The better one is improved in rounds, by steps
-that change all of it (`agents.planner.steps`), and by small changes at random. Plans are compared by what is known, on
-average, when parts of them have been followed: judged by its end alone, the best plan may be to wait for a move, and so
-at every decision anew. The first part is as long as a third of what it takes to swing to the limit.
+that change all of it (`agents.planner.steps`), and by small changes at random, until a round brings little. Plans are
+compared by what is known, on average, when parts of them have been followed: judged by its end alone, the best plan may
+be to wait for a move, and so at every decision anew. The first part is as long as a third of what it takes to swing to
+the limit.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ _LATE, _LATE_WAYS, _LATE_HORIZON = 48, 6 * LANES, 24
 #: For so many first moves all inputs are tried, and up to so many some of them.
 _FINEST, _FINE = 3, 7
 
+#: A round of steps and changed copies that brings less [nats] is the last one of a decision.
+_LITTLE = 0.001
+
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
 
@@ -51,7 +55,8 @@ class Search(NamedTuple):
             - ``records`` (n, size): their beliefs;
             - ``left`` (n,): samples left in their episodes;
             - ``horizon``: moves to plan, at most;
-            - ``rounds``: of steps and changed copies, two blocks of `LANES` each;
+            - ``rounds``: of steps and changed copies, at most, two blocks of `LANES` each; one that brings little is
+              the last;
             - ``terms``: `agents.planner.imagination.Terms` of the whole episode;
             - ``lasts`` (n, 2): the inputs that were applied last, newest first;
             - ``plans`` (n, horizon): the last plans, begun one move ago; overwritten by the new ones;
@@ -174,10 +179,13 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         after = np.zeros((k, k))
         score = compete(W, task, rivals, LANES, best, -np.inf, after, words)
         for _ in range(rounds):
+            so_far = score
             first = nudge(rivals, best, steps, terms.amplitude)
             score = compete(W, task, rivals, first, best, score, after, words)
             first = step(rivals, steps, terms.amplitude)
             score = compete(W, task, rivals, first, best, score, after, words)
+            if score < so_far + _LITTLE:
+                break
         # Where the coefficients walk, what is learned later does not add to what is learned now.
         if not (terms.walk > 0.0).any():
             refresh(W, task, after, rate)
