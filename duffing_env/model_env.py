@@ -17,6 +17,7 @@ from estimator.belief import Belief
 from estimator.checks import number, one_of, shown
 from estimator.models import MODELS
 from estimator.models.model import Model
+from estimator.parameters import FloatArray
 from estimator.priors import gaussian_moments, weak_prior
 from estimator.units import Scales
 

@@ -57,8 +57,8 @@ def coefficients_of(model: Model, parameters: Mapping[str, Any], scales: Scales 
         scales: what one inside is worth.
 
     Raises:
-        ValueError: for a parameter that is missing; or where the model's two maps contradict each other, which the first
-            of the parameters tells.
+        ValueError: for a parameter that is missing; or where the model's two maps contradict each other at the first
+            of the parameters.
     """
     names = list(model.physical if Model.checked(model).inverse else model.coefficients)
     mapping("parameters", parameters)
