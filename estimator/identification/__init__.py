@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -18,6 +18,7 @@ from estimator.identification.problem import LATEST, Problem, explicable
 from estimator.identification.records import Record, records_of
 from estimator.identification.result import Result
 from estimator.identification.search import search
+from estimator.models.duffing import KINDS
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -71,13 +72,15 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         scales = _scales(rig, read)
         u = tuple(one.u / scales.input for one in read)
         y = tuple(explicable(one.y, rig, LATEST) / scales.output for one in read)
-        found = search(Problem(rig, scales, u, y), tell)
+        origin = _origin(rig, y)
+        found = search(Problem(rig, scales, u, tuple(one - origin for one in y), origin), tell)
         problem = found.fitter.problem
         belief, noises = posterior(problem, found)
         tell("checking the result")
-        forecasts = tuple(_forecast(belief, rig, one, motion) for one, motion in zip(read, found.motions, strict=True))
+        begun = found.motions + np.array([origin, 0.0])
+        forecasts = tuple(_forecast(belief, rig, one, motion) for one, motion in zip(read, begun, strict=True))
         parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
-        warnings = examine(problem, found, parameters, noises["input"][0], read, forecasts)
+        warnings = examine(problem, found, parameters, noises["input"], read, forecasts)
     history = partial(contraction, problem, found, parameters)
     return Result(rig, belief, warnings, tuple(read), forecasts, noises, history)
 
@@ -90,6 +93,13 @@ def _scales(rig: Rig, records: list[Record]) -> Scales:
     return replace(
         scales, input=scales.input if rig.input.limit else largest, output=scales.output if rig.output.range else widest
     )
+
+
+def _origin(rig: Rig, outputs: Sequence[FloatArray]) -> float:
+    """Where to count outputs from: their mean, of a displacement that is farther from 0 than it moves; else 0."""
+    seen = np.concatenate(outputs)
+    mean = float(np.nanmean(seen))
+    return mean if KINDS[rig.output.kind] == 0 and abs(mean) > np.nanstd(seen) else 0.0
 
 
 def _forecast(belief: Belief, rig: Rig, record: Record, motion: FloatArray) -> FloatArray:

@@ -35,7 +35,7 @@ History = tuple[tuple[int, dict[str, tuple[float, float]]], ...]
 def posterior(problem: Problem, found: Found) -> tuple[Belief, dict[str, tuple[float, float]]]:
     """The posterior of the rig's own model, and the noises' standard deviations in its units."""
     rig, scales = problem.rig, problem.scales
-    belief = about(rig, scales, found.mean, found.cov)
+    belief = about(rig, scales, *problem.outward(found.mean, found.cov))
     shapes = np.full(len(found.weights), problem.samples / 2)
     gamma, xi = (matched_gamma(found.weights, shapes, shapes * noise**2) for noise in found.noises)
     belief = Belief.of(problem.believed, belief.mean, _with_start(belief, problem), gamma, xi, scales=scales)
@@ -87,7 +87,7 @@ def contraction(problem: Problem, found: Found, parameters: dict[str, tuple[floa
         short = problem.shortened(count)
         fits = found.fitter.on(short).fit([found.best], found.mean, found.level, _STEPS)
         if fits.free_energy[0] < float("inf"):
-            belief = about(problem.rig, problem.scales, fits.mean[0], fits.cov[0])
+            belief = about(problem.rig, problem.scales, *problem.outward(fits.mean[0], fits.cov[0]))
             told = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
             history.append((short.samples, told))
     return (*history, (problem.samples, parameters))
@@ -113,11 +113,11 @@ def refit(
     start, cov = near.coefficients_mean, near.coefficients_cov
     u = tuple(inputs / near.scales.input for inputs, _ in records)
     y = tuple(explicable(outputs, rig) / near.scales.output for _, outputs in records)
-    problem = Problem(rig, near.scales, u, y, _SUBSTEPS)
+    problem = Problem(rig, near.scales, u, y, substeps=_SUBSTEPS)
     if list(problem.model.coefficients) != list(near.model.coefficients):
         return start, cov
     q, r = near.noises[1] / near.noises[0], near.noises[3] / near.noises[2]
-    fitter = Fitter(problem, Prior.of(prior))
+    fitter = Fitter(problem, Prior.of(prior.coefficients_mean, prior.coefficients_cov))
     hypothesis = Hypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)))
     level = float(np.sqrt(r))
     hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start[None], level)[0])

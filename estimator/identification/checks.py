@@ -41,6 +41,9 @@ _ALARM = 1e-4
 #: is, and in parts of what the rig says of it.
 _DISTURBANCE, _REST, _BEYOND = 0.02, 0.005, 3.0
 
+#: Standard deviations by which the disturbance is larger than that for sure: with a probability of 95 %, about.
+_SURE = 1.645
+
 #: Largest relative standard deviation of a parameter that is called identified.
 _VAGUE = 1 / 3
 
@@ -67,7 +70,7 @@ def examine(
     problem: Problem,
     found: Found,
     parameters: dict[str, tuple[float, float]],
-    disturbance: float,
+    disturbance: tuple[float, float],
     records: Sequence[Record],
     forecasts: Sequence[FloatArray],
 ) -> tuple[Warning, ...]:
@@ -77,7 +80,7 @@ def examine(
         problem: the records, scaled.
         found: the result of the search.
         parameters: their means and standard deviations, in the rig's units.
-        disturbance: of the force, as a standard deviation in the unit of the input.
+        disturbance: of the force, as a standard deviation in the unit of the input; its mean and standard deviation.
         records: as they were read.
         forecasts: of their outputs.
     """
@@ -203,10 +206,12 @@ def disturbed(channel: Channel, strength: float, disturbance: float) -> str:
     return f"the force is disturbed by {disturbance:.3g} {channel.unit} in every sample{part}"
 
 
-def _of_noise(problem: Problem, disturbance: float) -> list[Warning]:
-    said = disturbed(problem.rig.input, problem.strength * problem.scales.input, disturbance)
+def _of_noise(problem: Problem, disturbance: tuple[float, float]) -> list[Warning]:
+    channel, strength, (mean, std) = problem.rig.input, problem.strength * problem.scales.input, disturbance
+    if not disturbed(channel, strength, mean - _SURE * std):  # where the sensor's noise hides it, it may be any
+        return []
     because = "either the recorded input is noisy, or the equation lacks something"
-    return [Warning("process_noise", f"{said}; {because}")] if said else []
+    return [Warning("process_noise", f"{disturbed(channel, strength, mean)}; {because}")]
 
 
 def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Warning]:

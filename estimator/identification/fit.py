@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from estimator.belief import Belief
 from estimator.identification.problem import Problem
 from estimator.information import follow
 from estimator.parameters import FloatArray
@@ -63,11 +62,10 @@ class Prior:
     precision: FloatArray
 
     @classmethod
-    def of(cls, belief: Belief) -> Prior:
-        """That of a belief."""
-        cov = belief.coefficients_cov
+    def of(cls, mean: FloatArray, cov: FloatArray) -> Prior:
+        """That of given moments (K,) and (K, K)."""
         scale = np.sqrt(np.diag(cov))
-        return cls(belief.coefficients_mean, np.linalg.inv(cov / np.outer(scale, scale)) / np.outer(scale, scale))
+        return cls(mean, np.linalg.inv(cov / np.outer(scale, scale)) / np.outer(scale, scale))
 
     def widened(self, std: float) -> Prior:
         """With one more coefficient, of which it is only known that it is about 0."""

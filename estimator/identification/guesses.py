@@ -125,7 +125,7 @@ def without_guess(problem: Problem, found: Found) -> tuple[Parameters, float]:
         return {}, 0.0
     judge = Fitter(found.fitter.problem, alone.fitter.prior)
     own = judge.fit([found.best], found.mean, found.level, iterations=0).free_energy[0]
-    told = about(problem.rig, problem.scales, alone.mean, alone.cov).parameters()
+    told = about(problem.rig, problem.scales, *problem.outward(alone.mean, alone.cov)).parameters()
     return {name: (mean, std) for name, (mean, std, _) in told.items()}, float(own - alone.fits.free_energy.min())
 
 

@@ -22,6 +22,10 @@ LATEST = 3
 EXTRA = ("cubic_damping", "quintic")
 
 
+#: Samples of a gap that is bridged before it is known how long a period is.
+_BRIDGED = 16
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Records to identify a rig from.
@@ -30,7 +34,8 @@ class Problem:
         rig: as it was given.
         scales: that the records are in.
         u: inputs of each record, in parts of their scale.
-        y: outputs of each record, in parts of theirs, NaN where one is missing.
+        y: outputs of each record, in parts of theirs, counted from the origin, NaN where one is missing.
+        origin: where outputs are counted from, in parts of their scale: about their middle, where that is far from 0.
         substeps: steps of integration a sample.
         terms: of the equation, beside those of Eq. (1) and the offsets; some of `EXTRA`.
     """
@@ -39,6 +44,7 @@ class Problem:
     scales: Scales
     u: tuple[FloatArray, ...]
     y: tuple[FloatArray, ...]
+    origin: float = 0.0
     substeps: int = 2
     terms: tuple[str, ...] = ()
 
@@ -72,6 +78,14 @@ class Problem:
         rig = replace(self.rig, interpolation=interpolation, delay=delay)
         return _stacked([driven(self.model, rig, u) for u in self.u], rows)
 
+    def inward(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Moments (K,) and (K, K) of the model's coefficients, where outputs are counted from the origin."""
+        return _recounted(self.model, mean, cov, self.origin)
+
+    def outward(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The moments of which `inward` makes these."""
+        return _recounted(self.model, mean, cov, -self.origin)
+
     def shortened(self, samples: int) -> Problem:
         """The same with the first samples of each record only."""
         return replace(self, u=tuple(u[:samples] for u in self.u), y=tuple(y[:samples] for y in self.y))
@@ -92,7 +106,8 @@ class Problem:
         """Where the outputs have their power: the mean angular frequency [rad per sample], robust to white noise."""
         power = total = 0.0
         for y in self.y:
-            whole = np.where(np.isfinite(y), y, np.nanmean(y))
+            whole = bridged(y, _BRIDGED)
+            whole = np.where(np.isfinite(whole), whole, np.nanmean(y))
             spectrum = np.abs(np.fft.rfft(whole - whole.mean())) ** 2
             floor = 2 * np.median(spectrum)
             spectrum = np.where(spectrum > 20 * floor, spectrum, 0.0)
@@ -124,6 +139,21 @@ class Problem:
         return sizes | {"cubic_damping": w / (w * x) ** 2, "quintic": w**2 / x**4}
 
 
+def bridged(y: FloatArray, longest: float) -> FloatArray:
+    """Outputs (T,) with straight lines through gaps of no more than so many samples.
+
+    Example:
+        >>> bridged(np.array([0.0, np.nan, 2.0, np.nan, np.nan, 5.0, np.nan]), 1)
+        array([ 0.,  1.,  2., nan, nan,  5., nan])
+    """
+    seen = np.flatnonzero(np.isfinite(y))
+    filled = y.copy()
+    for before, after in zip(seen[:-1], seen[1:], strict=True):
+        if 1 < after - before <= longest + 1:
+            filled[before : after + 1] = np.linspace(y[before], y[after], after - before + 1)
+    return filled
+
+
 def explicable(y: FloatArray, rig: Rig, later: int = 0) -> FloatArray:
     """Outputs (T,) of a record, NaN where inputs acted that came before it and that nobody recorded.
 
@@ -153,6 +183,15 @@ def driven(model: Model, rig: Rig, u: FloatArray) -> FloatArray:
     if not way.fills:
         acting = np.where(places < 0, 0.0, acting)
     return np.asarray(acting @ way.stencil.T)
+
+
+def _recounted(model: Model, mean: FloatArray, cov: FloatArray, origin: float) -> tuple[FloatArray, FloatArray]:
+    """Moments where outputs are counted from another origin, of a displacement: z'' = force - stiffness z + ..."""
+    turned, offset = np.eye(len(mean)), np.zeros(len(mean))
+    names = list(model.coefficients)
+    turned[names.index("force"), names.index("stiffness")] = -origin
+    offset[names.index("output_offset")] = -origin
+    return turned @ mean + offset, turned @ cov @ turned.T
 
 
 def _stacked(series: list[FloatArray], columns: int) -> FloatArray:

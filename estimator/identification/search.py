@@ -100,7 +100,8 @@ def prior_of(problem: Problem) -> Prior:
         natural = problem.natural()
         stds = np.array([_WIDE * natural[name] for name in problem.model.coefficients])
         return Prior(np.zeros(len(stds)), np.diag(stds**-2))
-    return Prior.of(rig_prior(problem.rig, problem.scales))
+    guess = rig_prior(problem.rig, problem.scales)
+    return Prior.of(*problem.inward(guess.coefficients_mean, guess.coefficients_cov))
 
 
 def search(problem: Problem, tell: Callable[[str], None]) -> Found:
@@ -148,12 +149,14 @@ def _look(fitter: Fitter) -> tuple[Fits, float]:
     candidates = starts(problem.shortened(_LONGEST))
     if problem.rig.guess is not None:
         middle = {name: (low + high) / 2 for name, (low, high) in problem.rig.guess.items()}
-        none = dict.fromkeys(problem.model.physical, 0.0)
-        candidates.append(coefficients_of(problem.model, none | middle, problem.scales))
+        middle |= {"u0": problem.rig.input.offset, "y0": problem.rig.output.offset}
+        guessed = coefficients_of(problem.model, middle, problem.scales)
+        candidates.append(problem.inward(guessed, np.zeros((len(guessed),) * 2))[0])
     if not candidates:
         raise ValueError(
-            f"records must be longer than a few periods to find a start, but have {problem.samples} outputs; add "
-            f"samples, or a guess to the rig"
+            f"records must have a few periods without long gaps to find a start, but have {problem.samples} outputs in "
+            f"some {sum(map(len, problem.y)) * problem.frequency / (2 * np.pi):.0f} periods; add samples, or a guess to "
+            "the rig"
         )
     ratios = _RATIOS * problem.frequency ** (2 - problem.scales.order)
     base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]))

@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from estimator.identification.problem import Problem
+from estimator.identification.problem import Problem, bridged
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
 
@@ -25,6 +25,9 @@ _WIDTHS = (0.12, 0.25, 0.5, 1.0)
 #: (1 - s²)^n has n - 1 derivatives that vanish at the ends.
 _POWER = 6
 
+#: A gap of so many periods is bridged: what comes of it is a start, and no more.
+_BRIDGED = 1 / 6
+
 #: Periods over which an integrated signal loses its drift.
 _PERIODS = (3.0, 10.0, 30.0)
 
@@ -32,15 +35,18 @@ _PERIODS = (3.0, 10.0, 30.0)
 def starts(problem: Problem) -> list[FloatArray]:
     """Coefficients (K,) to begin with: one set for each width of the bumps, and each way to lose the drift.
 
-    None where the records are too short.
+    Where outputs are counted from an origin, also one for each place that may be the spring's middle: the origin, 0,
+    and the rig's offset. None where the records are too short.
     """
     names = list(problem.model.coefficients)
     inputs = problem.inputs(problem.rig.interpolation, problem.rig.delay)
     found = []
     integrates = KINDS[problem.rig.output.kind] > 0
-    for part, periods in product(_WIDTHS[:2] if integrates else _WIDTHS, _PERIODS if integrates else (0.0,)):
+    middles = middles_of(problem)
+    widths, drifts = (_WIDTHS[:2], _PERIODS) if integrates else (_WIDTHS, (0.0,))
+    for offset, part, periods in product(middles, widths, drifts):
         half = max(3, round(part * 2 * np.pi / problem.frequency))
-        rows = [_equations(problem, u, y, half, periods) for u, y in zip(inputs, problem.y, strict=True)]
+        rows = [_equations(problem, u, y - offset, half, periods) for u, y in zip(inputs, problem.y, strict=True)]
         kept = [row for row in rows if row is not None]
         if not kept:
             continue
@@ -57,9 +63,19 @@ def starts(problem: Problem) -> list[FloatArray]:
         middle = square / (3 * cubic) if abs(cubic) > 0 else 0.0
         inside = abs(middle) < 3 * problem.displacement and integrates
         values["stiffness"] = stiffness - (3 * cubic * middle**2 if inside else 0.0)
+        values["force"] += offset * stiffness
+        values["output_offset"] = offset
         if np.isfinite(list(values.values())).all() and gain != 0:
             found.append(np.array([values[name] for name in names]))
     return found
+
+
+def middles_of(problem: Problem) -> list[float]:
+    """Places, counted as the outputs are, where the spring may be without force; just 0 where these have no origin."""
+    if not problem.origin:
+        return [0.0]
+    given = problem.rig.output.offset / problem.scales.output
+    return sorted({0.0, -problem.origin, given - problem.origin})
 
 
 def _equations(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, periods: float) -> FloatArray | None:
@@ -73,8 +89,9 @@ def _equations(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, p
     first = -2 * _POWER * s * base ** (_POWER - 1) / half
     second = (-2 * _POWER * base ** (_POWER - 1) + 4 * _POWER * (_POWER - 1) * s**2 * base ** (_POWER - 2)) / half**2
     over = lambda test, values: np.convolve(values, test[::-1], mode="valid")  # noqa: E731
-    missing = ~np.isfinite(y)
-    seen = np.where(missing, np.nanmean(y), y)
+    seen = bridged(y, _BRIDGED * 2 * np.pi / problem.frequency)
+    missing = ~np.isfinite(seen)
+    seen = np.where(missing, np.nanmean(y), seen)
     order = KINDS[problem.rig.output.kind]
     shown, x = seen, seen
     for _ in range(order):

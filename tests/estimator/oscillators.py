@@ -14,10 +14,11 @@ BENCH = ({"m": 0.4, "c": 0.6, "a": 2500.0, "b": 4e7}, 1e-3, 6.0, 5e-6, 8)
 SOFT = ({"m": 1.0, "c": 0.5, "a": 400.0, "b": -4000.0}, 1e-2, 6.0, 1e-4, 4)
 
 
-def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3):
+def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3, start=0.0):
     """Input and output of a record that begins at rest, with the force disturbed by so many parts of the input.
 
-    The plant is the engine's, without what the benchmark's own integrator is for.
+    It begins at a displacement ``start`` [m]. The plant is the engine's, without what the benchmark's own integrator is
+    for.
     """
     truth, step, amplitude, noise, hold = case
     rng = np.random.default_rng(seed)
@@ -26,8 +27,9 @@ def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3):
     scales = Scales(step, amplitude, 1e-2, KINDS[kind])
     known = {p: truth.get(p, 0.0) for p in model.physical}
     disturbed = u / amplitude + force * rng.standard_normal(samples)
-    y = scales.output * free_run(model, coefficients_of(model, known, scales), disturbed)
-    y = np.concatenate([[0.0], y[:-1]])
+    state = [start / scales.displacement, 0.0]
+    y = scales.output * free_run(model, coefficients_of(model, known, scales), disturbed, state)
+    y = np.concatenate([[start], y[:-1]])
     sensor = noise if kind == "displacement" else 2e-3 * y.std()
     return u, y + sensor * rng.standard_normal(samples)
 

@@ -111,7 +111,11 @@ def test_the_motion_before_each_record_is_found(kind):
     rig = rig_of(SOFT, kind)
     pieces = [slice(k, k + 100) for k in places]
     problem = Problem(
-        rig, scales, tuple(u[p] / amplitude for p in pieces), tuple(explicable(shown[kind][p], rig) for p in pieces), 4
+        rig,
+        scales,
+        tuple(u[p] / amplitude for p in pieces),
+        tuple(explicable(shown[kind][p], rig) for p in pieces),
+        substeps=4,
     )
     assert problem.model.digest == replace(model, substeps=4).digest
     level = 1e-4 * np.abs(shown[kind]).max()
@@ -151,3 +155,51 @@ def test_the_result_goes_on(tmp_path):
     assert "http" not in page.replace("http://www.w3.org", "").replace("https://matplotlib.org", "").replace(
         "http://purl.org", ""
     ).replace("http://creativecommons.org", "")
+
+
+@pytest.mark.parametrize("guessed", [False, True])
+@pytest.mark.parametrize("offset", [0.05, 2.0])
+def test_a_sensor_far_off_the_oscillator_changes_nothing_but_its_offset(offset, guessed):
+    # Displacements are of 2 mm; a laser stands 5 cm away, or 2 m.
+    u, y = simulated(BENCH)
+    guess = {name: (0.7 * value, 1.4 * value) for name, value in BENCH[0].items()} if guessed else None
+    near, far = identify(rig_of(BENCH, guess=guess), (u, y)), identify(rig_of(BENCH, guess=guess), (u, y + offset))
+    for name in BENCH[0]:
+        mean, std = near.parameters[name]
+        assert far.parameters[name] == pytest.approx((mean, std), abs=0.2 * std)
+    mean, std = near.parameters["y0"]
+    assert far.parameters["y0"] == pytest.approx((mean + offset, std), abs=0.2 * std)
+    assert far.warnings == ()
+    told = [found["y0"][0] for _, found in far.history]
+    assert told == pytest.approx([offset] * len(told), abs=2e-4)
+    for forecast, beside in zip(far.forecasts, near.forecasts, strict=True):
+        seen = np.isfinite(beside[:, 0])
+        assert np.abs(forecast - beside - [offset, 0.0])[seen, 0].max() < 1e-6
+
+
+def test_one_well_of_two_is_found_where_the_output_never_comes_near_zero():
+    wells = ({"m": 0.4, "c": 0.6, "a": -2500.0, "b": 4e7}, 1e-3, 0.5, 2e-6, 8)
+    u, y = simulated(wells, start=np.sqrt(2500.0 / 4e7))
+    result = identify(rig_of(wells), (u, y))
+    assert np.abs(y - y.mean()).max() < 0.5 * y.mean()
+    assert np.abs(deviations(result, wells[0])).max() < 4.5
+    assert result.warnings == ()
+
+
+def test_noise_of_the_sensor_is_not_told_to_be_a_disturbance():
+    u, y = simulated(BENCH, force=0.0)
+    hidden = y + y.std() * np.random.default_rng(1).standard_normal(len(y))
+    result = identify(rig_of(BENCH), (u, hidden))
+    assert np.abs(deviations(result, BENCH[0])).max() < 4.5
+    assert "process_noise" not in [warning.name for warning in result.warnings]
+
+
+@pytest.mark.parametrize("seen", ["every second", "every tenth", "most"])
+def test_a_sensor_that_is_slower_than_the_input_or_loses_outputs_needs_no_guess(seen):
+    u, y = simulated(BENCH)
+    kept = {"every second": np.arange(len(y)) % 2 == 0, "every tenth": np.arange(len(y)) % 10 == 0}
+    kept["most"] = np.random.default_rng(0).random(len(y)) < 0.7
+    result = identify(rig_of(BENCH), (u, np.where(kept[seen], y, np.nan)))
+    assert np.abs(deviations(result, BENCH[0])).max() < 4.5
+    assert all(std < 0.03 * abs(BENCH[0][name]) for name, (_, std) in list(result.parameters.items())[:4])
+    assert result.warnings == ()
