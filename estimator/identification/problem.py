@@ -148,9 +148,10 @@ def bridged(y: FloatArray, longest: float) -> FloatArray:
     """
     seen = np.flatnonzero(np.isfinite(y))
     filled = y.copy()
-    for before, after in zip(seen[:-1], seen[1:], strict=True):
-        if 1 < after - before <= longest + 1:
-            filled[before : after + 1] = np.linspace(y[before], y[after], after - before + 1)
+    gaps = np.diff(seen) - 1
+    for gap in np.flatnonzero((gaps > 0) & (gaps <= longest)):
+        ends = seen[gap : gap + 2]
+        filled[ends[0] : ends[1] + 1] = np.linspace(*y[ends], gaps[gap] + 2)
     return filled
 
 

@@ -29,6 +29,9 @@ _PERIODS, _SHORTEST, _LONGEST = 25, 1024, 4096
 #: Steps of it, after which so many of its hypotheses are kept.
 _LOOK = ((3, 8), (10, 1))
 
+#: Steps of a fit to all records, from what the first look found and from where it began, of which the best is kept.
+_FEW = 3
+
 #: Ratios of a grid, how many standard deviations it is to reach either way in the end, and by how many nats its ends
 #: must be worse than its best.
 _GRID, _REACH, _EDGE = 8, 3.0, 2.0
@@ -117,9 +120,9 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
     coarse = next(n for n in _SUBSTEPS if problem.frequency / n < _ANGLE)
     fitter = Fitter(replace(problem, substeps=coarse), prior_of(problem))
     tell("looking for a start")
-    looked, share = _look(fitter)
+    looked = _look(fitter)
     start, level, hypothesis, reach = looked.mean[0], float(looked.level[0]), looked.hypotheses[0], 30.0
-    substeps = enough_substeps(problem, start, looked.cov[0] * share)
+    substeps = enough_substeps(problem, start, looked.cov[0])
     tell("fitting coefficients and noises")
     for _ in range(_ROUNDS):
         problem = replace(problem, substeps=substeps)
@@ -141,8 +144,8 @@ def _begins_otherwise(found: Found) -> bool:
     return not np.isclose(before, after, rtol=0.0, atol=_SMALL)
 
 
-def _look(fitter: Fitter) -> tuple[Fits, float]:
-    """The best of all starts and ratios of the noises, and the share of the outputs that it was fitted to."""
+def _look(fitter: Fitter) -> Fits:
+    """The best of all starts and ratios of the noises."""
     problem = fitter.problem
     period = 2 * np.pi / problem.frequency
     short = fitter.on(problem.shortened(int(np.clip(_PERIODS * period, _SHORTEST, _LONGEST))))
@@ -169,12 +172,16 @@ def _look(fitter: Fitter) -> tuple[Fits, float]:
     for steps, kept in _LOOK:
         fits = short.fit(hypotheses, points, level, steps).best(kept)
         hypotheses, points, level = list(fits.hypotheses), fits.mean, fits.level
+    if short.problem.samples < problem.samples and np.isfinite(fits.free_energy).any():
+        # The first periods may tell little of a coefficient, which then is anywhere: all records judge.
+        points = np.array([*fits.mean, *candidates])
+        fits = fitter.fit(list(fits.hypotheses) * len(points), points, fits.level[0], _FEW).best(1)
     if not np.isfinite(fits.free_energy).any():
         raise ValueError(
             "records must be of an oscillator that Eq. (1) can follow, but every start ran away; check units, columns "
             "and the sampling step, or add a guess to the rig"
         )
-    return fits, short.problem.samples / problem.samples
+    return fits
 
 
 def enough_substeps(problem: Problem, mean: FloatArray, cov: FloatArray) -> int:
