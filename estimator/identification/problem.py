@@ -150,8 +150,8 @@ def bridged(y: FloatArray, longest: float) -> FloatArray:
     filled = y.copy()
     gaps = np.diff(seen) - 1
     for gap in np.flatnonzero((gaps > 0) & (gaps <= longest)):
-        ends = seen[gap : gap + 2]
-        filled[ends[0] : ends[1] + 1] = np.linspace(*y[ends], gaps[gap] + 2)
+        before, after = seen[gap], seen[gap + 1]
+        filled[before : after + 1] = np.linspace(y[before], y[after], after - before + 1)
     return filled
 
 

@@ -158,8 +158,7 @@ def _look(fitter: Fitter) -> Fits:
     if not candidates:
         raise ValueError(
             f"records must have a few periods without long gaps to find a start, but have {problem.samples} outputs in "
-            f"some {sum(map(len, problem.y)) * problem.frequency / (2 * np.pi):.0f} periods; add samples, or a guess to "
-            "the rig"
+            f"some {sum(map(len, problem.y)) / period:.0f} periods; add samples, or a guess to the rig"
         )
     ratios = _RATIOS * problem.frequency ** (2 - problem.scales.order)
     base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]))
