@@ -114,7 +114,10 @@ class OnlineEstimator:
             units = Channel(prior.scales.input_unit), Channel(prior.scales.output_unit)
             rig = Rig(prior.step, *(("linear", 0) if self.model.is_continuous else ("zero_order", 1)), *units)
         if rig.step != prior.step:
-            raise ValueError(f"rig.step must be that of the prior, {prior.step}, but is {rig.step}; make both alike")
+            raise ValueError(
+                f"rig.step must be that of the prior, {prior.step}, but is {rig.step}; make the prior with "
+                "scales=rig.scales, or give the rig the prior's step"
+            )
         self.rig, self.scales = rig, prior.scales
         self._filter = Filter(prior, rig, self.settings)
 

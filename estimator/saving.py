@@ -87,7 +87,7 @@ def _built(arrays: dict[str, Any]) -> OnlineEstimator:
     description = json.loads(text.tobytes())
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         found = description.get("format") if isinstance(description, dict) else None
-        raise ValueError(f"it is of format {found!r}, not {FORMAT}")
+        raise ValueError(f"it is of format {found!r}, and this version reads {FORMAT}")
     model, settings = Model(**description["model"]), description["settings"]
     rig, scales = Rig.from_dict(description["rig"]), Scales(**description["scales"])
     first = arrays.get("first")

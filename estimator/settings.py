@@ -82,7 +82,6 @@ def checked_hypotheses(given: object, factorisation: str, model: Model, most: in
     published = factorisation == "mean_field"
     if list(counts) != [1] and (published or model.n_outputs > 1):
         what = "factorisation='mean_field'" if published else f"{model.name}, which has several sensors"
-        raise ValueError(
-            f"noise_hypotheses must be 1 for {what}, but is {given}; use factorisation='structured' and one sensor"
-        )
+        remedy = "use factorisation='structured'" if published else "centre the priors of its noises with care"
+        raise ValueError(f"noise_hypotheses must be 1 for {what}, but is {given}; {remedy}")
     return (int(counts[0]), int(counts[1])) if len(counts) == 2 else int(counts[0])

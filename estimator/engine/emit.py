@@ -42,15 +42,13 @@ class _Printer(PythonCodePrinter):
 
     def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
         base, exponent = expr.as_base_exp()
-        if exponent == sp.Rational(1, 2):
-            return f"sqrt({self._print(base)})"
-        if exponent == -sp.Rational(1, 2):
-            return f"(1.0/sqrt({self._print(base)}))"
-        if exponent.is_Integer and 1 <= abs(int(exponent)) <= 8:
-            inner = self._print(base) if base.is_Symbol else f"({self._print(base)})"
-            product = "*".join([inner] * abs(int(exponent)))
-            return f"(1.0/({product}))" if exponent < 0 else f"({product})" if exponent > 1 else product
-        return f"({self._print(base)})**({self._print(exponent)})"
+        if not (2 * exponent).is_Integer:
+            return f"exp(({self._print(exponent)})*log({self._print(base)}))"
+        whole, half = divmod(2 * abs(exponent), 2)
+        inner = self._print(base) if base.is_Symbol else f"({self._print(base)})"
+        factors = [inner] * int(whole) + [f"sqrt({self._print(base)})"] * int(half)
+        product = "*".join(factors)
+        return f"(1.0/({product}))" if exponent < 0 else f"({product})" if len(factors) > 1 else product
 
     def _print_Function(self, expr: sp.Function) -> str:
         name, given = expr.func.__name__, [self._print(argument) for argument in expr.args]

@@ -6,11 +6,12 @@ Fisher information, what a planner imagines and the gradient that an oracle clim
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import keyword
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 
@@ -19,10 +20,43 @@ from estimator.checks import flag, mapping, shown, whole
 #: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
+#: Functions that expressions may use.
+FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "tanh")
+
 #: Names that stand for something else: the input and its older values, the sampling step, what generated code calls.
-RESERVED = frozenset(
-    {"u", "u1", "u2", "step", "sin", "cos", "exp", "log", "sqrt", "tanh", "present", "select", "below", "range"}
-)
+RESERVED = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, "present", "select", "below", "range"})
+
+
+#: What an expression is made of.
+_PARTS = (
+    ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Constant, ast.Load, ast.Add, ast.Sub, ast.Mult,
+    ast.Div, ast.Pow, ast.USub, ast.UAdd,
+)  # fmt: skip
+
+
+def names_of(text: object, known: Collection[str], where: str) -> set[str]:
+    """Names that an expression uses, besides `FUNCTIONS`.
+
+    Raises:
+        ValueError: naming the text, for what is no formula or uses another name than the known ones.
+    """
+    if not isinstance(text, str) or "__" in text or len(text) > 10_000:
+        raise ValueError(f"expressions of {where} must be short strings without '__', but one is {text!r:.80}")
+    try:
+        parts = list(ast.walk(ast.parse(text.strip(), mode="eval")))
+    except (SyntaxError, ValueError, RecursionError) as error:
+        raise ValueError(f"expressions of {where} must be formulas, but {text!r} is not one: {error}") from error
+    if not all(isinstance(part, _PARTS) for part in parts):
+        raise ValueError(
+            f"expressions of {where} may use + - * / **, brackets and {[*FUNCTIONS]}, but {text!r} uses something else"
+        )
+    used = {part.id for part in parts if isinstance(part, ast.Name)} - set(FUNCTIONS)
+    unknown = sorted(used.difference(known))
+    if unknown:
+        raise ValueError(
+            f"expressions of {where} may use {sorted(known)} and {sorted(FUNCTIONS)}, but {text!r} uses {unknown}"
+        )
+    return used
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +86,8 @@ class Model:
         inverse: coefficient to its expression in the parameters and ``step``; all of them, where ``physical`` is given.
 
     Raises:
-        ValueError: naming the argument, for a name that is not a lower-case identifier or stands twice, or expressions
-            that do not fit the names.
+        ValueError: naming the argument, for a name that is not a lower-case identifier or stands twice, expressions
+            that do not fit the names, a coefficient that does nothing, or an output that nothing moves.
 
     Example:
         >>> from estimator.models.model import Model
@@ -125,10 +159,29 @@ class Model:
                 f"physical and inverse go together, and inverse must give {list(self.coefficients)}, but gives "
                 f"{list(self.inverse)}"
             )
+        self._check_expressions()
         # By name, in whatever order they are written.
         object.__setattr__(self, "dimensions", {name: self.dimensions[name] for name in self.physical})
         if self.inverse:
             object.__setattr__(self, "inverse", {name: self.inverse[name] for name in self.coefficients})
+
+    def _check_expressions(self) -> None:
+        """Refuse those that are no formulas of the names they may use, and what they leave without effect."""
+        inputs = ("u",) if self.is_continuous else ("u", "u1", "u2")
+        for texts, known in ((self.physical, self.coefficients), (self.inverse, self.physical)):
+            for text in texts.values():
+                names_of(text, (*known, "step"), self.name)
+        told = [names_of(text, (*self.names, *inputs), self.name) for text in self.outputs.values()]
+        for sensor, names in zip(self.outputs, told, strict=True):
+            if names.isdisjoint(self.names):
+                raise ValueError(f"outputs must show a state or a coefficient each, but {sensor!r} shows none")
+        moving = [names_of(text, (*self.names, *inputs), self.name) for text in self.moves]
+        shaking = [names_of(text, self.names, self.name) for text in self.noise]
+        idle = sorted(set(self.coefficients).difference(*told, *moving, *shaking))
+        if idle:
+            raise ValueError(
+                f"coefficients must stand in an expression, but {idle} do not; use them, or leave them out"
+            )
 
     @property
     def is_continuous(self) -> bool:

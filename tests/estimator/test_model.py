@@ -1,0 +1,69 @@
+"""Declarations of a model: what is refused, when it is written and not when it runs."""
+
+import re
+
+import numpy as np
+import pytest
+
+from estimator.engine.derive import calculus, symbol
+from estimator.free_run import free_run
+from estimator.information import fisher_information
+from estimator.models.model import Model
+
+TANK = {
+    "name": "tank", "states": {"x": "V"}, "coefficients": {"loss": "1"}, "noise": ("1",), "outputs": {"y": "x"},
+    "rates": ("u - loss*x",),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (
+            {"rates": ("u - leak*x",)},
+            "may use ['loss', 'u', 'x'] and ['cos', 'exp', 'log', 'sin', 'sqrt', 'tanh'], but",
+        ),
+        ({"rates": ("u - loss*x*u1",)}, "uses ['u1']"),
+        ({"rates": ("u - loss*x//2",)}, "may use + - * / **, brackets and ['sin', 'cos'"),
+        ({"rates": ("u - loss*x if x else 0",)}, "uses something else"),
+        ({"rates": ("u - loss*(x",)}, "expressions of tank must be formulas, but 'u - loss*(x' is not one"),
+        ({"rates": ("u - x",)}, "coefficients must stand in an expression, but ['loss'] do not"),
+        ({"outputs": {"y": "2"}}, "outputs must show a state or a coefficient each, but 'y' shows none"),
+        ({"noise": ("u",)}, "may use ['loss', 'x']"),
+        ({"rates": ("u", "loss*x")}, "rates must have one expression per state, 1, but has 2"),
+        ({"next_state": ("u - loss*x",)}, "either rates or next_state must be given"),
+        ({"states": {"X": "V"}}, "names must be lower-case identifiers"),
+        ({"coefficients": {"x": "1"}}, "must have different names, but share ['x']"),
+        ({"physical": {"t": "1/loss"}, "dimensions": {"t": (0, 0, 1)}}, "physical and inverse go together"),
+        (
+            {"physical": {"t": "step/loss"}, "dimensions": {"t": (0, 0, 1)}, "inverse": {"loss": "step/tau"}},
+            "may use ['step', 't']",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_at_once(given, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        Model(**{**TANK, **given})
+
+
+def test_powers_too_high_for_a_product_are_refused():
+    with pytest.raises(ValueError, match="powers of tank must be from -16 to 16, but 'u - loss"):
+        calculus(Model(**{**TANK, "rates": ("u - loss*x**17",)}))
+
+
+@pytest.mark.parametrize("power", ["0.5", "1.5", "(-1/2)", "2.0", "9", "(-3)", "0.3", "loss", "(loss - 1)"])
+def test_any_power_is_what_it_says(power):
+    x, loss = 1.7, 0.4
+    model = Model(**{**TANK, "rates": (), "next_state": (f"u + loss*x**{power}",)})
+    expected = loss * x ** eval(power, {"loss": loss})
+    assert free_run(model, [loss], [0.25], [x])[0] == pytest.approx(0.25 + expected, rel=1e-14)
+    slope = calculus(model).by[0][0].subs({symbol("x"): x, symbol("loss"): loss})
+    assert float(slope) == pytest.approx(expected * eval(power, {"loss": loss}) / x, rel=1e-12)
+
+
+def test_the_information_of_powers_is_that_of_differences():
+    model = Model(**{**TANK, "rates": ("u - loss*x**1.5",)})
+    u = np.repeat([0.5, 0.1], 20)
+    slope = (free_run(model, [0.3 + 1e-6], u) - free_run(model, [0.3 - 1e-6], u)) / 2e-6
+    found = fisher_information(model, [0.3], u, process_noise=0.0, measurement_noise=0.02)
+    assert found[0, 0] == pytest.approx((slope**2).sum() / 0.02**2, rel=1e-6)
