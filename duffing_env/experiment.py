@@ -305,7 +305,7 @@ def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None
         raise ValueError(f"prior must be an estimator.Belief or None, but is {shown(prior)}")
     if prior.scales != scales:
         pairs = {name: (getattr(scales, name), getattr(prior.scales, name)) for name in asdict(scales)}
-        words = {"input": "limit", "output": "range"}
+        words = {"input": "limit", "output": "range", "order": "time derivative that the sensor shows"}
         other = ", ".join(
             f"{words.get(name, name)} {its!r} in place of {own!r}" for name, (own, its) in pairs.items() if own != its
         )
