@@ -21,6 +21,7 @@ from torch import nn
 from torch.distributions import Normal
 
 from agents import save_policy
+from agents.policies.saving import check_policy_folder
 from agents.results import versions
 
 
@@ -146,6 +147,8 @@ def update(args: Args, agent: Agent, optimizer: torch.optim.Optimizer, batch: tu
 
 def main(args: Args) -> Path:
     """Train, write the policy folder, and give its path."""
+    track = args.env_id.split("/")[-1].lower()
+    folder = check_policy_folder("output", args.output or Path("runs") / f"cleanrl-ppo-{track}-{args.seed}")
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     # Our vector environment, in CleanRL's wrappers; observations are normalised in `Observations`.
@@ -181,8 +184,6 @@ def main(args: Args) -> Path:
         rate, mean = steps / (time.time() - begun), np.mean(episodes.return_queue)
         print(f"{steps:9,} samples, {rate:,.0f}/s, return {mean:.2f}", flush=True)
 
-    track = args.env_id.split("/")[-1].lower()
-    folder = args.output or Path("runs") / f"cleanrl-ppo-{track}-{args.seed}"
     card = {
         "algorithm": "ppo",
         "steps": steps,

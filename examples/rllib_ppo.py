@@ -19,6 +19,7 @@ import tyro
 from ray.rllib.algorithms.ppo import PPOConfig
 
 from agents import save_policy
+from agents.policies.saving import check_policy_folder
 from agents.results import versions
 
 
@@ -46,6 +47,8 @@ def mean_network(module: torch.nn.Module) -> torch.nn.Sequential:
 
 def main(args: Args) -> Path:
     """Train, write the policy folder, and give its path."""
+    track = args.env_id.split("/")[-1].lower()
+    folder = check_policy_folder("output", args.output or Path("runs") / f"rllib-ppo-{track}-{args.seed}")
     torch.set_num_threads(1)  # more than one are slower, and many times so on a busy machine
     ray.init(os.environ.get("RAY_ADDRESS", "local"))  # and not whatever cluster runs on this machine
     config = PPOConfig().environment(f"duffing_env:{args.env_id}").debugging(seed=args.seed)
@@ -56,8 +59,6 @@ def main(args: Args) -> Path:
         steps = int(result["num_env_steps_sampled_lifetime"])
         print(f"{steps:9,} samples, return {result['env_runners']['episode_return_mean']:.2f}", flush=True)
 
-    track = args.env_id.split("/")[-1].lower()
-    folder = args.output or Path("runs") / f"rllib-ppo-{track}-{args.seed}"
     card = {
         "algorithm": "ppo",
         "steps": steps,

@@ -22,6 +22,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from agents import save_policy
+from agents.policies.saving import check_policy_folder
 from agents.results import versions
 
 
@@ -51,6 +52,8 @@ class Args:
 
 def main(args: Args) -> Path:
     """Train, write the policy folder, and give its path."""
+    track = args.env_id.split("/")[-1].lower()
+    folder = check_policy_folder("output", args.output or Path("runs") / f"torchrl-ppo-{track}-{args.seed}")
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     # TorchRL resets the rows that have ended itself.
@@ -96,8 +99,6 @@ def main(args: Args) -> Path:
         steps += rolled.numel()
         print(f"{steps:9,} samples, mean reward {rolled['next', 'reward'].mean():.3f}", flush=True)
 
-    track = args.env_id.split("/")[-1].lower()
-    folder = args.output or Path("runs") / f"torchrl-ppo-{track}-{args.seed}"
     card = {
         "algorithm": "ppo",
         "steps": steps,

@@ -26,6 +26,9 @@ WEIGHTS = "policy.safetensors"
 CARD = "policy.json"
 FORMAT = 3
 
+#: File beside them in the folder of a training, which says what the run was made from.
+CONFIG = "config.json"
+
 #: No file of a policy is larger [bytes].
 _LARGEST = 2**30
 

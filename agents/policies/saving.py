@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.learned import ACTIVATIONS, CARD, FORMAT, WEIGHTS, LearnedPolicy, Network
+from agents.policies.learned import ACTIVATIONS, CARD, CONFIG, FORMAT, WEIGHTS, LearnedPolicy, Network
+from agents.results import check_folder
 from estimator.checks import shown
 from estimator.files import file_name, write_atomically
 
@@ -37,7 +38,7 @@ def save_policy(
     ``VecNormalize.load("vecnormalize.pkl", env)`` if it was trained with one.
 
     Args:
-        folder: made where it is missing.
+        folder: made where it is missing. A policy that is there is replaced; a training run is not.
         model: PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, TQC or RecurrentPPO of sb3-contrib, with a network of
             linear layers. Of those that learn from a buffer only the actor is written; the others are written whole.
             Or, of whatever was trained elsewhere, the ``torch.nn.Sequential`` that gives the mean of the action: linear
@@ -48,11 +49,40 @@ def save_policy(
             network of torch sees at most; None where it sees them as they are.
 
     Raises:
-        ValueError: for a model that `LearnedPolicy` could not play as it is; nothing is written then.
+        ValueError: for a folder that `check_policy_folder` refuses, or a model that `LearnedPolicy` could not play as
+            it is; nothing is written then.
+        NotADirectoryError: where the folder is a file.
     """
+    write_policy(check_policy_folder("folder", folder), model, card, normalizer)
+
+
+def check_policy_folder(name: str, folder: str | Path) -> Path:
+    """The folder for a policy, before the work begins.
+
+    Args:
+        name: of the argument.
+        folder: that it names.
+
+    Raises:
+        ValueError: for what is no path, or the folder of a training run, whose policy is that of its log.
+        NotADirectoryError: where it is a file.
+    """
+    place = file_name(name, folder)
+    check_folder(name, place)
+    if (place / CONFIG).exists():
+        raise ValueError(f"{name} must be a folder for a policy, but {place} holds a run; remove it or name another")
+    return place
+
+
+def write_policy(
+    folder: Path,
+    model: BaseAlgorithm | Module,
+    card: dict[str, Any] | None = None,
+    normalizer: Normalizer | None = None,
+) -> None:
+    """As `save_policy`, and also into the folder of a run, by the training itself."""
     from torch.nn import Module
 
-    folder = file_name("folder", folder)
     if isinstance(model, Module):
         _write(folder, *_network_alone(model, normalizer), card or {})
         return

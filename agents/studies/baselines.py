@@ -47,9 +47,10 @@ def main(config: Config) -> None:
     from sb3_contrib import TQC
     from stable_baselines3 import PPO, SAC
 
-    from agents.policies.saving import save_policy
+    from agents.policies.saving import check_policy_folder, save_policy
     from agents.results import versions
 
+    check_policy_folder("folder", config.folder)
     torch.set_num_threads(1)
     algorithm = {"ppo": PPO, "sac": SAC, "tqc": TQC}[config.algo]
     model = algorithm("MlpPolicy", gym.make(config.env), seed=config.seed, device="cpu").learn(config.steps)

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.policies.learned import WEIGHTS
-from agents.policies.saving import save_policy
+from agents.policies.saving import write_policy
 from estimator.files import whole_file, write_atomically
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def save_checkpoint(run: Path, model: BaseAlgorithm, card: dict[str, Any], progr
     half_written = Path(tempfile.mkdtemp(dir=run, prefix=_HALF_WRITTEN))
     try:
         half_written.chmod(0o755)
-        save_policy(half_written, model, card)
+        write_policy(half_written, model, card)
         if progress is not None:
             _save_state(half_written, model, progress)
         shutil.rmtree(target, ignore_errors=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.cli import RIG_TRACK, JsonOptions, check_track, full_id, with_rig
+from agents.policies.learned import CONFIG
 from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
 from agents.training.family import FAMILY
@@ -20,9 +21,6 @@ from estimator.lanes import LANES
 
 #: Rewards that count information.
 IN_NATS = ("information_gain", "log_posterior", "fisher", "expected_free_energy")
-
-#: File of a run folder that says what the run was made from.
-CONFIG = "config.json"
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.evaluation.rollout import roll_out
 from agents.policies.learned import CARD
-from agents.policies.saving import save_policy
+from agents.policies.saving import write_policy
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class HeldOut:
             `METRICS`.
         """
         with tempfile.TemporaryDirectory() as candidate:
-            save_policy(Path(candidate), model, card)
+            write_policy(Path(candidate), model, card)
             options = self._config.options | {"branch": "validation"}
             evaluation, *_ = roll_out(candidate, self._config.env, _SYSTEMS, _SEED, options)
         found = {name: float(evaluation.metrics[name].mean()) for name in METRICS}
@@ -90,5 +90,5 @@ class HeldOut:
         if found[SCORE] > self._best:
             self._best = found[SCORE]
             judged = card | {"evaluation": {"seed": _SEED, "systems": _SYSTEMS, **found}}
-            save_policy(self._folder / BEST, model, judged)
+            write_policy(self._folder / BEST, model, judged)
         return found

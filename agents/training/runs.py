@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.policies.learned import CARD
-from agents.policies.saving import save_policy
+from agents.policies.learned import CARD, CONFIG
+from agents.policies.saving import write_policy
 from agents.results import write_json
 from agents.running.stopping import Stopper, telling
 from agents.training import family
@@ -29,7 +29,7 @@ from agents.training.checkpoints import (
     restore,
     save_checkpoint,
 )
-from agents.training.config import CONFIG, IN_NATS, TrainConfig, contrib, describe, read_config
+from agents.training.config import IN_NATS, TrainConfig, contrib, describe, read_config
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import track_of
 from estimator.extras import need
@@ -182,7 +182,7 @@ class _Training:
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
         if not all(math.isnan(mean) for *_, mean in curve):
             save(figure_of_learning(curve, self._config.reward), self._folder / LEARNING)
-        save_policy(self._folder, self._model, self._card())
+        write_policy(self._folder, self._model, self._card())
         drop_states(self._folder)
         self._envs.close()
         return Run(self._config, self._folder, curve, self._seconds())

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from agents.policies.learned import CONFIG
 from agents.training.cluster import spread
-from agents.training.config import CONFIG, TrainConfig, claim, read_config
+from agents.training.config import TrainConfig, claim, read_config
 from agents.training.hyperparameters import track_of
 from agents.training.runs import carry_on
 from estimator.extras import need

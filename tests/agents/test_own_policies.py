@@ -11,6 +11,8 @@ from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNorm
 from agents import make_policy, save_policy
 from agents.evaluation.rollout import evaluate
 from agents.studies import baselines
+from agents.training import TrainConfig, train
+from agents.training.algorithms import PPOSettings
 from agents.vec_env import DuffingVecEnv
 
 FEATURES = 22
@@ -219,6 +221,27 @@ def test_a_network_alone_that_could_not_be_played_is_refused(tmp_path, model, me
     with pytest.raises(ValueError, match=message):
         save_policy(tmp_path / "new", model)
     assert not (tmp_path / "new").exists()
+
+
+def everything(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_run_is_not_replaced_and_a_policy_is(tmp_path):
+    tiny = PPOSettings(num_envs=4, n_steps=8, batch_size=32, hidden=(4,))
+    run = train(TrainConfig(env="Short-v0", steps=32, hyperparameters=tiny, output=tmp_path / "run", checkpoints=1))
+    before = everything(run.folder)
+    with pytest.raises(ValueError, match=r"folder must be a folder for a policy, but .*run holds a run; remove it or"):
+        save_policy(run.folder, sequence())
+    assert everything(run.folder) == before
+    (run.folder / "policy.json").unlink()  # as a training that was stopped leaves it
+    with pytest.raises(ValueError, match="holds a run"):
+        save_policy(run.folder, sequence())
+    with pytest.raises(NotADirectoryError, match=r"folder must be a folder, but .*config.json is a file"):
+        save_policy(run.folder / "config.json", sequence())
+    for steps in (1, 2):
+        save_policy(tmp_path / "mine", sequence(), {"steps": steps})
+        assert make_policy(tmp_path / "mine").card["steps"] == steps
 
 
 def test_a_normaliser_beside_an_algorithm_is_refused(tmp_path):
