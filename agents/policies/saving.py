@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,8 +16,8 @@ import numpy.typing as npt
 
 from agents.policies.learned import ACTIVATIONS, CARD, CONFIG, FORMAT, WEIGHTS, LearnedPolicy, Network
 from agents.results import check_folder
-from estimator.checks import shown
-from estimator.files import file_name, write_atomically
+from estimator.checks import mapping, shown
+from estimator.files import file_name, write_atomically, writing
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -30,7 +33,7 @@ def save_policy(
     card: dict[str, Any] | None = None,
     normalizer: Normalizer | None = None,
 ) -> None:
-    """Write a trained policy into a folder, each file in one piece; `make_policy` plays it, without torch.
+    """Write a trained policy into a folder, all of it or nothing; `make_policy` plays it, without torch.
 
     The observations' normaliser goes with it, where the model's environment is a `VecNormalize`. An archive of
     Stable-Baselines3 holds pickles, which can run any code when they are opened. So it is never opened here. Whoever
@@ -44,13 +47,13 @@ def save_policy(
             Or, of whatever was trained elsewhere, the ``torch.nn.Sequential`` that gives the mean of the action: linear
             layers with tanh, ReLU or ELU between them, and perhaps a tanh at the end.
         card: what it was trained on: algorithm, track, options, seed, steps, versions; its algorithm and steps where
-            it is None.
+            it is None. JSON must be able to hold it.
         normalizer: mean and standard deviation (features,) of the observations, and how many standard deviations a
             network of torch sees at most; None where it sees them as they are.
 
     Raises:
         ValueError: for a folder that `check_policy_folder` refuses, or a model that `LearnedPolicy` could not play as
-            it is; nothing is written then.
+            it is, or a card that JSON cannot hold; nothing is written then.
         NotADirectoryError: where the folder is a file.
     """
     write_policy(check_policy_folder("folder", folder), model, card, normalizer)
@@ -109,12 +112,36 @@ def write_policy(
 
 
 def _write(folder: Path, network: Network, tensors: dict[str, Any], card: dict[str, Any]) -> None:
+    """Write both files, or nothing: what is there is gone only when all of the new is."""
     from safetensors.numpy import save
 
+    _check_card(card)
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / WEIGHTS, save(tensors))
-    described = {"format": FORMAT, "network": asdict(network), **card}
-    write_atomically(folder / CARD, json.dumps(described, indent=2).encode())
+    with writing(folder):
+        half_written = Path(tempfile.mkdtemp(dir=folder, prefix=f".{WEIGHTS}."))
+    try:
+        write_atomically(half_written / WEIGHTS, save(tensors))
+        described = {"format": FORMAT, "network": asdict(network), **card}
+        write_atomically(half_written / CARD, json.dumps(described, indent=2))
+        # Weights without a card are no policy, so none is ever read with the card of another.
+        (folder / CARD).unlink(missing_ok=True)
+        for name in (WEIGHTS, CARD):
+            os.replace(half_written / name, folder / name)
+    finally:
+        shutil.rmtree(half_written, ignore_errors=True)
+
+
+def _check_card(card: dict[str, Any]) -> None:
+    """Refuse a card that JSON cannot hold."""
+    mapping("card", card)
+    for key, value in card.items():
+        try:
+            json.dumps(value)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(
+                f"card[{key!r}] must be what JSON can hold, but is {shown(value)}: {error}; "
+                "pass e.g. float(...) or str(...)"
+            ) from error
 
 
 def _network_alone(model: Module, normalizer: Normalizer | None) -> tuple[Network, dict[str, Any]]:

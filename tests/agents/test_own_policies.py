@@ -1,5 +1,6 @@
 """Policies of a user's own: made from instances, classes, functions and models, and evaluated as any other."""
 
+import os
 import sys
 
 import numpy as np
@@ -242,6 +243,47 @@ def test_a_run_is_not_replaced_and_a_policy_is(tmp_path):
     for steps in (1, 2):
         save_policy(tmp_path / "mine", sequence(), {"steps": steps})
         assert make_policy(tmp_path / "mine").card["steps"] == steps
+
+
+@pytest.mark.parametrize(
+    ("card", "message"),
+    [
+        (
+            {"steps": 2, "loss": np.float32(0.1)},
+            r"card\['loss'\] must be what JSON can hold, but is .*0.1.*; pass e.g.",
+        ),
+        ({"config": {"output": object}}, r"card\['config'\] must be what JSON can hold, but is {'output'"),
+        ({3: 2}, "card must be a dictionary from names to values, but is {3: 2}"),
+        ([3], r"card must be a dictionary from names to values, but is \[3\]"),
+    ],
+)
+def test_a_card_that_cannot_be_written_is_refused_and_leaves_what_was_there(tmp_path, card, message):
+    save_policy(tmp_path, sequence(), {"steps": 1})
+    before = everything(tmp_path)
+    for folder in (tmp_path, tmp_path / "new"):
+        with pytest.raises(ValueError, match=message):
+            save_policy(folder, sequence(torch.nn.Tanh), card)
+    assert everything(tmp_path) == before
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("failing", [1, 2, 3, 4])
+def test_a_policy_that_is_half_written_is_no_policy(tmp_path, monkeypatch, failing):
+    """Each file is renamed once beside the policy, and once into its place."""
+    save_policy(tmp_path, sequence(), {"steps": 1})
+    before, replace, calls = everything(tmp_path), os.replace, []
+
+    def fails(source, target):
+        calls.append(target)
+        if len(calls) == failing:
+            raise OSError(28, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", fails)
+    with pytest.raises(OSError, match="No space left"):
+        save_policy(tmp_path, sequence(torch.nn.Tanh), {"steps": 2})
+    assert everything(tmp_path) == before if failing < 3 else not (tmp_path / "policy.json").exists()
+    assert all(path.is_file() for path in tmp_path.iterdir())
 
 
 def test_a_normaliser_beside_an_algorithm_is_refused(tmp_path):
