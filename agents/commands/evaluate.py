@@ -70,12 +70,14 @@ class Evaluate:
         )  # fmt: skip
 
     def _measure(self, protocol: str) -> None:
-        from agents.evaluation.board import CAPTION, TITLES, append, cells
+        from agents.evaluation.board import CAPTION, TITLES, append, cells, check
         from agents.evaluation.protocol import measure
         from agents.results import show, spinner, table
 
         (policy,) = self.policies
         track = full_id(protocol)
+        if self.submit is not None:
+            check(self.board)
         with spinner("Measuring") as say:
             name = policy.partition("=")[0] if self.submit is None else self.submit
             entry = measure(policy, track, name, self.samples, say)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 from agents.evaluation.leaderboard import METRICS, Metric, center_of
 from agents.evaluation.oracle import FOLDER
 from agents.evaluation.protocol import SCORE, TRACKS, VERSION, digest
-from agents.results import finite
+from agents.results import check_file, check_folder, finite
 from estimator.checks import printable
 from estimator.files import append_atomically, whole_file, write_atomically
 
@@ -30,14 +31,35 @@ TITLES = (
 )  # fmt: skip
 
 
+def check(path: Path) -> list[dict[str, Any]]:
+    """The entries of a board that is to be added to, before the work begins; none where it is still to be made.
+
+    Raises:
+        ValueError: as `read`.
+        OSError: for a folder, or a file where its folder is to be.
+    """
+    check_folder("folder of board", path.parent)
+    check_file("board", path)
+    return read(path) if path.exists() else []
+
+
 def append(path: Path, entry: dict[str, Any]) -> None:
-    """Add an entry, in one piece.
+    """Add an entry, in one piece, on a line of its own: an editor may have left the last one without its end.
 
     Raises:
         OSError: where it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    append_atomically(path, json.dumps(finite(entry), ensure_ascii=False, allow_nan=False) + "\n")
+    line = json.dumps(finite(entry), ensure_ascii=False, allow_nan=False) + "\n"
+    append_atomically(path, line if _ends_a_line(path) else "\n" + line)
+
+
+def _ends_a_line(path: Path) -> bool:
+    if not path.exists() or not path.stat().st_size:
+        return True
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        return file.read() == b"\n"
 
 
 def read(path: Path) -> list[dict[str, Any]]:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from agents.evaluation.board import SHIPPED
 from agents.policies.learned import CARD, WEIGHTS
 from agents.running.simulated import SimulatedPlant
 from agents.training.checkpoints import STATE
@@ -170,7 +171,8 @@ class Submit(Case):
     def prepare(self, folder: Path) -> None:
         """With an entry of before."""
         super().prepare(folder)
-        (folder / self._board).write_text('{"name": "of before"}\n')
+        entry = json.loads(SHIPPED.read_text().splitlines()[0])
+        (folder / self._board).write_text(json.dumps(entry | {"name": "of before"}) + "\n")
 
     def start(self, folder: Path) -> list[str]:
         """A signal."""

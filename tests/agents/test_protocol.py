@@ -140,6 +140,34 @@ def test_a_broken_board_is_told(tmp_path, entry, line):
         board.read(path)
 
 
+def test_an_entry_begins_a_line(tmp_path, entry):
+    path = tmp_path / "board.jsonl"
+    path.write_text(json.dumps(entry))  # as some editors leave it
+    board.append(path, entry | {"name": "other"})
+    board.append(path, entry | {"name": "third"})
+    assert [found["name"] for found in board.read(path)] == ["noise", "other", "third"]
+    assert path.read_text().count("\n") == 3
+
+
+def test_a_board_is_looked_at_before_the_measurement(command, monkeypatch, tmp_path, entry):
+    def measure(*arguments):
+        raise AssertionError("it is refused before")
+
+    monkeypatch.setattr(protocol, "measure", measure)
+    words = ("evaluate", "--protocol", "Short-v0", "--policies", "prbs", "--submit", "mine", "--board")
+    (tmp_path / "broken.jsonl").write_text(json.dumps(entry) + "\n" + json.dumps(entry)[:200])
+    before = (tmp_path / "broken.jsonl").read_bytes()
+    for path, message in {
+        "broken.jsonl": "board must hold an entry a line, but broken.jsonl:2 is not one",
+        "broken.jsonl/mine.jsonl": "folder of board must be a folder, but broken.jsonl is a file; name another place",
+        str(tmp_path): "board must be a file, but is the folder",
+    }.items():
+        status, _, messages = command(*words, path)
+        assert status == 2
+        assert message in messages
+    assert (tmp_path / "broken.jsonl").read_bytes() == before
+
+
 def _append(path, entry, name):
     for k in range(50):
         board.append(path, entry | {"name": f"{name}-{k}"})
