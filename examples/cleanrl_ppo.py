@@ -1,7 +1,7 @@
 """PPO in one file, as CleanRL's ``ppo_continuous_action.py`` has it: its loop, its defaults, plain torch.
 
 $ python examples/cleanrl_ppo.py --seed 0
-$ duffing-env evaluate --protocol Short-v0 --policies "cleanrl-ppo=runs/cleanrl-ppo-short-v0-*" --submit cleanrl-ppo
+$ duffing-env evaluate --protocol Short-v0 --policies "mine=runs/cleanrl-ppo-short-v0-*" --submit mine
 
 Ours are the environment, by its id, and the policy folder at the end. Needs the extra ``train``.
 """

@@ -3,7 +3,7 @@
 Only the environments that a runner steps at once are eight instead of one, which samples four times as fast.
 
 $ python examples/rllib_ppo.py --seed 0
-$ duffing-env evaluate --protocol Short-v0 --policies "rllib-ppo=runs/rllib-ppo-short-v0-*" --submit rllib-ppo
+$ duffing-env evaluate --protocol Short-v0 --policies "mine=runs/rllib-ppo-short-v0-*" --submit mine
 
 Needs ``ray[rllib]``; benchmarks/compat.lock has the versions that this runs with.
 """

@@ -1,7 +1,7 @@
 """PPO of TorchRL's parts on our vector environment, with the hyperparameters that TorchRL's example for MuJoCo has.
 
 $ python examples/torchrl_ppo.py --seed 0
-$ duffing-env evaluate --protocol Short-v0 --policies "torchrl-ppo=runs/torchrl-ppo-short-v0-*" --submit torchrl-ppo
+$ duffing-env evaluate --protocol Short-v0 --policies "mine=runs/torchrl-ppo-short-v0-*" --submit mine
 
 Needs ``torchrl``; benchmarks/compat.lock has the versions that this runs with.
 """

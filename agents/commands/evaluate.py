@@ -76,8 +76,7 @@ class Evaluate:
 
         (policy,) = self.policies
         track = full_id(protocol)
-        if self.submit is not None:
-            check(self.board)
+        before = set() if self.submit is None else check(self.board, self.submit)
         with spinner("Measuring") as say:
             name = policy.partition("=")[0] if self.submit is None else self.submit
             entry = measure(policy, track, name, self.samples, say)
@@ -85,3 +84,5 @@ class Evaluate:
         if self.submit is not None:
             append(self.board, entry)
             print(f"{self.submit} is on the board {self.board}: duffing-env report")
+            if track in before:
+                print(f"The board had {self.submit} on {track} before; the report shows the latest entry of a name.")

@@ -31,16 +31,20 @@ TITLES = (
 )  # fmt: skip
 
 
-def check(path: Path) -> list[dict[str, Any]]:
-    """The entries of a board that is to be added to, before the work begins; none where it is still to be made.
+def check(path: Path, name: str) -> set[str]:
+    """The tracks that a board, which is to be added to, has this name on already, before the work begins.
 
     Raises:
-        ValueError: as `read`.
+        ValueError: as `read`; or for a name of the board that ships, whose entry a report would show no longer.
         OSError: for a folder, or a file where its folder is to be.
     """
     check_folder("folder of board", path.parent)
     check_file("board", path)
-    return read(path) if path.exists() else []
+    if path.resolve() != SHIPPED.resolve() and name.strip() in {entry["name"] for entry in read(SHIPPED)}:
+        raise ValueError(
+            f"submit must be a name of your own, but is {name}, which the board that ships has; name another"
+        )
+    return {str(entry["track"]) for entry in read(path) if entry["name"] == name} if path.exists() else set()
 
 
 def append(path: Path, entry: dict[str, Any]) -> None:

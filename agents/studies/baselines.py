@@ -1,7 +1,7 @@
 """Stable-Baselines3's algorithms as they come: their own hyperparameters, one environment, only the track is ours.
 
 $ python -m agents.studies.baselines --algo ppo --seed 0
-$ duffing-env evaluate --protocol Short-v0 --policies "sb3-ppo=runs/sb3-ppo-short-v0-*" --submit sb3-ppo
+$ duffing-env evaluate --protocol Short-v0 --policies "mine=runs/sb3-ppo-short-v0-*" --submit mine
 
 A run on one core takes minutes with PPO, and hours with SAC and TQC, which take a gradient step with every sample.
 """

@@ -176,7 +176,7 @@ class Submit(Case):
 
     def start(self, folder: Path) -> list[str]:
         """A signal."""
-        words = ["evaluate", "--protocol", "Short-v0", "--policies", "prbs", "--submit", "prbs"]
+        words = ["evaluate", "--protocol", "Short-v0", "--policies", "prbs", "--submit", "mine"]
         return [*words, "--board", self._board]
 
     def measured(self, folder: Path) -> list[Any]:

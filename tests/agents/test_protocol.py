@@ -149,6 +149,24 @@ def test_an_entry_begins_a_line(tmp_path, entry):
     assert path.read_text().count("\n") == 3
 
 
+def test_names_of_the_board_that_ships_are_taken(command, tmp_path):
+    words = ("evaluate", "--protocol", "Short-v0", "--policies", "uniform", "--submit")
+    status, _, messages = command(*words, "efe")
+    assert status == 2
+    assert "submit must be a name of your own, but is efe, which the board that ships has; name another" in messages
+    assert list(tmp_path.iterdir()) == []
+    assert board.check(board.SHIPPED, "efe") == {SHORT}
+
+
+def test_a_name_that_is_submitted_twice_is_told(tmp_path, command, entry, monkeypatch):
+    monkeypatch.setattr(protocol, "measure", lambda *arguments: entry)
+    words = ("evaluate", "--protocol", "Short-v0", "--policies", "uniform", "--submit", "noise", "--board", "b.jsonl")
+    first, second = command(*words)[1], command(*words)[1]
+    told = f"The board had noise on {SHORT} before; the report shows the latest entry of a name."
+    assert told not in first
+    assert told in second
+
+
 def test_a_board_is_looked_at_before_the_measurement(command, monkeypatch, tmp_path, entry):
     def measure(*arguments):
         raise AssertionError("it is refused before")

@@ -21,7 +21,7 @@ COMMANDS = {
     "train": f"train --env {SHORT} --steps 8192 --systems 0 --output new/run {' '.join(SMALL)}",
     "tune": f"train --env {SHORT} --steps 1024 --tune 2 --output new/search {' '.join(SMALL)}",
     "evaluate": f"evaluate --env {SHORT} --policies uniform prbs --systems 16 --output new",
-    "submit": "evaluate --protocol Short-v0 --policies prbs --submit prbs --board new/board.jsonl",
+    "submit": "evaluate --protocol Short-v0 --policies prbs --submit mine --board new/board.jsonl",
     "export": "export prbs --samples 2000000 --output new/signal.csv",
     "design": "design rig.toml --policy efe --samples 64 -o new/next.csv",
     "identify": "identify rig.toml record.csv --report new/page.html --save new/known.npz",
