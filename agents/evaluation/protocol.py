@@ -23,8 +23,9 @@ from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.rollout import Evaluation, members_of, roll_out
 from agents.loading import load_object
 from agents.policies import TRAINED, trained_policies
-from agents.policies.learned import CARD, WEIGHTS
+from agents.policies.learned import CARD, MOST_STEPS, WEIGHTS
 from agents.results import versions
+from estimator.checks import whole
 from estimator.parameters import FloatArray
 
 #: Of the protocol: entries of another version do not compare.
@@ -90,12 +91,14 @@ def measure(
         on_step: told what is measured next.
 
     Raises:
-        ValueError: for another track, a missing name, or something that is not a policy.
+        ValueError: for another track, a missing name, samples that are no number of them, or something that is not a
+            policy.
     """
     if track not in TRACKS:
         raise ValueError(f"protocol must be one of {', '.join(TRACKS)}, but is {track}; others have no oracle")
     if not name.strip():
         raise ValueError("submit must be a name, but is empty; it is what the board shows")
+    whole("samples", 0 if samples is None else samples, MOST_STEPS, 0)
     _, members = members_of(policy)
     samples = max((_samples_of(member) or samples or 0 for member in members), default=0)
     budget = _budget(samples)
@@ -170,7 +173,11 @@ def _folder_of(policy: str) -> Path | None:
 def _samples_of(policy: str) -> int | None:
     """Samples that a trained policy learned from, by its card."""
     folder = _folder_of(policy)
-    return None if folder is None else int(json.loads((folder / CARD).read_text()).get("steps", 0))
+    if folder is None:
+        return None
+    steps = json.loads((folder / CARD).read_text()).get("steps", 0)
+    whole(f"steps of {folder / CARD}", steps, MOST_STEPS, 0)
+    return int(steps)
 
 
 def fingerprint(policy: str) -> str:

@@ -29,6 +29,9 @@ FORMAT = 3
 #: File beside them in the folder of a training, which says what the run was made from.
 CONFIG = "config.json"
 
+#: No policy learns from more samples.
+MOST_STEPS = 10**15
+
 #: No file of a policy is larger [bytes].
 _LARGEST = 2**30
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.learned import ACTIVATIONS, CARD, CONFIG, FORMAT, WEIGHTS, LearnedPolicy, Network
+from agents.policies.learned import ACTIVATIONS, CARD, CONFIG, FORMAT, MOST_STEPS, WEIGHTS, LearnedPolicy, Network
 from agents.results import check_folder
-from estimator.checks import mapping, shown
+from estimator.checks import mapping, shown, whole
 from estimator.files import file_name, write_atomically, writing
 
 if TYPE_CHECKING:
@@ -132,8 +132,9 @@ def _write(folder: Path, network: Network, tensors: dict[str, Any], card: dict[s
 
 
 def _check_card(card: dict[str, Any]) -> None:
-    """Refuse a card that JSON cannot hold."""
+    """Refuse a card that JSON cannot hold, or whose steps are no number of samples, which the protocol reads."""
     mapping("card", card)
+    whole("card['steps']", card.get("steps", 0), MOST_STEPS, 0)
     for key, value in card.items():
         try:
             json.dumps(value)

@@ -253,6 +253,8 @@ def test_a_run_is_not_replaced_and_a_policy_is(tmp_path):
             r"card\['loss'\] must be what JSON can hold, but is .*0.1.*; pass e.g.",
         ),
         ({"config": {"output": object}}, r"card\['config'\] must be what JSON can hold, but is {'output'"),
+        ({"steps": -5}, r"card\['steps'\] must be a whole number from 0 to 1000000000000000, but is -5"),
+        ({"steps": "many"}, r"card\['steps'\] must be a whole number from 0 to 1000000000000000, but is 'many'"),
         ({3: 2}, "card must be a dictionary from names to values, but is {3: 2}"),
         ([3], r"card must be a dictionary from names to values, but is \[3\]"),
     ],

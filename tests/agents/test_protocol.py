@@ -111,6 +111,10 @@ def test_budgets(samples, budget):
         (("--protocol", "Drift-v0", "--policies", "prbs"), "protocol must be one of duffing_env/Short-v0"),
         (("--protocol", "Short-v0", "--policies", "prbs", "--submit", " "), "submit must be a name"),
         (("--protocol", "Short-v0", "--policies", "prbz"), "did you mean 'prbs'"),
+        (
+            ("--protocol", "Short-v0", "--policies", "prbs", "--samples", "-5"),
+            "samples must be a whole number from 0 to",
+        ),
     ],
 )
 def test_what_is_no_submission_is_refused(command, words, message, tmp_path):
@@ -118,6 +122,13 @@ def test_what_is_no_submission_is_refused(command, words, message, tmp_path):
     assert status == 2
     assert message in messages
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("steps", [-5, "many", 1.5, None])
+def test_steps_of_a_card_that_are_no_number_of_samples_are_refused(tmp_path, steps):
+    (tmp_path / "policy.json").write_text(json.dumps({"steps": steps}))
+    with pytest.raises(ValueError, match=r"steps of .*policy.json must be a whole number from 0 to .*, but is"):
+        protocol.measure(str(tmp_path), SHORT, "mine")
 
 
 def test_the_latest_entry_of_a_name_counts(tmp_path, entry):
