@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from agents.cli import RIG_TRACK, JsonOptions, check_track, full_id, with_rig
+
+#: What goes with a protocol.
+_CHOSEN = ("policies", "protocol", "submit", "samples", "board")
 
 
 @dataclass(frozen=True)
@@ -24,8 +27,8 @@ class Evaluate:
 
     policies: tuple[str, ...] = ()
     """Names, run folders, module:name, TITLE=PATTERN for folders of seeds; what ships and the planner if none."""
-    env: str = "duffing_env/Amplitude-v0"
-    """Track, such as Short-v0."""
+    env: str | None = None
+    """Track, such as Short-v0; Amplitude-v0 where it is not given."""
     rig: str | None = None
     """Rig file; the track is then Rig-v0."""
     options: JsonOptions = field(default_factory=dict)
@@ -48,12 +51,23 @@ class Evaluate:
     """File of the board."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "env", RIG_TRACK if self.rig is not None else full_id(self.env))
-        check_track(self.env)
+        check_track(self._track)
         if self.protocol is not None and len(self.policies) != 1:
             raise ValueError(f"policies must name one for the protocol, but are {list(self.policies)}; name one")
         if self.protocol is None and self.submit is not None:
             raise ValueError("submit goes with a protocol, but that is None; add e.g. --protocol Short-v0")
+
+    @property
+    def _track(self) -> str:
+        return RIG_TRACK if self.rig is not None else full_id("Amplitude-v0" if self.env is None else self.env)
+
+    def _check_protocol(self, track: str) -> None:
+        """Refuse what contradicts the protocol, and would not count."""
+        same = replace(self, env=None) if full_id(self.env) == track else self
+        usual = asdict(Evaluate())
+        for name, value in asdict(same).items():
+            if name not in _CHOSEN and value != usual[name]:
+                raise ValueError(f"protocol fixes all but the policy, but {name} is {value}; leave it out")
 
     def run(self) -> None:
         """Compare or measure, and say where everything is."""
@@ -65,7 +79,7 @@ class Evaluate:
         options = with_rig(self.options, self.rig)
         folder = self.report if self.report is not None else self.output
         compare(
-            self.policies or usual_policies(self.env, options), self.env, self.systems, options, folder,
+            self.policies or usual_policies(self._track, options), self._track, self.systems, options, folder,
             seed=self.seed, report=self.report is not None,
         )  # fmt: skip
 
@@ -76,6 +90,7 @@ class Evaluate:
 
         (policy,) = self.policies
         track = full_id(protocol)
+        self._check_protocol(track)
         before = set() if self.submit is None else check(self.board, self.submit)
         with spinner("Measuring") as say:
             name = policy.partition("=")[0] if self.submit is None else self.submit

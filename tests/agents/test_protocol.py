@@ -13,6 +13,7 @@ from agents.evaluation import board, protocol
 from agents.evaluation.oracle import Oracle, Systems
 
 SHORT = "duffing_env/Short-v0"
+PRBS = ("--protocol", "Short-v0", "--policies", "prbs")
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +55,12 @@ def test_a_policy_of_one_s_own_reaches_the_board_with_one_command(command, tmp_p
     assert status == 0
     assert any(line.split()[:1] == ["push"] for line in told.splitlines())
     assert "<td>push</td>" in (tmp_path / "board.html").read_text()
+
+
+def test_what_the_protocol_fixes_may_be_said(command, entry, monkeypatch):
+    monkeypatch.setattr(protocol, "measure", lambda *arguments: entry)
+    said = ("--env", "Short-v0", "--systems", "256", "--seed", "0", "--options", "{}")
+    assert command("evaluate", *PRBS, *said)[0] == 0
 
 
 def test_the_score_is_against_the_bound_where_there_is_one(entry):
@@ -111,6 +118,12 @@ def test_budgets(samples, budget):
         (("--protocol", "Drift-v0", "--policies", "prbs"), "protocol must be one of duffing_env/Short-v0"),
         (("--protocol", "Short-v0", "--policies", "prbs", "--submit", " "), "submit must be a name"),
         (("--protocol", "Short-v0", "--policies", "prbz"), "did you mean 'prbs'"),
+        ((*PRBS, "--systems", "8"), "protocol fixes all but the policy, but systems is 8; leave it out"),
+        ((*PRBS, "--seed", "3"), "protocol fixes all but the policy, but seed is 3; leave it out"),
+        ((*PRBS, "--env", "Amplitude-v0"), "protocol fixes all but the policy, but env is Amplitude-v0; leave it out"),
+        ((*PRBS, "--options", '{"horizon": 6}'), "but options is {'horizon': 6}; leave it out"),
+        ((*PRBS, "--rig", "beam"), "but rig is beam; leave it out"),
+        ((*PRBS, "--report", "out"), "but report is out; leave it out"),
         (
             ("--protocol", "Short-v0", "--policies", "prbs", "--samples", "-5"),
             "samples must be a whole number from 0 to",
