@@ -101,6 +101,8 @@ class TrainConfig(Subject):
                 f"hyperparameters must be {ALGORITHMS[self.algo].__name__} for {self.algo}, "
                 f"but are {type(self.hyperparameters).__name__}"
             )
+        if self.hyperparameters.foresight and self.env != FAMILY:
+            _check_seen(self)
         if self.vary:
             object.__setattr__(self, "vary", _ranges(self))
         if (first := getattr(self.hyperparameters, "learning_starts", 0)) >= self.steps:
@@ -114,6 +116,18 @@ class TrainConfig(Subject):
         """Samples that are learned from: ``steps``, up to a whole number of updates."""
         each = self.hyperparameters.samples_per_update
         return -(-self.steps // each) * each
+
+
+def _check_seen(config: TrainConfig) -> None:
+    """Refuse an observation that a foresight cannot look out from."""
+    import gymnasium as gym
+
+    shown_there = {**gym.spec(config.env).kwargs, **config.options}.get("observation", "posterior")
+    if shown_there != "posterior":
+        raise ValueError(
+            f"observation must be 'posterior' with foresight, but is {shown(shown_there)}; "
+            f"add --{config.algo.replace('_', '-')}.no-foresight"
+        )
 
 
 def _ranges(config: TrainConfig) -> dict[str, list[float]]:

@@ -231,6 +231,16 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch):
     assert json.loads((folders[0] / "config.json").read_text())["config"]["output"] is None
 
 
+@pytest.mark.parametrize("seen", ["history", "privileged"])
+def test_another_observation_than_the_posterior_has_no_foresight(tmp_path, seen):
+    with pytest.raises(
+        ValueError, match=f"observation must be 'posterior' with foresight, but is '{seen}'; add --ppo.no-foresight"
+    ):
+        TrainConfig(env="Short-v0", options={"observation": seen})
+    run = tiny(tmp_path / "run", env="Short-v0", options={"observation": seen})
+    assert (run.folder / "policy.json").exists()
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
