@@ -25,10 +25,12 @@ SIGNALS = ("prbs", "uniform")
 def usual_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
     """What is compared on a track where nothing else is asked for: what ships for it, the planner, and two signals.
 
-    A record can be asked for its own input only.
+    A record can be asked for its own input only; and all but the signals look at the posterior.
     """
     if gym.spec(env_id).kwargs.get("regime") is not None:
         return (f"silverbox-{options.get('regime', 'multisine')}",)
+    if options.get("observation", "posterior") != "posterior":
+        return SIGNALS
     shipped = [name for name in trained_policies() if load_policy(TRAINED / name).card["track"] == env_id]
     # The planner decides sample by sample.
     planner = ["efe"] if options.get("hold", 1) == 1 else []

@@ -228,8 +228,7 @@ def roll_out(
     hold = envs.experiment.hold
     if hold > 1:  # applied sample by sample instead, which is the same, so that every sample is seen
         envs = make(env_id, systems, {**options, "hold": 1})
-    entries = list(observation_bounds(envs.experiment.model))
-    sensors, last_input = envs.experiment.model.n_outputs, entries.index("last_input")
+    sensors, last_input = envs.experiment.model.n_outputs, _place_of_input(envs.experiment)
     last_outputs = slice(last_input + 1, last_input + 1 + sensors)
     first = parameter_names(envs.experiment.truth_model)[0]
     observations, _ = envs.reset(seed=seed)
@@ -288,6 +287,18 @@ def roll_out(
     }
     seen = outputs[..., 0] if sensors == 1 else outputs
     return Evaluation(title_of(name), values, curve, inputs, seen, prior.scales), beliefs, truth, envs.experiment
+
+
+def _place_of_input(experiment: Experiment) -> int:
+    """Where an observation has the last input, which the last outputs follow."""
+    if experiment.observation == "history":
+        return (experiment.history - 1) * (1 + experiment.model.n_outputs)
+    if callable(experiment.observation):
+        raise ValueError(
+            "observation must not be a function where policies are compared, which need the last input and outputs; "
+            "take 'posterior', 'history' or 'privileged'"
+        )
+    return list(observation_bounds(experiment.model)).index("last_input")
 
 
 def _check_predict(policy: Any, name: Any) -> None:

@@ -536,3 +536,17 @@ def test_a_file_in_place_of_the_folder_is_found_before_the_work(tmp_path):
     with pytest.raises(NotADirectoryError, match=r"output must be a folder, but .*file is a file; name another place"):
         compare(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "file" / "below")
     assert (tmp_path / "file").read_text() == "kept"
+
+
+@pytest.mark.parametrize("shown", [{"observation": "history"}, {"observation": "history", "history": 1}])
+def test_what_is_shown_changes_nothing_of_what_is_measured(shown):
+    usual, other = (evaluate(["uniform"], TRACK, 3, SEED, {"horizon": 12} | options)[0] for options in ({}, shown))
+    np.testing.assert_array_equal(other.inputs, usual.inputs)
+    np.testing.assert_array_equal(other.outputs, usual.outputs)
+    np.testing.assert_array_equal(other.metrics["fisher_gain"], usual.metrics["fisher_gain"])
+
+
+def test_a_function_as_an_observation_is_not_compared_on():
+    options = {"horizon": 12, "observation": lambda beliefs: beliefs.coefficients_mean}
+    with pytest.raises(ValueError, match="observation must not be a function where policies are compared"):
+        evaluate(["uniform"], TRACK, 3, SEED, options)
