@@ -124,16 +124,24 @@ class LearnedPolicy:
         if network.normalised:
             mean, std = (_tensor(tensors, f"normalizer.{part}", self._features) for part in ("mean", "std"))
             self._normalizer = mean, std, float(network.normalised)
+        self._shown = "posterior" if network.foresight else _learned_from(card)
         self._rng = np.random.default_rng(seed)
 
     def move_to(self, env: Any) -> None:
         """Let a foresight look out in this unwrapped environment, instead of that which it was trained in.
 
         Raises:
-            ValueError: for a policy with foresight and an environment that is not one of duffing_env, or is of another
-                model than a policy was trained on that sees its observations too; for one whose actions are no longer
-                known.
+            ValueError: for an environment that shows another observation than the policy learned from, where its card
+                says which. Of a policy with foresight: for an environment that is not one of duffing_env, or is of
+                another model than a policy was trained on that sees its observations too; for one whose actions are no
+                longer known.
         """
+        shown = observation_of(env)
+        if None not in (self._shown, shown) and shown != self._shown:
+            raise ValueError(
+                f"env must show the observation {self._shown!r}, which the policy learned from, but shows {shown!r}; "
+                f"make it with the option observation={self._shown!r}"
+            )
         if self._is_common:
             if self.card["foresight"].get("drives"):
                 raise ValueError(
@@ -213,6 +221,19 @@ class LearnedPolicy:
             return np.clip(hidden @ weight.T + bias, -20.0, 2.0)
         assert self._spread is not None
         return self._spread
+
+
+def observation_of(env: Any) -> str | None:
+    """What an unwrapped environment shows, by its name; "own" for a function, and None for an environment of others."""
+    shown = getattr(getattr(env, "experiment", None), "observation", None)
+    return shown if shown is None or isinstance(shown, str) else "own"
+
+
+def _learned_from(card: dict[str, Any]) -> Any:
+    """The observation that a card says that its policy learned from, by itself or in the options of its run."""
+    config = card.get("config")
+    options = config.get("options") if isinstance(config, dict) else None
+    return card.get("observation", options.get("observation") if isinstance(options, dict) else None)
 
 
 def _tensor(tensors: Mapping[str, FloatArray], name: str, *shape: int | None) -> FloatArray:

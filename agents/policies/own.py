@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import Wrapper
+from gymnasium.vector import VectorWrapper
 
 from estimator.checks import numbers
 
@@ -33,6 +35,23 @@ def own_policy(made: Any, env: Any, seed: int, options: dict[str, Any]) -> Any:
     if not callable(made):
         raise ValueError(f"policy must have predict, or be a function of observations, but is {made!r:.60}")
     return _Function(made)
+
+
+def environments_of(model: Any) -> list[Any]:
+    """A model's environment, as Gymnasium's wrappers have it, from the outermost to the environment itself.
+
+    Of several that are alike the first; nothing where the model of Stable-Baselines3 holds none here.
+    """
+    held: Any = model.get_env() if hasattr(model, "get_env") else None
+    while hasattr(held, "venv"):
+        held = held.venv
+    place = getattr(held, "envs", None)
+    place = place[0] if isinstance(place, list) else place
+    found = []
+    while place is not None:
+        found.append(place)
+        place = place.env if isinstance(place, Wrapper | VectorWrapper) else None
+    return found
 
 
 class _Normalised:

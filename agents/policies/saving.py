@@ -14,7 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.learned import ACTIVATIONS, CARD, CONFIG, FORMAT, MOST_STEPS, WEIGHTS, LearnedPolicy, Network
+from agents.policies.learned import (
+    ACTIVATIONS,
+    CARD,
+    CONFIG,
+    FORMAT,
+    MOST_STEPS,
+    WEIGHTS,
+    LearnedPolicy,
+    Network,
+    observation_of,
+)
+from agents.policies.own import environments_of
 from agents.results import check_folder
 from estimator.checks import mapping, shown, whole
 from estimator.files import file_name, write_atomically, writing
@@ -47,7 +58,8 @@ def save_policy(
             Or, of whatever was trained elsewhere, the ``torch.nn.Sequential`` that gives the mean of the action: linear
             layers with tanh, ReLU or ELU between them, and perhaps a tanh at the end.
         card: what it was trained on: algorithm, track, options, seed, steps, versions; its algorithm and steps where
-            it is None. JSON must be able to hold it.
+            it is None. JSON must be able to hold it. Its ``observation`` ("posterior", "history", "privileged", or
+            "own") is that of the model's environment where it has none; an environment that shows another is refused.
         normalizer: mean and standard deviation (features,) of the observations, and how many standard deviations a
             network of torch sees at most; None where it sees them as they are.
 
@@ -94,6 +106,8 @@ def write_policy(
     if not hasattr(model, "policy"):
         raise ValueError(f"model must be an algorithm or a module of torch, but is {shown(model)}; pass one")
     card = {"algorithm": type(model).__name__.lower(), "steps": model.num_timesteps} if card is None else card
+    if held := environments_of(model):
+        card = {"observation": observation_of(held[-1])} | card
     tensors = {name: value.detach().cpu().numpy() for name, value in model.policy.state_dict().items()}
     if not hasattr(model.policy, "mlp_extractor"):
         tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}

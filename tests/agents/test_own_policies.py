@@ -3,6 +3,7 @@
 import os
 import sys
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -222,6 +223,41 @@ def test_a_network_alone_that_could_not_be_played_is_refused(tmp_path, model, me
     with pytest.raises(ValueError, match=message):
         save_policy(tmp_path / "new", model)
     assert not (tmp_path / "new").exists()
+
+
+HISTORY = {"observation": "history", "history": 10}
+
+
+@pytest.mark.parametrize("how", ["saved", "trained", "card", "config"])
+def test_a_policy_plays_the_observation_that_it_learned_from(tmp_path, how):
+    """A history of ten samples has as many entries as the posterior."""
+    mine = str(tmp_path / "mine")
+    if how == "saved":
+        model = PPO(
+            "MlpPolicy", DuffingVecEnv("duffing_env/Short-v0", 2, **HISTORY), device="cpu", n_steps=8, batch_size=16
+        )
+        save_policy(mine, model)
+    elif how == "trained":
+        tiny = PPOSettings(num_envs=4, n_steps=8, batch_size=32, hidden=(4,))
+        train(TrainConfig(env="Short-v0", steps=32, hyperparameters=tiny, output=tmp_path / "mine", options=HISTORY))
+    else:
+        card = {"observation": "history"} if how == "card" else {"config": {"options": HISTORY}}
+        save_policy(mine, sequence(), card)
+    told = (
+        r"mine: env must show the observation 'history', which the policy learned from, but shows 'posterior'; make it"
+    )
+    with pytest.raises(ValueError, match=told):
+        evaluate([mine], **SHORT)
+    (found,) = evaluate([mine], SHORT["env_id"], 4, options={"horizon": 6, **HISTORY})
+    assert np.isfinite(found.inputs).all()
+
+
+def test_a_policy_of_the_posterior_does_not_play_a_history(tmp_path):
+    save_policy(tmp_path / "mine", PPO("MlpPolicy", gym.make("duffing_env/Short-v0"), device="cpu"))
+    assert make_policy(tmp_path / "mine").card["observation"] == "posterior"
+    for name in (str(tmp_path / "mine"), "ppo/short"):
+        with pytest.raises(ValueError, match="must show the observation 'posterior', which the policy learned from"):
+            evaluate([name], SHORT["env_id"], 4, options=HISTORY)
 
 
 def everything(folder):
