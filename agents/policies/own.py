@@ -84,7 +84,10 @@ class _Function:
         else:
             like = next(self._function.parameters(), self._torch.zeros(()))
             with self._torch.no_grad():
-                chosen = self._function(self._torch.as_tensor(rows, dtype=like.dtype, device=like.device))
+                try:
+                    chosen = self._function(self._torch.as_tensor(rows, dtype=like.dtype, device=like.device))
+                except RuntimeError as error:
+                    raise ValueError(f"it must take observations of shape {rows.shape}, but says: {error}") from error
         if hasattr(chosen, "detach"):
             chosen = chosen.detach().cpu().numpy()
         actions = np.asarray(chosen, dtype=np.float32)
