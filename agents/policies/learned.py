@@ -19,7 +19,7 @@ import numpy.typing as npt
 from agents.asked import check_state, starts
 from agents.policies.foresight import CommonForesight, Foresight
 from agents.policies.imagined import FEATURES
-from estimator.checks import numbers
+from estimator.checks import number, numbers
 from estimator.files import whole_file
 
 WEIGHTS = "policy.safetensors"
@@ -84,7 +84,8 @@ class LearnedPolicy:
 
     Raises:
         KeyError: for a tensor that is missing, or an activation that is unknown.
-        ValueError: for a tensor that is not finite, or whose shape does not go with the others.
+        ValueError: for a tensor that is not finite, or whose shape does not go with the others; for a normaliser that
+            divides by what is not positive.
     """
 
     def __init__(
@@ -123,6 +124,9 @@ class LearnedPolicy:
         self._normalizer: tuple[FloatArray, FloatArray, float] | None = None
         if network.normalised:
             mean, std = (_tensor(tensors, f"normalizer.{part}", self._features) for part in ("mean", "std"))
+            number("normalised", network.normalised)
+            if std.min() <= 0:
+                raise ValueError(f"normalizer.std must be positive, but is {std.min()} somewhere; take 1 there")
             self._normalizer = mean, std, float(network.normalised)
         self._shown = "posterior" if network.foresight else _learned_from(card)
         self._rng = np.random.default_rng(seed)
@@ -241,9 +245,11 @@ def _tensor(tensors: Mapping[str, FloatArray], name: str, *shape: int | None) ->
     found = tensors[name]
     sides = zip(found.shape, shape, strict=False)
     fits = found.ndim == len(shape) and all(length > 0 and wish in (None, length) for length, wish in sides)
-    if not fits or found.dtype != np.float32 or not np.isfinite(found).all():
-        wishes = tuple("any" if wish is None else wish for wish in shape)
-        raise ValueError(f"{name} must be finite float32 of shape {wishes}, but is {found.dtype} of {found.shape}")
+    must = f"{name} must be finite float32 of shape {tuple('any' if wish is None else wish for wish in shape)}"
+    if not fits or found.dtype != np.float32:
+        raise ValueError(f"{must}, but is {found.dtype} of {found.shape}")
+    if bad := np.count_nonzero(~np.isfinite(found)):
+        raise ValueError(f"{must}, but {bad} of its {found.size} numbers are not finite; find what made them so")
     return found
 
 

@@ -27,7 +27,7 @@ from agents.policies.learned import (
 )
 from agents.policies.own import environments_of
 from agents.results import check_folder
-from estimator.checks import mapping, shown, whole
+from estimator.checks import mapping, number, numbers, shown, whole
 from estimator.files import file_name, write_atomically, writing
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def save_policy(
             it is None. JSON must be able to hold it. Its ``observation`` ("posterior", "history", "privileged", or
             "own") is that of the model's environment where it has none; an environment that shows another is refused.
         normalizer: mean and standard deviation (features,) of the observations, and how many standard deviations a
-            network of torch sees at most; None where it sees them as they are.
+            network of torch sees at most, all positive but the mean; None where it sees them as they are.
 
     Raises:
         ValueError: for a folder that `check_policy_folder` refuses, or a model that `LearnedPolicy` could not play as
@@ -98,6 +98,7 @@ def write_policy(
     """As `save_policy`, and also into the folder of a run, by the training itself."""
     from torch.nn import Module
 
+    mapping("card", {} if card is None else card)
     if isinstance(model, Module):
         _write(folder, *_network_alone(model, normalizer), card or {})
         return
@@ -106,8 +107,9 @@ def write_policy(
     if not hasattr(model, "policy"):
         raise ValueError(f"model must be an algorithm or a module of torch, but is {shown(model)}; pass one")
     card = {"algorithm": type(model).__name__.lower(), "steps": model.num_timesteps} if card is None else card
-    if held := environments_of(model):
-        card = {"observation": observation_of(held[-1])} | card
+    held = environments_of(model)
+    if held and (seen_there := observation_of(held[-1])) is not None:
+        card = {"observation": seen_there} | card
     tensors = {name: value.detach().cpu().numpy() for name, value in model.policy.state_dict().items()}
     if not hasattr(model.policy, "mlp_extractor"):
         tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
@@ -130,6 +132,10 @@ def _write(folder: Path, network: Network, tensors: dict[str, Any], card: dict[s
     from safetensors.numpy import save
 
     _check_card(card)
+    try:
+        LearnedPolicy(network, tensors, card)
+    except KeyError as error:
+        raise ValueError(f"model must have a bias in every layer, but {error} is missing; give it one") from error
     folder.mkdir(parents=True, exist_ok=True)
     with writing(folder):
         half_written = Path(tempfile.mkdtemp(dir=folder, prefix=f".{WEIGHTS}."))
@@ -147,7 +153,6 @@ def _write(folder: Path, network: Network, tensors: dict[str, Any], card: dict[s
 
 def _check_card(card: dict[str, Any]) -> None:
     """Refuse a card that JSON cannot hold, or whose steps are no number of samples, which the protocol reads."""
-    mapping("card", card)
     whole("card['steps']", card.get("steps", 0), MOST_STEPS, 0)
     for key, value in card.items():
         try:
@@ -160,7 +165,7 @@ def _check_card(card: dict[str, Any]) -> None:
 
 
 def _network_alone(model: Module, normalizer: Normalizer | None) -> tuple[Network, dict[str, Any]]:
-    """A network that is not an algorithm's, and its tensors; ValueError where `LearnedPolicy` could not play it."""
+    """A network that is not an algorithm's, and its tensors; ValueError for what has no place in a `Network`."""
     from torch.nn import Sequential
 
     model = model if isinstance(model, Sequential) else Sequential(model)
@@ -177,13 +182,15 @@ def _network_alone(model: Module, normalizer: Normalizer | None) -> tuple[Networ
     tensors = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
     network = Network(names, next(iter(between), "tanh"), squashed=squashed, spread=None)
     if normalizer is not None:
-        mean, std, most = normalizer
-        network = replace(network, normalised=float(most))
-        tensors |= {"normalizer.mean": np.asarray(mean, np.float32), "normalizer.std": np.asarray(std, np.float32)}
-    try:
-        LearnedPolicy(network, tensors, {})
-    except KeyError as error:
-        raise ValueError(f"model must have a bias in every layer, but {error} is missing") from error
+        if not isinstance(normalizer, tuple | list) or len(normalizer) != 3:
+            raise ValueError(
+                "normalizer must be mean, standard deviation, and how many of these are seen at most, but is "
+                f"{shown(normalizer)}; pass all three"
+            )
+        mean, std = (numbers(f"normalizer[{k}]", normalizer[k]).astype(np.float32) for k in (0, 1))
+        number("normalizer[2]", normalizer[2], remedy="pass e.g. 10.0")
+        network = replace(network, normalised=float(normalizer[2]))
+        tensors |= {"normalizer.mean": mean, "normalizer.std": std}
     return network, tensors
 
 

@@ -225,6 +225,56 @@ def test_a_network_alone_that_could_not_be_played_is_refused(tmp_path, model, me
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize(
+    ("normalizer", "message"),
+    [
+        ((np.zeros(FEATURES), np.zeros(FEATURES), 10.0), "normalizer.std must be positive, but is 0.0 somewhere"),
+        ((np.zeros(FEATURES), np.full(FEATURES, 1e-60), 10.0), "normalizer.std must be positive, but is 0.0 somewhere"),
+        (
+            (np.zeros(FEATURES), np.full(FEATURES, np.inf), 10.0),
+            "normalizer.std must be finite .*, but 22 of its 22 numbers are not finite",
+        ),
+        ((np.full(FEATURES, np.nan), np.ones(FEATURES), 10.0), "normalizer.mean must be finite .*, but 22 of its 22"),
+        (
+            (np.zeros(FEATURES), np.ones(FEATURES), -1.0),
+            r"normalizer\[2\] must be a number from .*, but is -1.0; pass e.g.",
+        ),
+        (
+            (np.zeros(FEATURES), np.ones(FEATURES), 0.0),
+            r"normalizer\[2\] must be a number from .*, but is 0.0; pass e.g.",
+        ),
+        ((np.zeros(FEATURES), "ones", 10.0), r"normalizer\[1\] must be numbers, but is 'ones'"),
+        (
+            (np.zeros(FEATURES), np.ones(FEATURES)),
+            r"(?s)normalizer must be mean, standard deviation, .*; pass all three",
+        ),
+        (3, "normalizer must be mean, standard deviation, .*, but is 3; pass all three"),
+    ],
+)
+def test_a_normaliser_that_cannot_be_played_is_refused(tmp_path, normalizer, message):
+    with pytest.raises(ValueError, match=message):
+        save_policy(tmp_path / "new", sequence(), normalizer=normalizer)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("kind", ["network", "algorithm"])
+def test_weights_that_are_not_finite_are_refused(tmp_path, kind):
+    model = sequence() if kind == "network" else PPO("MlpPolicy", gym.make("duffing_env/Short-v0"), device="cpu")
+    layer = model[2] if kind == "network" else model.policy.action_net
+    torch.nn.init.constant_(layer.weight, float("nan"))
+    with pytest.raises(
+        ValueError, match=r"weight must be finite .*, but .* of its .* numbers are not finite; find what made them so"
+    ):
+        save_policy(tmp_path / "new", model)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_network_for_other_observations_is_told_with_its_name():
+    told = r"policy Sequential does not play duffing_env/Short-v0: it must take observations of shape \(4, 22\), but"
+    with pytest.raises(ValueError, match=told):
+        evaluate([torch.nn.Sequential(torch.nn.Linear(10, 1))], **SHORT)
+
+
 HISTORY = {"observation": "history", "history": 10}
 
 
