@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from agents.cli import check_track, run_script
+from agents.cli import check_track, full_id, run_script
 from estimator.extras import need
 
 
@@ -24,13 +24,14 @@ class Config:
     algo: Literal["ppo", "sac", "tqc"] = "ppo"
     """Algorithm."""
     env: str = "duffing_env/Short-v0"
-    """Id of the track."""
+    """Track, such as Short-v0."""
     steps: int = 1_000_000
     """Samples to learn from; the last roll-out of PPO is finished."""
     seed: int = 0
     """Seed of everything."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "env", full_id(self.env))
         check_track(self.env)
 
     @property

@@ -1,7 +1,7 @@
 """Datasets for offline learning, in Minari's format: episodes of policies of four grades on a track.
 
 $ python -m agents.studies.datasets --grade random
-$ python -m agents.studies.datasets --grade expert --env duffing_env/Amplitude-v0 --episodes 5000
+$ python -m agents.studies.datasets --grade expert --env Amplitude-v0 --episodes 5000
 
 A dataset is called duffing/TRACK/GRADE-v0, and lies where Minari keeps its own (MINARI_DATASETS_PATH). Its systems are
 of the branch ``train`` of the seeds, so what learns from it has met none of those that it is evaluated on.
@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from agents.cli import check_track, run_script
+from agents.cli import check_track, followed, full_id, run_script
 from agents.evaluation.batch import make
 from agents.evaluation.comparison import usual_policies
 from agents.policies import make_policy, trained_policies
@@ -39,13 +39,14 @@ class Config:
     grade: Literal["random", "medium", "expert", "planner"] = "expert"
     """Who plays: uniform noise, the feedback law velocity-sign, the trained policy of the track, or the planner."""
     env: str = "duffing_env/Short-v0"
-    """Id of the track."""
+    """Track, such as Short-v0."""
     episodes: int = 1000
     """Number of episodes."""
     seed: int = 0
     """Seed of systems, noise and policy."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "env", full_id(self.env))
         check_track(self.env)
         one_of("grade", self.grade, (*POLICIES, "expert"))
         whole("episodes", self.episodes, _MOST)
@@ -73,8 +74,10 @@ def collect(config: Config) -> list[dict[str, Any]]:
     envs = make(config.env, min(_ROWS, config.episodes))
     policy = make_policy(name, envs, seed=config.seed)
     episodes: list[dict[str, Any]] = []
-    for seed in np.random.SeedSequence(config.seed).generate_state(-(-config.episodes // envs.num_envs)):
-        episodes += _play(envs, policy, int(seed))
+    seeds = np.random.SeedSequence(config.seed).generate_state(-(-config.episodes // envs.num_envs))
+    batches = [(f"batch {number} of {len(seeds)}", int(seed)) for number, seed in enumerate(seeds, start=1)]
+    for seed in followed(batches):
+        episodes += _play(envs, policy, seed)
     envs.close()
     return episodes[: config.episodes]
 
@@ -107,11 +110,20 @@ def _play(envs: Any, policy: Any, seed: int) -> list[dict[str, Any]]:
 
 
 def main(config: Config) -> None:
-    """Collect, and hand over to Minari."""
+    """Collect, and hand over to Minari.
+
+    Raises:
+        ModuleNotFoundError: without the packages of the extra ``datasets``.
+        ValueError: where there is a dataset of this name, before anything is played.
+    """
     need("minari", "h5py")
     import minari
     from minari.data_collector.episode_buffer import EpisodeBuffer
+    from minari.storage import get_dataset_path
 
+    place = get_dataset_path(config.name)
+    if place.exists():
+        raise ValueError(f"{config.name} must be a new dataset, but is in {place}; delete that folder to make it anew")
     buffers = [EpisodeBuffer(id=number, **episode) for number, episode in enumerate(collect(config))]
     with warnings.catch_warnings():
         # There is no author to write to, no page of its own, and no other environment to evaluate on.

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from agents.evaluation.batch import make
+from agents.studies import datasets
 from agents.studies.datasets import Config, collect, main
 
 ROOT = Path(__file__).parents[2]
@@ -42,6 +43,21 @@ def test_actions_give_what_is_told_again():
 def test_a_track_without_an_expert_has_none():
     with pytest.raises(ValueError, match="grade must not be expert on duffing_env/WienerHammerstein-v0"):
         collect(Config("expert", "duffing_env/WienerHammerstein-v0", episodes=1))
+
+
+def test_a_track_is_known_by_its_name():
+    assert Config("random", "Short-v0") == Config("random", SHORT)
+    assert Config("random", "Pendulum-v0").name == "duffing/pendulum-v0/random-v0"
+
+
+def test_a_dataset_is_not_replaced(tmp_path, monkeypatch):
+    """What is there is found before anything is played."""
+    pytest.importorskip("minari", reason="minari is not installed; it is the extra datasets")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.setattr(datasets, "collect", lambda config: pytest.fail("it is refused before"))
+    (tmp_path / "duffing/short-v0/random-v0").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"random-v0 must be a new dataset, but is in .*random-v0; delete that folder"):
+        main(Config("random", "Short-v0"))
 
 
 def test_a_learner_learns_from_a_dataset(tmp_path, monkeypatch, capsys):
