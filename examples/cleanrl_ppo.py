@@ -14,13 +14,13 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
-import tyro
 from gymnasium.wrappers.utils import RunningMeanStd
 from gymnasium.wrappers.vector import ClipAction, NormalizeReward, RecordEpisodeStatistics, TransformReward
 from torch import nn
 from torch.distributions import Normal
 
 from agents import save_policy
+from agents.cli import full_id, run_script
 from agents.policies.saving import check_policy_folder
 from agents.results import versions
 
@@ -30,7 +30,7 @@ class Args:
     """CleanRL's PPO on an environment of duffing_env."""
 
     env_id: str = "duffing_env/Short-v0"
-    """Id of the environment."""
+    """Id of the environment; of ours the name of the track will do, such as Short-v0."""
     seed: int = 0
     """Seed of everything."""
     output: Path | None = None
@@ -152,7 +152,7 @@ def main(args: Args) -> Path:
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     # Our vector environment, in CleanRL's wrappers; observations are normalised in `Observations`.
-    envs = gym.make_vec(f"duffing_env:{args.env_id}", num_envs=args.num_envs, autoreset_mode="SameStep")
+    envs = gym.make_vec(f"duffing_env:{full_id(args.env_id)}", num_envs=args.num_envs, autoreset_mode="SameStep")
     episodes = RecordEpisodeStatistics(envs)
     envs = NormalizeReward(ClipAction(episodes), gamma=args.gamma)
     envs = TransformReward(envs, lambda reward: np.clip(reward, -10, 10))
@@ -165,7 +165,10 @@ def main(args: Args) -> Path:
     logprobs, rewards, dones, values = (torch.zeros(shape) for _ in range(4))
     begun, iterations = time.time(), args.total_timesteps // (args.num_steps * args.num_envs)
     if iterations == 0:
-        raise ValueError(f"total_timesteps must be a roll-out at least, but are {args.total_timesteps}")
+        least = args.num_steps * args.num_envs
+        raise ValueError(
+            f"total_timesteps must be at least a roll-out, {least}, but are {args.total_timesteps}; take more"
+        )
     next_obs = observe(envs.reset(seed=args.seed)[0])
     for iteration in range(iterations):
         optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - iteration / iterations)
@@ -197,4 +200,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    run_script(main, Args, __doc__)

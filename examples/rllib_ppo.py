@@ -13,14 +13,18 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import ray
 import torch
-import tyro
-from ray.rllib.algorithms.ppo import PPOConfig
 
 from agents import save_policy
+from agents.cli import full_id, run_script
 from agents.policies.saving import check_policy_folder
 from agents.results import versions
+
+try:
+    import ray
+    from ray.rllib.algorithms.ppo import PPOConfig
+except ModuleNotFoundError as missing:
+    sys.exit(f"rllib_ppo.py: {missing.name} is not installed; get it with: pip install 'ray[rllib]'")
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Args:
     """RLlib's PPO on an environment of duffing_env."""
 
     env_id: str = "duffing_env/Short-v0"
-    """Id of the environment."""
+    """Id of the environment; of ours the name of the track will do, such as Short-v0."""
     seed: int = 0
     """Seed of everything."""
     output: Path | None = None
@@ -50,9 +54,13 @@ def main(args: Args) -> Path:
     track = args.env_id.split("/")[-1].lower()
     folder = check_policy_folder("output", args.output or Path("runs") / f"rllib-ppo-{track}-{args.seed}")
     torch.set_num_threads(1)  # more than one are slower, and many times so on a busy machine
-    ray.init(os.environ.get("RAY_ADDRESS", "local"))  # and not whatever cluster runs on this machine
-    config = PPOConfig().environment(f"duffing_env:{args.env_id}").debugging(seed=args.seed)
+    config = PPOConfig().environment(f"duffing_env:{full_id(args.env_id)}").debugging(seed=args.seed)
     config.env_runners(num_envs_per_env_runner=8)
+    if (least := config.train_batch_size) > args.total_timesteps:
+        raise ValueError(
+            f"total_timesteps must be at least a roll-out, {least}, but are {args.total_timesteps}; take more"
+        )
+    ray.init(os.environ.get("RAY_ADDRESS", "local"))  # and not whatever cluster runs on this machine
     algorithm, steps = config.build_algo(), 0
     while steps + config.train_batch_size <= args.total_timesteps:
         result = algorithm.train()
@@ -74,4 +82,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    run_script(main, Args, __doc__)

@@ -12,18 +12,22 @@ from pathlib import Path
 
 import gymnasium as gym
 import torch
-import tyro
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
-from torchrl.collectors import Collector
-from torchrl.envs import GymWrapper
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 from agents import save_policy
+from agents.cli import full_id, run_script
 from agents.policies.saving import check_policy_folder
 from agents.results import versions
+
+try:
+    from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+    from torchrl.collectors import Collector
+    from torchrl.envs import GymWrapper
+    from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+    from torchrl.objectives import ClipPPOLoss
+    from torchrl.objectives.value import GAE
+except ModuleNotFoundError as missing:
+    sys.exit(f"torchrl_ppo.py: {missing.name} is not installed; get it with: pip install torchrl")
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class Args:
     """TorchRL's PPO on an environment of duffing_env."""
 
     env_id: str = "duffing_env/Short-v0"
-    """Id of the environment."""
+    """Id of the environment; of ours the name of the track will do, such as Short-v0."""
     seed: int = 0
     """Seed of everything."""
     output: Path | None = None
@@ -56,8 +60,13 @@ def main(args: Args) -> Path:
     folder = check_policy_folder("output", args.output or Path("runs") / f"torchrl-ppo-{track}-{args.seed}")
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
+    total = args.total_timesteps // args.batch * args.batch
+    if total == 0:
+        raise ValueError(
+            f"total_timesteps must be at least a roll-out, {args.batch}, but are {args.total_timesteps}; take more"
+        )
     # TorchRL resets the rows that have ended itself.
-    envs = gym.make_vec(f"duffing_env:{args.env_id}", num_envs=args.num_envs, autoreset_mode="Disabled")
+    envs = gym.make_vec(f"duffing_env:{full_id(args.env_id)}", num_envs=args.num_envs, autoreset_mode="Disabled")
     env = GymWrapper(envs)
     env.set_seed(args.seed)
     features = envs.single_observation_space.shape[0]
@@ -80,7 +89,6 @@ def main(args: Args) -> Path:
     )  # fmt: skip
     optimiser = torch.optim.Adam(loss.parameters(), lr=args.learning_rate, eps=1e-5)
 
-    total = args.total_timesteps // args.batch * args.batch
     steps = 0
     for rolled in Collector(
         env, actor, frames_per_batch=args.batch, total_frames=total, auto_register_policy_transforms=True
@@ -113,4 +121,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    run_script(main, Args, __doc__)

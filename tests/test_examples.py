@@ -38,3 +38,41 @@ def test_an_example_trains_a_policy_that_is_played_as_any_other(name, tmp_path):
     assert one == two  # the same seed, the same weights
     (found,) = evaluate([str(folders[0])], env_id="duffing_env/Short-v0", systems=4)
     assert np.isfinite(found.metrics["information_gain"]).all()
+
+
+def example(name, *words, folder):
+    """Its exit status and messages."""
+    command = [sys.executable, str(ROOT / "examples" / f"{name}.py"), *words]
+    told = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=told, capture_output=True, text=True, check=False)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--total-timesteps", "1000"], "total_timesteps must be at least a roll-out, 2048, but are 1000; take more"),
+        (["--env-id", "Short-v7"], "Short"),
+        (["--output", "taken"], "output must be a folder, but taken is a file; name another place"),
+        (["--output", "run"], "output must be a folder for a policy, but run holds a run; remove it or name another"),
+    ],
+)
+def test_what_an_example_cannot_do_is_one_line_before_it_trains(tmp_path, words, message):
+    (tmp_path / "taken").write_text("")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text("{}")
+    status, messages = example("cleanrl_ppo", *words, folder=tmp_path)
+    assert status == 2
+    assert len(messages.splitlines()) == 1
+    assert message in messages
+
+
+@pytest.mark.parametrize(("name", "package"), [("torchrl_ppo", "torchrl"), ("rllib_ppo", "ray[rllib]")])
+def test_a_library_that_is_missing_is_named(tmp_path, name, package):
+    if importlib.util.find_spec(LIBRARY[name]) is not None:
+        pytest.skip("it is installed here")
+    status, messages = example(name, "--help", folder=tmp_path)
+    assert status == 1
+    assert len(messages.splitlines()) == 1
+    assert "is not installed; get it with: pip install" in messages
+    assert package in messages
