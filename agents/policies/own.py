@@ -8,17 +8,21 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import Wrapper
-from gymnasium.vector import VectorWrapper
+from gymnasium import ActionWrapper, ObservationWrapper, Wrapper
+from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
 
 from estimator.checks import numbers
+
+#: Gymnasium's wrappers that change observations or actions.
+_CHANGING = (ObservationWrapper, ActionWrapper, VectorObservationWrapper, VectorActionWrapper)
 
 
 def own_policy(made: Any, env: Any, seed: int, options: dict[str, Any]) -> Any:
     """The policy that a user's own thing is, or makes; see `agents.policies.make_policy`.
 
     Raises:
-        ValueError: for options that it does not take, or a thing that is not a policy.
+        ValueError: for options that it does not take, a thing that is not a policy, or a model that `check_wrappers`
+            refuses.
     """
     if isinstance(made, type):
         taken = inspect.signature(made).parameters
@@ -30,6 +34,7 @@ def own_policy(made: Any, env: Any, seed: int, options: dict[str, Any]) -> Any:
     elif options:
         raise ValueError(f"options must be none for a policy that is made, but are {options}; leave them out")
     if hasattr(made, "predict"):
+        check_wrappers(made)
         seen = made.get_vec_normalize_env() if hasattr(made, "get_vec_normalize_env") else None
         return made if seen is None else _Normalised(made, seen)
     if not callable(made):
@@ -52,6 +57,25 @@ def environments_of(model: Any) -> list[Any]:
         found.append(place)
         place = place.env if isinstance(place, Wrapper | VectorWrapper) else None
     return found
+
+
+def check_wrappers(model: Any) -> None:
+    """Refuse a model of Stable-Baselines3 whose environment is wrapped in what changes observations or actions.
+
+    Those wrappers are not played: a policy is asked for actions of the environment itself.
+
+    Raises:
+        ValueError: naming the wrapper.
+    """
+    for wrapper in environments_of(model)[:-1]:
+        # A wrapper has spaces of its own where it changes them, whatever its kind.
+        spaces = (getattr(wrapper, f"_{space}_space", None) for space in ("observation", "action"))
+        if isinstance(wrapper, _CHANGING) or any(space is not None for space in spaces):
+            raise ValueError(
+                f"model must see its environment as it is or through VecNormalize, but it is wrapped in "
+                f"{type(wrapper).__name__}; train without it, with VecNormalize, which is kept, or save the network of "
+                "torch with the normalizer that it saw"
+            )
 
 
 class _Normalised:

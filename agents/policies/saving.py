@@ -25,7 +25,7 @@ from agents.policies.learned import (
     Network,
     observation_of,
 )
-from agents.policies.own import environments_of
+from agents.policies.own import check_wrappers, environments_of
 from agents.results import check_folder
 from estimator.checks import mapping, number, numbers, shown, whole
 from estimator.files import file_name, write_atomically, writing
@@ -107,6 +107,7 @@ def write_policy(
     if not hasattr(model, "policy"):
         raise ValueError(f"model must be an algorithm or a module of torch, but is {shown(model)}; pass one")
     card = {"algorithm": type(model).__name__.lower(), "steps": model.num_timesteps} if card is None else card
+    check_wrappers(model)
     held = environments_of(model)
     if held and (seen_there := observation_of(held[-1])) is not None:
         card = {"observation": seen_there} | card
@@ -114,6 +115,11 @@ def write_policy(
     if not hasattr(model.policy, "mlp_extractor"):
         tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
     network = _network_of(model.policy, tensors)
+    if network.levels and not _chooses_levels(model):
+        raise ValueError(
+            f"model must choose an input, or one of the levels of DuffingVecEnv, but its actions are {network.levels} "
+            f"numbers of another environment; train and save it with DuffingVecEnv(..., levels={network.levels})"
+        )
     seen = _normalizer_of(model)
     if seen is not None:
         network = replace(network, normalised=float(seen.clip_obs))
@@ -213,6 +219,16 @@ def _normalizer_of(model: BaseAlgorithm) -> Any:
             )
         envs = envs.venv
     return found
+
+
+def _chooses_levels(model: BaseAlgorithm) -> bool:
+    """Whether numbers as actions are evenly spaced inputs, as in our environments."""
+    from agents.vec_env import BatchVecEnv
+
+    envs: Any = model.get_env()
+    while hasattr(envs, "venv"):
+        envs = envs.venv
+    return isinstance(envs, BatchVecEnv)
 
 
 def _network_of(policy: Any, tensors: Mapping[str, Any]) -> Network:

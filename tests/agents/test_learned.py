@@ -197,7 +197,8 @@ def test_the_card_tells_what_it_was_told(tmp_path):
     card = load_policy(folder).card
     assert json.loads((folder / CARD).read_text()) == card
     assert card.pop("network")["activation"] == "tanh"
-    assert card == {"format": 3, "algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}}
+    told = {"format": 3, "observation": "posterior", "algorithm": "ppo", "steps": 7}
+    assert card == {**told, "config": {"reward": "log_posterior"}}
 
 
 def test_actions_are_in_range_and_the_state_is_passed_on(tmp_path):

@@ -172,6 +172,80 @@ def test_a_wrapper_that_is_not_written_is_refused(tmp_path):
         save_policy(tmp_path / "mine", model)
 
 
+class Halved(gym.ActionWrapper):
+    """Pushes half as hard."""
+
+    def action(self, action):
+        return action / 2
+
+
+class Three(gym.ActionWrapper):
+    """Chooses one of three inputs, which are not evenly spaced."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = gym.spaces.Discrete(3)
+
+    def action(self, action):
+        return np.array([(-1.0, 0.5, 1.0)[action]], dtype=np.float32)
+
+
+class Stacked(gym.Wrapper):
+    """Shows every observation twice, though it is no `ObservationWrapper`."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = gym.spaces.Box(-10, 10, (2 * FEATURES,), np.float32)
+
+    def reset(self, **how):
+        seen, info = self.env.reset(**how)
+        return np.tile(seen, 2), info
+
+
+def normalised(env):
+    from gymnasium.wrappers import NormalizeObservation
+
+    return NormalizeObservation(env)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "name"),
+    [(normalised, "NormalizeObservation"), (Halved, "Halved"), (Three, "Three"), (Stacked, "Stacked")],
+)
+def test_a_wrapper_of_gymnasium_that_would_not_be_played_is_refused(tmp_path, wrap, name):
+    model = PPO("MlpPolicy", wrap(gym.make("duffing_env/Short-v0")), device="cpu")
+    told = (
+        f"model must see its environment as it is or through VecNormalize, but it is wrapped in {name}; train without"
+    )
+    with pytest.raises(ValueError, match=told):
+        save_policy(tmp_path / "mine", model)
+    with pytest.raises(ValueError, match=told):
+        make_policy(model)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrappers_that_change_nothing_are_no_matter(tmp_path):
+    from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit, TransformReward
+
+    env = TimeLimit(RecordEpisodeStatistics(gym.make("duffing_env/Short-v0")), 20)
+    model = PPO("MlpPolicy", TransformReward(env, lambda reward: 2 * reward), device="cpu")
+    save_policy(tmp_path, model)
+    expected, _ = model.predict(observations(), deterministic=True)
+    for policy in (make_policy(str(tmp_path)), make_policy(model)):
+        np.testing.assert_allclose(
+            policy.predict(observations(), deterministic=True)[0].clip(-1, 1), expected, atol=2e-6
+        )
+
+
+def test_numbers_as_actions_are_those_of_our_levels(tmp_path):
+    envs = DuffingVecEnv("duffing_env/Short-v0", 2, levels=3)
+    model = PPO("MlpPolicy", VecNormalize(envs), n_steps=8, batch_size=16, device="cpu")
+    save_policy(tmp_path / "mine", model)
+    model.env = None  # as of an archive that is opened without one
+    with pytest.raises(ValueError, match=r"its actions are 3 numbers of another environment; train and save it with"):
+        save_policy(tmp_path / "other", model)
+
+
 def test_an_archive_says_how_it_is_converted(tmp_path):
     (tmp_path / "model.zip").write_bytes(b"")
     with pytest.raises(ValueError, match=r"agents.save_policy\('.*/model', PPO.load"):
