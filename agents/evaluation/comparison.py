@@ -27,9 +27,10 @@ def usual_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
 
     A record can be asked for its own input only; and all but the signals look at the posterior.
     """
-    if gym.spec(env_id).kwargs.get("regime") is not None:
+    usual = gym.spec(env_id).kwargs
+    if usual.get("regime") is not None:
         return (f"silverbox-{options.get('regime', 'multisine')}",)
-    if options.get("observation", "posterior") != "posterior":
+    if {**usual, **options}.get("observation", "posterior") != "posterior":
         return SIGNALS
     shipped = [name for name in trained_policies() if load_policy(TRAINED / name).card["track"] == env_id]
     # The planner decides sample by sample.

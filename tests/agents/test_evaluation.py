@@ -15,7 +15,7 @@ import agents.evaluation.metrics
 import agents.evaluation.rollout
 from agents import make_policy
 from agents.evaluation.batch import TESTED, make
-from agents.evaluation.comparison import compare
+from agents.evaluation.comparison import compare, usual_policies
 from agents.evaluation.oracle import Systems
 from agents.evaluation.rollout import evaluate
 from agents.policies.learned import WEIGHTS, load_policy
@@ -544,6 +544,11 @@ def test_what_is_shown_changes_nothing_of_what_is_measured(shown):
     np.testing.assert_array_equal(other.inputs, usual.inputs)
     np.testing.assert_array_equal(other.outputs, usual.outputs)
     np.testing.assert_array_equal(other.metrics["fisher_gain"], usual.metrics["fisher_gain"])
+
+
+def test_what_is_compared_where_the_posterior_is_not_seen_are_signals():
+    assert usual_policies(TRACK, {"observation": "history"}) == ("prbs", "uniform")
+    assert {"efe", "ppo/amplitude"} < set(usual_policies(TRACK, {"observation": "posterior"}))
 
 
 def test_a_function_as_an_observation_is_not_compared_on():
