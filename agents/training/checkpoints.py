@@ -114,11 +114,17 @@ def begin_with(folder: Path, model: BaseAlgorithm) -> None:
 
     try:
         tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(folder / WEIGHTS).items()}
-        model.policy.load_state_dict({name: t for name, t in tensors.items() if name != "foresight"})
     except OSError as error:
         raise ValueError(f"begin must be the folder of a policy, but {folder} has no {WEIGHTS}; name one") from error
-    except RuntimeError as error:
-        raise ValueError(f"begin must be a policy with the network of the training, but {folder} is not") from error
+    tensors.pop("foresight", None)
+    shapes, own = ({name: tuple(t.shape) for name, t in of.items()} for of in (tensors, model.policy.state_dict()))
+    for name in sorted({*shapes, *own}):
+        if shapes.get(name) != own.get(name):
+            raise ValueError(
+                f"begin must be a policy with the network of the training, but {folder} has {name} of shape "
+                f"{shapes.get(name, 'none')} in place of {own.get(name, 'none')}; train with its hyperparameters"
+            )
+    model.policy.load_state_dict(tensors)
 
 
 def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
