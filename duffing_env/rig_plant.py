@@ -57,7 +57,8 @@ def checked_rig(rig: AnyRig | None, needs_guess: bool = True) -> Rig:
     environment's goes linearly from one to the next instead.
 
     Raises:
-        ValueError: for none, one without limit, range or guess, or one with a delay.
+        ValueError: for none, one without limit, range or guess, one with a delay, or one whose motion is guessed but
+            whose sensor stands so far off that its range says nothing of the motion.
     """
     if rig is None:
         raise ValueError("rig must be a Rig, a dictionary or a file name, but is None; pass rig='rig.toml'")
@@ -69,6 +70,13 @@ def checked_rig(rig: AnyRig | None, needs_guess: bool = True) -> Rig:
     if rig.delay > 0:
         raise ValueError(
             f"rig must have no delay for an environment, but has {rig.delay}; the plant waits for its input"
+        )
+    sensor = rig.output
+    assert sensor.range is not None
+    if needs_guess and sensor.kind == "displacement" and abs(sensor.offset) > sensor.range / 2:
+        raise ValueError(
+            f"output.offset must be within half of the range, which the motion is guessed by, but is {sensor.offset:g} "
+            f"of {sensor.range:g} {sensor.unit}; subtract it from the output, and give the range of the motion"
         )
     return rig
 

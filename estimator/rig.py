@@ -44,7 +44,8 @@ class Channel:
         kind: what an output shows: ``displacement``, ``velocity`` or ``acceleration``.
         noise: standard deviation, per sample: of an output its sensor's, of an input what disturbs the force. A first
             value of what stays unknown; None: nothing is known of it.
-        offset: first value of the offset, which stays unknown.
+        offset: first value of the offset, which stays unknown. `identify` takes outputs that lie far from 0 as they
+            are; a rig that is played has a range about 0.
         column: its name in CSV files, with or without the unit behind it, or in MAT files. None stands for the usual
             names (`estimator.identification.tables.read_table`).
 

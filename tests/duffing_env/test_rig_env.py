@@ -145,6 +145,10 @@ def test_an_input_that_is_smooth_goes_linearly_from_one_action_to_the_next(inter
         ({}, "rig must be a Rig, a dictionary or a file name, but is None"),
         ({"rig": Rig(1.0, guess=GUESS)}, "rig must have input.limit to be played, but has none"),
         ({"rig": {**RIG.to_dict(), "delay": 1}}, "rig must have no delay for an environment, but has 1"),
+        (
+            {"rig": {**RIG.to_dict(), "output": {**RIG.to_dict()["output"], "offset": 0.6 * RIG.output.range}}},
+            "output.offset must be within half of the range, which the motion is guessed by, but is",
+        ),
         ({"rig": RIG, "max_input": 1.5}, "max_input must be at most 1, the rig's own limit, but is 1.5"),
         ({"rig": RIG, "spread": 0.2}, "spread must be left out for a rig"),
         ({"rig": RIG, "factorisation": "mean_field"}, "factorisation must be 'structured' for a rig"),
