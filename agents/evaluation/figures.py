@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
 _STROKES = ("-", "--", ":")
 
+#: A limit is drawn where a signal comes as near as this part of it: one that is far away would hide the signal.
+_NEAR = 0.5
+
 #: Of fewer points each is marked.
 _FEW = 20
 
@@ -89,7 +92,7 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
 def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
     """Input and output of one system in time, and the spectrum of the inputs: root of the mean power over systems.
 
-    Of several sensors the first is shown.
+    Of several sensors the first is shown. Dashed lines are limits that are come near to.
     """
     figure = new_figure(12, 1.6 * len(evaluations) + 0.8)
     grid = figure.subplots(len(evaluations), 3, sharex="col", sharey="col", squeeze=False)
@@ -103,13 +106,16 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
         spectrum = factor * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         frequencies = np.fft.rfftfreq(len(inputs), scales.step)
         shown = evaluation.outputs[:, system].reshape(len(time), -1)[:, 0]
+        (largest, widest), never = evaluation.limits, np.inf
         lines = (
-            (labelled("u", unit), time, scales.input * evaluation.inputs[:, system]),
-            (labelled("y", scales.output_unit), time, scales.output * shown),
-            (labelled("|U|", small), frequencies, spectrum),
+            (labelled("u", unit), time, scales.input * evaluation.inputs[:, system], scales.input * largest),
+            (labelled("y", scales.output_unit), time, scales.output * shown, scales.output * widest),
+            (labelled("|U|", small), frequencies, spectrum, never),
         )
-        for axes, (label, x, y) in zip(row, lines, strict=True):
+        for axes, (label, x, y, limit) in zip(row, lines, strict=True):
             axes.plot(x, y, color=colour, linewidth=0.8, drawstyle="steps-post" if axes is row[0] else "default")
+            if np.nanmax(np.abs(y), initial=0.0) > _NEAR * limit:
+                axes.hlines([-limit, limit], x[0], x[-1], color="black", linestyle="--", linewidth=0.8, zorder=1)
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
         row[0].set_title(plain(evaluation.title), loc="left", fontsize=9)

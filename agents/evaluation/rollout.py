@@ -56,6 +56,7 @@ class Evaluation:
         scales: what one of them is worth, and the sampling step: 1 V, or what the rig says.
         estimators: what others make of the same inputs and outputs: name of an estimator to its `metrics`.
         seeds: number of policies.
+        limits: of input and output, in parts of their scales.
     """
 
     policy: str
@@ -66,6 +67,7 @@ class Evaluation:
     scales: Scales
     estimators: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
     seeds: int = 1
+    limits: tuple[float, float] = (np.inf, np.inf)
 
     @property
     def title(self) -> str:
@@ -186,6 +188,7 @@ def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
         evaluations[0].scales,
         {name: join([e.estimators[name] for e in evaluations]) for name in evaluations[0].estimators},
         sum(e.seeds for e in evaluations),
+        evaluations[0].limits,
     )
 
 
@@ -286,7 +289,11 @@ def roll_out(
         "decision_time": np.full(systems, np.mean(deciding[1:] or deciding) / systems),
     }
     seen = outputs[..., 0] if sensors == 1 else outputs
-    return Evaluation(title_of(name), values, curve, inputs, seen, prior.scales), beliefs, truth, envs.experiment
+    setup = envs.experiment.setup
+    evaluation = Evaluation(
+        title_of(name), values, curve, inputs, seen, prior.scales, limits=(setup.max_input, setup.max_output)
+    )
+    return evaluation, beliefs, truth, envs.experiment
 
 
 def _place_of_input(experiment: Experiment) -> int:

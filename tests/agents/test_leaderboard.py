@@ -228,6 +228,10 @@ def test_a_rigs_table_and_figure_are_in_its_units():
     np.testing.assert_allclose(u.lines[0].get_ydata(), 20.0 * evaluation.inputs[:, 0])
     np.testing.assert_allclose(y.lines[0].get_ydata(), 0.03 * evaluation.outputs[:, 0])
     np.testing.assert_allclose(u.lines[0].get_xdata(), np.arange(20))  # ms
+    near, far, _ = figure_of_inputs([replace(evaluation, limits=(0.12, 0.6))]).axes  # signals reach 0.1
+    (lines,) = near.collections
+    np.testing.assert_allclose([segment[:, 1] for segment in lines.get_segments()], [[-2.4, -2.4], [2.4, 2.4]])
+    assert not far.collections
     in_volts = figure_of_inputs([replace(evaluation, scales=VOLTS)]).axes[2].lines[0].get_ydata()
     np.testing.assert_allclose(spectrum.lines[0].get_ydata(), 20.0 * 1e-3 * in_volts)
 
