@@ -106,7 +106,7 @@ def test_every_check_is_explained():
     from estimator.identification import checks, guesses
 
     source = "".join(Path(module.__file__).read_text() for module in (checks, guesses))
-    names = set(re.findall(r'Warning\("(\w+)"', source)) | set(checks._TERMS) | {"delay", "interpolation"}
+    names = set(re.findall(r'Finding\("(\w+)"', source)) | set(checks._TERMS) | {"delay", "interpolation"}
     names |= {slip.check for slip in (*guesses._SLIPS, *guesses._OF_STEP.values())}
     assert len(names) > 10
     explained = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "checks.md").read_text(), re.MULTILINE)

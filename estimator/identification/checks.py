@@ -11,7 +11,7 @@ from estimator.identification.fit import Fitter, Hypothesis
 from estimator.identification.guesses import astray, leads_astray, of_guess, without_guess
 from estimator.identification.problem import EXTRA, LATEST, Problem, explicable
 from estimator.identification.records import Record, residuals
-from estimator.identification.result import Warning
+from estimator.identification.result import Finding
 from estimator.identification.search import Found
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
@@ -73,7 +73,7 @@ def examine(
     disturbance: tuple[float, float],
     records: Sequence[Record],
     forecasts: Sequence[FloatArray],
-) -> tuple[Warning, ...]:
+) -> tuple[Finding, ...]:
     """All checks.
 
     Args:
@@ -110,28 +110,28 @@ def _error(records: Sequence[Record], forecasts: Sequence[FloatArray]) -> float:
     return float(np.sqrt(np.nanmedian(variances)) / np.nanstd(outputs))
 
 
-def _of_records(problem: Problem, records: Sequence[Record]) -> list[Warning]:
+def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
     rig, warnings = problem.rig, []
     stops = sum(one.clipped for one in records)
     if stops:
         message = f"{stops} outputs stand at a stop and were taken as missing; widen the range, or drive it less"
-        warnings.append(Warning("clipped", message))
+        warnings.append(Finding("clipped", message))
     largest = max(np.abs(one.u).max() for one in records)
     widest = max(np.nanmax(np.abs(one.y)) for one in records)
     source, sink = rig.input, rig.output
     if source.limit and largest > source.limit * (1 + 1e-6):
         message = f"inputs of {largest:.3g} {source.unit} exceed the rig's limit of {source.limit:g} {source.unit}"
-        warnings.append(Warning("limit", message))
+        warnings.append(Finding("limit", message))
     if sink.range and widest > sink.range * (1 + 1e-6):
         message = f"outputs of {widest:.3g} {sink.unit} leave the rig's range of {sink.range:g} {sink.unit}"
-        warnings.append(Warning("range", message))
+        warnings.append(Finding("range", message))
     if 2 * np.pi / problem.frequency < SLOWEST:
         message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, 6 at least"
-        warnings.append(Warning("sampling_too_slow", message))
+        warnings.append(Finding("sampling_too_slow", message))
     return warnings
 
 
-def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
+def _of_hypotheses(problem: Problem, found: Found) -> list[Finding]:
     """The input's way and delay, and further terms, by their evidence."""
     rig, own = problem.rig, found.fits.free_energy.min()
     ways = [name for name in ("zero_order", "linear") if INTERPOLATIONS[rig.interpolation] < 2] or [rig.interpolation]
@@ -161,12 +161,12 @@ def _of_hypotheses(problem: Problem, found: Found) -> list[Warning]:
         )
         if rig.output.kind == "acceleration" and (rig.interpolation, better.interpolation) == ("zero_order", "linear"):
             message += "; or make outputs missing where the input switches, if y shows it just after that"
-        warnings.append(Warning(name, message))
+        warnings.append(Finding(name, message))
         return warnings
     for term, gain in zip(EXTRA, of_terms, strict=True):
         if gain > _EVIDENCE and gain == max(of_terms):
             message = f"the records speak for {_TERMS[term]}, by {gain:.0f} nats; m, c, a and b alone do not hold"
-            warnings.append(Warning(term, message))
+            warnings.append(Finding(term, message))
     return warnings
 
 
@@ -206,15 +206,15 @@ def disturbed(channel: Channel, strength: float, disturbance: float) -> str:
     return f"the force is disturbed by {disturbance:.3g} {channel.unit} in every sample{part}"
 
 
-def _of_noise(problem: Problem, disturbance: tuple[float, float]) -> list[Warning]:
+def _of_noise(problem: Problem, disturbance: tuple[float, float]) -> list[Finding]:
     channel, strength, (mean, std) = problem.rig.input, problem.strength * problem.scales.input, disturbance
     if not disturbed(channel, strength, mean - _SURE * std):  # where the sensor's noise hides it, it may be any
         return []
     because = "either the recorded input is noisy, or the equation lacks something"
-    return [Warning("process_noise", f"{disturbed(channel, strength, mean)}; {because}")]
+    return [Finding("process_noise", f"{disturbed(channel, strength, mean)}; {because}")]
 
 
-def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Warning]:
+def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Finding]:
     """Whether m is negative, or c without it: a channel that is turned round changes the sign of all four."""
     m, c = parameters["m"], parameters["c"]
     if m[0] < -_FAR * m[1]:
@@ -223,17 +223,17 @@ def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Warning]:
         message = "c is negative: energy flows in, so that the oscillator is driven by more than u, such as a feedback"
     else:
         return []
-    return [Warning("sign", message)]
+    return [Finding("sign", message)]
 
 
-def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[float, float]]) -> list[Warning]:
+def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[float, float]]) -> list[Finding]:
     vague = [name for name, deviation in _told(problem, found).items() if deviation > _VAGUE]
     warnings = []
     if vague:
         message = f"{', '.join(vague)}: not identified by this input; the records leave more than a third of it open"
         if "b" in vague and (part := _cubic(problem, parameters)) < _LINEAR:
             message += f"; the spring is linear to {100 * part:.2g} %, as far as the oscillator moved"
-        warnings.append(Warning("not_identified", message))
+        warnings.append(Finding("not_identified", message))
     return warnings
 
 
@@ -257,7 +257,7 @@ def _told(problem: Problem, found: Found) -> dict[str, float]:
     return {name: float(value) for name, value in zip(model.physical, deviations, strict=True) if name in "mcab"}
 
 
-def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Warning]:
+def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Finding]:
     """Whether what the forecasts left is white and normal."""
     from statistics import NormalDist
 
@@ -266,7 +266,7 @@ def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequen
         for one, forecast in zip(records, forecasts, strict=True)
     ]
     values = np.concatenate(left)
-    n, warnings = len(values), list[Warning]()
+    n, warnings = len(values), list[Finding]()
     if n < 100:
         return warnings
     lags, most = 20, 52.386  # chi2.isf(_ALARM, lags): SciPy's statistics take longer to import than records to identify
@@ -276,10 +276,10 @@ def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequen
         message = (
             "errors of the forecasts can be foreseen: the equation, the way of the input or the noise is not as assumed"
         )
-        warnings.append(Warning("residuals_not_white", message))
+        warnings.append(Finding("residuals_not_white", message))
     centred = (values - values.mean()) / values.std()
     kurtosis = (np.mean(centred**4) - 3) * np.sqrt(n / 24)
     if abs(kurtosis) > 6.0 or np.abs(centred).max() > -NormalDist().inv_cdf(_ALARM / n / 2):
         message = "errors of the forecasts are not normal: there are outliers, or the noise comes and goes"
-        warnings.append(Warning("residuals_not_normal", message))
+        warnings.append(Finding("residuals_not_normal", message))
     return warnings

@@ -9,7 +9,7 @@ import numpy as np
 
 from estimator.identification.fit import Fitter
 from estimator.identification.problem import Problem
-from estimator.identification.result import Warning
+from estimator.identification.result import Finding
 from estimator.identification.search import Found, search
 from estimator.rig_prior import HALF_WIDTH, about
 
@@ -71,7 +71,7 @@ _SLIPS = (
 )
 
 
-def of_guess(guess: Guess, parameters: Parameters, kind: str) -> list[Warning]:
+def of_guess(guess: Guess, parameters: Parameters, kind: str) -> list[Finding]:
     """Whether parameters are far from the guess, and what explains most of it; a negative mass is no matter of it.
 
     Args:
@@ -81,11 +81,11 @@ def of_guess(guess: Guess, parameters: Parameters, kind: str) -> list[Warning]:
     """
     if parameters["m"][0] <= 0:
         return []
-    off, warnings = _surprise(guess, parameters), list[Warning]()
+    off, warnings = _surprise(guess, parameters), list[Finding]()
     far = [name for name, squared in off.items() if squared > _FAR**2]
     if far:
         message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
-        warnings = [Warning("guess", message)]
+        warnings = [Finding("guess", message)]
     least = sum(off.values()) / 2
     for slip in (_OF_STEP[kind], *_SLIPS):
         first = next(iter(slip.powers))
@@ -97,7 +97,7 @@ def of_guess(guess: Guess, parameters: Parameters, kind: str) -> list[Warning]:
         left = sum(_surprise(guess, mended).values())
         unlikely = sum(off[name] for name in slip.powers) > _UNLIKELY[len(slip.powers)]
         if abs(np.log(factor)) > _FACTOR and unlikely and left < least:
-            least, warnings = left, [Warning(slip.check, slip.message.format(factor))]
+            least, warnings = left, [Finding(slip.check, slip.message.format(factor))]
     return warnings
 
 
@@ -134,11 +134,11 @@ def leads_astray(guess: Guess, parameters: Parameters, alone: Parameters) -> boo
     return any(abs(alone[name][0] - parameters[name][0]) > _ASTRAY * abs(alone[name][0]) for name in guess)
 
 
-def astray(guess: Guess, parameters: Parameters, alone: Parameters, gain: float, kind: str) -> list[Warning]:
+def astray(guess: Guess, parameters: Parameters, alone: Parameters, gain: float, kind: str) -> list[Finding]:
     """That the guess has led the fit astray: by so many nats the records are more probable with what they say alone."""
     values = ", ".join(f"{name} = {alone[name][0]:.4g} and not {parameters[name][0]:.4g}" for name in guess)
     led = f"the guess leads the fit astray: by {gain:.0f} nats the records speak for {values}"
     why = of_guess(guess, alone, kind) or [
-        Warning("guess", "check the units of guess and columns, or leave out the guess")
+        Finding("guess", "check the units of guess and columns, or leave out the guess")
     ]
-    return [Warning(one.name, f"{led}; {one.message}") for one in why]
+    return [Finding(one.name, f"{led}; {one.message}") for one in why]

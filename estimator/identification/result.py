@@ -19,7 +19,7 @@ from estimator.units import digits_of
 
 
 @dataclass(frozen=True)
-class Warning:
+class Finding:
     """What a check found.
 
     Attributes:
@@ -51,7 +51,7 @@ class Result:
 
     rig: Rig
     belief: Belief
-    warnings: tuple[Warning, ...]
+    warnings: tuple[Finding, ...]
     records: tuple[Record, ...]
     forecasts: tuple[FloatArray, ...]
     noises: Mapping[str, tuple[float, float]]
