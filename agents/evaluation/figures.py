@@ -106,19 +106,22 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
         spectrum = factor * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         frequencies = np.fft.rfftfreq(len(inputs), scales.step)
         shown = evaluation.outputs[:, system].reshape(len(time), -1)[:, 0]
-        (largest, widest), never = evaluation.limits, np.inf
         lines = (
-            (labelled("u", unit), time, scales.input * evaluation.inputs[:, system], scales.input * largest),
-            (labelled("y", scales.output_unit), time, scales.output * shown, scales.output * widest),
-            (labelled("|U|", small), frequencies, spectrum, never),
+            (labelled("u", unit), time, scales.input * evaluation.inputs[:, system]),
+            (labelled("y", scales.output_unit), time, scales.output * shown),
+            (labelled("|U|", small), frequencies, spectrum),
         )
-        for axes, (label, x, y, limit) in zip(row, lines, strict=True):
+        for axes, (label, x, y) in zip(row, lines, strict=True):
             axes.plot(x, y, color=colour, linewidth=0.8, drawstyle="steps-post" if axes is row[0] else "default")
-            if np.nanmax(np.abs(y), initial=0.0) > _NEAR * limit:
-                axes.hlines([-limit, limit], x[0], x[-1], color="black", linestyle="--", linewidth=0.8, zorder=1)
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
         row[0].set_title(plain(evaluation.title), loc="left", fontsize=9)
+    for panels, worth, limit in zip(grid.T, (scales.input, scales.output), evaluations[0].limits, strict=False):
+        values = np.concatenate([axes.lines[0].get_ydata() for axes in panels])
+        if np.nanmax(np.abs(values), initial=0.0) > _NEAR * worth * limit:
+            for axes in panels:
+                ends = axes.lines[0].get_xdata()[[0, -1]]
+                axes.hlines(worth * limit * np.array([-1, 1]), *ends, "black", "--", linewidth=0.8, zorder=1)
     for axes in grid[0, :2]:
         axes.set_title(f"system {system}", loc="right", fontsize=9, color=_COLOURS[6])
     grid[0, 2].set_title("all systems", loc="right", fontsize=9, color=_COLOURS[6])
