@@ -147,8 +147,8 @@ def _write(folder: Path, network: Network, tensors: dict[str, Any], card: dict[s
         half_written = Path(tempfile.mkdtemp(dir=folder, prefix=f".{WEIGHTS}."))
     try:
         write_atomically(half_written / WEIGHTS, save(tensors))
-        described = {"format": FORMAT, "network": asdict(network), **card}
-        write_atomically(half_written / CARD, json.dumps(described, indent=2))
+        own = {"format": FORMAT, "network": asdict(network)}  # also where the card is that of another policy
+        write_atomically(half_written / CARD, json.dumps({**own, **card, **own}, indent=2))
         # Weights without a card are no policy, so none is ever read with the card of another.
         (folder / CARD).unlink(missing_ok=True)
         for name in (WEIGHTS, CARD):

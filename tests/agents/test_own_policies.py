@@ -429,6 +429,13 @@ def test_a_card_that_cannot_be_written_is_refused_and_leaves_what_was_there(tmp_
     assert not (tmp_path / "new").exists()
 
 
+def test_the_card_of_another_policy_says_nothing_of_the_network(tmp_path):
+    save_policy(tmp_path / "first", sequence(torch.nn.Tanh), {"steps": 1})
+    card = load_policy(tmp_path / "first").card
+    save_policy(tmp_path / "second", sequence(), card)
+    assert load_policy(tmp_path / "second").card["network"]["activation"] == "relu"
+
+
 @pytest.mark.parametrize("failing", [1, 2, 3, 4])
 def test_a_policy_that_is_half_written_is_no_policy(tmp_path, monkeypatch, failing):
     """Each file is renamed once beside the policy, and once into its place."""
