@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNorm
 
 from agents import make_policy, save_policy
 from agents.evaluation.rollout import evaluate
+from agents.policies.learned import load_policy
 from agents.studies import baselines
 from agents.training import TrainConfig, train
 from agents.training.algorithms import PPOSettings
