@@ -101,7 +101,7 @@ def test_the_card_says_what_the_policy_was_trained_on(runs):
     description = json.loads((folder / "config.json").read_text())
     card = make_policy(str(folder)).card
     assert card.pop("network")["layers"] == ["mlp_extractor.policy_net.0", "action_net"]
-    assert card == {"format": 3, "algorithm": "ppo", "steps": 20_480, **description}
+    assert card == {"format": 3, "observation": "posterior", "algorithm": "ppo", "steps": 20_480, **description}
     assert make_policy(str(folder / "checkpoints" / "000008192")).card["steps"] == 8192
 
 

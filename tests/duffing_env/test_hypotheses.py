@@ -289,15 +289,15 @@ def test_a_bad_number_is_named(value):
 
 
 @pytest.mark.parametrize(
-    ("make", "options"),
+    ("make", "options", "remedy"),
     [
-        (DuffingEnv, {"factorisation": "mean_field"}),
-        (ContinuousEnv, {"factorisation": "mean_field", "estimator": "nlarx"}),
-        (ModelEnv, TRACKS["duffing_env/Pendulum-v0"]["kwargs"]),
+        (DuffingEnv, {"factorisation": "mean_field"}, "use factorisation='structured'"),
+        (ContinuousEnv, {"factorisation": "mean_field", "estimator": "nlarx"}, "use factorisation='structured'"),
+        (ModelEnv, TRACKS["duffing_env/Pendulum-v0"]["kwargs"], "centre the priors of its noises with care"),
     ],
 )
-def test_what_cannot_weigh_hypotheses_says_so(make, options):
-    with pytest.raises(ValueError, match=r"^noise_hypotheses must be 1 for .*, but is 3; use factorisation="):
+def test_what_cannot_weigh_hypotheses_says_so(make, options, remedy):
+    with pytest.raises(ValueError, match=f"^noise_hypotheses must be 1 for .*, but is 3; {remedy}"):
         make(noise_hypotheses=3, **options)
 
 
