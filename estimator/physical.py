@@ -71,7 +71,9 @@ def coefficients_of(model: Model, parameters: Mapping[str, Any], scales: Scales 
         return points
     inside = points / _worth(model, scales)
     found = _evaluate(_code(model, "inverse")[0], inside, scales.step)
-    _check_inverse(model, inside.reshape(-1, len(names))[0], found.reshape(-1, model.n_coefficients)[0], scales.step)
+    if found.size:
+        first = inside.reshape(-1, len(names))[0], found.reshape(-1, model.n_coefficients)[0]
+        _check_inverse(model, *first, scales.step)
     return found
 
 

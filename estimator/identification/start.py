@@ -42,7 +42,7 @@ def starts(problem: Problem) -> list[FloatArray]:
     inputs = problem.inputs(problem.rig.interpolation, problem.rig.delay)
     found = []
     integrates = KINDS[problem.rig.output.kind] > 0
-    middles = middles_of(problem)
+    middles = _middles(problem)
     widths, drifts = (_WIDTHS[:2], _PERIODS) if integrates else (_WIDTHS, (0.0,))
     for offset, part, periods in product(middles, widths, drifts):
         half = max(3, round(part * 2 * np.pi / problem.frequency))
@@ -70,7 +70,7 @@ def starts(problem: Problem) -> list[FloatArray]:
     return found
 
 
-def middles_of(problem: Problem) -> list[float]:
+def _middles(problem: Problem) -> list[float]:
     """Places, counted as the outputs are, where the spring may be without force; just 0 where these have no origin."""
     if not problem.origin:
         return [0.0]

@@ -209,6 +209,11 @@ def test_maps_are_read_by_name_in_whatever_order_they_are_written(order):
     assert heat == Model("heat", **HEAT, **written)
 
 
+def test_no_parameters_have_no_coefficients():
+    nothing = dict.fromkeys(PAPER.physical, np.zeros((0, 3)))
+    assert coefficients_of(PAPER, nothing).shape == (0, 3, 4)
+
+
 def test_an_inverse_that_undoes_nothing_is_refused():
     # At a step of a second nobody would see it.
     heat = Model("heat", **HEAT, dimensions=DIMENSIONS, inverse={"gain": "step/cap", "loss": "cond/cap"})
