@@ -19,6 +19,14 @@ ROOT = Path(__file__).parents[1]
 LIBRARY = {"cleanrl_ppo": "torch", "torchrl_ppo": "torchrl", "rllib_ppo": "ray"}
 
 
+def example(name, *words, folder):
+    """Its exit status and messages; what lies in the folder is imported before what is installed."""
+    command = [sys.executable, str(ROOT / "examples" / f"{name}.py"), *words]
+    told = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    done = subprocess.run(command, cwd=folder, env=told, capture_output=True, text=True, check=False)
+    return done.returncode, done.stderr
+
+
 @pytest.mark.parametrize("name", LIBRARY)
 def test_an_example_trains_a_policy_that_is_played_as_any_other(name, tmp_path):
     if importlib.util.find_spec(LIBRARY[name]) is None:
@@ -26,10 +34,8 @@ def test_an_example_trains_a_policy_that_is_played_as_any_other(name, tmp_path):
     folders = [tmp_path / run for run in ("one", "two")]
     for folder in folders:
         words = ["--total-timesteps", "4096", "--seed", "3", "--output", str(folder)]
-        told = {**os.environ, "PYTHONPATH": str(ROOT)}
-        command = [sys.executable, str(ROOT / "examples" / f"{name}.py"), *words]
-        done = subprocess.run(command, cwd=tmp_path, env=told, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr[-2000:]
+        status, messages = example(name, *words, folder=tmp_path)
+        assert status == 0, messages[-2000:]
     card = json.loads((folders[0] / "policy.json").read_text())
     assert 4000 <= card["steps"] <= 4096 * 1.05
     assert (card["config"]["seed"], card["command"][0]) == (3, f"{name}.py")
@@ -38,14 +44,6 @@ def test_an_example_trains_a_policy_that_is_played_as_any_other(name, tmp_path):
     assert one == two  # the same seed, the same weights
     (found,) = evaluate([str(folders[0])], env_id="duffing_env/Short-v0", systems=4)
     assert np.isfinite(found.metrics["information_gain"]).all()
-
-
-def example(name, *words, folder):
-    """Its exit status and messages."""
-    command = [sys.executable, str(ROOT / "examples" / f"{name}.py"), *words]
-    told = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=folder, env=told, capture_output=True, text=True, check=False)
-    return done.returncode, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -63,16 +61,19 @@ def test_what_an_example_cannot_do_is_one_line_before_it_trains(tmp_path, words,
     (tmp_path / "run" / "config.json").write_text("{}")
     status, messages = example("cleanrl_ppo", *words, folder=tmp_path)
     assert status == 2
-    assert len(messages.splitlines()) == 1
-    assert message in messages
+    told = [line for line in messages.splitlines() if "is compiling" not in line]  # as it says on a slow machine
+    assert len(told) == 1
+    assert message in told[0]
 
 
-@pytest.mark.parametrize(("name", "package"), [("torchrl_ppo", "torchrl"), ("rllib_ppo", "ray[rllib]")])
-def test_a_library_that_is_missing_is_named(tmp_path, name, package):
-    if importlib.util.find_spec(LIBRARY[name]) is not None:
-        pytest.skip("it is installed here")
+@pytest.mark.parametrize(
+    ("name", "first", "package"), [("torchrl_ppo", "tensordict", "torchrl"), ("rllib_ppo", "ray", "ray[rllib]")]
+)
+def test_a_library_that_is_missing_is_named(tmp_path, name, first, package):
+    # As if it were not installed, on machines that have it, too.
+    (tmp_path / f"{first}.py").write_text(f"raise ModuleNotFoundError(name={first!r})")
     status, messages = example(name, "--help", folder=tmp_path)
     assert status == 1
-    assert len(messages.splitlines()) == 1
-    assert "is not installed; get it with: pip install" in messages
+    assert messages.splitlines() == [messages.strip()]
+    assert f"{first} is not installed; get it with: pip install" in messages
     assert package in messages
