@@ -41,7 +41,8 @@ class Imagination:
             covariance any more.
         layout: rows of the block. The first are all that stands for a plan between two samples: the states, their joint
             covariance with the coefficients (``P_i_j``), the inputs, ``COST``, and ``BEGUN``, which is 0 before the
-            first sample. ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` are the caller's.
+            first sample. Then, of a differential equation, the states in the middle of the last sample and at its end
+            (``MIDDLE_i``, ``END_i``). ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` are the caller's.
         kept: number of these first rows.
     """
 
@@ -67,7 +68,8 @@ def imagination(model: Model, degree: int = 0, lag: int = 0) -> Imagination:
         raise ValueError(f"degree and lag must be 0 or 1, and lag 0 for a differential equation: {degree}, {lag}")
     inputs = inputs_of(model, degree, lag)
     kept = [*model.states, *pairs("P", model.names), *inputs, "COST", "BEGUN"]
-    place = rows(*kept, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "MARGIN", "NEAR", "CELL")
+    between = [f"{at}_{i}" for at in ("MIDDLE", "END") for i in model.states] if model.is_continuous else []
+    place = rows(*kept, *between, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "MARGIN", "NEAR", "CELL")
     key = repr((model.digest, degree, lag))
     code = stored.load(model.name, "imagination", key, lambda: _source(model, degree, lag, inputs, place), NAMES)
     return Imagination(code.advance, code.judge, place, len(kept))
@@ -105,13 +107,19 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], place: Mappi
     noises = ["Q", *(f"R_{y}" for y in model.outputs)]
     uniform = [*coefficients, *noises, *(f"WALK_{c}" for c in coefficients)]
     source = emit.lane_loop("expect", lines, results, place, LANES, uniform, doc="One expected sample.")
+    if model.is_continuous:
+        # In a loop of its own: each step waits for the one before, and meanwhile processors take those of other lanes.
+        path, points = sensitivity.coarse_path(model, degree)
+        path = derive.renamed(path, given)
+        source += emit.lane_loop("travel", path, points, place, LANES, coefficients, "Where the sample leads to.")
     # What the loops want of a record.
     n, k = model.n_states, model.n_coefficients
     first = (n + k) + (n + k) * (n + k + 1) // 2
     means = ", ".join(f"record[{n + c}]" for c in range(k))
     told = [f"record[{first + 2 * i + 1}] / record[{first + 2 * i}]" for i in range(1 + model.n_outputs)]
     told += [f"walk[{c}]" for c in range(k)]
-    source += f"@straight\ndef advance(W, record, walk):\n    expect(W, {means}, {', '.join(told)})\n"
+    go = f"    travel(W, {means})\n" if model.is_continuous else ""
+    source += f"@straight\ndef advance(W, record, walk):\n{go}    expect(W, {means}, {', '.join(told)})\n"
     return source + _judgement(model, place)
 
 

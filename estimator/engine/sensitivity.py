@@ -122,31 +122,38 @@ def _stage(model: Model) -> tuple[Assignments, _Slopes]:
     return shared(named, "W"), slopes
 
 
-def coarse_motion(model: Model, degree: int) -> tuple[Assignments, derive.Moved]:
-    """A sample of a differential equation that is only imagined: where it moves the state, and M, S and N.
+def coarse_path(model: Model, degree: int) -> tuple[Assignments, dict[str, str]]:
+    """The state over a sample that is only imagined, in some Runge-Kutta steps: where it is in the middle, at the end.
 
-    The state takes some Runge-Kutta steps. The sensitivities take one, through the slopes at begin, middle and end of
-    the sample, which is much less work. With H of its stages and g what unit noise adds to the rates, N is Simpson's
-    rule:
+    Returns:
+        The assignments, and their names of ``MIDDLE_<state>`` and ``END_<state>``.
+    """
+    steps = _STEPS if model.substeps >= _STEPS else _FEWER
+    step = derive.plain_step(replace(model, substeps=steps), degree)
+    lines, points = Lines(), [{i: i for i in model.states}]
+    for s in range(steps):
+        own = {name: f"{name}_{s}" for name, _ in step}
+        begin = {f"M_{i}": name for i, name in points[-1].items()}
+        lines += derive.renamed(step, {**own, **begin, "T": sp.Rational(s, steps)})
+        points.append({i: own[f"M_{i}_E"] for i in model.states})
+    middle = {f"MIDDLE_{i}": name for i, name in points[steps // 2].items()}
+    return lines, middle | {f"END_{i}": name for i, name in points[-1].items()}
+
+
+def coarse_motion(model: Model, degree: int) -> tuple[Assignments, derive.Moved]:
+    """A sample of a differential equation that is only imagined: M, S and N, where the path (`coarse_path`) is known.
+
+    The sensitivities take one step, through the slopes at begin, middle and end of the sample, which is much less work
+    than the path's. With H of its stages and g what unit noise adds to the rates, N is Simpson's rule:
 
         N = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
     """
-    states, lines = list(model.states), Lines()
-    steps = _STEPS if model.substeps >= _STEPS else _FEWER
-    points = [{i: symbol(i) for i in states}]
-    inputs: list[sp.Expr] = []
-    for s in range(steps):
-        step = derive.plain_step(replace(model, substeps=steps), degree)
-        own = {name: f"{name}_{s}" for name, _ in step}
-        begin = {f"M_{i}": value for i, value in points[-1].items()}
-        lines += derive.renamed(step, {**own, **begin, "T": sp.Rational(s, steps)})
-        inputs += [symbol(own[f"V_{tag}"]) for tag in "AD"]
-        points.append({i: symbol(own[f"M_{i}_E"]) for i in states})
-    end = {symbol(i): value for i, value in points[-1].items()}
+    states = list(model.states)
+    lines = Lines(derive.renamed(input_over_step(degree, 1), {"T": sp.S.Zero}))
+    points = {tag: {i: symbol(f"{at}{i}") for i in states} for tag, at in (("A", ""), ("B", "MIDDLE_"), ("D", "END_"))}
+    end = {symbol(i): value for i, value in points["D"].items()}
     noise = [g.xreplace(end) for g in calculus(model).noise]
-    middle = steps // 2
-    stages = ("A", points[0], inputs[0]), ("B", points[middle], inputs[2 * middle]), ("D", points[-1], inputs[-1])
-    slopes = {tag: _slopes_at(model, tag, point, u, lines) for tag, point, u in stages}
+    slopes = {tag: _slopes_at(model, tag, point, symbol(f"V_{tag}"), lines) for tag, point in points.items()}
     slopes["C"] = slopes["B"]
     through: _Slopes = {}
     total: _Slopes = dict.fromkeys(slopes["A"], sp.S.Zero)
@@ -170,7 +177,7 @@ def coarse_motion(model: Model, degree: int) -> tuple[Assignments, derive.Moved]
             value = sum((share * kicks[tag][a] * kicks[tag][b] for tag, share in shares.items()), sp.S.Zero)
             spread[i, k] = spread[k, i] = lines.put(f"N_{i}_{k}", by[i, _HELD] * by[k, _HELD] if model.held else value)
     return lines, derive.Moved(
-        tuple(points[-1].values()),
+        tuple(points["D"].values()),
         tuple(tuple(by[i, j] if j in model.movers else sp.S.Zero for j in model.names) for i in states),
         tuple(tuple(spread[i, k] for k in states) for i in states),
     )
