@@ -7,6 +7,7 @@ import builtins
 import hashlib
 import linecache
 import math
+import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, cached_property, reduce
@@ -102,9 +103,14 @@ _FUNCTIONS: dict[Callable[..., Any], str] = {
 #: What every text must declare.
 EXTERNAL = tuple(sorted(set(_FUNCTIONS.values())))
 
-#: Doubles in a register of AVX-512, and what marks loops over the lanes of a block, whose turns are a multiple of that
-#: (`vectorised`).
-VECTOR, OF_LANES = 8, ", !llvm.loop !of_lanes"
+#: Doubles in a register of AVX-512; loops over the lanes of a block have a multiple of that as turns.
+VECTOR = 8
+
+#: Lines of such a loop up to which two turns go side by side. Of long ones processors' registers do not hold two.
+_SHORT = 340
+
+#: What marks them, and what their marks tell LLVM (`vectorised`).
+_MARK, _MARKS = ", !llvm.loop !lanes_{}", re.compile(r", !llvm\.loop !lanes_(\d)")
 
 _CONVERSIONS: dict[Any, str] = {np.float64: "double", np.int64: "i64", np.uint64: "word"}
 
@@ -113,14 +119,18 @@ def vectorised(text: str, is_wide: bool) -> str:
     """The text of a module whose loops over lanes use registers of AVX-512, where there are any.
 
     LLVM by itself takes half of them on Intel's processors, for the sake of code that needs wide ones here and there.
-    Loops over lanes are little else, and take less time with them.
+    Loops over lanes are little else, and take less time with them. Nor does it put turns side by side where each is
+    more than a few lines; but what waits for results of its own leaves time for another turn.
     """
-    head, *rest = text.split(OF_LANES)
+    head, *rest = _MARKS.split(text)
     if not rest or not is_wide:
-        return head + "".join(rest)
-    marked = (f", !llvm.loop !{i}{part}" for i, part in enumerate(rest, 1))
-    loops = (f"!{i} = distinct !{{!{i}, !0}}\n" for i in range(1, len(rest) + 1))
-    return f'{head}{"".join(marked)}!0 = !{{!"llvm.loop.vectorize.width", i32 {VECTOR}}}\n{"".join(loops)}'
+        return head + "".join(rest[1::2])
+    numbers = range(1, 1 + len(rest) // 2)
+    marked = (f", !llvm.loop !{2 + i}{part}" for i, part in zip(numbers, rest[1::2], strict=True))
+    told = f'!0 = !{{!"llvm.loop.vectorize.width", i32 {VECTOR}}}\n'
+    told += "".join(f'!{turns} = !{{!"llvm.loop.interleave.count", i32 {turns}}}\n' for turns in (1, 2))
+    loops = (f"!{2 + i} = distinct !{{!{2 + i}, !0, !{turns}}}\n" for i, turns in zip(numbers, rest[::2], strict=True))
+    return f"{head}{''.join(marked)}{told}{''.join(loops)}"
 
 
 def leaves(kinds: Any) -> list[str]:
@@ -242,7 +252,7 @@ class Translation(Arithmetic):
         self.lines += [f"%n{n} = add nsw i64 %i{n}, 1", f"%c{n} = icmp slt i64 %n{n}, {end}"]
         calls = any("call void" in line for line in self.lines[at:])
         is_of_lanes = is_number(count) and count % VECTOR == 0 and not calls
-        marked = OF_LANES if is_of_lanes else ""
+        marked = _MARK.format(2 if len(self.lines) - at < _SHORT else 1) if is_of_lanes else ""
         self.lines += [f"br i1 %c{n}, label %loop{n}, label %done{n}{marked}", f"done{n}:"]
         self._block = f"done{n}"
 

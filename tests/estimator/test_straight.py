@@ -2,6 +2,7 @@
 
 import math
 import re
+from typing import Any
 
 import numba
 import numpy as np
@@ -264,6 +265,22 @@ def test_loops_over_lanes_are_of_eight_where_registers_are_wide(is_wide):
     assert text.count("llvm.loop.vectorize.width") == is_wide
     assert text.count("br i1") == 2
     assert len(re.findall(r"br i1 .*!llvm\.loop", text)) == is_wide
+
+
+@pytest.mark.parametrize(("lines", "turns"), [(2, 2), (400, 1)])
+def test_turns_of_short_loops_go_side_by_side(lines, turns):
+    sums = "".join(f"        a{i + 1} = a{i} * a{i}\n" for i in range(lines))
+    text = f"def sums(W):\n    for j in range(16):\n        a0 = W[j]\n{sums}        W[16 + j] = a{lines}\n"
+    scope: dict[str, Any] = {}
+    exec(text, scope)
+    function = straight_within(text)(scope["sums"])
+    module = vectorised(next(iter(function.translated(("ptr",)).definitions.values())), True)
+    loop = re.search(r"br i1 .*!llvm\.loop (!\d+)", module)
+    assert loop
+    count = re.search(rf"^{loop[1]} = .*, (!\d+)}}$", module, re.M)
+    assert count
+    assert f'{count[1]} = !{{!"llvm.loop.interleave.count", i32 {turns}}}' in module
+    binding.parse_assembly(module)
 
 
 @pytest.mark.parametrize(
