@@ -23,7 +23,7 @@ import numpy as np
 
 from agents.planner.candidates import CHOICES, choose, uniform
 from agents.planner.imagination import mind
-from estimator.arrays import copy, highest
+from estimator.arrays import aligned, copy, highest
 from estimator.engine.imagination import imagination
 from estimator.lanes import LANES, jit, lanewise, part
 from estimator.models.model import Model
@@ -133,7 +133,7 @@ def mapped(model: Model, degree: int = 0, lag: int = 0) -> Map:
     @inner
     def memory(horizon, ways):
         blocks = ways // LANES
-        followed, continued = np.empty((blocks, size)), np.empty((len(CHOICES) * blocks, size))
+        followed, continued = aligned(blocks, size), aligned(len(CHOICES) * blocks, size)
         origins, inputs = np.empty((horizon, ways), np.int64), np.empty((horizon, ways))
         most = len(CHOICES) * ways
         scores, ends, visited = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)

@@ -1,8 +1,10 @@
 """Arrays, number by number."""
 
+import numba
 import numpy as np
+import pytest
 
-from estimator.arrays import copy, copy_scaled, fill, highest
+from estimator.arrays import aligned, copy, copy_scaled, fill, highest
 
 
 def test_numbers_go_where_they_are_told():
@@ -20,3 +22,19 @@ def test_the_highest_is_the_first_of_its_like():
     values = np.array([1.0, 3.0, 3.0, 9.0])
     assert highest(values, 3) == 1
     assert highest(values, 4) == 3
+
+
+@numba.njit
+def address(rows, size):
+    matrix = aligned(rows, size)
+    matrix[:] = 1.0
+    return matrix, matrix.ctypes.data
+
+
+@pytest.mark.parametrize("shape", [(1, 8), (3, 1216), (5, 3)])
+def test_an_aligned_matrix_begins_with_a_cache_line(shape):
+    kept = [address(*shape) for _ in range(9)]  # kept, so that each lies elsewhere
+    for matrix, place in kept:
+        assert matrix.shape == shape
+        assert matrix.flags.c_contiguous
+        assert place % 64 == 0
