@@ -148,7 +148,15 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
             told[i, j] = symbol(f"A_{i}_{j}")
     to_come = factorise(told, k, "J", known=True)
     now = factorise({(i, j): cov[j][i] for i in range(k) for j in range(i + 1)}, k, "N", known=True)
-    lines += [*to_come.lines, *now.lines, ("NOW", now.determinant), ("RATIO", to_come.determinant / symbol("NOW"))]
+    # Divisions take longest, so the two share them.
+    both = dict(zip(map(str, to_come.inverse), zip(to_come.pivots, now.pivots, strict=True), strict=True))
+    for (name, value), (name_now, value_now) in zip(to_come.lines, now.lines, strict=True):
+        if name in both:
+            first, second = both[name]
+            lines.append((f"SHARED_{name}", 1 / (first * second)))
+            value, value_now = symbol(f"SHARED_{name}") * second, symbol(f"SHARED_{name}") * first
+        lines += [(name, value), (name_now, value_now)]
+    lines += [("NOW", now.determinant), ("RATIO", to_come.determinant / symbol("NOW"))]
     choose, ratio = sp.Function("select"), symbol("RATIO")
     # `log` is that of positive, normal numbers; comparisons with NaN do not hold.
     known = choose(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(LOST))
