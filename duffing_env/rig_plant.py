@@ -24,7 +24,7 @@ from estimator.ensemble import Hypotheses
 from estimator.models.model import Model
 from estimator.parameters import Parameters
 from estimator.rig import Rig
-from estimator.rig_prior import balance, rig_prior
+from estimator.rig_prior import balance, begun_again, rig_prior
 from estimator.units import Scales
 
 AnyRig = Rig | Mapping[str, Any] | str | Path
@@ -126,7 +126,7 @@ class RigPlantExperiment(RigNumbers, Experiment):
 
     Attributes:
         prior: the belief that every episode starts from, in the rig's scales; what the guess says where it is None.
-            With one the rig needs no guess.
+            With one the rig needs no guess. The state of an oscillator's does not count.
     """
 
     rig: AnyRig | None = None
@@ -140,9 +140,11 @@ class RigPlantExperiment(RigNumbers, Experiment):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rig", checked_rig(self.rig, self.prior is None))
-        if self.prior is None:
-            object.__setattr__(self, "prior", rig_prior(self.described))
-        check_prior(self.prior, self.scales)
+        if self.prior is not None:
+            check_prior(self.prior, self.scales)
+        # A posterior's state is that of the end of its record, and the plant is brought to rest.
+        prior = rig_prior(self.described) if self.prior is None else begun_again(self.prior)
+        object.__setattr__(self, "prior", prior)
         super().__post_init__()
         self._check_parts()
         whole("horizon", self.horizon, MOST_SAMPLES)

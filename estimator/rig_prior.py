@@ -8,6 +8,7 @@ import numpy as np
 
 from estimator.belief import Belief
 from estimator.models.duffing import KINDS
+from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.priors import add_offset, gaussian, moments
 from estimator.rig import Rig
@@ -53,18 +54,40 @@ def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
 def about(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief:
     """A belief in given moments of the coefficients of the rig's model, before a record that may begin in motion."""
     model, known = rig.model, dict(zip(rig.model.coefficients, mean, strict=True))
-    frequency = _frequency(known)
-    displacement = _START / frequency ** KINDS[rig.output.kind]
-    n, d = model.n_states, len(model.names)
-    joint_mean, joint = np.concatenate([np.zeros(n), mean]), np.zeros((d, d))
-    joint[:n, :n] = np.diag([displacement**2, (displacement * frequency) ** 2])
-    joint[n:, n:] = cov
-    if KINDS[rig.output.kind] == 0:
-        add_offset(model, joint_mean, joint)
+    joint_mean, joint = _started(model, KINDS[rig.output.kind], mean, cov)
     force = (rig.input.noise or NOISE * scales.input) / scales.input
     noises = known["gain"] * force / np.sqrt(3), (rig.output.noise or NOISE * scales.output) / scales.output
     gamma, xi = ((2.0, 2.0 * float(noise) ** 2) for noise in noises)
     return Belief.of(model, joint_mean, joint, gamma, xi, scales=scales)
+
+
+def begun_again(belief: Belief) -> Belief:
+    """A belief in a rig of which nobody knows what happened since, as it is before a record that may begin in motion.
+
+    Coefficients and noises stay. So does the state of a model that is no oscillator's with a stiffness.
+    """
+    if not _has_stiffness(belief.model) or belief.model.n_states != 2:
+        return belief
+    order = belief.scales.order
+    mean, cov = _started(belief.model, order, belief.coefficients_mean, belief.coefficients_cov)
+    gamma, *xi = belief.noises.reshape(-1, 2)
+    return Belief.of(belief.model, mean, cov, gamma, xi, scales=belief.scales).factorised(belief.factorisation)
+
+
+def _started(model: Model, order: int, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of states that may be in any motion, and of coefficients with the given ones.
+
+    ``order`` is the time derivative of the displacement that the sensor shows.
+    """
+    frequency = _frequency(dict(zip(model.coefficients, mean, strict=True)))
+    displacement = _START / frequency**order
+    n, d = model.n_states, len(model.names)
+    joint_mean, joint = np.concatenate([np.zeros(n), mean]), np.zeros((d, d))
+    joint[:n, :n] = np.diag([displacement**2, (displacement * frequency) ** 2])
+    joint[n:, n:] = cov
+    if order == 0 and "output_offset" in model.coefficients:
+        add_offset(model, joint_mean, joint)
+    return joint_mean, joint
 
 
 def balance(belief: Belief) -> float | None:
@@ -72,10 +95,14 @@ def balance(belief: Belief) -> float | None:
 
     None for a model without stiffness, of which that is not known.
     """
-    known = dict(zip(belief.model.coefficients, belief.coefficients_mean, strict=True))
-    if not {"stiffness", "cubic"} <= set(known):
+    if not _has_stiffness(belief.model):
         return None
+    known = dict(zip(belief.model.coefficients, belief.coefficients_mean, strict=True))
     return float((2 - belief.scales.order) * np.log(_frequency(known)))
+
+
+def _has_stiffness(model: Model) -> bool:
+    return {"stiffness", "cubic"} <= set(model.coefficients)
 
 
 def _frequency(known: Mapping[str, float]) -> float:

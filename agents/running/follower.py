@@ -21,7 +21,7 @@ from estimator.models.model import Model
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
-from estimator.rig_prior import rig_prior
+from estimator.rig_prior import begun_again, rig_prior
 
 #: A pause is of an unknown length up to so many periods, and never more samples.
 _PERIODS, _LONGEST = 2.0, 4_000
@@ -75,6 +75,7 @@ class Follower:
     Args:
         rig: with a guess, where there is no prior.
         prior: what is believed before the run, such as the ``belief`` of `estimator.identify`; the guess where None.
+            Nobody knows what the rig did since: its state does not count.
 
     Raises:
         ValueError: for a rig with neither guess nor prior, or whose input is not held, or comes early.
@@ -93,7 +94,7 @@ class Follower:
             )
         # What came before an output is given with it: so the belief is that of the tick, before the next input.
         self.delay, paired = rig.delay, replace(rig, delay=rig.delay - 1)
-        prior = rig_prior(rig) if prior is None else prior
+        prior = rig_prior(rig) if prior is None else begun_again(prior)
         self._paused = 0
         self._starts: list[tuple[float, FloatArray, FloatArray]] = []
         self._rung: Drawn | None = None

@@ -17,11 +17,12 @@ from duffing_env.env import DuffingEnv
 from duffing_env.rewards import REWARDS
 from duffing_env.rig_env import RigEnv
 from estimator import Channel, OnlineEstimator, Rig
+from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.pendulum import PENDULUM
 from estimator.parameters import SAMPLING_STEP
 from estimator.priors import silverbox_prior, weak_prior
-from estimator.rig_prior import rig_prior
+from estimator.rig_prior import begun_again, rig_prior
 
 #: In volts, as the tracks are, so that the same numbers go into the same estimator.
 VOLTS = Rig(SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
@@ -235,6 +236,21 @@ def test_a_prior_of_ones_own_is_where_episodes_start():
     np.testing.assert_array_equal(env.belief.coefficients_cov, prior.coefficients_cov)
     env.step([1.0])
     assert env.belief.entropy() < around(Difference(), prior=prior).belief.entropy()
+
+
+def test_an_episode_does_not_begin_where_the_record_of_its_prior_ended():
+    prior = rig_prior(replace(VOLTS, guess=GUESS))
+    mean, cov = prior.mean, prior.cov
+    mean[:2], cov[:2], cov[:, :2] = (0.4, -0.2), 0.0, 0.0
+    cov[0, 0] = cov[1, 1] = 1e-8
+    ended = Belief.of(prior.model, mean, cov, prior.noises[:2], prior.noises[2:], scales=prior.scales)
+    np.testing.assert_allclose(begun_again(ended).record, prior.record, rtol=1e-9, atol=1e-15)
+    env = around(Difference(), prior=ended)
+    env.reset()
+    np.testing.assert_allclose(env.belief.state_mean, prior.state_mean)
+    np.testing.assert_allclose(env.belief.state_cov, prior.state_cov)
+    outputs = silverbox_prior(difference())
+    assert begun_again(outputs) is outputs, "its states are outputs"
 
 
 @pytest.mark.slow  # a kernel of its own

@@ -17,6 +17,7 @@ from agents.running.run import run
 from agents.running.simulated import SimulatedPlant
 from agents.running.simulated import plant as simulated
 from estimator import OnlineEstimator, identify, load_estimator, save_estimator
+from estimator.identification.beliefs import disturbance
 from estimator.identification.tables import read_table
 from estimator.models.duffing import duffing
 
@@ -208,6 +209,27 @@ def test_a_run_goes_on_from_a_posterior(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "next" / "manifest.json").read_text())["message"] == ""
     assert told["m"]["std"] < 0.9 * known.parameters["m"][1]
     assert abs(told["m"]["mean"] - TRUTH["m"]) < 4 * told["m"]["std"]
+
+
+@pytest.mark.parametrize("block", [None, 64])
+def test_a_run_goes_on_from_one_that_ended_in_motion(tmp_path, block):
+    """The estimator of a run by samples knows the state to a thousandth; nobody knows what it became since."""
+
+    def played(name, samples, **more):
+        clock = JumpingClock()
+        plant = SimulatedPlant(RIG, TRUTH, seed=samples, clock=clock)
+        return run(RIG, plant, tmp_path / name, Plan(policy="prbs", samples=samples, **more.pop("plan", {})),
+                   clock=clock, **more)  # fmt: skip
+
+    first = played("first", 200)
+    known = load_estimator(first.folder / "estimator.npz").belief
+    assert np.abs(known.state_mean[0]) > 10 * np.sqrt(known.state_cov[0, 0]), "as where an input drove it"
+    last = played("next", 128, prior=known, plan={"block": block})
+    assert (last.ended, last.message) == ("complete", "")
+    assert 0.5 < disturbance(last.belief) / RIG.input.noise < 2.0
+    for name, (mean, std) in last.parameters.items():
+        assert std < 1.02 * first.parameters[name][1], name
+        assert abs(mean - TRUTH.get(name, 0.0)) < 4 * std, name
 
 
 @pytest.mark.parametrize("block", [None, 64])
