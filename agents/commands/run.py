@@ -38,7 +38,7 @@ class Run:
     """What to do."""
 
     def run(self) -> None:
-        """Run, and print the parameters; the exit status is 1 after a trip, and 128 + its number after a signal."""
+        """Run, and print the parameters; the exit status is 1 after a trip, or where the input could not be zeroed."""
         from agents.cli import progress_bar
         from agents.running.plant import load_plant
         from agents.running.run import run
@@ -58,7 +58,9 @@ class Run:
             if hasattr(plant, "close"):
                 plant.close()
         show(result)
-        if result.exit_status:
+        if result.ended == "zero":
+            print(f"duffing-env: complete, but {result.message}", file=sys.stderr)
+        elif result.exit_status:
             print(f"duffing-env: ended early ({result.ended}): {result.message}", file=sys.stderr)
         elif result.message:
             print(f"duffing-env: warning: {result.message}", file=sys.stderr)

@@ -44,11 +44,12 @@ class Run:
         rig: of the run.
         folder: with manifest.json, samples.csv, events.jsonl, parameters.json and estimator.npz.
         ended: ``complete``; ``range``, ``stale``, ``late``, ``input``, ``plant`` or ``design`` for what tripped
-            (`agents.running.session.Tripped`); or the name of a signal.
+            (`agents.running.session.Tripped`); the name of a signal; or ``zero`` where all was complete, but the input
+            could not be zeroed.
         message: why, where it is not complete; else a warning, or nothing.
         belief: at the end, from all that was measured.
         late: ticks that were missed, those of the silence included.
-        exit_status: for a shell: 0, 1 after a trip, 128 + its number after a signal.
+        exit_status: for a shell: 0, 1 after a trip or ``zero``, 128 + its number after a signal.
     """
 
     rig: Rig
@@ -134,9 +135,10 @@ def run(
     _warm_up(follower, observed, design, policy, plan)
     described = {"command": sys.argv, "rig": rig.to_dict(), "plan": asdict(plan), "watchdog": silence}
     recording = Recording(out, {**described, "plant": repr(plant)[:200]}, rig)
+    session = Session(plant, rig, recording.note, silence, plan.stale)
     message, status, late = "", 1, 0
     try:
-        with Session(plant, rig, recording.note, silence, plan.stale) as session:
+        with session:
             rng = np.random.default_rng(plan.seed)
             if plan.block:
                 assert design is not None
@@ -165,13 +167,21 @@ def run(
     except Stopped as stopped:
         ended, message, status = str(stopped), f"stopped by {stopped}", 128 + stopped.signum
     except BaseException as error:
+        message = _joined(session.failure, f"{type(error).__name__}: {error}")
         with suppress(OSError):  # a full disk may be what ended it
-            recording.close(how="error", message=f"{type(error).__name__}: {error}", late=late)
+            recording.close(how="error", message=message, late=late)
         raise
+    if session.failure:
+        ended, status = "zero" if status == 0 else ended, status or 1
+        message = _joined(session.failure, message)
     recording.close(how=ended, message=message, late=late)
     result = Run(rig, Path(out), ended, message, follower.belief, late, status)
     _write(result, follower)
     return result
+
+
+def _joined(*messages: str) -> str:
+    return "; ".join(filter(None, messages))
 
 
 def _contradiction(rig: Rig, belief: Belief, samples: Path) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -43,6 +45,9 @@ class Session:
         watchdog: seconds of silence after which the plant zeroes its input by itself; None: without.
         stale: outputs in a row that are missing, late, or the very same number, which trip; 0: never.
 
+    Attributes:
+        failure: after it was left: what of zeroing and disarming failed, which stderr is told, too; empty if nothing.
+
     Raises:
         ValueError: as `check_session`.
     """
@@ -53,7 +58,7 @@ class Session:
         check_session(rig, plant, watchdog)
         self.plant, self.watchdog, self.stale = plant, watchdog, stale
         self.limit, self.range = float(rig.input.limit or 0.0), float(rig.output.range or 0.0)
-        self.is_armed = False
+        self.is_armed, self.failure = False, ""
         self._note, self._last, self._same = note, math.nan, 0
         self._stopper = Stopper()
 
@@ -66,10 +71,16 @@ class Session:
     ) -> None:
         self._stopper.ignore()
         try:
-            failures = self.disarm()
+            failures = self._bring_to_zero()
             if failures:
                 told = "the watchdog has to" if self.watchdog is not None else "NOBODY DID: switch it off by hand"
-                self._note("zero failed", message=f"{'; '.join(failures)}; {told}")
+                self.failure = f"the input could not be zeroed at the end: {'; '.join(failures)}; {told}"
+                # Before anything is written: whatever else fails, a person has to know.
+                with suppress(OSError):
+                    print(f"duffing-env: {self.failure}", file=sys.stderr, flush=True)
+            self._note_disarmed(failures)
+            if failures:
+                self._note("zero failed", message=self.failure)
         finally:
             self._stopper.__exit__()
 
@@ -82,16 +93,23 @@ class Session:
 
     def disarm(self) -> list[str]:
         """Zero the input and disarm, whatever fails of it; returns what did."""
+        failures = self._bring_to_zero()
+        self._note_disarmed(failures)
+        return failures
+
+    def _bring_to_zero(self) -> list[str]:
         failures = []
-        for command in (self.plant.zero, self.plant.disarm):
+        for name in ("zero", "disarm"):
             try:
-                command()
+                getattr(self.plant, name)()
             except Exception as error:
-                failures.append(f"{type(error).__name__}: {error}")
+                failures.append(f"{name} failed: {type(error).__name__}: {error}")
+        return failures
+
+    def _note_disarmed(self, failures: list[str]) -> None:
         if self.is_armed:
             self._note("disarmed", input_zeroed=not failures)
         self.is_armed = False
-        return failures
 
     def clamped(self, u: Any) -> Any:
         """What of an input, or of several, is within the limit.

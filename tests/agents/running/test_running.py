@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 
 import gymnasium as gym
@@ -114,6 +115,24 @@ def test_disarming_goes_on_where_zeroing_fails():
         session.arm()
     assert "disarm" in noted
     assert "NOBODY DID" in noted[-1][1]["message"]
+
+
+@pytest.mark.parametrize("method", ["zero", "disarm"])
+@pytest.mark.parametrize("ended", ["zero", "range", "error"])
+def test_an_input_that_could_not_be_zeroed_is_told_loudly(method, ended, tmp_path, capsys):
+    plant = Bench()
+    plant.fault = lambda k, y: 0.09 if k == 20 and ended == "range" else y
+    setattr(plant, method, lambda: 1 / 0)
+    plan = Plan(policy="prbs", samples=16, no_watchdog=True)
+    told = {"told": lambda samples: {}["a bug"]} if ended == "error" else {}
+    with pytest.raises(KeyError) if told else nullcontext():
+        result = run(RIG, plant, tmp_path / "run", plan, clock=plant.clock, **told)
+        assert (result.ended, result.exit_status) == (ended, 1)
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["how"] == ended
+    for said in (capsys.readouterr().err, manifest["message"]):
+        assert f"could not be zeroed at the end: {method} failed: ZeroDivisionError" in said
+        assert "NOBODY DID: switch it off by hand" in said
 
 
 def test_trips():
@@ -595,6 +614,21 @@ def test_the_command(folder, capsys):
     assert Rig.from_file("rig.toml") == RIG
     assert command(*words) == 2
     assert "holds something" in capsys.readouterr().err
+
+
+def test_the_command_fails_where_the_input_could_not_be_zeroed(folder, capsys):
+    (folder / "stuck_of_tests.py").write_text(
+        "from agents.running.simulated import SimulatedPlant\n"
+        "class Stuck(SimulatedPlant):\n    def zero(self):\n        raise OSError('the converter does not answer')\n"
+        "    def disarm(self):\n        self._armed = False\n"
+        "plant = Stuck\n"
+    )
+    words = ["--plant", "stuck_of_tests:plant", "--policy", "prbs", "--samples", "8", "--stale", "0", "--out", "run"]
+    assert command(*words) == 1
+    told = capsys.readouterr()
+    assert "kg" in told.out
+    assert "duffing-env: complete, but the input could not be zeroed at the end" in told.err
+    assert "the watchdog has to" in told.err
 
 
 @pytest.mark.parametrize(
