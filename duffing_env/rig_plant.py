@@ -261,7 +261,7 @@ class RigPlantEnv(DuffingEnv):
         scales = self.experiment.scales
         u = self.max_input * float(np.float32(action))
         try:
-            y = _number(self.plant.step(scales.input * u)) / scales.output
+            y = number_of("step", self.plant.step(scales.input * u)) / scales.output
         except Exception as error:  # whatever it is: the episode ends in order, and its belief is told
             self.plant_error = f"{type(error).__name__}: {error}"
             logger.warn(f"plant.step failed, which ends the episode: {self.plant_error}")
@@ -270,9 +270,13 @@ class RigPlantEnv(DuffingEnv):
         self._batch.step(action)
 
 
-def _number(given: Any) -> float:
-    """The output that a plant gave."""
+def number_of(method: str, given: Any) -> float:
+    """The number that a method of a plant gave.
+
+    Raises:
+        TypeError: for what is neither a number nor an array that holds one.
+    """
     try:
         return float(given.item() if isinstance(given, np.ndarray) else given)
     except (TypeError, ValueError):
-        raise TypeError(f"step must give one number, but gave {shown(given)}") from None
+        raise TypeError(f"{method} must give one number, but gave {shown(given)}") from None

@@ -65,9 +65,20 @@ def load_plant(place: str, rig: Rig, settings: Mapping[str, Any] | None = None) 
         settings: the table ``[instrument]`` of the rig file.
 
     Raises:
-        ValueError: naming what is wrong: no such module or factory, or no plant.
+        ValueError: naming what is wrong: no such module or factory, one that fails, or no plant.
+        ModuleNotFoundError: for a package that the factory needs, and that is not there.
     """
-    return check_plant(load_object(place, "plant")(rig, **(settings or {})))
+    factory = load_object(place, "plant")
+    try:
+        plant = factory(rig, **(settings or {}))
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(
+            f"plant must be made by {place}(rig, **instrument), with the table [instrument] of the rig file, but that "
+            f"failed: {type(error).__name__}: {error}"
+        ) from error
+    return check_plant(plant)
 
 
 def check_plant(plant: Any) -> Plant:

@@ -13,6 +13,8 @@ import numpy as np
 
 from agents.running.plant import Plant
 from agents.running.stopping import Stopper
+from duffing_env.rig_plant import number_of
+from estimator.checks import shown
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
 
@@ -27,7 +29,8 @@ class Tripped(RuntimeError):
 
     Attributes:
         reason: ``range`` (the output left its range), ``stale`` (no new output), ``late`` (none in time), ``input``
-            (the plant applied more than the limit), ``plant`` (it raised an exception), ``design`` (no input is safe).
+            (the plant applied more than the limit), ``plant`` (it raised an exception, or gave something else than it
+            must), ``design`` (no input is safe).
     """
 
     def __init__(self, reason: str, message: str) -> None:
@@ -125,11 +128,11 @@ class Session:
         """Apply an input, clamped; returns what was applied.
 
         Raises:
-            Tripped: if more than the limit was applied, or the plant raised.
+            Tripped: if more than the limit was applied, or the plant raised or gave no number.
         """
         self._stopper.check()
         value = float(self.clamped(u))
-        applied = float(self._do("apply", self.plant.apply, value))
+        applied = self._number("apply", value)
         self._check_applied(np.array([applied]))
         return applied
 
@@ -137,10 +140,10 @@ class Session:
         """The output; NaN where it is missing. `check` judges it.
 
         Raises:
-            Tripped: if the plant raised.
+            Tripped: if the plant raised or gave no number.
         """
         self._stopper.check()
-        return float(self._do("read", self.plant.read))
+        return self._number("read")
 
     def play(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Arm, play inputs (N,), disarm; returns inputs as applied and outputs, (N,) each. `check` judges them.
@@ -154,9 +157,13 @@ class Session:
         failures = self.disarm()
         if failures:
             raise Tripped("plant", f"the input could not be zeroed after a block: {'; '.join(failures)}")
-        applied, y = (np.array(one, dtype=np.float64) for one in told)
+        must = f"play must give two arrays of {asked.shape}, inputs as applied and outputs, but gave"
+        try:
+            applied, y = (np.array(one, dtype=np.float64) for one in told)
+        except (TypeError, ValueError):
+            raise Tripped("plant", f"{must} {shown(told)}") from None
         if applied.shape != asked.shape or y.shape != asked.shape:
-            raise Tripped("plant", f"play must give two arrays of {asked.shape}, but gave {applied.shape}, {y.shape}")
+            raise Tripped("plant", f"{must} {applied.shape}, {y.shape}")
         self._check_applied(applied)
         return applied, y
 
@@ -178,6 +185,13 @@ class Session:
     def _check_applied(self, applied: FloatArray) -> None:
         if not (np.abs(applied) <= self.limit * (1 + _ROUNDING)).all():
             raise Tripped("input", f"the plant applied {np.abs(applied).max():.6g}, beyond ±{self.limit:.6g}")
+
+    def _number(self, name: str, *arguments: Any) -> float:
+        given = self._do(name, getattr(self.plant, name), *arguments)
+        try:
+            return number_of(name, given)
+        except TypeError as error:
+            raise Tripped("plant", str(error)) from None
 
     def _do(self, name: str, command: Callable[..., Value], *arguments: Any) -> Value:
         try:

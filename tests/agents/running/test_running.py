@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -442,6 +443,41 @@ def test_sensors_that_fail_end_the_run_and_everything_measured_is_kept(fault, en
     assert events(tmp_path / "run")[-1]["how"] == ended
 
 
+@pytest.mark.parametrize(
+    ("method", "given", "message"),
+    [
+        ("read", lambda y: None, "read must give one number, but gave None"),
+        ("read", lambda y: "1.2 mm", "read must give one number, but gave '1.2 mm'"),
+        ("read", lambda y: [y], r"read must give one number, but gave \["),
+        ("apply", lambda u: None, "apply must give one number, but gave None"),
+        ("play", lambda told: told[1], r"play must give two arrays of \(16,\), inputs as applied and outputs, "),
+        ("play", lambda told: None, r"play must give two arrays of \(16,\), .* but gave None"),
+        ("play", lambda told: (told[0], "abc"), r"play must give two arrays of \(16,\), .* but gave \("),
+    ],
+)
+def test_a_plant_that_gives_something_else_ends_the_run_by_name(method, given, message, tmp_path):
+    plant, calls = Bench(), []
+    right = getattr(plant, method)
+
+    def wrong(*arguments):
+        calls.append(method)
+        return given(right(*arguments)) if len(calls) > (1 if method == "play" else 20) else right(*arguments)
+
+    setattr(plant, method, wrong)
+    result = play(tmp_path / "run", plant, block=16 if method == "play" else None)
+    assert (result.ended, result.exit_status, plant.applied) == ("plant", 1, 0.0)
+    assert re.match(message, result.message)
+    assert len(rows(tmp_path / "run")) >= 16
+    assert {"parameters.json", "estimator.npz"} <= {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_a_plant_may_give_arrays_of_one_number(tmp_path):
+    plant = Bench()
+    read = plant.read
+    plant.read = lambda: np.array([read()])
+    assert play(tmp_path / "run", plant, samples=8).ended == "complete"
+
+
 def test_an_output_out_of_range_before_arming_arms_nothing(tmp_path):
     plant = Bench()
     plant.fault = lambda k, y: 0.1
@@ -639,6 +675,8 @@ def test_the_command_fails_where_the_input_could_not_be_zeroed(folder, capsys):
         ("agents.running.simulated:plan", "has no 'plan'"),
         ("builtins:repr", "plant must have"),
         ("agents.running.instrument:plant", "must be a table of the rig file"),
+        ("operator:neg", r"made by operator:neg\(rig, \*\*instrument\), .* but that failed: TypeError: bad operand"),
+        ("builtins:divmod", r"the table \[instrument\] of the rig file, but that failed: TypeError: divmod expected 2"),
     ],
 )
 def test_plants_that_are_none(folder, plant, message):
