@@ -46,7 +46,7 @@ class Run:
         ended: ``complete``; ``range``, ``stale``, ``late``, ``input``, ``plant`` or ``design`` for what tripped
             (`agents.running.session.Tripped`); the name of a signal; or ``zero`` where all was complete, but the input
             could not be zeroed.
-        message: why, where it is not complete; else a warning, or nothing.
+        message: why, where it is not complete; then warnings, if any.
         belief: at the end, from all that was measured.
         late: ticks that were missed, those of the silence included.
         exit_status: for a shell: 0, 1 after a trip or ``zero``, 128 + its number after a signal.
@@ -136,7 +136,7 @@ def run(
     described = {"command": sys.argv, "rig": rig.to_dict(), "plan": asdict(plan), "watchdog": silence}
     recording = Recording(out, {**described, "plant": repr(plant)[:200]}, rig)
     session = Session(plant, rig, recording.note, silence, plan.stale)
-    message, status, late = "", 1, 0
+    message, lost, status, late = "", "", 1, 0
     try:
         with session:
             rng = np.random.default_rng(plan.seed)
@@ -155,11 +155,9 @@ def run(
                     assert choose is not None
                     session.arm()
                     ticker.play(choose, plan.samples, told)
-                    message = ticker.warning
                 finally:
-                    late = ticker.late
+                    late, lost = ticker.late, ticker.warning
         ended, status = "complete", 0
-        message = message or _contradiction(rig, follower.belief, recording.samples)
     except Tripped as trip:
         ended, message = trip.reason, str(trip)
         if late and ended == "range":
@@ -173,7 +171,9 @@ def run(
         raise
     if session.failure:
         ended, status = "zero" if status == 0 else ended, status or 1
-        message = _joined(session.failure, message)
+    # That outputs came late is what ended such a run.
+    warnings = "" if ended == "late" else lost, _contradiction(rig, follower.belief, recording.samples)
+    message = _joined(session.failure, message, *warnings)
     recording.close(how=ended, message=message, late=late)
     result = Run(rig, Path(out), ended, message, follower.belief, late, status)
     _write(result, follower)
@@ -189,6 +189,9 @@ def _contradiction(rig: Rig, belief: Belief, samples: Path) -> str:
 
     A belief that is sure of wrong coefficients keeps them.
     """
+    with samples.open(encoding="utf-8") as lines:
+        if sum(1 for _ in lines) <= _FEWEST:
+            return ""
     table = read_table(samples, rig.input.column, rig.output.column)
     u, y = table.columns[table.u], table.columns[table.y]
     if np.isfinite(y).sum() < _FEWEST:

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import re
+import signal
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -583,6 +584,37 @@ def test_a_complete_run_that_lost_many_outputs_warns(tmp_path):
     )
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["message"] == result.message
     assert play(tmp_path / "other").message == ""
+
+
+@pytest.mark.parametrize("ended", ["complete", "SIGINT", "plant"])
+def test_every_warning_is_told_whatever_ended_the_run(ended, tmp_path):
+    known = Bench()
+    known.arm(None)
+    believed = identify(RIG, known.play(np.repeat(np.random.default_rng(0).choice([-3.0, 3.0], 32), 8))).belief
+    plant = slow_to_read(1.5, after=120)
+    plant.truth |= {"a": 1.1 * TRUTH["a"]}
+    plant.fault = lambda k, y: 1 / 0 if k == 140 and ended == "plant" else y
+
+    def told(samples):
+        if samples > 150 and ended == "SIGINT":
+            signal.raise_signal(signal.SIGINT)
+
+    plan = Plan(policy="prbs", samples=160, stale=0)
+    result = run(RIG, plant, tmp_path / "run", plan, prior=believed, clock=plant.clock, told=told)
+    assert result.ended == ended
+    assert "outputs came too late to be used: intervals may be too narrow" in result.message
+    assert "what was believed before is wrong: identify" in result.message
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["message"] == result.message
+
+
+def test_a_run_without_any_output_ends_in_order(tmp_path):
+    plant = Bench()
+    plant.fault = lambda k, y: 1 / 0
+    result = play(tmp_path / "run", plant)
+    assert (result.ended, result.message) == ("plant", "read failed: ZeroDivisionError: division by zero")
+    plant = Bench()
+    plant.fault = lambda k, y: math.nan
+    assert play(tmp_path / "other", plant, samples=100, stale=0).ended == "complete"
 
 
 def test_the_folder_of_another_run_is_left_alone(tmp_path):
