@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from tyro.constructors import PrimitiveConstructorSpec
 
+from agents.loading import spec_of
 from agents.running.stopping import Stopped, stopped_by_sigterm
 
 
@@ -104,14 +105,15 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[str | Pat
 
 
 def full_id(env: Any) -> Any:
-    """The id of a track by its name; anything else as it is.
+    """The id of a track by its name, without the module that registers it; anything else as it is.
 
     Example:
-        >>> full_id("Short-v0"), full_id("duffing_env/Short-v0"), full_id("CartPole-v1")
+        >>> full_id("Short-v0"), full_id("duffing_env:duffing_env/Short-v0"), full_id("CartPole-v1")
         ('duffing_env/Short-v0', 'duffing_env/Short-v0', 'CartPole-v1')
     """
     from duffing_env import TRACKS
 
+    env = env.removeprefix("duffing_env:") if isinstance(env, str) else env
     return f"duffing_env/{env}" if f"duffing_env/{env}" in TRACKS else env
 
 
@@ -132,7 +134,7 @@ def check_track(env_id: str) -> None:
     if not isinstance(env_id, str):
         raise ValueError(f"env must be the id of a track such as duffing_env/Short-v0, but is {shown(env_id)}")
     try:
-        entry: Any = gym.spec(env_id).vector_entry_point
+        entry: Any = spec_of(env_id).vector_entry_point
         entry = load_env_creator(entry) if isinstance(entry, str) else entry
     except ImportError as error:
         raise ValueError(

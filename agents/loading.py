@@ -5,7 +5,10 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
 
 
 def load_object(place: str, what: str) -> Any:
@@ -21,14 +24,33 @@ def load_object(place: str, what: str) -> Any:
     module, _, name = place.partition(":")
     if not module or not name:
         raise ValueError(f"{what} must be module:name, but is {place!r}; such as lab:{what}, for {what} in lab.py")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)
     try:
-        return getattr(importlib.import_module(module), name)
+        return getattr(_imported(module), name)
     except ModuleNotFoundError as error:
         if error.name is None or not module.startswith(error.name):
             raise
         raise ValueError(f"{what} must be module:name, but there is no module {module!r}: {error}") from error
     except AttributeError as error:
         raise ValueError(f"{what} must be module:name, but {module} has no {name!r}; name one it has") from error
+
+
+def spec_of(env_id: str) -> EnvSpec:
+    """What Gymnasium has registered under an id, of which ``module:`` is imported first, as ``gym.make`` does.
+
+    Raises:
+        ModuleNotFoundError: if there is no such module.
+        gymnasium.error.Error: for an id that is not registered.
+    """
+    import gymnasium as gym
+
+    module, _, name = env_id.rpartition(":")
+    if module:
+        _imported(module)
+    return gym.spec(name)
+
+
+def _imported(module: str) -> Any:
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    return importlib.import_module(module)

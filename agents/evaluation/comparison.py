@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
 from agents.cli import RIG_TRACK
 from agents.evaluation.leaderboard import print_estimators, print_table, write_evaluations
 from agents.evaluation.rollout import Evaluation, evaluate
+from agents.loading import spec_of
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import load_policy
 from agents.results import check_folder, spinner
@@ -27,7 +26,7 @@ def usual_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
 
     A record can be asked for its own input only; and all but the signals look at the posterior.
     """
-    usual = gym.spec(env_id).kwargs
+    usual = spec_of(env_id).kwargs
     if usual.get("regime") is not None:
         return (f"silverbox-{options.get('regime', 'multisine')}",)
     if {**usual, **options}.get("observation", "posterior") != "posterior":

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.cli import RIG_TRACK, JsonOptions, check_track, full_id, with_rig
+from agents.loading import spec_of
 from agents.policies.learned import CONFIG
 from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
@@ -120,9 +121,7 @@ class TrainConfig(Subject):
 
 def _check_seen(config: TrainConfig) -> None:
     """Refuse an observation that a foresight cannot look out from."""
-    import gymnasium as gym
-
-    shown_there = {**gym.spec(config.env).kwargs, **config.options}.get("observation", "posterior")
+    shown_there = {**spec_of(config.env).kwargs, **config.options}.get("observation", "posterior")
     if shown_there != "posterior":
         raise ValueError(
             f"observation must be 'posterior' with foresight, but is {shown(shown_there)}; "

@@ -26,8 +26,8 @@ Settings = TypeVar("Settings")
 
 
 def track_of(env_id: str) -> str:
-    """The name of a track without its namespace: "Amplitude-v0"."""
-    return env_id.split("/")[-1]
+    """The name of a track without its module and namespace: "Amplitude-v0"."""
+    return env_id.rpartition(":")[2].split("/")[-1]
 
 
 def table_of(env_id: str) -> str:

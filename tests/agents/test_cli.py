@@ -14,6 +14,8 @@ import pytest
 import tyro
 
 from agents.cli import JsonOptions, run_script
+from agents.training import TrainConfig
+from agents.training.hyperparameters import track_of
 
 ROOT = Path(__file__).parents[2]
 #: Where the options of each script are declared: file and class.
@@ -202,6 +204,26 @@ def test_a_folder_that_is_a_file_is_one_message(script, tmp_path):
     assert messages.startswith("evaluate.py: ")
     assert "out" in messages
     assert (tmp_path / "out").read_text() == "precious"
+
+
+def test_the_module_that_registers_a_track_may_stand_before_its_id(script, tmp_path, monkeypatch):
+    (tmp_path / "own_of_tests.py").write_text(
+        "import gymnasium as gym\n"
+        "gym.register('mine/OfTests-v0', entry_point='duffing_env.env:DuffingEnv',\n"
+        "             vector_entry_point='duffing_env.vector_env:DuffingVectorEnv', kwargs={'horizon': 4})\n"
+    )
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
+    env = "own_of_tests:mine/OfTests-v0"
+    status, messages = script("evaluate.py", "--env", env, "--policies", "uniform", "--systems", 2)
+    assert status == 0, messages
+    told = json.loads((tmp_path / "runs" / "evaluation" / "evaluation.json").read_text())
+    assert told["settings"]["env"] == env
+    config = TrainConfig(env=env)
+    assert (config.env, track_of(config.env)) == (env, "OfTests-v0")
+    assert TrainConfig(env="duffing_env:duffing_env/Short-v0") == TrainConfig(env="Short-v0")
+    status, messages = script("evaluate.py", "--env", "no_such_module:mine/OfTests-v0")
+    assert status == 2
+    assert "env must be the id of a track such as duffing_env/Short-v0, but is no_such_module:mine/OfTests-v0" in messages
 
 
 def test_train_then_evaluate(script, tmp_path):
