@@ -51,6 +51,8 @@ class Evaluate:
     """File of the board."""
 
     def __post_init__(self) -> None:
+        if self.rig is not None and self.env is not None and full_id(self.env) != RIG_TRACK:
+            raise ValueError(f"env must be left out with rig, whose track is Rig-v0, but is {self.env}; leave one out")
         check_track(self._track)
         if self.protocol is not None and len(self.policies) != 1:
             raise ValueError(f"policies must name one for the protocol, but are {list(self.policies)}; name one")

@@ -38,6 +38,8 @@ class Subject:
     """File of hyperparameters, TOML; the one that comes with the package where it is not given."""
 
     def __post_init__(self) -> None:
+        if self.rig is not None and full_id(self.env) not in (Subject.env, RIG_TRACK):
+            raise ValueError(f"env must be left out with rig, whose track is Rig-v0, but is {self.env}; leave one out")
         object.__setattr__(self, "env", RIG_TRACK if self.rig is not None else full_id(self.env))
 
 
