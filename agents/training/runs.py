@@ -292,13 +292,18 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
 
 
 def _run_folder(config: TrainConfig) -> Path:
-    """The folder to write to; one that is named must not hold a run already."""
+    """The folder to write to; one that is named must be new or empty."""
     if config.output is not None:
         for kept, name in (("run", CONFIG), ("policy", CARD)):
             if (config.output / name).exists():
                 raise ValueError(
                     f"output must be a new folder, but {config.output} holds a {kept}; remove it or name another"
                 )
+        if config.output.is_dir() and (other := min((path.name for path in config.output.iterdir()), default="")):
+            raise ValueError(
+                f"output must be a new or empty folder, but {config.output} holds {other}, which is no training's; "
+                "name another"
+            )
         return config.output
     base = Path("runs") / f"{config.algo}-{track_of(config.env).lower()}-{config.seed}"
     folder, number = base, 1

@@ -202,6 +202,13 @@ def test_checkpoints_are_evenly_spaced(tmp_path, checkpoints, expected):
     assert sorted(int(path.name) for path in (run.folder / "checkpoints").iterdir()) == expected
 
 
+def test_a_folder_that_holds_something_else_is_refused(tmp_path):
+    (tmp_path / "manifest.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"output must be a new or empty folder, but .* holds manifest.json, "):
+        tiny(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+
+
 def test_a_folder_that_holds_a_run_is_refused_untouched(runs):
     folder = runs["other"].folder
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
