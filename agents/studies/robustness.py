@@ -47,6 +47,12 @@ class Config:
     output: Path | None = None
     """File for the figures of every system, as JSON."""
 
+    def __post_init__(self) -> None:
+        for name, known in (("cases", range(1, len(CASES) + 1)), ("versions", (0, 1))):
+            given = getattr(self, name)
+            if not given or not set(given) <= set(known):
+                raise ValueError(f"{name} must be of {list(known)}, but are {list(given)}; name some of these")
+
 
 def own(track: str, version: int) -> str:
     """The policy that ships for a track."""

@@ -55,3 +55,11 @@ def test_policies_are_judged_beside_the_planner():
     assert signal["efficiency"].mean() < 1.0
     assert robustness.own("Power", 0) == "ppo/power"
     assert robustness.own("Power", 1) == "ppo/power-v1"
+
+
+@pytest.mark.parametrize("cases", [(9,), (0,), ()])
+def test_cases_that_are_none_are_refused(cases):
+    with pytest.raises(ValueError, match=r"cases must be of \[1, 2, 3, 4\], but are \["):
+        robustness.Config(cases=cases)
+    with pytest.raises(ValueError, match=r"versions must be of \[0, 1\], but are \[2\]"):
+        robustness.Config(versions=(2,))
