@@ -16,7 +16,7 @@ from estimator.checks import hint, number, one_of, printable, shown, whole
 from estimator.files import file_name, whole_file, write_atomically
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
-from estimator.units import SIZES, Scales
+from estimator.units import SIZES, Scales, kind_of
 
 #: How the input goes between samples, and the degree of the polynomial that each takes.
 INTERPOLATIONS = {"zero_order": 0, "linear": 1, "look_ahead": 5, "spline": 5}
@@ -133,6 +133,10 @@ class Rig:
                 raise ValueError(f"{name} must have no {other}, but has {getattr(channel, other)}; use {right}")
         if self.input.kind != "displacement":
             raise ValueError(f"input must have no kind, but has {self.input.kind!r}; kind is of the output")
+        if (told := kind_of(self.output.unit)) not in (None, self.output.kind):
+            raise ValueError(
+                f"output.kind must be {told!r} with the unit {self.output.unit}, but is {self.output.kind!r}; mend one"
+            )
         object.__setattr__(self, "guess", _guessed(self.guess))
 
     @classmethod

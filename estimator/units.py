@@ -20,9 +20,17 @@ Dimension = tuple[int, int, int]
 #: Smallest and largest size of anything, in its unit: products of several stay within what numbers can hold.
 SIZES = 1e-30, 1e30
 
+#: Units that only one kind of output has.
+_KINDS = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "acceleration": r".+/s(²|\^?2|/s)|m?g"}
+
 SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _DIGITS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _ATOM = re.compile(r"([^\s·/\d⁰¹²³⁴⁵⁶⁷⁸⁹⁻^-]+)(?:\^?(-?\d+))?")
+
+
+def kind_of(unit: str) -> str | None:
+    """The kind of output that alone has a unit; None for one that tells none, such as V."""
+    return next((kind for kind, units in _KINDS.items() if re.fullmatch(units, unit)), None)
 
 
 @dataclass(frozen=True)

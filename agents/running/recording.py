@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from agents.results import finite, versions
+from agents.results import check_folder, finite, versions
 from estimator.files import append_atomically, write_atomically
 from estimator.rig import Rig
 
@@ -35,11 +35,13 @@ class Recording:
 
     Raises:
         ValueError: for a folder that holds something.
+        NotADirectoryError: for a file, or a place in one.
     """
 
     def __init__(self, folder: str | Path, manifest: dict[str, Any], rig: Rig) -> None:
         self.folder = Path(folder)
-        if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
+        check_folder("out", self.folder)
+        if self.folder.exists() and any(self.folder.iterdir()):
             raise ValueError(f"out must be a new or empty folder, but {self.folder} holds something; name another one")
         self.folder.mkdir(parents=True, exist_ok=True)
         self._manifest = {**manifest, "versions": versions(), "commit": _commit(), "started": _time(), "ended": None}

@@ -180,7 +180,8 @@ class Session:
             self._same = self._same + 1 if not math.isfinite(y) or y == self._last else 0
             self._last = y if math.isfinite(y) else self._last
             if self.stale and self._same >= self.stale:
-                raise Tripped("stale", f"{self._same} outputs in a row were missing, or {self._last:.6g} again")
+                again = "" if math.isnan(self._last) else f", or {self._last:.6g} again"
+                raise Tripped("stale", f"{self._same} outputs in a row were missing{again}")
 
     def _check_applied(self, applied: FloatArray) -> None:
         if not (np.abs(applied) <= self.limit * (1 + _ROUNDING)).all():

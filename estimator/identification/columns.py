@@ -17,9 +17,6 @@ KINDS = {
 _OUTPUTS = ("y", "output", "out", "response", "x", *(word for words in KINDS.values() for word in words))
 _TIMES = ("t", "time")
 
-#: Units that only one kind of output has.
-UNITS = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "acceleration": r".+/s(²|\^?2|/s)|m?g"}
-
 #: What a time column may be in [s].
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 

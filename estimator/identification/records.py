@@ -64,7 +64,8 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
     """Records from a pair (u, y), a file name, or a list of these.
 
     A record is cut in two where an input is missing; clipped outputs are taken as missing. Pieces of fewer than 8
-    outputs are left out, but not a whole record. A record may not be given twice: its samples would count twice.
+    outputs are left out, but not a whole record. A record may not be given twice, also with other outputs missing: its
+    samples would count twice.
 
     Args:
         given: what the caller has.
@@ -81,7 +82,7 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
     listed = list(given)
     if not listed:
         raise ValueError("records must hold at least one pair (u, y) or file name, but are empty")
-    found, names = list[Record](), dict[int, str]()
+    found, whole = list[Record](), list[Record]()
     for number, one in enumerate(listed):
         name = str(one) if isinstance(one, str | Path) else f"record {number}"
         if isinstance(one, str | Path):
@@ -94,10 +95,10 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
             )
         if len(u) != len(y):
             raise ValueError(f"u and y of {name} must have one length, but have {len(u)} and {len(y)}; cut the longer")
-        first = names.setdefault(hash((u.tobytes(), y.tobytes())), name)
-        if len(names) <= number:
+        whole.append(Record(name, u, y))
+        if first := next((earlier.name for earlier in whole[:-1] if _are_same(earlier, whole[-1])), None):
             raise ValueError(f"{name} must be a record of its own, but has the samples of {first}; leave one out")
-        pieces = _cut(Record(name, u, y))
+        pieces = _cut(whole[-1])
         if not pieces:
             count = int((np.isfinite(u) & np.isfinite(y)).sum())
             raise ValueError(
@@ -116,6 +117,14 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
 
 def _is_pair(one: Any) -> bool:
     return isinstance(one, tuple) and len(one) == 2 and not any(isinstance(part, str | Path) for part in one)
+
+
+def _are_same(one: Record, other: Record) -> bool:
+    """Whether inputs are the same, and all outputs that both have."""
+    if not np.array_equal(one.u, other.u, equal_nan=True):
+        return False
+    both = np.isfinite(one.y) & np.isfinite(other.y)
+    return int(both.sum()) >= _SHORTEST and np.array_equal(one.y[both], other.y[both])
 
 
 def _seen(values: FloatArray) -> FloatArray:

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from estimator.identification.columns import KINDS, SECONDS, UNITS, chosen, plain, unit_of, with_unit, word_of
+from estimator.identification.columns import KINDS, SECONDS, chosen, plain, unit_of, with_unit, word_of
 from estimator.parameters import FloatArray
 from estimator.rig import Channel
+from estimator.units import kind_of
 
 #: What stands for a missing number, in lower case.
 _MISSING = ("", "na", "n/a", "#n/a", "null", "none", "-")
@@ -111,7 +112,7 @@ class Table:
         """
         word, unit = word_of(self.names[self.y]) if self.names else "", self.unit(self.y) or ""
         named = next((kind for kind, words in KINDS.items() if word in words), None)
-        told = next((kind for kind, units in UNITS.items() if re.fullmatch(units, unit)), None)
+        told = kind_of(unit)
         if named and told and named != told:
             raise ValueError(
                 f"{self.path}: unit of {self.names[self.y]!r:.60} must be of a kind with the name, {named}, but tells "

@@ -41,7 +41,7 @@ def test_files(tmp_path):
     plain.write_text("\n".join(lines))
     lines[7] = lines[7].rsplit(",", 1)[0] + ","
     named.write_text("# a comment\nTime [s],Force [N],Displacement [m]\n" + "\n".join(lines) + "\n")
-    one, other = records_of([plain, str(named)], Rig(0.01))
+    (one,), (other,) = (records_of(path, Rig(0.01)) for path in (plain, str(named)))
     np.testing.assert_array_equal(one.u, u)
     assert (one.missing, other.missing) == (0, 1)
     from scipy.io import savemat
@@ -175,6 +175,10 @@ def test_errors_of_files_name_the_line(tmp_path, text, message):
         ),
         ([simulated(SOFT, samples=400), (np.ones(5), np.arange(5.0))], "record 1 must have 8 outputs or more"),
         ([simulated(SOFT, samples=400)] * 2, "record 1 must be a record of its own, but has the samples of record 0"),
+        (
+            [given := simulated(SOFT, samples=400), (given[0], np.where(np.arange(400) % 9, given[1], np.nan))],
+            "record 1 must be a record of its own, but has the samples of record 0",
+        ),
         ([(np.ones(100), np.arange(100.0))], "u must vary, but is constant"),
         ([(np.full(100, np.inf), np.arange(100.0))], "u of record 0 must be finite"),
     ],

@@ -51,7 +51,7 @@ def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
         Rig(0.1),
         BENCH,
         Rig(np.float64(1 / 3), "linear", 2, {"unit": "N", "limit": np.float32(0.1), "noise": 1e-7, "offset": -0.2}),
-        replace(BENCH, delay=-1, output=Channel("µm", None, 3, "acceleration", 1e-300 * 1e280, 5.0, "Weg ü")),
+        replace(BENCH, delay=-1, output=Channel("µm/s²", None, 3, "acceleration", 1e-300 * 1e280, 5.0, "Weg ü")),
         *map(Rig.shipped, SHIPPED),
     ],
 )
@@ -77,6 +77,7 @@ def test_a_saved_rig_is_the_same(rig, tmp_path):
         ({"output": {"unit": "m", "limit": 3.0}}, "output must have no limit, but has 3.0; use range"),
         ({"input": {"unit": "N", "kind": "velocity"}}, "input must have no kind"),
         ({"output": {"kind": "jerk"}}, "kind must be one of ['displacement', 'velocity', 'acceleration']"),
+        ({"output": {"unit": "mm", "kind": "velocity"}}, "output.kind must be 'displacement' with the unit mm, but is"),
         ({"output": {"noise": 0}}, "noise must be a number from 1e-30 to 1e+30, but is 0; leave it out"),
         ({"output": {"unit": ""}}, "unit must be a short text"),
         ({"output": 3}, "output must be a Channel, but is 3"),

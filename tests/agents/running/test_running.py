@@ -149,6 +149,11 @@ def test_trips():
         with pytest.raises(Tripped, match="again") as tripped:
             session.check(np.array([0.01, np.nan]))
         assert tripped.value.reason == "stale"
+        with (
+            pytest.raises(Tripped, match=r"^5 outputs in a row were missing$"),
+            Session(plant, RIG, nothing, 2.0, stale=5) as other,
+        ):
+            other.check(np.full(5, np.nan))
         plant.apply = lambda u: 4.1
         with pytest.raises(Tripped, match=r"applied 4\.1") as tripped:
             session.apply(1.0)
@@ -623,6 +628,9 @@ def test_the_folder_of_another_run_is_left_alone(tmp_path):
     with pytest.raises(ValueError, match="out must be a new or empty folder"):
         play(tmp_path / "run")
     assert (tmp_path / "run" / "samples.csv").read_bytes() == before
+    for place in ("run/samples.csv", "run/samples.csv/next"):
+        with pytest.raises(NotADirectoryError, match=r"out must be a folder, but .*samples\.csv is a file; "):
+            play(tmp_path / place)
 
 
 @pytest.mark.parametrize(
