@@ -26,6 +26,9 @@ Frame = npt.NDArray[np.uint8]
 WIDTH, HEIGHT = 960, 540
 """Size of a frame in pixels."""
 
+#: Most of the width that the heading may take: the status of a long episode begins behind it.
+_HEADING = 0.13
+
 SPAN = 256
 """Samples on the time axes. Longer episodes scroll: more samples would hide the single periods."""
 
@@ -188,7 +191,10 @@ class _Picture:
         ]
         self._panels: tuple[_SignalPanel | _ParameterPanel, ...] = (*self._signals, *self._parameters)
         style: dict[str, Any] = {"color": INK, "verticalalignment": "center_baseline"}
-        self._figure.text(0.06, 0.945, title, fontsize=12, weight="bold", **style)
+        heading = self._figure.text(0.06, 0.945, title, fontsize=12, weight="bold", **style)
+        # The name of a model is made as small as it has to be to end before the status begins.
+        wide = heading.get_window_extent(self._canvas.get_renderer()).width / WIDTH
+        heading.set_fontsize(min(12.0, 12.0 * _HEADING / wide))
         self._status = self._figure.text(0.47, 0.945, "", fontsize=9, ha="right", animated=True, **style)
         self._figure.text(0.505, 0.48, "deviation from the truth [%]", color=INK, fontsize=9, rotation=90, va="center")
         self._add_legend()

@@ -144,7 +144,11 @@ def test_other_models_are_drawn_with_their_own_names_units_and_truth(track, titl
         env.step(action[np.newaxis])
     assert env.render().shape == (HEIGHT, WIDTH, 3)
     picture, names = env._screen._picture, rendering.named(env.belief.model)
-    assert picture._figure.texts[0].get_text() == title
+    heading = picture._figure.texts[0]
+    assert heading.get_text() == title
+    picture._status.set_text("sample 1024 of 1024, 123.4 nats gained")
+    spaces = [text.get_window_extent(picture._canvas.get_renderer()) for text in (heading, picture._status)]
+    assert spaces[0].x1 + 4 < spaces[1].x0
     assert [panel.axes.get_title("left") for panel in picture._parameters] == labels
     assert [panel.axes.get_title("left") for panel in picture._signals] == signals
     for panel, name in zip(picture._parameters, names, strict=True):
