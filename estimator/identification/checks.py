@@ -57,6 +57,9 @@ _FAR = 5.0
 #: and all that is left of a simulated record without noise.
 _FINEST = 1e-6
 
+#: How far off a gross outlier is: in parts of what 99 % of all are off, and of those beside it.
+_GROSS, _ALONE = 10.0, 5.0
+
 #: Fewest samples in a period.
 SLOWEST = 5.0
 
@@ -111,7 +114,7 @@ def _error(records: Sequence[Record], forecasts: Sequence[FloatArray]) -> float:
 
 
 def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
-    rig, warnings = problem.rig, []
+    rig, warnings = problem.rig, _of_outliers(problem.rig.output, records)
     stops = sum(one.clipped for one in records)
     if stops:
         message = f"{stops} outputs stand at a stop and were taken as missing; widen the range, or drive it less"
@@ -129,6 +132,32 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
         message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, 6 at least"
         warnings.append(Finding("sampling_too_slow", message))
     return warnings
+
+
+def _of_outliers(channel: Channel, records: Sequence[Record]) -> list[Finding]:
+    """Outputs that are far off alone, which spoil the fit that the other checks judge.
+
+    Not of accelerations, which answer an impulse at once.
+    """
+    if channel.kind == "acceleration":
+        return []
+    outputs = np.concatenate([one.y for one in records])
+    middle = np.nanmedian(outputs)
+    usual = float(np.nanquantile(np.abs(outputs - middle), 0.99))
+    found = []
+    for one in records:
+        off = np.nan_to_num(np.abs(one.y - middle))
+        beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
+        found += [(off[k], k, one) for k in np.flatnonzero(off > np.maximum(_GROSS * usual, _ALONE * beside))]
+    if not found or usual == 0:
+        return []
+    _, k, one = max(found, key=lambda place: float(place[0]))
+    message = (
+        f"{len(found)} outputs stand alone, far off all others: sample {k} of {one.name} is {one.y[k]:.3g} "
+        f"{channel.unit}, and 99 % are within {usual:.3g} {channel.unit} of the middle; make them missing, and "
+        "identify again, before anything else is looked at"
+    )
+    return [Finding("outliers", message)]
 
 
 def _of_hypotheses(problem: Problem, found: Found) -> list[Finding]:

@@ -8,6 +8,8 @@ import pytest
 from oscillators import BENCH, SOFT, deviations, rig_of, simulated
 
 from estimator import Channel, Rig, identify
+from estimator.identification.checks import _of_outliers
+from estimator.identification.records import Record
 
 GUESS = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
 
@@ -23,6 +25,27 @@ GUESS = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENC
 def test_faults_are_named(change, name):
     result = identify(rig_of(BENCH), change(*simulated(BENCH)))
     assert name in [warning.name for warning in result.warnings]
+
+
+def test_a_gross_outlier_stands_first():
+    u, y = simulated(BENCH)
+    y[700], y[3] = 1e3, -80.0
+    first = identify(rig_of(BENCH), (u, y)).warnings[0]
+    assert first.name == "outliers"
+    assert "2 outputs stand alone, far off all others: sample 700 of record 0 is 1e+03 m" in first.message
+    assert "and 99 % are within 0.0" in first.message
+
+
+def test_a_blow_that_rings_out_in_a_long_silence_is_no_outlier():
+    k = np.arange(4000)
+    y = np.exp(-k / 15) * np.cos(2 * np.pi * k / 5) + 1e-4 * np.random.default_rng(0).standard_normal(len(k))
+    assert np.abs(y).max() > 20 * np.quantile(np.abs(y), 0.99)
+    struck = Record("struck", np.zeros(4000), np.concatenate([y[:1000] * 1e-4, y[:3000]]))
+    assert _of_outliers(Channel("m"), [struck]) == []
+    struck.y[50] = 30.0
+    (found,) = _of_outliers(Channel("m"), [struck])
+    assert "sample 50 of struck is 30 m" in found.message
+    assert _of_outliers(Channel("m/s²", kind="acceleration"), [struck]) == []
 
 
 @pytest.mark.parametrize("late", [4, 12, 24, 45])
