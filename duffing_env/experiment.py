@@ -57,7 +57,7 @@ class Experiment:
 
     #: Whether there is a true plant to compare with.
     knows_truth: ClassVar[bool] = True
-    #: Whether hypotheses about the noises are moved by sigma points: where they start from a wide belief.
+    #: Whether hypotheses about the noises are moved by sigma points: from a wide belief, or where a model bends.
     points: ClassVar[bool] = False
 
     def __post_init__(self) -> None:

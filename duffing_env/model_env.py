@@ -33,6 +33,9 @@ class ModelExperiment(SimulatedExperiment):
     interpolation: str = "zero_order"
     sensor_noise: tuple[float, ...] | None = None
 
+    #: A model may bend more than can be followed to first order.
+    points: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         super().__post_init__()
         names = parameter_names(self.plant)
@@ -145,6 +148,12 @@ class ModelEnv(DuffingEnv):
 
     Terminated at \|y\| > ``max_output`` of the first sensor, or at a number that is not finite; truncated after
     ``horizon`` samples.
+
+    ## Belief
+
+    The estimator follows the model to first order. Where a model bends more than that, its intervals are too narrow:
+    of ``WienerHammerstein-v0`` those of 90 % hold 68 to 84 % under binary inputs at the limit. With
+    ``noise_hypotheses`` above 1 it moves sigma points, and they hold 87 to 90 % (docs/coverage.md).
 
     ## Information
 

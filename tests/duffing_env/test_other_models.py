@@ -99,3 +99,14 @@ def test_the_prior_of_a_range_is_as_wide_as_the_range_for_several_sensors_too():
     np.testing.assert_array_equal(belief.coefficients_mean, mean)
     np.testing.assert_array_equal(belief.coefficients_cov, cov)
     assert belief.noises[2:] == pytest.approx([2.0, 2.0 * 5e-4**2, 2.0, 2.0 * 0.01**2])
+
+
+@pytest.mark.slow  # a kernel of its own
+def test_hypotheses_about_a_model_that_bends_are_moved_by_sigma_points():
+    """To first order, 0.80 of the intervals cover under this input, and NEES per coefficient is 2.5."""
+    from agents.evaluation.rollout import evaluate
+
+    (played,) = evaluate(["prbs-4"], "duffing_env/WienerHammerstein-v0", 256, options={"noise_hypotheses": 3})
+    assert np.mean(played.metrics["coverage"]) > 0.85
+    assert np.mean(played.metrics["nees"]) < 1.7
+    assert np.mean(played.metrics["log_posterior_gain"]) > 18.5
