@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from estimator.belief import Belief
+from estimator.belief import Belief, covariance_places
 from estimator.models.duffing import KINDS
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
@@ -70,8 +71,9 @@ def begun_again(belief: Belief) -> Belief:
         return belief
     order = belief.scales.order
     mean, cov = _started(belief.model, order, belief.coefficients_mean, belief.coefficients_cov)
-    gamma, *xi = belief.noises.reshape(-1, 2)
-    return Belief.of(belief.model, mean, cov, gamma, xi, scales=belief.scales).factorised(belief.factorisation)
+    record = belief.record.copy()
+    record[: len(mean)], record[covariance_places(belief.model)] = mean, cov
+    return replace(belief, record=record).factorised(belief.factorisation)
 
 
 def _started(model: Model, order: int, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
