@@ -152,8 +152,9 @@ def _of_outliers(channel: Channel, records: Sequence[Record]) -> list[Finding]:
     if not found or usual == 0:
         return []
     _, k, one = max(found, key=lambda place: float(place[0]))
+    many = "1 output stands" if len(found) == 1 else f"{len(found)} outputs stand"
     message = (
-        f"{len(found)} outputs stand alone, far off all others: sample {k} of {one.name} is {one.y[k]:.3g} "
+        f"{many} alone, far off all others: sample {k} of {one.name} is {one.y[k]:.3g} "
         f"{channel.unit}, and 99 % are within {usual:.3g} {channel.unit} of the middle; make them missing, and "
         "identify again, before anything else is looked at"
     )
