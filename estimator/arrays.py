@@ -19,7 +19,7 @@ _CACHE_LINE = 8
 def aligned(rows, size):
     """An empty matrix (rows, size) that begins with a cache line; each of its rows does where so many fill some.
 
-    Registers of AVX-512 are as long as a cache line, and take twice as long to fill from two of them.
+    Registers of AVX-512 are as long as a cache line, and take longer to fill from two of them.
     """
     numbers = np.empty(rows * size + _CACHE_LINE)
     start = (-(numbers.ctypes.data // 8)) % _CACHE_LINE
