@@ -206,10 +206,11 @@ def _summit(
 def drafts(planner: Planner, record: FloatArray, samples: int, seed: int, noises: int = 2) -> FloatArray:
     """(2 + noises, samples) to begin from: the planner's plan, were the belief's means true, a weaker one, and noise.
 
-    The plan's margin is the least of an episode's: the limits that a block must keep are `best_block`'s.
+    The plan's margin is the least of an episode's, and no output is answered: the limits that a block must keep are
+    `best_block`'s.
     """
     plan = np.zeros(samples)
-    terms = planner.terms._replace(margin=float(np.min(planner.terms.margin)))
+    terms = planner.terms._replace(margin=float(np.min(planner.terms.margin)), reach=0.0)
     words = np.random.SFC64(seed).state["state"]["state"]
     horizon = min(planner.horizon, samples)
     search(*planner.view).play(record.copy(), 0, horizon, planner.rounds, terms, plan, words)

@@ -76,6 +76,8 @@ class Terms(NamedTuple):
             where it yields.
         soon: moves of a plan after which it first counts what is known (`agents.planner.search`).
         cells: of the map of the state along each axis, from minus a state's scale to plus (`agents.planner.mapped`).
+        reach: by how much an input of 1 over a sample moves what the first sensor shows after it, as far as that can be
+            counted on to make up for what the output before tells; 0 where it cannot.
     """
 
     amplitude: float
@@ -92,6 +94,7 @@ class Terms(NamedTuple):
     firm: float = 0.0
     soon: int = 1
     cells: int = 24
+    reach: float = 0.0
 
 
 @jit
@@ -99,7 +102,7 @@ def terms_of(episode, left):
     """The terms of a plan from those of an episode of which so many samples are left: with the margin of the next."""
     e, size = episode, len(episode.margin)
     margin = e.margin[min(max(0, size - left), size - 1)]
-    judged = e.walk, e.scales, e.pace, e.shaken, e.price, e.goal, e.goal_weight, e.firm, e.soon, e.cells
+    judged = e.walk, e.scales, e.pace, e.shaken, e.price, e.goal, e.goal_weight, e.firm, e.soon, e.cells, e.reach
     return Terms(e.amplitude, e.slew, e.limit, margin, *judged)
 
 
@@ -139,10 +142,14 @@ class Mind(NamedTuple):
     precision: Any
 
 
-def _charge(INPUT, SHOWN, SPREAD, SURPRISE, COST, noise, shaken, limit, margin, firm, price, goal, goal_weight):
+def _charge(
+    INPUT, SHOWN, SPREAD, SURPRISE, COST, noise, shaken, limit, margin, firm, price, goal, goal_weight, amplitude, reach
+):  # fmt: skip
     """What has been charged after a sample, its margin, and how near it leads; ``noise`` is the sensor's variance."""
     deviation = np.sqrt(SPREAD + max(SURPRISE, shaken))
-    wide = min(margin * deviation, MOST_MARGIN * limit)
+    # What the output before tells is made up for by braking harder than planned, where there is harder.
+    spared = abs(reach) * amplitude + (reach * INPUT if SHOWN > 0.0 else -reach * INPUT)
+    wide = min(max(margin * np.sqrt(SPREAD), margin * deviation - spared), MOST_MARGIN * limit)
     near = (1.0 - firm) * (abs(SHOWN) + wide - limit) / deviation
     over = abs(SHOWN) + firm * wide - limit
     over, square = (over if over > 0.0 else 0.0), (near * near if near > 0.0 else 0.0)
@@ -174,7 +181,7 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     covariance = place[f"P_{first}_{first}"] * LANES
     noise = names.index("GAMMA_SHAPE") + 2
     advance_belief, judge = imagined.advance, imagined.judge
-    uniform = "noise shaken limit margin firm price goal goal_weight"
+    uniform = "noise shaken limit margin firm price goal goal_weight amplitude reach"
     charge = lanewise(place, "COST MARGIN NEAR", uniform=uniform)(_charge)
     weigh = lanewise(place, "SCORE")(_weigh)
     inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
@@ -202,7 +209,7 @@ def mind(model: Model, degree: int = 0, lag: int = 0) -> Mind:
     def advance(W, record, terms):
         advance_belief(W, record, terms.walk)
         r, q = record[noise + 1] / record[noise], record[noise - 1] / record[noise - 2]
-        told = terms.price, terms.goal, terms.goal_weight
+        told = terms.price, terms.goal, terms.goal_weight, terms.amplitude, terms.reach
         charge(W, r, terms.shaken * q, terms.limit, terms.margin, terms.firm, *told)
 
     @inner

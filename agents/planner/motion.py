@@ -196,6 +196,9 @@ def limit_of(experiment: Any, sizes: FloatArray) -> float:
 #: Samples of the motion by which a system is measured, and where it turns, in parts of the limit.
 _SAMPLES, _TURN = 128, 0.95
 
+#: The part of what a believed system's input moves that plans count on.
+_SURE = 0.75
+
 #: Moves of the input in a period of the motion: fewer cannot follow it, more take time and look less far.
 MOVES = 9
 
@@ -215,6 +218,7 @@ class Swing(NamedTuple):
         taught: (K, K) the mean of φ φᵀ over the samples, with φ the derivatives by the coefficients of what the first
             sensor shows a sample later.
         built: samples until it comes near the limit; inf where it does not within `_SAMPLES`.
+        moved: by how much an input of 1 over a sample from rest moves what the first sensor shows after it.
     """
 
     scales: FloatArray
@@ -222,13 +226,15 @@ class Swing(NamedTuple):
     shaken: float
     taught: FloatArray
     built: float
+    moved: float
 
 
 @cache
 def _swinger(view: View) -> Any:
     """``swing(means, max_input, limit, peaks, taught)`` fills `Swing.taught`, and what the others are made of.
 
-    These are the peaks of states and sensor, samples in a period, or 0, and samples until the limit is near, or 0.
+    These are the peaks of states and sensor, samples in a period, or 0, samples until the limit is near, or 0, and how
+    far the largest input moves what the first sensor shows after a sample from rest.
     """
     found = motion(*view)
     at, sense, glance, step = found.layout, found.sense, found.glance, found.step
@@ -246,6 +252,11 @@ def _swinger(view: View) -> Any:
         fill(peaks, 0.0)
         for a in range(k):
             fill(taught[a], 0.0)
+        glance(W)
+        still = W[shown]
+        W[u] = max_input
+        glance(W)
+        peaks[n + 3] = W[shown] - still
         turns, first, last, way = 0, 0, 0, 0.0
         for t in range(_SAMPLES):
             sense(W)
@@ -285,9 +296,9 @@ def swing_of(view: View, prior_means: npt.ArrayLike, max_input: float, limit: fl
         limit: of the first sensor.
     """
     model = view.model
-    peaks, taught = np.empty(model.n_states + 3), np.empty((model.n_coefficients, model.n_coefficients))
+    peaks, taught = np.empty(model.n_states + 4), np.empty((model.n_coefficients, model.n_coefficients))
     _swinger(view)(np.asarray(prior_means, dtype=np.float64), float(max_input), float(limit), peaks, taught)
-    sizes, (peak, period, built) = peaks[:-3], peaks[-3:]
+    sizes, (peak, period, built, moved) = peaks[:-4], peaks[-4:]
     sensor = next(iter(model.outputs.values()))
     moves = zip(model.states, model.moves, strict=True)
     keeps = np.array([x == sensor or (not model.is_continuous and move == sensor) for x, move in moves])
@@ -295,7 +306,8 @@ def swing_of(view: View, prior_means: npt.ArrayLike, max_input: float, limit: fl
     scales = limit * np.divide(sizes, peak, out=np.ones(model.n_states), where=~keeps)
     # Kicks of the velocity, of variance 3 a sample, after a quarter period 2π/4ω: 3 (t/2ω²), of the displacement.
     shaken = max(0.0, 3.0 * period**3 / (32.0 * np.pi**2) - 1.0) * float(limit / scales[0]) ** 2
-    return Swing(scales, max(1, round(period / MOVES)), float(shaken), taught, float(built) or np.inf)
+    pace = max(1, round(period / MOVES))
+    return Swing(scales, pace, float(shaken), taught, float(built) or np.inf, float(moved) / max_input)
 
 
 def shaken_of(experiment: Any, swing: Swing) -> float:
@@ -304,3 +316,14 @@ def shaken_of(experiment: Any, swing: Swing) -> float:
     On a rig they do. With several sensors, too: the others tell of a kick before the first one shows it.
     """
     return swing.shaken if is_of_rig(experiment) or experiment.model.n_outputs > 1 else 0.0
+
+
+def reach_of(experiment: Any, view: View, swing: Swing) -> float:
+    """What of `Swing.moved` plans count on to make up for what the output before tells (`Terms.reach`); 0 for none.
+
+    None where an input acts in full only a sample later, or is held or changed slowly, where another sensor tells of a
+    kick before the first one shows it, and on a rig, where leaving the limit may cost more than information.
+    """
+    setup = experiment.setup
+    slow = view.degree or view.lag or swing.pace > 1 or np.isfinite(setup.max_slew)
+    return 0.0 if slow or is_of_rig(experiment) or experiment.model.n_outputs > 1 else _SURE * swing.moved

@@ -20,7 +20,8 @@ and beyond the limit they are worth nothing. On a rig the margin is as firm as t
 that Student's t exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin
 (`agents.planner.imagination.margin`); it narrows as the noises become known. Few are at it, so much less comes true.
 The standard deviation is what is expected two samples before: near its limit a plan may brake as hard as it can
-already, and cannot make up for what one more output tells. Where an input comes to act in full only a sample later,
+already, and cannot make up for what one more output tells. Where it could brake harder, most of what that would move
+the output is taken off the margin, down to the deviations that are expected one sample before (not on a rig). Where an input comes to act in full only a sample later,
 because it goes linearly from the last one to the new, the noise of the sample between moves the next output about as
 much again, and no input makes up for it: the margin is then twice as wide.
 
@@ -44,7 +45,7 @@ import numpy.typing as npt
 
 from agents.asked import check_rows, starts
 from agents.planner.imagination import RISK, Terms, margin
-from agents.planner.motion import View, is_of_rig, limit_of, places, shaken_of, swing_of
+from agents.planner.motion import View, is_of_rig, limit_of, places, reach_of, shaken_of, swing_of
 from agents.planner.pursuit import pursuit
 from agents.planner.search import search
 from estimator.checks import SMALLEST, number, numbers, shown, whole
@@ -191,6 +192,7 @@ class Planner:
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
             firm=float(is_of_rig(experiment)),
             soon=int(np.clip(_SOON * swing.built / swing.pace, 1, _MOST_MOVES)),
+            reach=reach_of(experiment, self.view, swing),
             cells=int(np.clip(_CELLS * np.cbrt(swing.built / swing.pace), _FEWEST_CELLS, _MOST_CELLS)),
         )
 

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.planner.imagination import RISK, Terms, margin
-from agents.planner.motion import View, is_of_rig, limit_of, places, shaken_of, survey, swing_of
+from agents.planner.motion import View, is_of_rig, limit_of, places, reach_of, shaken_of, survey, swing_of
 from agents.policies.bursts import burster, drawn
 from agents.policies.imagined import BOUND, FEATURES, HASTE, Ahead, as_feature, imaginer, look_ahead
 from agents.policies.prospects import EXPECTED, Outlook, feature_names, look_at
@@ -194,6 +194,7 @@ class CommonForesight:
             swing.pace,
             shaken_of(experiment, swing),
             firm=1.0,
+            reach=reach_of(experiment, self._view, swing),
         )
         at, model = places(self._view.model), self._view.model
         odd = (*range(at.state, at.state + model.n_states), at.last_input)

@@ -192,6 +192,24 @@ def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limi
     np.testing.assert_allclose(W[place["NEAR"]], (1 - firm) * within / deviation, rtol=1e-9)
 
 
+@pytest.mark.parametrize("reach", [0.0, 0.05, -0.05, 10.0])
+def test_what_the_output_before_tells_is_made_up_for_by_what_brakes_harder(reach):
+    model = duffing()
+    belief = random_belief(model, np.random.default_rng(1))
+    told = terms(model, limit=1.0, margin=3.0, reach=reach)
+    u = np.stack([np.full(LANES, 0.1), np.linspace(-0.15, 0.15, LANES)])
+    W, _ = block_after(model, 0, belief, u, told)
+    place = imagination(model, 0).layout
+    shown, alone, surprise = (W[place[row]] for row in ("SHOWN", "SPREAD", "SURPRISE"))
+    assert (surprise > 0).all()
+    # The input that brakes hardest is -0.15 where the sensor shows more than 0 and rises with the input.
+    hardest = np.where(shown > 0, -0.15, 0.15) * (-1 if reach < 0 else 1)
+    spared = np.abs(reach * (u[1] - hardest))
+    wide = np.maximum(3.0 * np.sqrt(alone), 3.0 * np.sqrt(alone + surprise) - spared)
+    np.testing.assert_allclose(W[place["MARGIN"]], np.minimum(wide, 0.5), rtol=1e-9)
+    assert (wide < 0.5).any()
+
+
 def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
     # Kalman's separation of state and parameters: -½ log det C_H of the joint recursion is ½ log det(Λ + F).
     model = difference()

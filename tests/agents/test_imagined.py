@@ -65,7 +65,9 @@ def reference(belief, seen, ahead, terms, least=0.0):
         surprise = (S @ gain)[0] ** 2 * variance  # what the output before may tell
         variance = P[0, 0] + r
         gain = P[:, 0] / variance
-        margin = min(terms.margin * np.sqrt(variance + max(surprise, terms.shaken * q)), 0.5 * L)
+        wide = terms.margin * np.sqrt(variance + max(surprise, terms.shaken * q))
+        spared = terms.reach * (A + u if moved[0] > 0 else A - u)  # what braking harder than planned makes up for
+        margin = min(max(terms.margin * np.sqrt(variance), wide - spared), 0.5 * L)
         return moved, P - np.outer(gain, P[0]), gain, variance, margin
 
     spread = sample(z, P, last_u * terms.amplitude, np.zeros(6), 0.0)[3]

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import t
 
 import duffing_env
-from agents.planner.motion import View, swing_of
+from agents.planner.motion import View, reach_of, swing_of
 from agents.planner.policy import Planner
 from agents.policies import make_policy
 from duffing_env.experiment import SimulatedExperiment
@@ -202,6 +202,23 @@ def test_the_map_measures_every_state_by_its_size_at_the_limit():
     assert np.all(seen[:2] > 0.1)
     decay = Model("decay", {"x": "V"}, {"rate": "1"}, noise=("1",), outputs={"y": "x"}, rates=("u - rate*x",))
     assert swing_of(View(decay), [0.3], 1.0, 2.0).scales == [2.0]
+
+
+def test_plans_count_on_what_an_input_moves_within_its_sample():
+    # From rest a held force moves a linear oscillator to its static deflection, less the cosine.
+    omega, gain = 2 * np.pi / 9, 0.5
+    held = swing_of(View(duffing()), [omega**2, 0.0, 0.0, gain], 0.15, 0.6)
+    np.testing.assert_allclose(held.moved, gain * (1 - np.cos(omega)) / omega**2, rtol=1e-3)
+    assert swing_of(View(difference()), [1.5, -0.2, -0.9, 0.4], 0.15, 0.6).moved == pytest.approx(0.4)
+
+    free = SimpleNamespace(setup=SimpleNamespace(max_slew=np.inf), model=duffing())
+    assert reach_of(free, View(duffing()), held) == 0.75 * held.moved
+    # An input that goes linearly from the last one acts in full a sample later; rigs keep the whole margin.
+    slow = SimpleNamespace(setup=SimpleNamespace(max_slew=0.1), model=duffing())
+    rig = SimpleNamespace(setup=free.setup, model=duffing(), rig=Rig(SAMPLING_STEP))
+    assert reach_of(free, View(duffing(), 1), held) == reach_of(free, View(difference(), 0, 1), held) == 0.0
+    assert reach_of(free, View(duffing()), held._replace(pace=2)) == 0.0
+    assert reach_of(slow, View(duffing()), held) == reach_of(rig, View(duffing()), held) == 0.0
 
 
 def test_other_sensors_see_the_same_swing():
