@@ -1,4 +1,4 @@
-"""Free runs: what a plant with given coefficients does with an input, without noise."""
+"""Free runs: what a plant with given coefficients does with an input, without noise; and what its sensor shows."""
 
 from __future__ import annotations
 
@@ -48,13 +48,27 @@ def free_run(
             f"have {c.shape}, {inputs.shape} and {start.shape}"
         )
     outputs = np.empty(len(inputs))
-    _compiled(model, input_degree(model, interpolation))(np.concatenate([start, c]), inputs, outputs)
+    run, _ = _compiled(model, input_degree(model, interpolation))
+    run(np.concatenate([start, c]), inputs, outputs)
     return outputs
 
 
+def shown_at(model: Model, coefficients: FloatArray, state: FloatArray, u: float) -> float:
+    """What the first sensor shows at a state, under an input that has been on for a while.
+
+    Args:
+        model: the equation.
+        coefficients: (K,), time counted in samples.
+        state: (n,).
+        u: the input, which an accelerometer feels at once.
+    """
+    _, look = _compiled(model, 0)
+    return float(look(np.concatenate([state, coefficients]), float(u)))
+
+
 @cache
-def _compiled(model: Model, degree: int) -> Any:
-    """``run(start, u, y)`` of a model; ``start`` holds states and coefficients."""
+def _compiled(model: Model, degree: int) -> tuple[Any, Any]:
+    """``run(start, u, y)`` and ``look(start, u)`` of a model; ``start`` holds states and coefficients."""
     place = rows(*model.names, *input_rows(model, degree), "SHOWN")
 
     def make() -> str:
@@ -86,4 +100,12 @@ def _compiled(model: Model, degree: int) -> Any:
             sense(W)
             y[t] = W[shown]
 
-    return run
+    @kernel(kind=f"{model.name}_{model.digest}_{degree}")
+    def look(start, u):
+        W = np.zeros(size)
+        copy(W, 0, start, n)
+        feed(W, 0, u, u, u)
+        sense(W)
+        return W[shown]
+
+    return run, look

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from duffing_env.layout import observation_bounds
 from duffing_env.rig_plant import RigPlantExperiment
 from estimator.belief import Belief
+from estimator.free_run import shown_at
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
 
@@ -49,7 +50,7 @@ class Observed:
 
         Args:
             u: the last input.
-            y: the last output; NaN, a missing one, is shown as what is believed of it.
+            y: the last output; NaN, a missing one, is shown as what the model expects of the sensor.
             elapsed: samples since the run began.
         """
         belief, prior = self.belief, self.experiment.believed
@@ -57,14 +58,15 @@ class Observed:
         stds = np.sqrt(np.diag(cov))
         pairs = list(combinations(range(len(stds)), 2))
         precisions = np.log(belief.noises[::2] / belief.noises[1::2]) - np.log(prior.noises[::2] / prior.noises[1::2])
-        states = belief.state_mean / self.experiment.max_output
+        if np.isnan(y):
+            y = shown_at(belief.model, belief.coefficients_mean, belief.state_mean, u)
         values = np.concatenate([
             (belief.coefficients_mean - prior.coefficients_mean) / first,
             np.log(stds / first),
             [cov[i, j] / (stds[i] * stds[j]) for i, j in pairs],
             precisions,
-            states,
-            [u / self.max_input, states[0] if np.isnan(y) else y / self.experiment.max_output],
+            belief.state_mean / self.experiment.max_output,
+            [u / self.max_input, y / self.experiment.max_output],
             [max(0.0, 1.0 - elapsed / self.horizon), 1.0],
         ])  # fmt: skip
         low, high = np.array(list(observation_bounds(belief.model).values())).T

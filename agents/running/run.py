@@ -206,7 +206,8 @@ def _warm_up(follower: Follower, observed: Observed, design: Design | None, poli
     """Compile what the run will call: a plant must not wait for the compiler with its input on."""
     observed.belief, rng = follower.ahead(0.0), np.random.default_rng(0)
     if design is None:
-        policy.predict(observed.observation(0.0, 0.0, 0), None, deterministic=True)
+        # A missing output is the longer way.
+        policy.predict(observed.observation(0.0, np.nan, 0), None, deterministic=True)
         return
     futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
     if plan.block:

@@ -26,7 +26,7 @@ from agents.running.plant import load_plant
 from agents.running.run import Plan, run
 from agents.running.session import Session, Tripped
 from agents.running.simulated import SimulatedPlant
-from estimator import OnlineEstimator, Rig, identify
+from estimator import Channel, OnlineEstimator, Rig, identify
 from estimator.free_run import free_run
 from estimator.identification.beliefs import refit
 from estimator.rig_prior import HALF_WIDTH
@@ -211,6 +211,23 @@ def test_a_policy_sees_what_the_environment_shows():
         mine = observed.observation(u / 4.0, y / 0.08, k + 1)
         assert mine.dtype == seen.dtype
         np.testing.assert_allclose(mine, seen, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["displacement", "velocity", "acceleration"])
+def test_a_missing_output_is_shown_as_what_the_model_expects_of_the_sensor(kind):
+    unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}[kind]
+    rig = replace(RIG, output=Channel(unit, range=2.0, kind=kind))
+    follower = Follower(rig)
+    follower.take([0.0, 3.0, -2.0, 1.0], [0.01, -0.02, 0.05, 0.03])
+    observed = Observed(rig, follower.belief, 40)
+    observed.belief, u = follower.ahead(0.5), 0.5
+    c = dict(zip(observed.belief.names, observed.belief.coefficients_mean, strict=True))
+    x, v = observed.belief.state_mean
+    spring = c["gain"] * u + c["force"] - c["damping"] * v - c["stiffness"] * x - c["cubic"] * x**3
+    expected = {"displacement": x, "velocity": v + c["output_offset"], "acceleration": spring + c["output_offset"]}
+    shown = observed.observation(u, math.nan, 4)
+    np.testing.assert_allclose(shown[-3], np.float32(expected[kind]), rtol=1e-6)
+    np.testing.assert_array_equal(shown, observed.observation(u, float(expected[kind]), 4))
 
 
 def test_the_belief_ahead_is_that_of_a_sample_nobody_measured():
