@@ -227,8 +227,9 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         Raises:
             ValueError: for another option, or what is no such system; nothing has changed then.
         """
-        options = checked_options(options, "truth")
+        options = checked_options(options, *self._choices)
         chosen = self._batch.checked_truth(options["truth"]) if "truth" in options else None
+        self._rest()
         super().reset(seed=seed)
         if self.np_random is not self._streamed:
             self._streamed = self.np_random
@@ -269,6 +270,11 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         seen: Observation = self._seen.observations[0].copy()
         return seen
 
+    def _rest(self) -> None:
+        """What else has to come to rest before an episode: nothing that is simulated."""
+
+    #: Options of a reset.
+    _choices: ClassVar[tuple[str, ...]] = ("truth",)
     _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _flags: ClassVar[tuple[str, ...]] = ("diverged",)
 

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from gymnasium import logger
 from gymnasium.error import ResetNeeded
 
-from duffing_env.contract import checked_options
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment import MOST_SAMPLES, Experiment, check_prior
 from duffing_env.rewards import rewarding
@@ -218,6 +217,7 @@ class RigPlantEnv(DuffingEnv):
     """
 
     experiment_kind: ClassVar[type[Experiment]] = RigPlantExperiment
+    _choices: ClassVar[tuple[str, ...]] = ()
     _reported: ClassVar[tuple[str, ...]] = ("information_gain",)
 
     #: Identity of a plant to the environment that reset it last.
@@ -249,11 +249,12 @@ class RigPlantEnv(DuffingEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Bring the plant to rest and start an episode; ``options`` has no keys, and the plant is not told the seed."""
-        checked_options(options)
+        return super().reset(seed=seed, options=options)
+
+    def _rest(self) -> None:
         self._running, self.plant_error = False, None
         self._drivers[id(self.plant)] = self
         self.plant.reset()
-        return super().reset(seed=seed, options=options)
 
     def _apply(self, action: float) -> None:
         if self._drivers.get(id(self.plant), self) is not self:

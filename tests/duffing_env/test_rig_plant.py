@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import threading
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -113,6 +114,31 @@ def test_the_plant_gets_the_clipped_float32_action_in_volts():
         assert observation[18] == np.float32(plant.inputs[-1] / 0.07)
     assert plant.inputs == [0.07 * float(np.float32(min(max(action, -1), 1))) for action in asked]
     assert all(type(u) is float for u in plant.inputs)
+
+
+def test_a_second_thread_does_not_reset_the_plant_in_the_middle_of_a_step():
+    plant, refused = Difference(), []
+    env = around(plant)
+    env.reset()
+
+    def reset_from_another_thread():
+        with pytest.raises(RuntimeError, match="must wait until the last call"):
+            env.reset()
+        refused.append(True)
+
+    move = plant.step
+
+    def slow(u):
+        thread = threading.Thread(target=reset_from_another_thread)
+        thread.start()
+        thread.join()
+        return move(u)
+
+    plant.step = slow
+    env.step([0.5])
+    assert (plant.resets, refused) == (1, [True])
+    plant.step = move
+    env.step([0.5])  # the episode goes on
 
 
 @pytest.mark.parametrize("output", [np.nan, np.inf, -np.inf, 1e200, "volts", None, [0.1, 0.2], OSError("cable")])
