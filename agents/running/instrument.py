@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import string
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from estimator.checks import number, shown
 from estimator.extras import need
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -35,13 +37,13 @@ class Commands:
         play: plays them, one a sampling step, then zero.
         outputs: asks for the outputs of the block, separated by commas, when it has been played.
         inputs: asks for the inputs as they were applied; those sent are taken for them where this is left out.
-        begin: commands when it is opened; ``zero`` follows.
-        timeout: seconds that an answer may take.
+        begin: a list of commands when it is opened; ``zero`` follows.
+        timeout: seconds that an answer may take, from 0.001 to 3600.
         termination: what ends a line, both ways.
         backend: of PyVISA; ``@py`` is pyvisa-py.
 
     Raises:
-        ValueError: for a command whose braces are not as above.
+        ValueError: for a command whose braces are not as above, or a value that is none.
     """
 
     resource: str
@@ -55,18 +57,23 @@ class Commands:
     play: str | None = None
     outputs: str | None = None
     inputs: str | None = None
-    begin: tuple[str, ...] = ()
+    begin: Sequence[str] = ()
     timeout: float = 2.0
     termination: str = "\n"
     backend: str = "@py"
 
     def __post_init__(self) -> None:
+        number("instrument.timeout", self.timeout, 1e-3, 3600.0)
+        if not isinstance(self.begin, list | tuple) or not all(isinstance(line, str) for line in self.begin):
+            raise ValueError(f"instrument.begin must be a list of texts, such as ['*RST'], but is {shown(self.begin)}")
         for one in fields(self):
             value, allowed = getattr(self, one.name), _FIELDS.get(one.name, set())
-            if one.name in ("timeout", "begin", "resource", "termination", "backend") or value is None:
+            if one.name in ("timeout", "begin") or (value is None and one.default is None):
                 continue
             if not isinstance(value, str):
-                raise ValueError(f"instrument.{one.name} must be a text, but is {value!r:.60}")
+                raise ValueError(f"instrument.{one.name} must be a text, but is {shown(value)}")
+            if one.name in ("resource", "termination", "backend"):
+                continue
             found = {name for _, name, _, _ in string.Formatter().parse(value) if name is not None}
             if found != allowed:
                 raise ValueError(
@@ -167,6 +174,4 @@ def plant(rig: Rig, **instrument: Any) -> Instrument:
             f"instrument must be a table of the rig file with keys of {sorted(known)}, but lacks {sorted(missing)} and "
             f"has {sorted(set(instrument) - known)}"
         )
-    if "begin" in instrument:
-        instrument["begin"] = tuple(instrument["begin"])
     return Instrument(rig, Commands(**instrument))

@@ -192,6 +192,13 @@ def test_an_instrument_without_a_watchdog_is_not_armed(scpi, tmp_path):
     [
         ({"set": "SOUR?"}, r"instrument.set must have \['u'\] in braces"),
         ({"read": None, "measure": "MEAS?"}, "has .*measure"),
+        ({"begin": "*RST"}, r"instrument.begin must be a list of texts, such as \['\*RST'\], but is '\*RST'"),
+        ({"begin": ["*RST", 1]}, "instrument.begin must be a list of texts"),
+        ({"timeout": "2"}, "instrument.timeout must be a number from 0.001 to 3600, but is '2'"),
+        ({"timeout": 0}, "instrument.timeout must be a number"),
+        ({"zero": None}, "instrument.zero must be a text, but is None"),
+        ({"resource": 7}, "instrument.resource must be a text, but is 7"),
+        ({"backend": True}, "instrument.backend must be a text"),
         ({"resource": "TCPIP::127.0.0.1::1::SOCKET"}, "cannot be opened"),
     ],
 )
