@@ -99,14 +99,18 @@ class Instrument:
 
         self._commands, self._step = commands, rig.step
         self.watches = commands.watchdog is not None
+        # The manager stays open: PyVISA shares it, and to close it would cut off other instruments.
+        link: Any = None
         try:
             ends = {"read_termination": commands.termination, "write_termination": commands.termination}
             manager: Any = pyvisa.ResourceManager(commands.backend)
-            self._link = manager.open_resource(commands.resource, **ends)
-            self._link.timeout = 1000 * commands.timeout
+            self._link = link = manager.open_resource(commands.resource, **ends)
+            link.timeout = 1000 * commands.timeout
             for line in (*commands.begin, commands.zero):
-                self._link.write(line)
+                link.write(line)
         except Exception as error:  # each backend has its own
+            if link is not None:
+                link.close()
             raise ValueError(f"instrument.resource {commands.resource!r} cannot be opened: {error}") from error
 
     def __repr__(self) -> str:
@@ -135,8 +139,10 @@ class Instrument:
         self._link.write(self._needed("upload").format(values=",".join(map(repr, u.tolist()))))
         self._link.write(self._needed("play"))
         usual, self._link.timeout = self._link.timeout, self._link.timeout + 1000 * len(u) * self._step
-        y = self._numbers(self._needed("outputs"))
-        self._link.timeout = usual
+        try:
+            y = self._numbers(self._needed("outputs"))
+        finally:  # what zeroes the input next must not wait for so long
+            self._link.timeout = usual
         return u if self._commands.inputs is None else self._numbers(self._commands.inputs), y
 
     def zero(self) -> None:

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from loopback import RIG, RIG_FILE, TABLE, TRUTH, Scpi
 
@@ -185,6 +186,38 @@ def test_an_instrument_without_a_watchdog_is_not_armed(scpi, tmp_path):
     assert "OUTP ON" not in scpi.lines
     assert run(RIG, plant, tmp_path / "run", Plan(policy="prbs", samples=20, no_watchdog=True)).ended == "complete"
     plant.close()
+
+
+class Broken:
+    """A connection over which nothing can be sent."""
+
+    timeout, closed = 0.0, 0
+
+    def write(self, line):
+        raise OSError("cable")
+
+    query = write
+
+    def close(self):
+        self.closed += 1
+
+
+def test_a_connection_that_cannot_be_made_ready_is_closed(monkeypatch):
+    link = Broken()
+    monkeypatch.setattr("pyvisa.ResourceManager.open_resource", lambda *_, **__: link)
+    with pytest.raises(ValueError, match="cannot be opened: cable"):
+        instrument.plant(RIG, resource="TCPIP::127.0.0.1::9::SOCKET", **TABLE)
+    assert link.closed == 1
+
+
+def test_the_usual_timeout_is_back_after_a_block_that_failed(monkeypatch):
+    link = Broken()
+    monkeypatch.setattr(link, "write", lambda line: None)
+    monkeypatch.setattr("pyvisa.ResourceManager.open_resource", lambda *_, **__: link)
+    plant = instrument.plant(RIG, resource="TCPIP::127.0.0.1::9::SOCKET", **TABLE)
+    with pytest.raises(OSError, match="cable"):
+        plant.play(np.zeros(1000))
+    assert link.timeout == 1000 * TABLE["timeout"], "what zeroes the input next would wait for a block's time"
 
 
 @pytest.mark.parametrize(
