@@ -22,7 +22,7 @@ from functools import cache
 import sympy as sp
 
 from estimator.engine.rows import carried_names
-from estimator.models.model import FUNCTIONS, Model, names_of
+from estimator.models.model import FUNCTIONS, HIGHEST_POWER, Model, names_of
 
 Assignments = list[tuple[str, sp.Expr]]
 
@@ -39,9 +39,6 @@ class Lines(Assignments):
 
 
 _FUNCTIONS = {name: getattr(sp, name) for name in FUNCTIONS}
-
-#: Highest power in an expression: one of a whole number is calculated as a product.
-_HIGHEST = 16
 
 
 def symbol(name: str) -> sp.Symbol:
@@ -109,8 +106,10 @@ def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
         raise ValueError(f"expressions of {where} must be finite and real, but {text!r} is {parsed}")
     parsed = parsed.replace(lambda part: part.is_Pow and part.exp.is_Float, lambda p: p.base ** sp.Rational(p.exp))
     for power in parsed.atoms(sp.Pow):
-        if power.exp.is_Number and abs(power.exp) > _HIGHEST:
-            raise ValueError(f"powers of {where} must be from -{_HIGHEST} to {_HIGHEST}, but {text!r} has {power}")
+        if power.exp.is_Number and abs(power.exp) > HIGHEST_POWER:
+            raise ValueError(
+                f"powers of {where} must be from -{HIGHEST_POWER} to {HIGHEST_POWER}, but {text!r} has {power}"
+            )
     return parsed
 
 

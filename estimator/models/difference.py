@@ -11,17 +11,17 @@ from __future__ import annotations
 from functools import cache
 from typing import NamedTuple
 
-from estimator.checks import shown
+from estimator.checks import shown, whole
 from estimator.models.duffing import DIMENSIONS
-from estimator.models.model import Model
+from estimator.models.model import HIGHEST_POWER, Model
 
 
 class Term(NamedTuple):
     """One regressor.
 
     Attributes:
-        lag1: power of x_{t-1}.
-        lag2: power of x_{t-2}.
+        lag1: power of x_{t-1}, 0 to 16.
+        lag2: power of x_{t-2}, 0 to 16.
         tap: delay of the input that multiplies it, 0 to 2, counted from the newest input that acts; None for no input.
     """
 
@@ -79,11 +79,16 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
             other terms are k0, k1, ...
 
     Raises:
-        ValueError: for an unknown preset, or terms that repeat or are not terms.
+        ValueError: for an unknown preset, terms that repeat or are not terms, or a power or tap out of its range.
     """
     is_terms = isinstance(preset, tuple) and all(isinstance(term, Term) for term in preset)
     if not is_terms and not (isinstance(preset, str) and preset in PRESETS):
         raise ValueError(f"preset must be one of {list(PRESETS)} or terms, but is {shown(preset)}")
+    for term in preset if isinstance(preset, tuple) else ():
+        whole("lag1 of a term", term.lag1, HIGHEST_POWER, 0)
+        whole("lag2 of a term", term.lag2, HIGHEST_POWER, 0)
+        if term.tap is not None:
+            whole("tap of a term", term.tap, 2, 0)
     return _difference(preset)
 
 

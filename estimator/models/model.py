@@ -23,6 +23,9 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 #: Functions that expressions may use.
 FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "tanh")
 
+#: Highest power in an expression: one of a whole number is calculated as a product.
+HIGHEST_POWER = 16
+
 #: Names that stand for something else: the input and its older values, the sampling step, what generated code calls.
 RESERVED = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, "present", "select", "below", "range"})
 

@@ -8,6 +8,7 @@ import pytest
 from estimator.engine.derive import calculus, symbol
 from estimator.free_run import free_run
 from estimator.information import fisher_information
+from estimator.models.difference import Term, difference
 from estimator.models.model import Model
 
 TANK = {
@@ -49,6 +50,21 @@ def test_what_does_not_fit_is_refused_at_once(given, words):
 def test_powers_too_high_for_a_product_are_refused():
     with pytest.raises(ValueError, match="powers of tank must be from -16 to 16, but 'u - loss"):
         calculus(Model(**{**TANK, "rates": ("u - loss*x**17",)}))
+
+
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [
+        (Term(lag1=-2), "lag1 of a term must be a whole number from 0 to 16, but is -2"),
+        (Term(lag1=True), "lag1 of a term must be a whole number from 0 to 16, but is True"),
+        (Term(lag2=1.5), "lag2 of a term must be a whole number from 0 to 16, but is 1.5"),
+        (Term(lag1=17), "lag1 of a term must be a whole number from 0 to 16, but is 17"),
+        (Term(tap=3), "tap of a term must be a whole number from 0 to 2, but is 3"),
+    ],
+)
+def test_terms_are_products_of_whole_powers(term, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        difference((Term(1), term))
 
 
 @pytest.mark.parametrize("power", ["0.5", "1.5", "(-1/2)", "2.0", "9", "(-3)", "0.3", "loss", "(loss - 1)"])
