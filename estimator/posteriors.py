@@ -31,7 +31,8 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
         prior: `Belief` before the first sample, of all records; its factorisation is that of the updates.
         rig: what the inputs do. Where it is None, pairs are those of an environment: a difference equation's t-th
             input acts on the state before the t-th output, and a differential equation's input goes linearly from the
-            one before to it. Not ``look_ahead`` or ``spline``.
+            one before to it. Not ``look_ahead`` or ``spline``, nor a difference equation with a delay of -1, whose
+            samples wait for the input after them.
 
     Returns:
         The n posteriors, each after the last sample of its record.
@@ -51,6 +52,10 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
     way = feed(prior.model, rig)
     if way.fills:
         raise ValueError(f"interpolation must be 'zero_order' or 'linear', but is {rig.interpolation!r}; or use run()")
+    if way.waits:
+        raise ValueError(
+            f"delay must be 0 or more for a difference equation, but is {rig.delay}; shift u by a sample, or use run()"
+        )
     lengths = lengths_of(inputs)
     for row, length in enumerate(lengths):
         if not (np.isfinite(inputs[row, :length]).all() and np.isfinite(outputs[row, :length]).all()):

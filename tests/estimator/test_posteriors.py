@@ -71,6 +71,10 @@ def test_several_sensors(records):
             lambda u: posteriors(u, u, silverbox_prior(duffing()), Rig.silverbox("look_ahead")),
             "interpolation must be 'zero_order' or 'linear', but is 'look_ahead'",
         ),
+        (
+            lambda u: posteriors(u, u, silverbox_prior(), Rig.silverbox("zero_order", -1)),
+            "delay must be 0 or more for a difference equation, but is -1",
+        ),
     ],
 )
 def test_what_is_no_record_is_refused(call, message, records):
