@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.arrays import copy
+from estimator.checks import numbers
 from estimator.engine import cache as stored
 from estimator.engine.feeding import feeder, input_degree
 from estimator.engine.rows import input_rows
@@ -38,10 +39,10 @@ def free_run(
         (T,) outputs; inf or NaN from where the model blows up.
 
     Raises:
-        ValueError: for shapes that do not fit.
+        ValueError: for shapes that do not fit, or what is no numbers.
     """
-    c, inputs = np.array(coefficients, dtype=np.float64), np.array(u, dtype=np.float64)
-    start = np.zeros(model.n_states) if state is None else np.array(state, dtype=np.float64)
+    c, inputs = numbers("coefficients", coefficients), numbers("u", u)
+    start = np.zeros(model.n_states) if state is None else numbers("state", state)
     if c.shape != (model.n_coefficients,) or inputs.ndim != 1 or start.shape != (model.n_states,):
         raise ValueError(
             f"coefficients, u and state must have shapes {(model.n_coefficients,)}, (T,) and {(model.n_states,)}, but "

@@ -117,7 +117,13 @@ def variances(model: Model, process_noise: npt.ArrayLike, measurement_noise: npt
         raise ValueError(
             f"measurement_noise must be positive and finite, but is {stds.tolist()}; pass a standard deviation"
         )
-    shape = np.broadcast_shapes(process.shape, stds.shape[:-1])
+    try:
+        shape = np.broadcast_shapes(process.shape, stds.shape[:-1])
+    except ValueError:
+        sizes = process.shape, stds.shape[:-1]
+        raise ValueError(
+            f"process_noise and measurement_noise must be of as many records, but are of {sizes}"
+        ) from None
     sensors = np.broadcast_to(stds, (*shape, model.n_outputs))
     return np.concatenate([np.broadcast_to(process, shape)[..., None], sensors], axis=-1) ** 2
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
+from estimator.checks import numbers
 from estimator.engine.feeding import input_degree
 from estimator.information import follow, outputs_of, sampled, variances
 from estimator.models.model import Model
@@ -72,12 +73,12 @@ def maximum_a_posteriori(
         measurement_noise: the sensors' standard deviations; (n, p) of each record.
         interpolation: of the input between samples.
         starts: (n, K) coefficients each, from which the records are fitted besides the prior's mean; of each record the
-            fit with the smallest L is kept.
+            fit with the smallest L is kept. One that is not finite leads nowhere.
 
     Raises:
         ValueError: naming the argument, for shapes that do not fit, or a number that is out of range.
     """
-    inputs = np.array(u, dtype=np.float64)
+    inputs = numbers("u", u)
     if inputs.ndim != 2:
         raise ValueError(f"u must have shape (n, T), but has {inputs.shape}")
     outputs = np.array(outputs_of(model, inputs, y))
@@ -103,9 +104,16 @@ def maximum_a_posteriori(
         curvature = found.information[:, free[:, None], free] * np.outer(scale, scale) + precision
         return loss, scale * found.slope[:, free] + pull, curvature
 
+    begins = [numbers(f"starts[{i}]", start) for i, start in enumerate(starts)]
+    for i, begin in enumerate(begins):
+        if begin.shape != (len(inputs), len(center)):
+            raise ValueError(
+                f"starts[{i}] must be coefficients of every record, of shape {(len(inputs), len(center))}, but has "
+                f"shape {begin.shape}"
+            )
     points, loss, curvature, converged = _search(appraise, np.zeros((len(inputs), len(free))))
-    for start in starts:
-        others = _search(appraise, (np.asarray(start)[:, free] - center[free]) / scale)
+    for begin in begins:
+        others = _search(appraise, (begin[:, free] - center[free]) / scale)
         deeper = others[1] < loss - _SAME
         points[deeper], loss[deeper], curvature[deeper], converged[deeper] = (found[deeper] for found in others)
     posterior = np.zeros((len(inputs), *cov.shape))

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
+from estimator.checks import numbers
 from estimator.engine import tasks
 from estimator.engine.rows import belief_names
 from estimator.inference import DEFAULT_ITERATIONS, mean_field
@@ -42,7 +43,7 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
     """
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be a Belief, but is {prior!r:.60}; see estimator.priors")
-    inputs, outputs = np.array(u, dtype=np.float64), np.array(y, dtype=np.float64)
+    inputs, outputs = numbers("u", u), numbers("y", y)
     sensors = prior.model.n_outputs
     if sensors == 1 and outputs.shape == inputs.shape:
         outputs = outputs[..., None]

@@ -99,6 +99,13 @@ def test_what_does_not_fit_is_refused():
         maximum_a_posteriori(PAPER, np.zeros((2, 3)), np.zeros((2, 3)), PRIOR, -1.0, 1e-4)
     with pytest.raises(ValueError, match="prior must be of"):
         maximum_a_posteriori(PENDULUM, np.zeros((2, 3)), np.zeros((2, 3, 2)), PRIOR, 1e-3, 1e-3)
+    zeros = np.zeros((2, 3))
+    with pytest.raises(
+        ValueError, match=r"starts\[1\] must be coefficients of every record, of shape \(2, 4\), but has"
+    ):
+        maximum_a_posteriori(PAPER, zeros, zeros, PRIOR, *NOISES, starts=[np.zeros((2, 4)), np.zeros(4)])
+    with pytest.raises(ValueError, match="u must not be a masked array"):
+        maximum_a_posteriori(PAPER, np.ma.masked_array(zeros), zeros, PRIOR, *NOISES)
 
 
 def test_it_fits_other_models_and_leaves_alone_what_is_known():

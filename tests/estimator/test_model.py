@@ -77,6 +77,13 @@ def test_any_power_is_what_it_says(power):
     assert float(slope) == pytest.approx(expected * eval(power, {"loss": loss}) / x, rel=1e-12)
 
 
+@pytest.mark.parametrize("name", ["coefficients", "u", "state"])
+def test_a_free_run_is_of_numbers(name):
+    given = {"coefficients": [0.4], "u": [0.25], "state": [1.0]}
+    with pytest.raises(ValueError, match=f"{name} must be numbers"):
+        free_run(Model(**TANK), **{**given, name: [1j]})
+
+
 def test_the_information_of_powers_is_that_of_differences():
     model = Model(**{**TANK, "rates": ("u - loss*x**1.5",)})
     u = np.repeat([0.5, 0.1], 20)

@@ -66,6 +66,8 @@ def test_several_sensors(records):
             "u and y must have one shape (n, T), but have (35, 40)",
         ),
         (lambda u: posteriors(u, u * np.nan, silverbox_prior()), "but those of record 0 are not"),
+        (lambda u: posteriors(np.ma.masked_array(u), u, silverbox_prior()), "u must not be a masked array"),
+        (lambda u: posteriors(u, u + 1j, silverbox_prior()), "y must be numbers"),
         (lambda u: posteriors(u, u, 3), "prior must be a Belief, but is 3"),
         (
             lambda u: posteriors(u, u, silverbox_prior(duffing()), Rig.silverbox("look_ahead")),
