@@ -230,11 +230,11 @@ def settle(fitter: Fitter, hypothesis: Hypothesis, start: FloatArray, level: flo
         best = int(np.argmin(energies))
         start, level = fits.mean[best], float(fits.level[best])
         worse = energies - energies[best]
+        weights = np.exp(-worse) / np.exp(-worse).sum()
         middle, std = _vertex(logs, worse, best)
         if (worse[[0, -1]] < _EDGE)[logs[[0, -1]] != bounds].any():
             width *= 1.5
             continue
-        weights = np.exp(-worse) / np.exp(-worse).sum()
         spread = np.sqrt(weights @ (logs - weights @ logs) ** 2)
         if spread > 0.8 * (logs[-1] - logs[0]) / (_GRID - 1) or width < 0.02:
             break
