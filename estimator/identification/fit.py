@@ -13,7 +13,7 @@ first outputs of a record, as many as there are states, do not count: any motion
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -83,7 +83,8 @@ class Fits:
         mean: (H, K) most probable coefficients.
         cov: (H, K, K) their covariance.
         level: (H,) σ_v.
-        free_energy: (H,) in nats, up to a constant that all share; inf where the numbers ran away.
+        free_energy: (H,) in nats, up to a constant that all share; inf where the numbers ran away, or the records and
+            the prior leave a coefficient open.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -147,7 +148,7 @@ class Fitter:
             if not len(at):
                 break
             damped = curvature[at] + (damping[at, None] * np.einsum("hii->hi", curvature[at]))[:, :, None] * np.eye(k)
-            step = -_solved(damped, slope[at])
+            step = -solved(damped, slope[at])
             promised = -0.5 * np.einsum("hk,hk->h", slope[at], step)
             trial = points[at] + self._scale * step
             found = self._appraise(trial, tuple(values[at] for values in held), levels[at])
@@ -163,8 +164,9 @@ class Fitter:
                 | (self._energy(loss[at], curvature[at]) - _MANY * gained > bar)
             )
             at = at[~over]
-        cov = _inverted(curvature) * np.outer(self._scale, self._scale)
-        return Fits(tuple(hypotheses), points, cov, levels, self._energy(loss, curvature))
+        cov = inverted(curvature) * np.outer(self._scale, self._scale)
+        energies = np.where(np.isfinite(cov).all(axis=(1, 2)), self._energy(loss, curvature), np.inf)
+        return Fits(tuple(hypotheses), points, cov, levels, energies)
 
     def _held(self, hypotheses: Sequence[Hypothesis]) -> tuple[FloatArray, ...]:
         """(H, records, T, rows) inputs, (H,) ratios and (H, records, 2) motions."""
@@ -230,20 +232,27 @@ def _unit(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     return matrices / (root[:, :, None] * root[:, None, :]), root
 
 
-def _solved(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+def solved(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(H, K) solutions; zeros where a matrix is singular."""
     unit, root = _unit(matrices)
-    try:
-        return np.asarray(np.linalg.solve(unit, (vectors / root)[:, :, None])[:, :, 0] / root)
-    except np.linalg.LinAlgError:
-        return np.zeros_like(vectors)
+    return _row_by_row(np.linalg.solve, 0.0, unit, (vectors / root)[:, :, None])[:, :, 0] / root
 
 
-def _inverted(matrices: FloatArray) -> FloatArray:
+def inverted(matrices: FloatArray) -> FloatArray:
+    """(H, K, K) inverses; NaN where a matrix is singular."""
     unit, root = _unit(matrices)
+    return _row_by_row(np.linalg.inv, np.nan, unit) / (root[:, :, None] * root[:, None, :])
+
+
+def _row_by_row(solve: Callable[..., FloatArray], lost: float, *stacks: FloatArray) -> FloatArray:
+    """What ``solve`` makes of stacks: of all at once, or where a matrix is singular, of each; ``lost`` for that one."""
     try:
-        return np.asarray(np.linalg.inv(unit) / (root[:, :, None] * root[:, None, :]))
+        return np.asarray(solve(*stacks))
     except np.linalg.LinAlgError:
-        return np.zeros_like(matrices)
+        if len(stacks[0]) == 1:
+            return np.full_like(stacks[-1], lost)
+        rows = [[stack[i : i + 1] for stack in stacks] for i in range(len(stacks[0]))]
+        return np.concatenate([_row_by_row(solve, lost, *row) for row in rows])
 
 
 def with_ratios(hypothesis: Hypothesis, ratios: FloatArray) -> list[Hypothesis]:

@@ -4,8 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from estimator.identification.fit import Fits, Hypothesis
+from estimator.identification.fit import Fits, Hypothesis, inverted, solved
 from estimator.identification.search import settle
+
+REGULAR, SINGULAR = np.array([[2.0, 1.0], [1.0, 4.0]]), np.array([[1.0, 1.0], [1.0, 1.0]])
 
 
 class Flat:
@@ -23,3 +25,11 @@ def test_a_grid_that_is_widened_to_the_last_has_the_weights_of_its_last_fits():
     assert len(found.weights) == len(found.fits.hypotheses)
     ratios = np.array([h.ratio for h in found.fits.hypotheses])
     np.testing.assert_allclose(found.weights, (1 / (1 + ratios**2) * ratios) / (1 / (1 + ratios**2) * ratios).sum())
+
+
+def test_a_singular_hypothesis_leaves_the_others_as_they_are():
+    both, vectors = np.array([REGULAR, SINGULAR]), np.array([[1.0, 2.0], [1.0, 2.0]])
+    np.testing.assert_allclose(inverted(both)[0], np.linalg.inv(REGULAR), rtol=1e-14)
+    assert np.isnan(inverted(both)[1]).all(), "no covariance is none of 0, which were certainty"
+    np.testing.assert_allclose(solved(both, vectors)[0], np.linalg.solve(REGULAR, vectors[0]), rtol=1e-14)
+    np.testing.assert_array_equal(solved(both, vectors)[1], [0.0, 0.0])
