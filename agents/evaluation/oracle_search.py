@@ -31,6 +31,7 @@ from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
 from agents.planner.pursuit import pursuit
 from estimator.belief import Belief
+from estimator.checks import whole
 from estimator.parameters import FloatArray
 
 #: Starts of a search at least; it goes on to so many times as many, until so many that began anew agree within [nats].
@@ -39,6 +40,9 @@ _TRIES, _LONGER, _AGREED, _SAME = 24, 8, 3, 0.002
 #: Cells of the map along each axis, and the spread of the factors by which starts change the rate of information that
 #: they expect: one of each is drawn for every start.
 _CELLS, _DOUBTS = (24, 32, 48, 64, 96), (0.1, 0.3, 0.8)
+
+#: Systems and starts of a command at most.
+_MOST = 100_000
 
 #: Share of the limits of signal and energy that is aimed at, because what is stored is rounded.
 _AIM = 1.0 - 1e-4
@@ -168,6 +172,12 @@ class Config:
     """Of the search."""
     check: bool = False
     """Search anew and compare, and store nothing."""
+
+    def __post_init__(self) -> None:
+        whole("systems", self.systems, _MOST)
+        whole("tries", self.tries, _MOST)
+        whole("seed", self.seed, 2**128, 0)
+        whole("first (below systems)", self.first, self.systems - 1, 0)
 
 
 def main(config: Config) -> None:

@@ -1,5 +1,7 @@
 """The oracle: its search, its store, and the D-efficiency against it; and the oracles that are in the package."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,20 @@ def test_the_search_keeps_the_limits_and_beats_a_random_signal():
     assert peaks[0] <= 0.6
     assert value == values[0]
     assert value > systems.worth(given)[0][0] + 2.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"first": 8, "systems": 8}, "first (below systems) must be a whole number from 0 to 7, but is 8"),
+        ({"systems": 0}, "systems must be a whole number from 1 to 100000, but is 0"),
+        ({"tries": 0}, "tries must be a whole number from 1"),
+        ({"seed": -1}, "seed must be a whole number from 0"),
+    ],
+)
+def test_searches_of_nothing_are_refused(options, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Config(**options)
 
 
 @pytest.mark.slow  # the search is seconds of compilation
