@@ -172,20 +172,36 @@ class Rig:
     def from_file(cls, path: str | Path) -> Rig:
         """Read a rig file, TOML: ``step``, ``interpolation``, ``delay``, tables ``input``, ``output`` and ``guess``.
 
-        A table ``instrument`` is for who drives the rig, and not looked at.
+        A table ``instrument`` is for who drives the rig (`with_instrument`).
 
         Raises:
             ValueError: naming the file and what is wrong in it.
             FileNotFoundError: if there is no such file.
         """
+        return cls._read(path)[0]
+
+    @classmethod
+    def with_instrument(cls, rig: str) -> tuple[Rig, dict[str, Any]]:
+        """A rig, as `of` has it, and the table ``instrument`` of its file; of a rig that ships, and of none, empty.
+
+        Raises:
+            ValueError: as `from_file`, or for an ``instrument`` that is no table.
+            FileNotFoundError: if there is no such file.
+        """
+        return (cls.shipped(rig), {}) if rig in SHIPPED else cls._read(rig)
+
+    @classmethod
+    def _read(cls, path: str | Path) -> tuple[Rig, dict[str, Any]]:
         must = f"rig must be a file, a short TOML, or one of {', '.join(SHIPPED)}"
         place = whole_file(path, must, _LARGEST_FILE, "write it by hand, or by duffing-env rig init")
         text = ""
         try:
             text = place.read_text(encoding="utf-8-sig")
             described = tomllib.loads(text)
-            described.pop("instrument", None)
-            return cls.from_dict(described)
+            instrument = described.pop("instrument", {})
+            if not isinstance(instrument, dict):
+                raise ValueError(f"instrument must be a table, but is {shown(instrument)}; write [instrument]")
+            return cls.from_dict(described), instrument
         except (ValueError, RecursionError) as error:
             comma = " (a number has a point: 0.5, not 0,5)" if re.search(r"=\s*[-+]?\d+,\d", text) else ""
             raise ValueError(f"{place} must be a rig file, but is not: {error}{comma}") from error

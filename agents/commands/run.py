@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -46,9 +45,9 @@ class Run:
         from estimator.checks import printable
         from estimator.saving import load_estimator
 
-        rig = Rig.of(self.rig)
+        rig, instrument = Rig.with_instrument(self.rig)
         prior = None if self.posterior is None else load_estimator(self.posterior).belief
-        plant = load_plant(self.plant, rig, instrument_of(self.rig))
+        plant = load_plant(self.plant, rig, instrument)
         try:
             with progress_bar() as bar:
                 task = bar.add_task(printable(self.plan.policy), total=self.plan.samples)
@@ -65,15 +64,6 @@ class Run:
         elif result.message:
             print(f"duffing-env: warning: {result.message}", file=sys.stderr)
         sys.exit(result.exit_status)
-
-
-def instrument_of(rig: str) -> dict[str, Any]:
-    """The table ``[instrument]`` of a rig file; empty where there is none."""
-    place = Path(rig)
-    table = tomllib.loads(place.read_text(encoding="utf-8")).get("instrument", {}) if place.is_file() else {}
-    if not isinstance(table, dict):
-        raise ValueError(f"{place}: instrument must be a table, but is {table!r:.60}; write [instrument]")
-    return table
 
 
 def show(result: Any) -> None:

@@ -5,6 +5,7 @@ import os
 import re
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -226,3 +227,13 @@ def test_an_estimator_of_a_rig_is_saved_whole(tmp_path):
     for one in (estimator, other):
         one.run(u[20:], y[20:])
     assert other.belief == estimator.belief
+
+
+def test_the_instrument_comes_from_the_file_that_the_rig_comes_from(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("beam").write_text("step = 0.5\n[instrument]\nresource = 'ASRL1'\n", encoding="utf-8-sig")
+    assert Rig.with_instrument("beam") == (Rig.shipped("beam"), {})
+    assert Rig.with_instrument("./beam") == (Rig(0.5), {"resource": "ASRL1"})
+    Path("beam").write_text("step = 0.5\ninstrument = 3\n")
+    with pytest.raises(ValueError, match="beam must be a rig file, but is not: instrument must be a table, but is 3"):
+        Rig.with_instrument("./beam")

@@ -698,7 +698,8 @@ def test_the_command(folder, capsys):
         "from agents.running.simulated import SimulatedPlant\n"
         "def plant(rig, seed=0):\n    return SimulatedPlant(rig, seed=seed)\n"
     )
-    (folder / "rig.toml").write_text(RIG_FILE + "\n[instrument]\nseed = 3\n")
+    # As an editor on Windows writes it, with a mark of byte order.
+    (folder / "rig.toml").write_text(RIG_FILE + "\n[instrument]\nseed = 3\n", encoding="utf-8-sig")
     words = ["--plant", "lab_of_tests:plant", "--policy", "prbs", "--samples", "64", "--block", "32", "--out", "run"]
     assert command(*words) == 0
     told = capsys.readouterr().out
