@@ -53,7 +53,7 @@ RIG_TRACK = "duffing_env/Rig-v0"
 
 
 def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
-    """Options of an environment, with the rig of a file written out.
+    """Options of an environment, with the rig of a file, or one that ships, written out.
 
     Raises:
         ValueError: for a file that is not a rig's.
@@ -63,7 +63,7 @@ def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
         return options
     from estimator.rig import Rig
 
-    return {**options, "rig": Rig.from_file(rig).to_dict()}
+    return {**options, "rig": Rig.of(rig).to_dict()}
 
 
 def progress_bar() -> Progress:

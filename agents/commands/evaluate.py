@@ -30,7 +30,7 @@ class Evaluate:
     env: str | None = None
     """Track, such as Short-v0; Amplitude-v0 where it is not given."""
     rig: str | None = None
-    """Rig file; the track is then Rig-v0."""
+    """Rig file, or the name of a rig that ships; the track is then Rig-v0."""
     options: JsonOptions = field(default_factory=dict)
     """Further options of the environment, as JSON."""
     systems: int = 256

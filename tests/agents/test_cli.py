@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 import tyro
 
-from agents.cli import JsonOptions, run_script
+from agents.cli import JsonOptions, run_script, with_rig
 from agents.training import TrainConfig
 from agents.training.hyperparameters import track_of
+from estimator import Rig
 
 ROOT = Path(__file__).parents[2]
 #: Where the options of each script are declared: file and class.
@@ -129,6 +130,11 @@ def test_a_bad_value_is_one_message_and_exit_status_2(script, name, arguments, m
     assert status == 2
     assert message in messages
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rig_may_be_one_that_ships(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert with_rig({"horizon": 9}, "beam") == {"horizon": 9, "rig": Rig.shipped("beam").to_dict()}
 
 
 @pytest.mark.parametrize(
