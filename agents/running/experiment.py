@@ -22,7 +22,7 @@ from estimator.belief import Belief, covariance_places
 from estimator.checks import SMALLEST, number, whole
 from estimator.files import write_atomically
 from estimator.free_run import free_run
-from estimator.identification.checks import SLOWEST
+from estimator.identification.checks import ENOUGH, SLOWEST
 from estimator.identification.columns import unit_of
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
@@ -176,8 +176,8 @@ def design(
 def too_slow(step: float, in_period: float) -> str:
     """What to say of a step [s] at which there are so many samples in a period."""
     return (
-        f"step must be at most a sixth of a period, but is {step:g} s: as believed now, there are {in_period:.1f} "
-        "samples in a period; sample faster"
+        f"step must be at most 1/{SLOWEST:g} of a period, but is {step:g} s: as believed now, there are "
+        f"{in_period:.1f} samples in a period; sample faster, {ENOUGH} at least"
     )
 
 

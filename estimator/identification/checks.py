@@ -60,8 +60,8 @@ _FINEST = 1e-6
 #: How far off a gross outlier is: in parts of what 99 % of all are off, and of those beside it.
 _GROSS, _ALONE = 10.0, 5.0
 
-#: Fewest samples in a period.
-SLOWEST = 5.0
+#: Fewest samples in a period that pass without a word, and as many as are asked for where there are fewer.
+SLOWEST, ENOUGH = 5.0, 6
 
 _TERMS = {
     "cubic_damping": "a damping that grows with the cube of the velocity",
@@ -129,7 +129,7 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
         message = f"outputs of {widest:.3g} {sink.unit} leave the rig's range of {sink.range:g} {sink.unit}"
         warnings.append(Finding("range", message))
     if 2 * np.pi / problem.frequency < SLOWEST:
-        message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, 6 at least"
+        message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, {ENOUGH} at least"
         warnings.append(Finding("sampling_too_slow", message))
     return warnings
 

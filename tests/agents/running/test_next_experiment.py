@@ -172,7 +172,7 @@ def test_too_few_samples_in_a_period_are_told(tmp_path, capsys):
 
 @pytest.mark.parametrize("step", [1.0, 3.0])
 def test_a_step_that_is_too_long_for_the_motion_is_refused(step):
-    with pytest.raises(ValueError, match="samples in a period; sample faster"):
+    with pytest.raises(ValueError, match=r"step must be at most 1/5 of a period, .* sample faster, 6 at least"):
         design(replace(RIG, step=step), policy="prbs", samples=64)
 
 
