@@ -252,7 +252,7 @@ class Belief:
         return dict(zip(self.names, zip(self.coefficients_mean.tolist(), stds, strict=True), strict=True))
 
     def entropy(self) -> float:
-        """Entropy of the coefficients in nats."""
+        """Entropy of the coefficients in nats; NaN where their covariance is singular."""
         active, cov = self._unknown()
         sign, log_det = np.linalg.slogdet(cov)
         return float(0.5 * (len(active) * np.log(2 * np.pi * np.e) + log_det)) if sign > 0 else float("nan")
@@ -264,7 +264,7 @@ class Belief:
             coefficients: values (..., K), in the order of ``coefficients_mean``.
 
         Returns:
-            Log density in nats, of shape (...): a float for one point.
+            Log density in nats, of shape (...): a float for one point. NaN where the covariance is singular.
 
         Raises:
             ValueError: for a wrong shape, or values that are not finite.
@@ -276,7 +276,10 @@ class Belief:
         if not np.isfinite(points).all():
             raise ValueError("coefficients must be finite, but has entries that are not; remove them")
         active, cov = self._unknown()
-        factor = np.linalg.cholesky(cov)
+        try:
+            factor = np.linalg.cholesky(cov)
+        except np.linalg.LinAlgError:
+            factor = np.eye(len(active)) * np.nan
         deviation = (points - self.coefficients_mean)[..., active]
         whitened = np.linalg.solve(factor, deviation[..., None])[..., 0]
         log_det = 2 * np.log(np.diag(factor)).sum()

@@ -87,6 +87,16 @@ def test_entropy_and_density_equal_scipy(known, rest):
     assert one.log_prob(points.reshape(7, 1, 3)).shape == (7, 1)
 
 
+def test_a_singular_covariance_has_neither_entropy_nor_density():
+    cov = covariance()
+    std = np.sqrt(np.diag(cov))
+    cov[3:, :] = cov[:, 3:] = 0.0
+    cov[3:, 3:] = np.outer(std[3:], std[3:])  # two coefficients that are as one
+    one = belief(cov=cov)
+    assert np.isnan(one.entropy())
+    assert np.isnan(one.log_prob(one.coefficients_mean))
+
+
 def test_nothing_can_be_written_into_it():
     mean, cov = FIELDS["mean"].copy(), covariance()
     one = belief(mean=mean, cov=cov)
