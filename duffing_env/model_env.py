@@ -44,6 +44,10 @@ class ModelExperiment(SimulatedExperiment):
                 raise ValueError(f"{name} must give the parameters {list(names)}, but is {given!r}")
         for parameter, value in (self.std or {}).items():
             number(f"std of {parameter}", value)
+        if self.std is not None and self.plant_spread not in (None, 0):
+            raise ValueError(
+                f"plant_spread must be 0 or left out where std says how plants are drawn, but is {self.plant_spread!r}"
+            )
         number("sampling_step", self.sampling_step)
         one_of("interpolation", self.interpolation, ("zero_order", "linear"))
         if self.factorisation != "structured":
@@ -169,6 +173,7 @@ class ModelEnv(DuffingEnv):
     | ``system`` | | a name of `estimator.models.MODELS`, a `Model`, or a dict of its fields |
     | ``mean`` | | parameter to its mean, or without ``std`` to the middle of its range |
     | ``std`` | None | parameter to its standard deviation: Gaussian; None: log-uniform within ``spread`` |
+    | ``plant_spread`` | ``spread`` | as there; with ``std`` it may only be 0 |
     | ``sampling_step`` | 1 | seconds between two samples |
     | ``interpolation`` | ``zero_order`` | or ``linear``: the input of a differential equation between samples |
     | ``sensor_noise`` | None | standard deviations of the further sensors; None: that of the first |

@@ -110,3 +110,10 @@ def test_hypotheses_about_a_model_that_bends_are_moved_by_sigma_points():
     assert np.mean(played.metrics["coverage"]) > 0.85
     assert np.mean(played.metrics["nees"]) < 1.7
     assert np.mean(played.metrics["log_posterior_gain"]) > 18.5
+
+
+def test_a_spread_is_not_ignored_where_deviations_say_how_plants_are_drawn():
+    told = {"system": "pendulum", "mean": {"p1": 14.7, "p2": 0.5, "p3": 3.0}, "std": {"p1": 0.3, "p2": 0.1, "p3": 0.3}}
+    with pytest.raises(ValueError, match=r"plant_spread must be 0 or left out where std says .* but is 0.1"):
+        ModelEnv(**told, plant_spread=0.1)
+    ModelEnv(**told, plant_spread=0.0)
