@@ -48,7 +48,7 @@ def _model(system: str, **kwargs: Any) -> dict[str, Any]:
 
 
 #: Id of a track to what it is registered with. Any change of numbers or spaces is a new version. None registers
-#: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short (`duffing_env.env.Specified`).
+#: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short (`duffing_env.contract.Specified`).
 TRACKS: dict[str, dict[str, Any]] = {
     "duffing_env/Amplitude-v0": _duffing("env:DuffingEnv"),
     "duffing_env/Short-v0": _duffing("limited:ShortEnv", horizon=48),

@@ -170,7 +170,7 @@ def cos(x):
 
 @straight
 def exp(x):
-    """Exponential to 2 units in the last place, without branches; 0 below -700, and its value at 700 above."""
+    """Exponential to 2 units in the last place, without branches; below -700 its value there, and above 700 too."""
     bounded = min(max(x, -700.0), 700.0)
     k = (bounded * 1.4426950408889634 + _ROUNDER) - _ROUNDER
     r = (bounded - k * _LN2_HIGH) - k * _LN2_LOW
