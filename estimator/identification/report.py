@@ -14,6 +14,7 @@ from estimator.files import write_atomically
 from estimator.identification.records import Record, residuals
 from estimator.page import page, plain, svg, table
 from estimator.parameters import FloatArray
+from estimator.rig_prior import HALF_WIDTH
 from estimator.units import digits_of
 
 if TYPE_CHECKING:
@@ -82,7 +83,8 @@ def _parameters(result: Result) -> str:
         rows.append([label, f"{mean:.{digits}g}", f"{std:.2g}", interval, escape(result.units[name])])
     for name, what in (("input", "disturbance of the force"), ("output", "noise of the sensor")):
         mean, std = result.noises[name]
-        interval = f"{max(mean - 1.645 * std, 0):.3g} to {mean + 1.645 * std:.3g}"
+        half = HALF_WIDTH * std
+        interval = f"{max(mean - half, 0):.3g} to {mean + half:.3g}"
         rows.append([what, f"{mean:.3g}", f"{std:.1g}", interval, escape(getattr(result.rig, name).unit)])
     equation = "<p>m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0 and noise.</p>"
     heads = ["", "mean", "standard deviation", "90 % interval", "unit"]
@@ -148,7 +150,8 @@ def _draw_fit(result: Result, record: Record, forecast: FloatArray) -> Figure:
     far.set_ylabel(plain(f"free run's error [{output.unit}]"))
     near.plot(seconds, measured - forecast[:count, 0], color="#06c", linewidth=0.8)
     std = np.sqrt(forecast[:count, 1])
-    near.fill_between(seconds, -1.645 * std, 1.645 * std, color="#06c", alpha=0.2, label="90 % of the forecast")
+    half = HALF_WIDTH * std
+    near.fill_between(seconds, -half, half, color="#06c", alpha=0.2, label="90 % of the forecast")
     near.set_ylim(*(6 * float(np.nanmedian(std)) * np.array([-1, 1])))
     near.set_ylabel(plain(f"forecast's error [{output.unit}]"))
     near.set_xlabel("time [s]")
