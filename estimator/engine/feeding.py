@@ -8,9 +8,10 @@ from typing import Any
 from estimator.checks import one_of
 from estimator.lanes import part
 from estimator.models.model import Model
+from estimator.rig import INTERPOLATIONS
 
-#: Ways of the input between samples, and the degree of the polynomial that each takes.
-INTERPOLATIONS = {"zero_order": 0, "linear": 1}
+#: Ways of the input between two samples that depend on these alone, and the degree of the polynomial of each.
+_DEGREES = {name: degree for name, degree in INTERPOLATIONS.items() if degree < 2}
 
 
 def input_degree(model: Model, interpolation: str) -> int:
@@ -19,13 +20,13 @@ def input_degree(model: Model, interpolation: str) -> int:
     Raises:
         ValueError: for an unknown interpolation, or one that is not ``zero_order`` for a difference equation.
     """
-    one_of("interpolation", interpolation, INTERPOLATIONS)
+    one_of("interpolation", interpolation, _DEGREES)
     if not model.is_continuous and interpolation != "zero_order":
         raise ValueError(
             f"interpolation must be 'zero_order' for the difference equation {model.name!r}, whose inputs are samples, "
             f"but is {interpolation!r}"
         )
-    return INTERPOLATIONS[interpolation]
+    return _DEGREES[interpolation]
 
 
 def older_inputs(model: Model, degree: int) -> int:
