@@ -17,8 +17,8 @@ from benchmarks.systems import SPREAD, draw, make_model, make_prior, make_rig, n
 from duffing_env.vector_env import ContinuousVectorEnv
 from estimator import OnlineEstimator, coefficients_of, duffing
 from estimator.belief import Belief
+from estimator.inference import EXPECTATIONS
 from estimator.parameters import FloatArray
-from estimator.settings import EXPECTATIONS
 
 LEVEL = 0.90
 QUANTILE = float(norm.ppf(0.5 + LEVEL / 2))

@@ -20,12 +20,12 @@ from duffing_env.rewards import check_reward, rewarding
 from estimator.belief import Belief
 from estimator.checks import LARGEST, SMALLEST, flag, number, one_of, shown, whole
 from estimator.ensemble import Hypotheses, first_weights, priors, start
-from estimator.inference import DEFAULT_ITERATIONS
+from estimator.inference import DEFAULT_ITERATIONS, MOST_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
-from estimator.settings import MOST_ITERATIONS, checked_hypotheses
+from estimator.settings import checked_hypotheses
 from estimator.units import Scales
 
 #: More ratios of the noises, or values of each, than are worth their time.

@@ -8,15 +8,9 @@ from typing import Any
 
 from estimator.checks import flag, number, one_of, whole
 from estimator.ensemble import Hypotheses
-from estimator.inference import DEFAULT_ITERATIONS
+from estimator.inference import DEFAULT_ITERATIONS, EXPECTATIONS, MOST_ITERATIONS
 from estimator.models.difference import difference
 from estimator.models.model import Model
-
-#: How a step may move a Gaussian belief.
-EXPECTATIONS = ("first_order", "sigma_points")
-
-#: More iterations per sample change nothing that shows.
-MOST_ITERATIONS = 100
 
 #: More ratios of the noises than data could tell apart; and of two numbers, more values of each than there are noises.
 _MOST_HYPOTHESES, _MOST_VALUES = 1000, 99

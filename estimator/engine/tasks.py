@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 
 from estimator import elementary
+from estimator.checks import one_of, whole
 from estimator.engine import cache as stored
 from estimator.engine.rows import carried_names, layout, path_layout, point_names, trace_names
+from estimator.inference import EXPECTATIONS, MOST_ITERATIONS
 from estimator.lanes import LANES, rows
 from estimator.models.model import Model
 from estimator.straight import straight
@@ -82,10 +84,8 @@ def structured(
 def _structured(
     model: Model, degree: int, iterations: int, lanes: int, within: Any, trace: bool, missing: bool, expectations: str
 ) -> Update:
-    if not 1 <= iterations <= 100:
-        raise ValueError(f"iterations must be from 1 to 100, but is {iterations}; 3 are enough")
-    if expectations not in ("first_order", "sigma_points"):
-        raise ValueError(f"expectations must be 'first_order' or 'sigma_points', but is {expectations!r}")
+    whole("iterations", iterations, MOST_ITERATIONS)
+    one_of("expectations", expectations, EXPECTATIONS)
     points = expectations == "sigma_points"
     place = dict(within) if within is not None else layout(model, degree)
     more_rows = [*(trace_names(model, iterations) if trace else ()), *(point_names(model) if points else ())]

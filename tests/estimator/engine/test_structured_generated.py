@@ -158,5 +158,5 @@ def test_lanes_do_not_know_one_another():
 
 @pytest.mark.parametrize("iterations", [0, 101])
 def test_iterations_out_of_range_are_refused(iterations):
-    with pytest.raises(ValueError, match=f"iterations must be from 1 to 100, but is {iterations}"):
+    with pytest.raises(ValueError, match=f"iterations must be a whole number from 1 to 100, but is {iterations}"):
         tasks.structured(CASES["paper"].model, iterations=iterations)
