@@ -295,6 +295,6 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
+    from agents.cli import run_script
 
-    main(tyro.cli(Config, description=__doc__))
+    run_script(main, Config, __doc__ or "")

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import tyro
 
+from agents.cli import run_script
 from agents.results import finite, show, table
 from agents.studies.silverbox_protocol import (
     GIVEN,
@@ -325,16 +325,22 @@ def _row(title: str, contender: Contender) -> tuple[str, ...]:
     )
 
 
-def main(json: Path | None = None, figures: Path = Path("runs/silverbox"), data: Path | None = None) -> None:
-    """Run the official Silverbox protocol for every estimator of this project, and for other packages beside them.
+@dataclass(frozen=True)
+class Config:
+    """Run the official Silverbox protocol for every estimator of this project, and for other packages beside them."""
 
-    Args:
-        json: file for the results, machine-readable.
-        figures: folder for the figures of errors, learning and parameters, as PNG.
-        data: the record, or its folder; searched for on this machine if not given.
-    """
-    run_protocol(data, json, figures, compare)
+    json: Path | None = None
+    """File for the results, machine-readable."""
+    figures: Path = Path("runs/silverbox")
+    """Folder for the figures of errors, learning and parameters, as PNG."""
+    data: Path | None = None
+    """The record, or its folder; searched for on this machine if not given."""
+
+
+def main(config: Config) -> None:
+    """Run the protocol and compare."""
+    run_protocol(config.data, config.json, config.figures, compare)
 
 
 if __name__ == "__main__":
-    tyro.cli(main, prog="python -m benchmarks.silverbox")
+    run_script(main, Config)
