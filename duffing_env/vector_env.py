@@ -24,7 +24,7 @@ from duffing_env.layout import OUTCOME
 from duffing_env.own import Own
 from duffing_env.replay import SilverboxReplayEnv
 from estimator.belief import Belief
-from estimator.checks import numbers, shown, whole
+from estimator.checks import MOST_SEED, numbers, shown, whole
 from estimator.parameters import FloatArray, Parameters
 
 _RESET_MODES = {
@@ -37,8 +37,8 @@ _RESET_MODES = {
 _PLACES = {name.lower(): place for place, name in enumerate(OUTCOME)}
 _FIRST_FLAG = _PLACES["terminated"]
 
-#: Rows at most, some gigabytes of them; and the largest seed.
-MOST_ENVS, MOST_SEED = 2**20, 2**128
+#: Rows at most, some gigabytes of them.
+MOST_ENVS = 2**20
 
 #: Numbers that all observations have together: 1 GiB.
 _MOST_SHOWN = 2**28

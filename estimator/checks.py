@@ -14,6 +14,9 @@ from estimator.parameters import FloatArray
 #: Options that are sizes lie between these: squares and products of some of them neither overflow nor vanish.
 SMALLEST, LARGEST = 1e-12, 1e12
 
+#: The largest seed.
+MOST_SEED = 2**128
+
 
 def shown(value: object) -> str:
     """A value as a message shows it, whatever it is."""

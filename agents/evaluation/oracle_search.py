@@ -31,7 +31,7 @@ from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
 from agents.planner.pursuit import pursuit
 from estimator.belief import Belief
-from estimator.checks import whole
+from estimator.checks import MOST_SEED, whole
 from estimator.parameters import FloatArray
 
 #: Starts of a search at least; it goes on to so many times as many, until so many that began anew agree within [nats].
@@ -176,7 +176,7 @@ class Config:
     def __post_init__(self) -> None:
         whole("systems", self.systems, _MOST)
         whole("tries", self.tries, _MOST)
-        whole("seed", self.seed, 2**128, 0)
+        whole("seed", self.seed, MOST_SEED, 0)
         whole("first (below systems)", self.first, self.systems - 1, 0)
 
 

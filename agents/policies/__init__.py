@@ -21,7 +21,7 @@ from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.own import own_policy
 from agents.policies.signals import make_signal
-from estimator.checks import hint, shown, whole
+from estimator.checks import MOST_SEED, hint, shown, whole
 
 
 class Policy(Protocol):
@@ -99,7 +99,7 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
         ValueError: There is neither a policy nor a file of this name, it has no such option, it is no
             policy, or `env` is not one of duffing_env.
     """
-    whole("seed", seed, 2**128, 0)
+    whole("seed", seed, MOST_SEED, 0)
     name = str(name) if isinstance(name, Path) else name
     if not isinstance(name, str):
         return own_policy(name, env, seed, options)

@@ -12,7 +12,7 @@ from agents.asked import MOST_SAMPLES
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_MAX_INPUT, DEFAULT_SAMPLES, Limits
-from estimator.checks import hint, shown, whole
+from estimator.checks import MOST_SEED, hint, shown, whole
 from estimator.files import write_atomically
 from estimator.parameters import SAMPLING_STEP
 
@@ -49,7 +49,7 @@ def draw_signal(
             remedy = "; it answers to what an oscillator does, so it must be played: use agents.make_policy"
         raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {shown(name)}{remedy}")
     whole("samples", samples, MOST_SAMPLES)
-    whole("seed", seed, 2**128, 0)
+    whole("seed", seed, MOST_SEED, 0)
     limits = Limits(max_input, max_rms)
     generator = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
     return max_input * limits.fit(EXCITATIONS[name](max_input)(generator, samples))

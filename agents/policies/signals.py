@@ -15,7 +15,7 @@ from agents.asked import MOST_SAMPLES, check_rows, check_state, starts
 from agents.planner.motion import frequency
 from agents.policies.excitations import EXCITATIONS, Draw, draw_recorded
 from estimator.belief import Belief
-from estimator.checks import SMALLEST, is_finite, numbers, shown, whole
+from estimator.checks import MOST_SEED, SMALLEST, is_finite, numbers, shown, whole
 from estimator.parameters import SAMPLING_STEP
 
 # Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
@@ -111,7 +111,7 @@ class SignalPolicy:
         seed: int = 0,
     ) -> None:
         whole("samples", samples, MOST_SAMPLES)
-        whole("seed", seed, 2**128, 0)
+        whole("seed", seed, MOST_SEED, 0)
         self.name = name
         self.limits = Limits(max_input, max_rms, hold)
         self.samples = samples

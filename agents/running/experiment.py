@@ -19,7 +19,7 @@ from agents.policies.signals import SignalPolicy
 from agents.running.blocks import Block, SignalDesign
 from agents.running.observed import Observed
 from estimator.belief import Belief, covariance_places
-from estimator.checks import SMALLEST, number, whole
+from estimator.checks import MOST_SEED, SMALLEST, number, whole
 from estimator.files import write_atomically
 from estimator.free_run import free_run
 from estimator.identification.checks import ENOUGH, SLOWEST
@@ -130,7 +130,7 @@ def design(
     """
     whole("samples", samples, _MOST, 8)
     number("bound", bound, SMALLEST, 1 - SMALLEST, "0.05 is usual")
-    whole("seed", seed, 2**128, 0)
+    whole("seed", seed, MOST_SEED, 0)
     rig = Rig.of(rig)
     belief = rig_prior(rig) if prior is None else prior
     observed = Observed(rig, belief, int(samples))

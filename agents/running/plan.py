@@ -46,11 +46,11 @@ class Plan:
 
     def _check(self) -> None:
         from agents.asked import MOST_SAMPLES
-        from estimator.checks import SMALLEST, flag, number, shown, whole
+        from estimator.checks import MOST_SEED, SMALLEST, flag, number, shown, whole
 
         ranges = {
-            "samples": (1, MOST_SAMPLES), "listen": (1, MOST_SAMPLES), "stale": (0, MOST_SAMPLES), "seed": (0, 2**128),
-            "block": (8, MOST_SAMPLES),
+            "samples": (1, MOST_SAMPLES), "listen": (1, MOST_SAMPLES), "stale": (0, MOST_SAMPLES),
+            "block": (8, MOST_SAMPLES), "seed": (0, MOST_SEED),
         }  # fmt: skip
         for name, (least, most) in ranges.items():
             if name != "block" or self.block is not None:

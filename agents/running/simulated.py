@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.running.clock import Clock, RealClock
-from estimator.checks import number, shown, whole
+from estimator.checks import MOST_SEED, number, shown, whole
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -58,7 +58,7 @@ class SimulatedPlant:
             )
         if truth is not None:
             check_truth(truth)
-        whole("seed", seed, 2**128, 0)
+        whole("seed", seed, MOST_SEED, 0)
         if rig.delay != 0:
             raise ValueError(f"rig must have a delay of 0 to be simulated here, but has {rig.delay}; set it to 0")
         self.truth = dict(truth) if truth is not None else {k: sum(v) / 2 for k, v in (rig.guess or {}).items()}
