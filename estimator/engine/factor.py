@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import sympy as sp
 
+from estimator.engine.algebra import select
 from estimator.engine.derive import Assignments, symbol
 
 
@@ -52,7 +53,7 @@ def factorise(entries: Mapping[tuple[int, int], Any], size: int, tag: str, known
             if j == i and known:
                 left = symbol(f"{tag}R_{i}")
                 lines.append((f"{tag}R_{i}", rest))
-                rest = sp.Function("select")(left**2, left, sp.S.One)
+                rest = select(left**2, left, sp.S.One)
             lines.append((f"{tag}D_{i}_{j}", rest))
             if j < i:
                 below[i, j] = symbol(f"{tag}L_{i}_{j}")

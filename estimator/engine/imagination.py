@@ -128,6 +128,7 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
     import sympy as sp
 
     from estimator.engine import derive, emit
+    from estimator.engine.algebra import select
     from estimator.engine.factor import factorise
 
     symbol, names = derive.symbol, list(model.coefficients)
@@ -157,10 +158,10 @@ def _judgement(model: Model, place: Mapping[str, int]) -> str:
             value, value_now = symbol(f"SHARED_{name}") * second, symbol(f"SHARED_{name}") * first
         lines += [(name, value), (name_now, value_now)]
     lines += [("NOW", now.determinant), ("RATIO", to_come.determinant / symbol("NOW"))]
-    choose, ratio = sp.Function("select"), symbol("RATIO")
+    ratio = symbol("RATIO")
     # `log` is that of positive, normal numbers; comparisons with NaN do not hold.
-    known = choose(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(LOST))
-    known = choose(symbol("NOW"), choose(ratio - 1e-300, known, sp.Float(LOST)), sp.Float(LOST))
+    known = select(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(LOST))
+    known = select(symbol("NOW"), select(ratio - 1e-300, known, sp.Float(LOST)), sp.Float(LOST))
     lines.append(("NATS", known))
     uniform = [str(factor[i][j]) for i in range(k) for j in range(i + 1)]
     source = emit.lane_loop("judge_lanes", lines, {"KNOWN": "NATS"}, place, LANES, uniform, doc="What will be known.")

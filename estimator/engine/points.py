@@ -20,20 +20,16 @@ from __future__ import annotations
 import sympy as sp
 
 from estimator.engine import derive
-from estimator.engine.algebra import HALF, ONE, ZERO
+from estimator.engine.algebra import HALF, ONE, ZERO, select
 from estimator.engine.derive import Assignments, Moved, calculus, pair, renamed, symbol
+from estimator.engine.rows import movers_first
 from estimator.models.model import Model
 
 #: What rounding leaves of the variance of a dimension that depends on those before it, as a part of that variance.
 ROUNDING = 1e-14
 
-#: The second of three where the first is positive, else the third; and 1 for what is negative or no number, else 0.
-select, below = sp.Function("select"), sp.Function("below")
-
-
-def order(model: Model) -> list[str]:
-    """Quantities in the order of the rows of L: the movers first."""
-    return [*model.movers, *(name for name in model.names if name not in model.movers)]
+#: 1 for what is negative or no number, else 0.
+below = sp.Function("below")
 
 
 def spread(model: Model) -> tuple[Assignments, dict[str, str]]:
@@ -42,7 +38,7 @@ def spread(model: Model) -> tuple[Assignments, dict[str, str]]:
     A column is dead where its pivot is within `ROUNDING` of the variance. P is not a covariance where a pivot is
     below that, or a dead column still goes along with another quantity.
     """
-    names, m = order(model), len(model.movers)
+    names, m = movers_first(model), len(model.movers)
     covariance = lambda i, j: pair("P", i, j, model.names)  # noqa: E731
     lines: Assignments = []
 

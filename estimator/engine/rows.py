@@ -42,14 +42,18 @@ def layout(model: Model, degree: int) -> dict[str, int]:
     return rows(*belief_names(model), *input_rows(model, degree), *outputs, *carried_names(model))
 
 
+def movers_first(model: Model) -> list[str]:
+    """Quantities in the order of the rows of the sigma points' factor L."""
+    return [*model.movers, *(name for name in model.names if name not in model.movers)]
+
+
 def point_names(model: Model) -> list[str]:
     """Rows of the sigma points (`estimator.engine.points`)."""
     columns, movers = range(len(model.movers)), model.movers
-    names = [*movers, *(i for i in model.names if i not in movers)]
     images = [f"I_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
     at_point = [f"X_{i}" for i in movers if i not in model.states]
-    return [*(f"L_{c}_{i}" for c in columns for i in names), *(f"WEIGHT_{c}" for c in columns), *at_point, *images,
-            "UNSOUND"]  # fmt: skip
+    factor = [f"L_{c}_{i}" for c in columns for i in movers_first(model)]
+    return [*factor, *(f"WEIGHT_{c}" for c in columns), *at_point, *images, "UNSOUND"]
 
 
 def trace_names(model: Model, iterations: int) -> list[str]:

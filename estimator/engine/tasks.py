@@ -16,10 +16,10 @@ import numpy as np
 from estimator import elementary
 from estimator.checks import one_of, whole
 from estimator.engine import cache as stored
-from estimator.engine.rows import carried_names, layout, path_layout, point_names, trace_names
+from estimator.engine.rows import carried_names, layout, movers_first, path_layout, point_names, trace_names
 from estimator.inference import EXPECTATIONS, MOST_ITERATIONS
 from estimator.lanes import LANES, rows
-from estimator.models.model import Model
+from estimator.models.model import FUNCTIONS, Model
 from estimator.straight import straight
 
 
@@ -30,7 +30,7 @@ def sqrt(value):
 
 
 #: What generated code may use.
-NAMES = {"sqrt": sqrt} | {name: getattr(elementary, name) for name in ("log", "sin", "cos", "exp", "tanh")}
+NAMES = {"sqrt": sqrt} | {name: getattr(elementary, name) for name in FUNCTIONS if name != "sqrt"}
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
     """Source of ``spread(W)``, and of ``update(W)`` that takes all points through the sample."""
     from estimator.engine import derive, emit, points, sensitivity
 
-    names = points.order(model)
+    names = movers_first(model)
     by_point: dict[str, int | str] = dict(place)
     by_point |= {f"L_C_{i}": f"{place[f'L_0_{names[0]}']} + C*{len(names)} + {k}" for k, i in enumerate(names)}
     first = place[f"I_0_{next(iter(model.states))}"]
