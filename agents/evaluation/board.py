@@ -40,7 +40,7 @@ def check(path: Path, name: str) -> set[str]:
     """
     check_folder("folder of board", path.parent)
     check_file("board", path)
-    if path.resolve() != SHIPPED.resolve() and name.strip() in {entry["name"] for entry in read(SHIPPED)}:
+    if path.resolve() != SHIPPED.resolve() and name.strip() in {entry["name"].strip() for entry in read(SHIPPED)}:
         raise ValueError(
             f"submit must be a name of your own, but is {name}, which the board that ships has; name another"
         )
@@ -79,7 +79,7 @@ def read(path: Path) -> list[dict[str, Any]]:
         try:
             entry = json.loads(line)
             key = str(entry["track"]), str(entry["name"])
-            tables([entry])
+            _rank(entry), cells(entry), _oracle(entry)
         except Exception as error:  # whatever a file of somebody else's makes of what is shown
             raise ValueError(f"board must hold an entry a line, but {path}:{number} is not one: {error!r}") from error
         if entry.get("protocol") == VERSION:
@@ -94,14 +94,22 @@ def stored_oracles() -> set[str]:
 
 def tables(entries: Sequence[dict[str, Any]]) -> dict[str, list[list[str]]]:
     """Rows under `TITLES` for each track, the best score first."""
-    ordered = sorted(entries, key=lambda entry: -entry["score"]["iqm"])
+    ordered = sorted(entries, key=_rank)
     present = stored_oracles()
     rows: dict[str, list[list[str]]] = {track: [] for track in TRACKS}
     for entry in ordered:
         name, score, *others = cells(entry)
-        earlier = "" if str(entry["reference"]["oracle"]) in present else " *"
+        earlier = "" if _oracle(entry) in present else " *"
         rows.setdefault(str(entry["track"]), []).append([name, score + earlier, *others])
     return {track: found for track, found in rows.items() if found}
+
+
+def _rank(entry: dict[str, Any]) -> float:
+    return float(-entry["score"]["iqm"])
+
+
+def _oracle(entry: dict[str, Any]) -> str:
+    return str(entry["reference"]["oracle"])
 
 
 def cells(entry: dict[str, Any]) -> list[str]:
