@@ -89,8 +89,8 @@ def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Fig
     return figure
 
 
-def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
-    """Input and output of one system in time, and the spectrum of the inputs: root of the mean power over systems.
+def figure_of_inputs(evaluations: list[Evaluation]) -> Figure:
+    """Input and output of the first system in time; of the inputs' spectrum the root of the mean power over systems.
 
     Of several sensors the first is shown. Dashed lines are limits that are come near to.
     """
@@ -105,9 +105,9 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
         inputs = np.nan_to_num(evaluation.inputs)  # an episode that ended is silent
         spectrum = factor * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         frequencies = np.fft.rfftfreq(len(inputs), scales.step)
-        shown = evaluation.outputs[:, system].reshape(len(time), -1)[:, 0]
+        shown = evaluation.outputs[:, 0].reshape(len(time), -1)[:, 0]
         lines = (
-            (labelled("u", unit), time, scales.input * evaluation.inputs[:, system]),
+            (labelled("u", unit), time, scales.input * evaluation.inputs[:, 0]),
             (labelled("y", scales.output_unit), time, scales.output * shown),
             (labelled("|U|", small), frequencies, spectrum),
         )
@@ -123,7 +123,7 @@ def figure_of_inputs(evaluations: list[Evaluation], system: int = 0) -> Figure:
                 ends = axes.lines[0].get_xdata()[[0, -1]]
                 axes.hlines(worth * limit * np.array([-1, 1]), *ends, "black", "--", linewidth=0.8, zorder=1)
     for axes in grid[0, :2]:
-        axes.set_title(f"system {system}", loc="right", fontsize=9, color=_COLOURS[6])
+        axes.set_title("system 0", loc="right", fontsize=9, color=_COLOURS[6])
     grid[0, 2].set_title("all systems", loc="right", fontsize=9, color=_COLOURS[6])
     for axes, label in zip(grid[-1], ("time / ms", "time / ms", "frequency / Hz"), strict=True):
         axes.set_xlabel(label)

@@ -113,9 +113,9 @@ def summarise(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
     return {"rows": finite(rows), "meta": meta}
 
 
-def submission(errors: Any, digits: int = 3) -> str:
+def submission(errors: Any) -> str:
     """The official line: multisine, arrow, arrow without extrapolation [mV]."""
-    return "[" + "; ".join(f"{error:.{digits}f}" for error in errors) + "]"
+    return "[" + "; ".join(f"{error:.3f}" for error in errors) + "]"
 
 
 def report(outcomes: Mapping[str, Outcome]) -> None:

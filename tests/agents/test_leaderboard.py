@@ -359,13 +359,13 @@ def test_contraction_shows_losses_too():
 @pytest.mark.parametrize("policies", [1, 10])
 def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
-    panels = figure_of_inputs(evaluations, system=4).axes
+    panels = figure_of_inputs(evaluations).axes
     assert len(panels) == 3 * policies
     for row, evaluation in enumerate(evaluations):
         left, middle, right = panels[3 * row : 3 * row + 3]
         for axes, signal, label in ((left, evaluation.inputs, "u / V"), (middle, evaluation.outputs, "y / V")):
             (line,) = axes.lines
-            np.testing.assert_array_equal(line.get_ydata(), signal[:, 4])
+            np.testing.assert_array_equal(line.get_ydata(), signal[:, 0])
             np.testing.assert_allclose(line.get_xdata(), 1e3 * SAMPLING_STEP * np.arange(20))
             assert axes.get_ylabel() == label
         assert left.get_title(loc="left") == evaluation.policy
