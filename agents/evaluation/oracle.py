@@ -180,8 +180,9 @@ class Oracle:
             raise FileNotFoundError(f"no oracle is stored for {systems.description}; run {command}")
         with np.load(path, allow_pickle=False) as stored:
             scaled, theta, bounds = stored["inputs"], stored["theta"], stored["bounds"]
+            task = str(stored["task"])
         n = min(len(theta), len(systems.theta))
-        if not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
+        if task != json.dumps(systems.description) or not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
             raise ValueError(f"oracle must be for the systems at hand, but {path.name} is not; make it anew")
         chosen = systems.rows(0, n)
         inputs = systems.limits.amplitude * (scaled[:n] / LEVELS)

@@ -1,6 +1,7 @@
 """The oracle: its search, its store, and the D-efficiency against it; and the oracles that are in the package."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -36,6 +37,14 @@ def answers(systems, inputs):
 
 def gains(systems, values):
     return values - 0.5 * np.linalg.slogdet(systems.precision)[1]
+
+
+def test_an_oracle_of_another_task_is_refused(tmp_path, monkeypatch):
+    ours, others = Systems.of(POWER, 2), Systems.of("duffing_env/Amplitude-v0", 2).path
+    monkeypatch.setattr(module_of_oracle, "FOLDER", tmp_path)
+    shutil.copy(others, ours.path)
+    with pytest.raises(ValueError, match=r"oracle must be for the systems at hand, but .*npz is not; make it anew"):
+        Oracle.of(ours)
 
 
 def test_systems_of_another_branch_are_others_with_an_oracle_of_their_own():
