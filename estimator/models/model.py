@@ -27,7 +27,7 @@ FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "tanh")
 HIGHEST_POWER = 16
 
 #: Names that stand for something else: the input and its older values, the sampling step, what generated code calls.
-RESERVED = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, "present", "select", "below", "range"})
+RESERVED = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, "capped", "range"})
 
 
 #: What an expression is made of.

@@ -34,6 +34,7 @@ TANK = {
         ({"rates": ("u", "loss*x")}, "rates must have one expression per state, 1, but has 2"),
         ({"next_state": ("u - loss*x",)}, "either rates or next_state must be given"),
         ({"states": {"X": "V"}}, "names must be lower-case identifiers"),
+        ({"outputs": {"capped": "x"}}, "but one is 'capped'; rename it"),
         ({"coefficients": {"x": "1"}}, "must have different names, but share ['x']"),
         ({"physical": {"t": "1/loss"}, "dimensions": {"t": (0, 0, 1)}}, "physical and inverse go together"),
         (
