@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy.typing as npt
 
@@ -12,7 +12,6 @@ from estimator.parameters import FloatArray
 from estimator.rig import Rig
 
 
-@runtime_checkable
 class Plant(Protocol):
     """A plant, in the rig's units. It begins disarmed, its input at zero; any exception ends the run.
 
