@@ -107,7 +107,7 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> dict[st
 def regime_information(truth: Any, experiment: Any, seed: int, scale: float = 1.0) -> FloatArray:
     """(lengths, n) what stretches of the Silverbox multisine regime, times ``scale``, tell of each system [nats].
 
-    They start anywhere in the regime and go on at its begin where it ends, so that every part of it counts alike: rare
+    They start anywhere in the regime and go on at its start where it ends, so that every part of it counts alike: rare
     peaks of the displacement tell most of what is known of b, and some parts have more of them.
     """
     rng = np.random.default_rng(seed)

@@ -55,7 +55,7 @@ def search(
 
     A start is the best way through the map of the states, whose criterion expects of the rest of the way the rate of
     information that the best input so far has brought, each coefficient's changed at random; every second one keeps the
-    begin of the best input. Under a limit of energy a start is a burst that pushes as the system moves.
+    start of the best input. Under a limit of energy a start is a burst that pushes as the system moves.
 
     Args:
         systems: of a track.

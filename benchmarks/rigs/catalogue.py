@@ -62,7 +62,7 @@ class Bench:
 
     @property
     def rest(self) -> float:
-        """Displacement where it rests at the begin: of two wells, the one on the right."""
+        """Displacement where it rests at the start: of two wells, the one on the right."""
         _, _, a, b = self.truth
         return math.sqrt(-a / b) if a < 0 else 0.0
 

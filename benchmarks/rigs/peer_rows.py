@@ -1,6 +1,6 @@
 """What a user of dynamax, SciPy or pysindy writes for a rig. Runs in the peers' environment, and imports none of ours.
 
-Each function takes a `Problem` and returns m, c, a and b. All begin at the guess, and know the rest at the begin, the
+Each function takes a `Problem` and returns m, c, a and b. All begin at the guess, and know the rest at the start, the
 interpolation of the input, and whether the sensor has an offset.
 """
 
@@ -60,7 +60,7 @@ def move(x: Any, v: Any, p: Any, forces: Any, step: float) -> tuple[Any, Any]:
 
 
 def substep(x: Any, v: Any, p: Any, forces: Any, h: float) -> tuple[Any, Any]:
-    """One of Runge and Kutta's steps, h seconds long, under the inputs at its begin, middle and end."""
+    """One of Runge and Kutta's steps, h seconds long, under the inputs at its start, middle and end."""
     first, middle, last = (p[0] * force for force in forces)
     k1 = first - p[1] * v - p[2] * x - p[3] * x**3
     x2, v2 = x + h / 2 * v, v + h / 2 * k1
@@ -157,7 +157,7 @@ def looped(x: Any, v: Any, p: Any, forces: Any, step: float) -> tuple[Any, Any]:
 
 
 def shooting(problem: Problem) -> Any:
-    """SciPy's least squares over coefficients and the begin of every segment, from short segments to longer ones."""
+    """SciPy's least squares over coefficients and the start of every segment, from short segments to longer ones."""
     guess = problem.guess
     for length in SEGMENTS:
         guess = shot(replace(problem, guess=guess), length)

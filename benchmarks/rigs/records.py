@@ -1,6 +1,6 @@
 """Records of the rigs: what a user's instrument would write, the rig file, and what the record could tell at best.
 
-That is the Cramér-Rao bound of m, c, a and b from one record, the noises known and the state at its begin unknown. The
+That is the Cramér-Rao bound of m, c, a and b from one record, the noises known and the state at its start unknown. The
 sensitivities of the outputs, taken along the path that the oscillator went, are whitened by the Kalman filter of the
 linearised motion. What the noises' dependence on the parameters would add is left out: it does not grow as noises
 shrink.
@@ -77,7 +77,7 @@ def information(moved, by_state, by_force, direct, process, sensor, spread):  # 
         direct: (T + 1, P) by the unknowns, at a given state.
         process: variance of the force held over a sample.
         sensor: variance of the sensor's noise.
-        spread: (2,) standard deviations of the state at the begin.
+        spread: (2,) standard deviations of the state at the start.
     """
     unknowns = direct.shape[1]
     found = np.zeros((unknowns, unknowns))

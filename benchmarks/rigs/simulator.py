@@ -137,7 +137,7 @@ def simulate(
 
     Args:
         parameters: (5,) m, c, a, b and q.
-        force: (T,) input and process noise at the begin of each interval between samples.
+        force: (T,) input and process noise at the start of each interval between samples.
         slope: (T,) its rate of change over the interval.
         initial: (2,) x and x' at sample 0.
         step: sampling step.

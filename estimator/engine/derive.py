@@ -162,7 +162,7 @@ def difference_step(model: Model) -> tuple[Assignments, Moved]:
 
 
 def carried_at_start(model: Model) -> dict[str, sp.Expr]:
-    """What is carried, at the begin of a sample."""
+    """What is carried, at the start of a sample."""
     start: dict[str, sp.Expr] = dict.fromkeys(carried_names(model), sp.S.Zero)
     for i in model.states:
         start |= {f"M_{i}": symbol(i), f"S_{i}_{i}": sp.S.One}
@@ -223,7 +223,7 @@ def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assi
 
 
 def input_over_step(degree: int, substeps: int) -> Assignments:
-    """``V_A``, ``V_B``, ``V_D``: the input at begin, middle and end of a Runge-Kutta step, by its polynomial."""
+    """``V_A``, ``V_B``, ``V_D``: the input at the start, middle and end of a Runge-Kutta step, by its polynomial."""
     h = sp.Rational(1, substeps)
     lines = []
     for tag, part in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):

@@ -143,8 +143,8 @@ def coarse_path(model: Model, degree: int) -> tuple[Assignments, dict[str, str]]
 def coarse_motion(model: Model, degree: int) -> tuple[Assignments, derive.Moved]:
     """A sample of a differential equation that is only imagined: M, S and N, where the path (`coarse_path`) is known.
 
-    The sensitivities take one step, through the slopes at begin, middle and end of the sample, which is much less work
-    than the path's. With H of its stages and g what unit noise adds to the rates, N is Simpson's rule:
+    The sensitivities take one step, through the slopes at the start, middle and end of the sample, which is much less
+    work than the path's. With H of its stages and g what unit noise adds to the rates, N is Simpson's rule:
 
         N = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
     """

@@ -136,7 +136,7 @@ def _points_source(model: Model, degree: int, place: Mapping[str, int], lanes: i
     source += loop("begin", [], start, (), "The mean, and its process noise.")
     step = sensitivity.motion_step(model, degree)
     source += loop("drift", step, {i: f"{i}_E" for i in noise}, ("T",), "One Runge-Kutta step of mean and noise.")
-    source += loop("place", *points.point(model), ("C", "SIGN"), "A point at the begin of the sample.")
+    source += loop("place", *points.point(model), ("C", "SIGN"), "A point at the start of the sample.")
     step, moved = points.point_step(model, degree), {f"M_{i}": f"M_{i}_E" for i in model.states}
     source += loop("move", step, moved, ("T",), "One Runge-Kutta step of a point.")
     source += loop("keep", [], {f"I_P_{i}": f"M_{i}" for i in model.states}, ("P",), "A point at the end.")

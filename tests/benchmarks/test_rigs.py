@@ -95,7 +95,7 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
 
 
 def whole_output(bench: Bench, u: np.ndarray, w: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
-    """Outputs without noise of the sensor, of the logarithms' changes, the begin in its scale and the offset."""
+    """Outputs without noise of the sensor, of the logarithms' changes, the start in its scale and the offset."""
     parameters = np.array([*bench.truth, 0.0])
     parameters[:4] *= np.exp(unknowns[:4])
     initial = np.array([bench.rest, 0.0]) + bench.scale * unknowns[4:6]

@@ -19,7 +19,7 @@ ENVS = {"difference": (DuffingEnv, TwinEnv), "continuous": (ContinuousEnv, TwinC
 
 
 def begun(size, **options):
-    """A batch at the begin of its episodes."""
+    """A batch at the start of its episodes."""
     batch = Batch(SimulatedExperiment(**options), size, RESET_BY_HAND)
     for row, seed in enumerate(spawn_seeds(0, size)):
         batch.seed(row, np.random.default_rng(seed))
