@@ -45,8 +45,8 @@ def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, An
 class Specified:
     """What an environment, single or vector, tells of its experiment and beliefs, and its specification.
 
-    That says after how many steps an episode ends, as wrappers of Gymnasium ask. It is not registered,
-    because Gymnasium would then cut a longer ``horizon`` short.
+    The specification tells Gymnasium's wrappers after how many steps an episode ends. That is no part of what is
+    registered, because Gymnasium would then cut a longer ``horizon`` short.
     """
 
     experiment: Experiment

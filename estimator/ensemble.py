@@ -65,8 +65,8 @@ def grid(noises: FloatArray, hypotheses: Hypotheses) -> FloatArray:
     combinations: for noises of which each may be wrong by itself, by a factor of 9 for five values and of 27 for seven.
 
     Of one number, for noises whose total is known about: their σ_w/σ_v is that of ``noises`` times 1/30 to 30 in equal
-    steps, and each is there with the same σ_w² + σ_v², and with a third and three times its root: the sum is what every
-    member learns by itself, so the members of a level start equally near to it.
+    steps. Each ratio stands there three times: with √(σ_w² + σ_v²) as given, with a third of it, and with three times
+    it. The sum is what every member learns by itself, so the members of a level start equally near to it.
     """
     if isinstance(hypotheses, tuple):
         process, sensor = (APART ** (2 * np.arange(count) - (count - 1.0)) for count in hypotheses)

@@ -44,7 +44,7 @@ class Evaluate:
     protocol: str | None = None
     """Track, such as Short-v0, to measure one policy on by docs/protocol.md instead, which fixes all but the policy."""
     submit: str | None = None
-    """Name to add what the protocol gives to the board under."""
+    """Add the result to the board under this name."""
     samples: int | None = None
     """Samples that the policy learned from, for the board; a run folder says it itself."""
     board: Path = Path("runs/leaderboard.jsonl")

@@ -96,7 +96,7 @@ def contraction(problem: Problem, found: Found, parameters: dict[str, tuple[floa
 def refit(
     rig: Rig, records: Sequence[tuple[FloatArray, FloatArray]], prior: Belief, near: Belief
 ) -> tuple[FloatArray, FloatArray]:
-    """What records tell of the coefficients together, where an estimator has come near it that took every sample once.
+    """Fit the coefficients to all records at once, from the belief of an estimator that took every sample once.
 
     A Gaussian that takes every sample once becomes sure too soon where two coefficients at first show as one, such as
     the cubic stiffness and the sensor's offset of a rig with two wells. All records at once do not.

@@ -145,16 +145,16 @@ class Table:
 def read_table(path: Path, source: str | None = None, sink: str | None = None) -> Table:
     """Read a CSV file.
 
-    Args:
-        path: of the file.
-        source: name of the input's column; one of the usual names where it is None.
-        sink: of the output's, likewise.
-
     Fields stand between commas, or semicolons or tabs (then 0,5 is a number, in a file without points), or blanks.
     Empty ones are missing, and NaN, NA, N/A, null, none or - in them. Lines that begin with # are passed over; one of
     separators alone sets records apart. The first line may hold names, such as ``u,y`` or ``time [ms],force [N],x
     [mm]``, and the next one units, such as ``ms,N,mm``; of numbers alone there are the columns u and y, or time in
     seconds, u and y. A column in a unit of time is the time, whatever its name.
+
+    Args:
+        path: of the file.
+        source: name of the input's column; one of the usual names where it is None.
+        sink: of the output's, likewise.
 
     Raises:
         ValueError: naming the file, the line and what is wrong.
