@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from tyro.constructors import PrimitiveConstructorSpec
 
 from agents.loading import spec_of
-from agents.running.stopping import Stopped, stopped_by_sigterm
+from agents.stopping import Stopped, stopped_by_sigterm
 
 
 def _parse_options(words: list[str]) -> dict[str, Any]:

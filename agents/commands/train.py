@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from agents.cli import told_in_one_line
-from agents.running.stopping import telling
+from agents.stopping import telling
 from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, train_seeds, tune
 from agents.training.family import FAMILY
 from agents.training.runs import LEARNING

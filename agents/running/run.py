@@ -23,7 +23,7 @@ from agents.running.plant import Plant, check_plant
 from agents.running.recording import Recording
 from agents.running.samples import Chooser, Ticker, asking, playing
 from agents.running.session import Session, Tripped, check_session
-from agents.running.stopping import Stopped
+from agents.stopping import Stopped
 from estimator.belief import Belief
 from estimator.files import write_atomically
 from estimator.identification.beliefs import disturbance

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from agents.running.plant import Plant
-from agents.running.stopping import Stopper
+from agents.stopping import Stopper
 from duffing_env.rig_plant import number_of
 from estimator.checks import shown
 from estimator.parameters import FloatArray

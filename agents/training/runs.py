@@ -17,7 +17,7 @@ import numpy as np
 from agents.policies.learned import CARD, CONFIG
 from agents.policies.saving import write_policy
 from agents.results import write_json
-from agents.running.stopping import Stopper, telling
+from agents.stopping import Stopper, telling
 from agents.training import family
 from agents.training.algorithms import OnPolicySettings
 from agents.training.checkpoints import (

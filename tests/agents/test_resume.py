@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save_file
 
 import agents
 from agents import make_policy
-from agents.running.stopping import Stopped
+from agents.stopping import Stopped
 from agents.training import ALGORITHMS, TrainConfig, resume, train
 from agents.training.checkpoints import (
     STATE,

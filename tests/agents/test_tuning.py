@@ -9,7 +9,7 @@ import pytest
 
 import agents.commands.train
 from agents.commands.train import main
-from agents.running.stopping import Stopped
+from agents.stopping import Stopped
 from agents.training import PPOSettings, TrainConfig, train, tune
 from agents.training.hyperparameters import read_settings
 
