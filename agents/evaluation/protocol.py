@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation.batch import TESTED
+from agents.evaluation.entries import members_of
 from agents.evaluation.leaderboard import IQM, METRICS, Metric, center_and_interval
 from agents.evaluation.metrics import information
 from agents.evaluation.oracle import Oracle, Systems
-from agents.evaluation.rollout import Evaluation, members_of, roll_out
+from agents.evaluation.rollout import Evaluation, roll_out
 from agents.loading import load_object
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import CARD, MOST_STEPS, WEIGHTS

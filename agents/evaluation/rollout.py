@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import glob
-import inspect
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents.evaluation import metrics
 from agents.evaluation.batch import TESTED, make
+from agents.evaluation.entries import check_policies, check_predict, members_of, title_of
 from agents.planner.plants import plant_of
 from agents.policies import make_policy
-from agents.policies.learned import CARD
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.layout import observation_bounds, parameter_names
 from duffing_env.silverbox import record_available
@@ -124,7 +121,7 @@ def evaluate(
     called = [title_of(members[0]) if title is None else title for title, members in groups]
     if len(set(called)) < len(called):
         raise ValueError(f"policies must differ by their names, but are called {called}; give each a name of its own")
-    _check_policies([member for _, members in groups for member in members], env_id, options, seed)
+    check_policies([member for _, members in groups for member in members], env_id, options, seed)
     evaluations = []
     told: dict[str, FloatArray] = {}
     for title, members in groups:
@@ -135,42 +132,6 @@ def evaluate(
             each.append(_evaluate(member, env_id, systems, seed, options, told))
         evaluations.append(each[0] if title is None else pooled(title, each))
     return evaluations
-
-
-def _check_policies(policies: Sequence[Any], env_id: str, options: dict[str, Any], seed: int) -> None:
-    """Refuse policies that cannot be made for an environment, before the first of them plays: that takes a while."""
-    envs = make(env_id, 2, options)
-    for policy in policies:
-        if isinstance(policy, str):
-            try:
-                make_policy(policy, envs, seed=seed)
-            except ValueError as error:
-                raise ValueError(f"{policy}: {error}") from error
-    envs.close()
-
-
-def title_of(policy: Any) -> str:
-    """What a policy is called in tables."""
-    if isinstance(policy, str):
-        return policy
-    known = getattr(policy, "name", None) or getattr(policy, "__name__", None) or type(policy).__name__
-    return str(known)
-
-
-def members_of(name: Any) -> tuple[str | None, list[Any]]:
-    """The title of a group and the policies in it; without a title, the one policy of this name."""
-    if not isinstance(name, str):
-        return None, [name]
-    title, equals, pattern = name.partition("=")
-    if not equals or Path(name).exists():
-        return None, [name]
-    found = sorted(path for path in glob.glob(pattern) if (Path(path) / CARD).is_file())
-    if not title or len(found) < 2:
-        raise ValueError(
-            f"policies must name a group as TITLE=PATTERN, whose pattern two policy folders or more match, but "
-            f"{name!r} matches {found}; write e.g. 'ppo=runs/ppo-amplitude-v0-*'"
-        )
-    return title, found
 
 
 def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
@@ -227,7 +188,7 @@ def roll_out(
     """One episode of every system; the beliefs it ended with, the truth and the experiment."""
     envs = make(env_id, systems, options)
     policy = make_policy(name, envs, seed=seed)
-    _check_predict(policy, name)
+    check_predict(policy, name)
     hold = envs.experiment.hold
     if hold > 1:  # applied sample by sample instead, which is the same, so that every sample is seen
         envs = make(env_id, systems, {**options, "hold": 1})
@@ -306,21 +267,6 @@ def _place_of_input(experiment: Experiment) -> int:
             "take 'posterior', 'history' or 'privileged'"
         )
     return list(observation_bounds(experiment.model)).index("last_input")
-
-
-def _check_predict(policy: Any, name: Any) -> None:
-    """Refuse a policy of one's own whose ``predict`` takes other arguments than it is called with."""
-    try:
-        taken = inspect.signature(policy.predict)
-    except ValueError:  # that of a builtin is not known
-        return
-    try:
-        taken.bind(None, None, None, deterministic=True)
-    except TypeError as error:
-        raise ValueError(
-            f"policy {title_of(name)} must have predict(observation, state, episode_start, deterministic), but its "
-            f"predict is {taken}: {error}; give it those"
-        ) from error
 
 
 def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) -> dict[str, dict[str, FloatArray]]:

@@ -1,0 +1,64 @@
+"""What is asked to be evaluated: policies and groups of them, what they are called, and whether they can play."""
+
+from __future__ import annotations
+
+import glob
+import inspect
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation.batch import make
+from agents.policies import make_policy
+from agents.policies.learned import CARD
+
+
+def title_of(policy: Any) -> str:
+    """What a policy is called in tables."""
+    if isinstance(policy, str):
+        return policy
+    known = getattr(policy, "name", None) or getattr(policy, "__name__", None) or type(policy).__name__
+    return str(known)
+
+
+def members_of(name: Any) -> tuple[str | None, list[Any]]:
+    """The title of a group and the policies in it; without a title, the one policy of this name."""
+    if not isinstance(name, str):
+        return None, [name]
+    title, equals, pattern = name.partition("=")
+    if not equals or Path(name).exists():
+        return None, [name]
+    found = sorted(path for path in glob.glob(pattern) if (Path(path) / CARD).is_file())
+    if not title or len(found) < 2:
+        raise ValueError(
+            f"policies must name a group as TITLE=PATTERN, whose pattern two policy folders or more match, but "
+            f"{name!r} matches {found}; write e.g. 'ppo=runs/ppo-amplitude-v0-*'"
+        )
+    return title, found
+
+
+def check_policies(policies: Sequence[Any], env_id: str, options: dict[str, Any], seed: int) -> None:
+    """Refuse policies that cannot be made for an environment, before the first of them plays: that takes a while."""
+    envs = make(env_id, 2, options)
+    for policy in policies:
+        if isinstance(policy, str):
+            try:
+                make_policy(policy, envs, seed=seed)
+            except ValueError as error:
+                raise ValueError(f"{policy}: {error}") from error
+    envs.close()
+
+
+def check_predict(policy: Any, name: Any) -> None:
+    """Refuse a policy of one's own whose ``predict`` takes other arguments than it is called with."""
+    try:
+        taken = inspect.signature(policy.predict)
+    except ValueError:  # that of a builtin is not known
+        return
+    try:
+        taken.bind(None, None, None, deterministic=True)
+    except TypeError as error:
+        raise ValueError(
+            f"policy {title_of(name)} must have predict(observation, state, episode_start, deterministic), but its "
+            f"predict is {taken}: {error}; give it those"
+        ) from error
