@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from estimator.checks import series
 from estimator.files import whole_file
+from estimator.identification.shared import shared
 from estimator.identification.tables import read_table
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -64,8 +65,8 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
     """Records from a pair (u, y), a file name, or a list of these.
 
     A record is cut in two where an input is missing; clipped outputs are taken as missing. Pieces of fewer than 8
-    outputs are left out, but not a whole record. A record may not be given twice, also with other outputs missing: its
-    samples would count twice.
+    outputs are left out, but not a whole record. A record may not be given twice, also with other outputs missing, nor
+    may records or the pieces of one share samples (`estimator.identification.shared.shared`): these would count twice.
 
     Args:
         given: what the caller has.
@@ -109,6 +110,11 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
     count = sum(int(np.isfinite(one.y).sum()) for one in found)
     if count < _FEWEST:
         raise ValueError(f"records must have at least {_FEWEST} outputs in all, but have {count}; add samples")
+    if twice := shared([(one.u, one.y) for one in found]):
+        raise ValueError(
+            f"{found[twice.later].name} must have samples of its own, but from its sample {twice.begin_later} on has "
+            f"those of {found[twice.earlier].name} from sample {twice.begin_earlier} on; leave them out of one"
+        )
     for part in "uy":
         if all(np.ptp(values) == 0 for one in found if len(values := _seen(getattr(one, part)))):
             raise ValueError(f"{part} must vary, but is constant in all records; excite the system")

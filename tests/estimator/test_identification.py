@@ -65,17 +65,15 @@ def test_noises_are_found():
 
 
 def test_gaps_clipped_samples_and_several_records():
-    u, y = simulated(BENCH)
-    holes = y.copy()
+    (u, holes), (driven, y), (pushed, far) = (simulated(BENCH, seed=seed) for seed in range(3))
     holes[300:330] = np.nan
-    driven = u.copy()
     driven[1000] = np.nan
-    stop = 0.7 * np.abs(y).max()
-    result = identify(rig_of(BENCH), [(u, holes), (driven, y), (u, np.clip(y, -stop, stop))])
+    stop = 0.7 * np.abs(far).max()
+    result = identify(rig_of(BENCH), [(u, holes), (driven, y), (pushed, np.clip(far, -stop, stop))])
     assert [one.missing for one in result.records] == [30, 0, 0, 0]
     assert [len(one.y) for one in result.records] == [2048, 1000, 1047, 2048]
     assert [one.name for one in result.records] == ["record 0", "record 1", "record 1, from sample 1001", "record 2"]
-    assert result.records[3].clipped == (np.abs(y) >= stop).sum()
+    assert result.records[3].clipped == (np.abs(far) >= stop).sum()
     assert [warning.name for warning in result.warnings] == ["clipped"]
     assert np.abs(deviations(result, BENCH[0])).max() < 5
 

@@ -211,3 +211,62 @@ def test_units_in_another_way_of_writing_and_times_of_another_name_are_taken(tmp
     (tmp_path / "r.csv").write_text("Zeit [ms];u [μN];a [m/s^2]\n0;1;2\n3;3;4\n")
     with pytest.raises(ValueError, match=re.escape("times are 0.003 s apart, but the step is 0.002 s")):
         read(tmp_path / "r.csv", rig)
+
+
+def copies(u, y):
+    """What a user may give together by mistake, and from which sample on the second has the samples of the first."""
+    again = np.concatenate([u, [np.nan], u]), np.concatenate([y, [np.nan], y])
+    late = y.copy()
+    late[[40, 150]] = np.nan
+    return {
+        "without the last": ([(u, y), (u[:-1], y[:-1])], "record 1", 0, "record 0", 0),
+        "without the first": ([(u, y), (u[1:], y[1:])], "record 1", 0, "record 0", 1),
+        "longer": ([(u[:200], y[:200]), (u, y)], "record 1", 0, "record 0", 0),
+        "the end only": ([(u[300:], y[300:]), (u, y)], "record 1", 300, "record 0", 0),
+        "overlap": ([(u[:250], y[:250]), (u[190:], y[190:])], "record 1", 0, "record 0", 190),
+        "one record": (again, "record 0, from sample 401", 0, "record 0", 0),
+        "missing": ([(u, y), (u[1:], late[1:])], "record 1", 40, "record 0", 41),
+        "three": ([(u, y), simulated(BENCH, samples=400), (u[2:], y[2:])], "record 2", 0, "record 0", 2),
+    }
+
+
+@pytest.mark.parametrize("how", copies(np.zeros(400), np.zeros(400)))
+def test_samples_that_come_twice_are_refused(how):
+    given, later, at, earlier, begin = copies(*simulated(SOFT, samples=400))[how]
+    message = (
+        f"{later} must have samples of its own, but from its sample {at} on has those of {earlier} from sample {begin}"
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        records_of(given, Rig(0.01))
+
+
+def test_experiments_that_were_repeated_are_two_records():
+    """The same inputs, periodic ones without noise, and rests between two levels of a converter, are no copies."""
+    rng = np.random.default_rng(0)
+    u, y = simulated(SOFT, samples=1_000)
+    assert len(records_of([(u, y), (u, y + 1e-3 * rng.standard_normal(1_000))], Rig(0.01))) == 2
+    half = np.repeat([0.5, -0.5], 500)
+    assert len(records_of([(half, y), (half, y[::-1].copy())], Rig(0.01))) == 2
+    period = np.tile(np.sin(np.arange(100) * 2 * np.pi / 100), 6)
+    gap = np.concatenate([period, [np.nan], period])
+    assert len(records_of((gap, np.roll(period, 9)[np.arange(len(gap)) % 600]), Rig(0.01))) == 2
+    rest = np.zeros(300)
+    one, other = (
+        (np.concatenate([rest, u]), np.concatenate([rest, noisy]))
+        for noisy in (y, y + 1e-3 * rng.standard_normal(1_000))
+    )
+    assert len(records_of([one, other], Rig(0.01))) == 2
+    # A converter whose levels are ten times the noise: most outputs are those of the first time.
+    level = np.ptp(y) / 100
+    coarse = [level * np.round((y + 0.1 * level * rng.standard_normal(1_000)) / level) for _ in range(2)]
+    assert 0.85 < (coarse[0] == coarse[1]).mean() < 1
+    assert len(records_of([(u, one) for one in coarse], Rig(0.01))) == 2
+
+
+def test_a_million_samples_are_compared_at_once():
+    from estimator.identification.shared import shared
+
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((2, 1_000_000))
+    assert shared([(u, y), (u, y[::-1])]) is None
+    assert shared([(u[:600_000], y[:600_000]), (u[599_900:], y[599_900:])]) == (0, 599_900, 1, 0)
