@@ -15,6 +15,12 @@ from estimator.checks import shown
 #: Errors of a disk, or a share of one, that has no room.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
+#: Errors of a place that is protected.
+_PROTECTED = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+#: Mode of a file that was not there: not the 0600 of a temporary one.
+_MODE = 0o644
+
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
@@ -24,25 +30,50 @@ def writing(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno is None:
             raise
-        remedy = "make room, or name another place" if error.errno in _FULL else "name another place"
-        raise OSError(error.errno, f"{error.strerror}; {remedy}", str(path)) from error
+        first = "make room, or " if error.errno in _FULL else ""
+        first = "allow to write there, or " if error.errno in _PROTECTED else first
+        raise OSError(error.errno, f"{error.strerror}; {first}name another place", str(path)) from error
+
+
+def _target(path: Path) -> tuple[Path, int]:
+    """The file that is to be written, which a link only names, and the mode that it has or is to have.
+
+    Raises:
+        OSError: for what is there and is no file, or is read-only, also to root, who may write it all the same.
+    """
+    target = Path(os.path.realpath(path))
+    try:
+        found = target.stat()
+    except FileNotFoundError:
+        return target, _MODE
+    if stat.S_ISDIR(found.st_mode):
+        raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "It is a device or a pipe, and no file")
+    if not found.st_mode & stat.S_IWUSR or not os.access(target, os.W_OK):
+        raise OSError(errno.EACCES, "It is read-only")
+    return target, stat.S_IMODE(found.st_mode)
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:
     """Write a file under a temporary name beside its place, then rename it.
 
+    A link stays, and what it names is written. A file that was there keeps its mode.
+
     Raises:
-        OSError: where it cannot be written; what was there before still is.
+        OSError: where it cannot be written, such as a device, a pipe, a folder or a read-only file; what was there
+            before still is.
     """
     data = content.encode() if isinstance(content, str) else content
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
+        target, mode = _target(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:100]}.")
         try:
             with os.fdopen(handle, "wb") as file:
                 file.write(data)
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
+            os.chmod(temporary, mode)
+            os.replace(temporary, target)
         except BaseException:
             Path(temporary).unlink(missing_ok=True)
             raise
@@ -54,11 +85,11 @@ def append_atomically(path: Path, text: str) -> None:
     Of two programs that add at once, each adds its text in one piece.
 
     Raises:
-        OSError: where it cannot be written.
+        OSError: where it cannot be written, such as a device, a pipe, a folder or a read-only file.
     """
     data, written = text.encode(), 0
     with writing(path):
-        place = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        place = os.open(_target(path)[0], os.O_WRONLY | os.O_APPEND | os.O_CREAT, _MODE)
         try:
             before = os.fstat(place).st_size
             while written < len(data):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from estimator.files import write_atomically
+from estimator.files import append_atomically, write_atomically
 
 
 def names(folder):
@@ -74,3 +74,45 @@ def test_an_interrupt_before_the_renaming_leaves_nothing_behind(tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "file", "new")
     assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("write", [write_atomically, append_atomically])
+def test_what_is_no_file_is_refused_and_stays(tmp_path, write):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "linked").symlink_to("pipe")
+    (tmp_path / "round").symlink_to("round")
+    before = {name: (tmp_path / name).lstat() for name in names(tmp_path)}
+    for name in before:
+        with pytest.raises(OSError, match=rf"name another place: '.*/{name}'"):
+            write(tmp_path / name, "new")
+    with pytest.raises(OSError, match="It is a device or a pipe, and no file; name another place: '/dev/null'"):
+        write(Path("/dev/null"), "new")
+    assert stat.S_ISCHR(Path("/dev/null").stat().st_mode)
+    assert {name: (tmp_path / name).lstat() for name in names(tmp_path)} == before
+
+
+@pytest.mark.parametrize("write", [write_atomically, append_atomically])
+def test_a_read_only_file_is_refused_also_to_root(tmp_path, write):
+    path = tmp_path / "file"
+    path.write_text("old")
+    path.chmod(0o444)
+    with pytest.raises(OSError, match="It is read-only; allow to write there, or name another place: '.*/file'"):
+        write(path, "new")
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["file"]
+
+
+@pytest.mark.parametrize("write", [write_atomically, append_atomically])
+def test_a_link_is_followed_and_a_mode_is_kept(tmp_path, write):
+    (tmp_path / "there").mkdir()
+    target, link = tmp_path / "there" / "file", tmp_path / "link"
+    link.symlink_to(Path("there") / "file")
+    write(link, "first")
+    assert stat.S_IMODE(target.stat().st_mode) & 0o700 == 0o600
+    target.chmod(0o640)
+    write(link, "second")
+    assert link.is_symlink()
+    assert target.read_text() == ("second" if write is write_atomically else "firstsecond")
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
+    assert names(tmp_path / "there") == ["file"]
