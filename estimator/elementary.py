@@ -187,3 +187,10 @@ def tanh(x):
     e = exp(-2.0 * abs(x))
     value = (1.0 - e) / (1.0 + e)
     return value if x >= 0.0 else -value
+
+
+@straight
+def sign(x):
+    """-1, 0 or 1; NaN of NaN, without branches."""
+    value = (1.0 if x > 0.0 else 0.0) - (1.0 if x < 0.0 else 0.0)
+    return value if x == x else x

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from estimator.checks import mapping, numbers
-from estimator.models.model import FUNCTIONS, Model
+from estimator.models.model import CALLED, Model
 from estimator.parameters import FloatArray
 from estimator.units import VOLTS, Scales
 
@@ -126,6 +126,6 @@ def _code(model: Model, which: str) -> tuple[Any, Any]:
             source += f"def {title}({', '.join([*names, 'step'])}):\n{body}    return ({gathered},)\n"
         return source
 
-    functions = {name: getattr(np, name) for name in FUNCTIONS}
+    functions = {name: getattr(np, name) for name in CALLED}
     code = stored.load(model.name, which, model.digest, make, functions)
     return code.values, code.slopes

@@ -38,7 +38,13 @@ class Lines(Assignments):
         return symbol(name)
 
 
-_FUNCTIONS = {name: getattr(sp, name) for name in FUNCTIONS}
+def _absolute(value: sp.Expr) -> sp.Expr:
+    """|value|. Of what SymPy does not know to be real, such as a logarithm, it would differentiate the parts."""
+    value = sp.sympify(value)
+    return sp.Abs(value) if value.is_extended_real else sp.sqrt(value**2)
+
+
+_FUNCTIONS = {name: getattr(sp, name) for name in FUNCTIONS if name != "abs"} | {"abs": _absolute}
 
 
 def symbol(name: str) -> sp.Symbol:

@@ -56,7 +56,11 @@ class _Printer(PythonCodePrinter):
             return _INLINE[name].format(*given)
         return f"{name}({', '.join(given)})"
 
-    _print_sin = _print_cos = _print_tanh = _print_exp = _print_log = _print_Function
+    _print_sin = _print_cos = _print_tanh = _print_exp = _print_log = _print_sign = _print_Function
+
+    def _print_DiracDelta(self, expr: sp.DiracDelta) -> str:
+        # The slope of a sign, which no number is: it is 0 but at the jump, where a sign counts as 0, too.
+        return "0.0"
 
 
 _PRINTER = _Printer({"fully_qualified_modules": False})

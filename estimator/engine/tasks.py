@@ -19,7 +19,7 @@ from estimator.engine import cache as stored
 from estimator.engine.rows import carried_names, layout, movers_first, path_layout, point_names, trace_names
 from estimator.inference import EXPECTATIONS, MOST_ITERATIONS
 from estimator.lanes import LANES, rows
-from estimator.models.model import FUNCTIONS, Model
+from estimator.models.model import CALLED, Model
 from estimator.straight import straight
 
 
@@ -30,7 +30,7 @@ def sqrt(value):
 
 
 #: What generated code may use.
-NAMES = {"sqrt": sqrt} | {name: getattr(elementary, name) for name in FUNCTIONS if name != "sqrt"}
+NAMES = {"sqrt": sqrt} | {name: getattr(elementary, name) for name in CALLED if name != "sqrt"}
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,16 @@ from estimator.checks import flag, mapping, shown, whole
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 #: Functions that expressions may use.
-FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "tanh")
+FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "tanh", "abs")
+
+#: Functions that generated code calls for them: a magnitude is Python's own, and its slope a sign.
+CALLED = tuple("sign" if name == "abs" else name for name in FUNCTIONS)
 
 #: Highest power in an expression: one of a whole number is calculated as a product.
 HIGHEST_POWER = 16
 
 #: Names that stand for something else: the input and its older values, the sampling step, what generated code calls.
-RESERVED = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, "capped", "range"})
+RESERVED = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, *CALLED, "capped", "range"})
 
 
 #: What an expression is made of.
@@ -68,8 +71,8 @@ class Model:
 
     Either ``rates`` (a differential equation; time is counted in samples) or ``next_state`` (a difference equation) is
     given. All expressions are strings in the names of states and coefficients and the input ``u``, with ``sin``,
-    ``cos``, ``exp``, ``log``, ``sqrt`` and ``tanh``. In a difference equation ``u`` is the newest input that acts on
-    the next state, ``u1`` and ``u2`` are the inputs one and two samples before it.
+    ``cos``, ``exp``, ``log``, ``sqrt``, ``tanh`` and ``abs``, whose slope at 0 counts as 0. In a difference equation
+    ``u`` is the newest input that acts on the next state, ``u1`` and ``u2`` are the inputs one and two samples before.
 
     Attributes:
         name: of the model, for messages and for the names of generated files.

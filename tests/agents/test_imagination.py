@@ -39,6 +39,27 @@ def pendulum_rates(z, p, u):
     return rates, by_state, np.array([[0.0] * 3, [-np.sin(q), -w, u]])
 
 
+DRAG = Model(
+    name="drag",
+    states={"x": "V", "v": "V"},
+    coefficients={"stiffness": "1", "drag": "1", "gain": "1"},
+    rates=("v", "gain*u - stiffness*x - drag*v*sqrt(v**2)"),
+    noise=("0", "sqrt(3)"),
+    outputs={"y": "x"},
+    substeps=4,
+)
+
+
+def drag_rates(z, p, u):
+    (x, v), (stiffness, drag, gain) = z, p
+    by_state = np.array([[0.0, 1.0], [-stiffness, -2 * drag * np.abs(v)]])
+    return (
+        np.array([v, gain * u - stiffness * x - drag * v * np.abs(v)]),
+        by_state,
+        np.array([[0.0] * 3, [-x, -v * np.abs(v), u]]),
+    )
+
+
 def runge_kutta(slope, start, h):
     """A step of order 4 from ``start``; ``slope(value, stage)`` of stages 0 to 3."""
     k1 = slope(start, 0)
@@ -80,6 +101,7 @@ def paper_next(z, p, inputs):
 CASES = {
     "paper": (difference(), 0, paper_next, (0,)),
     "duffing": (duffing(), 1, lambda z, p, u: integrate(duffing_rates, z, p, u, 4), (0,)),
+    "drag": (DRAG, 1, lambda z, p, u: integrate(drag_rates, z, p, u, 4), (0,)),
     "pendulum": (PENDULUM, 0, lambda z, p, u: integrate(pendulum_rates, z, p, (u[1], u[1]), 2), (0, 1)),
 }
 
@@ -89,6 +111,7 @@ def random_belief(model, rng):
     centers = {
         "difference": [1.8, -0.4, -0.93, 0.38],
         "duffing": [0.45, 1.4, 0.07, 0.4],
+        "drag": [0.45, 0.2, 0.4],
         "pendulum": [0.037, 0.002, 0.0075],
     }
     n, mean = model.n_states, np.array(centers[model.name])

@@ -12,6 +12,7 @@ from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.model_env import ModelEnv
 from duffing_env.vector_env import DuffingVectorEnv
+from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM, STEP
 from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
@@ -117,3 +118,32 @@ def test_a_spread_is_not_ignored_where_deviations_say_how_plants_are_drawn():
     with pytest.raises(ValueError, match=r"plant_spread must be 0 or left out where std says .* but is 0.1"):
         ModelEnv(**told, plant_spread=0.1)
     ModelEnv(**told, plant_spread=0.0)
+
+
+def test_drag_is_played_and_believed():
+    """A plant with a bend, against Runge and Kutta's method by hand: its outputs, and that a belief finds its truth."""
+    drag = Model(
+        name="drag", states={"x": "V", "v": "V"}, coefficients={"k": "1", "c": "1", "g": "1"},
+        rates=("v", "g*u - k*x - c*v*abs(v)"), noise=("0", "sqrt(3)"), outputs={"y": "x"}, substeps=4,
+    )  # fmt: skip
+    env = ModelEnv(
+        system=drag, mean={"k": 0.3, "c": 0.1, "g": 0.3}, spread=0.2, process_noise=1e-6, measurement_noise=1e-4,
+        horizon=64, max_input=0.5, max_output=6.0,
+    )  # fmt: skip
+    env.reset(seed=0)
+    k, c, g = (env.truth[name] for name in "kcg")
+    rates = lambda z, u: np.array([z[1], g * u - k * z[0] - c * z[1] * np.abs(z[1])])  # noqa: E731
+    z, rng, shown, expected = np.zeros(2), np.random.default_rng(0), [], []
+    for u in rng.choice([-0.5, 0.5], 64):
+        env.step(np.array([u / 0.5], dtype=np.float32))
+        shown.append(env._batch.quantity("Y_y")[0])
+        for _ in range(4):
+            a = rates(z, u)
+            b = rates(z + a / 8, u)
+            d = rates(z + b / 8, u)
+            z = z + (a + 2 * b + 2 * d + rates(z + d / 4, u)) / 24
+        expected.append(z[0])
+    assert np.ptp(expected) > 0.5
+    np.testing.assert_allclose(shown, expected, atol=6e-4)
+    for name, (mean, std) in env.belief.coefficients().items():
+        assert abs(mean - env.truth[name]) < 4 * std < 0.05 * env.truth[name]

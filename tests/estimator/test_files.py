@@ -97,7 +97,7 @@ def test_a_read_only_file_is_refused_also_to_root(tmp_path, write):
     path = tmp_path / "file"
     path.write_text("old")
     path.chmod(0o444)
-    with pytest.raises(OSError, match="It is read-only; allow to write there, or name another place: '.*/file'"):
+    with pytest.raises(OSError, match=r"It is read-only; allow to write there, or name another place: '.*/file'"):
         write(path, "new")
     assert path.read_text() == "old"
     assert names(tmp_path) == ["file"]

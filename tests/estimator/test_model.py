@@ -10,6 +10,8 @@ from estimator.free_run import free_run
 from estimator.information import fisher_information
 from estimator.models.difference import Term, difference
 from estimator.models.model import Model
+from estimator.physical import coefficients_of, propagate
+from estimator.units import Scales
 
 TANK = {
     "name": "tank", "states": {"x": "V"}, "coefficients": {"loss": "1"}, "noise": ("1",), "outputs": {"y": "x"},
@@ -22,7 +24,7 @@ TANK = {
     [
         (
             {"rates": ("u - leak*x",)},
-            "may use ['loss', 'u', 'x'] and ['cos', 'exp', 'log', 'sin', 'sqrt', 'tanh'], but",
+            "may use ['loss', 'u', 'x'] and ['abs', 'cos', 'exp', 'log', 'sin', 'sqrt', 'tanh'], but",
         ),
         ({"rates": ("u - loss*x*u1",)}, "uses ['u1']"),
         ({"rates": ("u - loss*x//2",)}, "may use + - * / **, brackets and ['sin', 'cos'"),
@@ -91,3 +93,28 @@ def test_the_information_of_powers_is_that_of_differences():
     slope = (free_run(model, [0.3 + 1e-6], u) - free_run(model, [0.3 - 1e-6], u)) / 2e-6
     found = fisher_information(model, [0.3], u, process_noise=0.0, measurement_noise=0.02)
     assert found[0, 0] == pytest.approx((slope**2).sum() / 0.02**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("magnitude", ["abs({})", "sqrt({}**2)"])
+def test_a_magnitude_is_what_numpy_says(magnitude):
+    """Of a number on either side of 0, at it, and of what SymPy does not know to be real."""
+    moves = f"u + loss*{magnitude.format('x')} + {magnitude.format('log(loss)')}"
+    model = Model(**{**TANK, "rates": (), "next_state": (moves,)})
+    for x in (-1.7, 0.0, 1.7):
+        expected = 0.25 + 0.4 * abs(x) + abs(np.log(0.4))
+        assert free_run(model, [0.4], [0.25], [x])[0] == pytest.approx(expected, rel=1e-14)
+        slope = calculus(model).by[0][0].subs({symbol("x"): x, symbol("loss"): 0.4})
+        assert float(slope) == pytest.approx(0.4 * np.sign(x))
+
+
+def test_parameters_may_be_magnitudes():
+    given = {
+        "physical": {"t": "step/sqrt(loss**2)"},
+        "dimensions": {"t": (0, 0, 1)},
+        "inverse": {"loss": "step/abs(t)"},
+    }
+    model = Model(**{**TANK, **given})
+    scales = Scales(0.01, 1.0, 1.0)
+    assert coefficients_of(model, {"t": 0.05}, scales) == pytest.approx([0.2])
+    mean, cov = propagate(model, np.array([0.2]), np.array([[1e-6]]), scales)
+    assert (mean[0], cov[0, 0]) == pytest.approx((0.05, (0.05 * 1e-3 / 0.2) ** 2))

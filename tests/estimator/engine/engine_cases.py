@@ -25,6 +25,17 @@ VAN_DER_POL = Model(
     substeps=4,
 )
 
+#: Drag, which is quadratic in the speed, and a sensor that shows no sign.
+DRAG = Model(
+    name="drag",
+    states={"x": "V", "v": "V"},
+    coefficients={"stiffness": "1", "drag": "1", "gain": "1"},
+    rates=("v", "gain*u - stiffness*x - drag*v*sqrt(v**2)"),
+    noise=("0", "sqrt(3)"),
+    outputs={"y": "abs(x)"},
+    substeps=4,
+)
+
 
 @dataclass(frozen=True)
 class Case:
@@ -66,6 +77,11 @@ def _duffing_full(z, c, u):
 
 def _first(z, c, u):
     return [z[0]]
+
+
+def _magnitude(value):
+    """Its absolute value, whose slope complex steps can find."""
+    return value * np.sign(np.real(value))
 
 
 def _white(z, c):
@@ -130,9 +146,17 @@ CASES = {
         ),
         (0.8, -0.3, 0.5, 0.6, 0.4), degree=1,
     ),
+    "drag": Case(
+        DRAG,
+        Plant(
+            lambda z, c, u: [z[1], c[2] * u - c[0] * z[0] - c[1] * z[1] * _magnitude(z[1])],
+            lambda z, c, u: [_magnitude(z[0])], _white, substeps=4,
+        ),
+        (-0.8, 0.9, 0.5, 0.6, 0.4), degree=1,
+    ),
 }  # fmt: skip
 
-#: One configuration of each of the five models.
+#: One configuration of each of the five models that are nowhere bent.
 FIVE = ("duffing", "paper", "pendulum", "wiener-hammerstein", "van der pol")
 
 

@@ -125,7 +125,7 @@ def central(f, x, step):
     return np.moveaxis(np.array(columns), 0, -1)
 
 
-@pytest.mark.parametrize("name", FIVE)
+@pytest.mark.parametrize("name", [*FIVE, "drag"])
 def test_the_information_is_that_of_the_responses_slopes(name):
     """Without process noise and from a known state, F is the sum of slopes of what is shown, over r."""
     case = CASES[name]
@@ -153,7 +153,7 @@ def test_the_information_is_that_of_the_responses_slopes(name):
     np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
 
 
-@pytest.mark.parametrize("name", FIVE)
+@pytest.mark.parametrize("name", [*FIVE, "drag"])
 def test_the_gradient_by_the_inputs_equals_differences(name):
     """Of a weighted sum of all that the path leaves, with process noise and an uncertain start."""
     case = CASES[name]
@@ -191,7 +191,9 @@ def test_the_gradient_by_the_inputs_equals_differences(name):
         found[t : t + 3] += slopes[::-1]  # of the inputs two samples before, one before, and now
     expected = central(value, inputs, 1e-3)[0]
     assert np.abs(expected).max() > 1.0
-    np.testing.assert_allclose(found[2:], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    # Where a step crosses the bend of drag, differences are of order 1 in it, of what half of a second derivative is.
+    tolerance = 1e-3 if name == "drag" else 1e-6
+    np.testing.assert_allclose(found[2:], expected, rtol=0, atol=tolerance * np.abs(expected).max())
 
 
 def test_a_lane_that_is_over_counts_nothing():
