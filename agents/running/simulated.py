@@ -21,6 +21,9 @@ _STEPS = 8
 #: Longest stretch that is integrated, in samples: of a longer pause the rest is left out.
 _PAUSE = 2_000
 
+#: The same as long as nothing has driven it: to catch up with more takes longer than the step of a fast rig.
+_REST = 20
+
 #: A noise that the rig does not give, in parts of the input's limit or the output's range.
 _NOISE = 1e-4
 
@@ -34,6 +37,10 @@ class SimulatedPlant:
     Its parameters are the middle of the rig's guess, its noises those of the channels; where the rig gives none, a
     ten-thousandth of the limit and of the range. It watches as an instrument does: silence of the watchdog's time
     brings its input to zero.
+
+    Time begins with its first call, and not when it is made: a run loads, compiles and plans in between. Until an input
+    drives it, it rests but for its noises, and a pause of more than 20 samples between two calls counts as one of 20;
+    later one of more than 2,000 as one of 2,000. So no call takes long because of what went by before the run.
 
     Args:
         rig: with a guess, or ``truth``.
@@ -67,8 +74,8 @@ class SimulatedPlant:
         self._noises = [_NOISE * (most or 0.0) if one.noise is None else one.noise for one, most in widest]
         self._rng = np.random.default_rng(seed)
         self._x = self._v = self._u = self._force = 0.0
-        self._armed, self._watchdog = False, math.inf
-        self._heard = self._moved = self.clock.now()
+        self._armed, self._watchdog, self._driven = False, math.inf, False
+        self._heard = self._moved = math.nan  # until the first call
 
     @property
     def applied(self) -> float:
@@ -118,7 +125,9 @@ class SimulatedPlant:
 
     def _let_through(self, u: float) -> float:
         limit = self.rig.input.limit or math.inf
-        return min(max(u, -limit), limit) if self._armed else 0.0
+        applied = min(max(u, -limit), limit) if self._armed else 0.0
+        self._driven |= applied != 0.0
+        return applied
 
     def _hear(self) -> None:
         self._move_to_now()
@@ -126,12 +135,18 @@ class SimulatedPlant:
 
     def _move_to_now(self) -> None:
         """Follow the clock; the watchdog bites on the way."""
-        now, bite = self.clock.now(), self._heard + self._watchdog
+        now = self.clock.now()
+        if math.isnan(self._moved):
+            self._heard = self._moved = now
+        bite = self._heard + self._watchdog
         if now > bite and self._armed:
-            self._move((bite - self._moved) / self.rig.step)
-            self._u, self._armed, self._moved = 0.0, False, bite
-        self._move((now - self._moved) / self.rig.step)
-        self._moved = now
+            self._catch_up(bite)
+            self._u, self._armed = 0.0, False
+        self._catch_up(now)
+
+    def _catch_up(self, time: float) -> None:
+        self._move(min((time - self._moved) / self.rig.step, float(_PAUSE if self._driven else _REST)))
+        self._moved = time
 
     def _shown(self) -> float:
         order = KINDS[self.rig.output.kind]
@@ -140,7 +155,6 @@ class SimulatedPlant:
 
     def _move(self, samples: float) -> None:
         """Runge and Kutta's method, with a force noise that is new for every sample."""
-        samples = min(samples, float(_PAUSE))
         while samples > 1e-9:
             part = min(samples, 1.0)
             self._force = self._noises[0] * self._rng.standard_normal()

@@ -677,6 +677,25 @@ def test_a_block_of_a_simulated_plant_takes_no_time_of_the_clock():
     np.testing.assert_allclose(*found, atol=2e-3)  # the clock moved a little before the block, and drew other noises
 
 
+def test_a_simulated_plant_does_not_catch_up_with_what_went_by_before_it_was_driven():
+    """What a run needs to load and to plan does not make its first ticks late."""
+    clock = JumpingClock()
+    plant = SimulatedPlant(RIG, TRUTH, clock=clock)
+    moved, move = [], plant._runge_kutta
+    plant._runge_kutta = lambda h: (moved.append(h), move(h))
+    clock.wait(5.0)
+    plant.read()
+    assert not moved
+    for call in (plant.read, lambda: plant.arm(None), lambda: plant.apply(4.0)):
+        clock.wait(clock.now() + 5.0)
+        call()
+        assert sum(moved) == pytest.approx(20 * RIG.step)
+        moved.clear()
+    clock.wait(clock.now() + 100 * RIG.step)
+    plant.read()
+    assert sum(moved) == pytest.approx(100 * RIG.step)
+
+
 # --- the command
 
 
