@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -168,15 +169,32 @@ def describe(config: TrainConfig) -> dict[str, Any]:
 def claim(file: Path, config: TrainConfig) -> None:
     """Write what something in the folder of a file is made from; a folder that holds another is refused.
 
+    Where the folder lies is not looked at: it may have been moved since, and what to begin with beside it. The file
+    then tells where they are now.
+
     Raises:
-        ValueError: for a file that says something else.
+        ValueError: for a file that says something else, naming the first setting that differs.
     """
     described = json.loads(json.dumps(describe(config)))
     before = json.loads(file.read_text()) if file.exists() else described
-    if any(before["config"].get(f.name) != described["config"][f.name] for f in fields(TrainConfig)):
-        raise ValueError(f"output must be a new folder or that of the same command, but {file} is another's")
-    if not file.exists():
-        write_json(file, described)
+    was, now = _compared(before["config"]), _compared(described["config"])
+    for name, value in now.items():
+        if was.get(name) != value:
+            raise ValueError(
+                f"output must be a new folder or that of the same command, but in {file} {name} is "
+                f"{shown(was.get(name))} instead of {shown(value)}; name another folder"
+            )
+    if not file.exists() or before["config"] != described["config"]:
+        write_json(file, before | {"config": described["config"]})
+
+
+def _compared(config: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a configuration as JSON has it, each hyperparameter by itself, paths as seen from the output."""
+    found = {name: config.get(name) for name in (f.name for f in fields(TrainConfig)) if name != "output"}
+    if config.get("output") and found["begin"]:
+        found["begin"] = os.path.relpath(found["begin"], config["output"])
+    within = found.pop("hyperparameters") or {}
+    return found | {f"hyperparameters.{name}": value for name, value in within.items()}
 
 
 def contrib(config: TrainConfig) -> tuple[str, ...]:

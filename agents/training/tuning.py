@@ -62,7 +62,9 @@ def tune(config: TrainConfig, trials: int, *, on_ray: bool = False) -> Path:
     claim(folder / "search.json", config)
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # it warns of a trial that a signal ended, with a traceback
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
-    study = optuna.create_study(storage=storage, study_name=folder.name, load_if_exists=True, direction="maximize")
+    # A folder that was renamed holds the study of its first name.
+    name = next(iter(optuna.study.get_all_study_names(storage)), folder.name)
+    study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True, direction="maximize")
     begun = study.get_trials(deepcopy=False)
     every = max(1, config.steps // _EVALUATIONS)
     study.sampler = optuna.samplers.TPESampler(

@@ -37,6 +37,7 @@ def scores(folder):
 def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
     folder = tmp_path / "search"
     best = tune(tiny(folder), 2)
+    assert best == folder / "best.toml"
     first = scores(folder)
     assert set(first) == {0, 1}
     used = json.loads((folder / "trials" / "000" / "config.json").read_text())["config"]["hyperparameters"]
@@ -46,13 +47,14 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
     }  # fmt: skip
     tune(tiny(folder), 2)  # nothing is left to do
     assert scores(folder) == first
+    folder = folder.rename(tmp_path / "moved")
     tune(tiny(folder), 3)
     found = scores(folder)
     assert set(found) == {0, 1, 2}
     assert {number: found[number] for number in first} == first
 
     winner = max(found, key=found.__getitem__)
-    assert best == folder / "best.toml"
+    best = folder / best.name
     assert best.read_text().startswith(f"# ppo, trial {winner} of ")
     settings = read_settings("ppo", ENV, best)
     again = train(tiny(tmp_path / "again", settings=best, hyperparameters=settings))
