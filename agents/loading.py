@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,23 @@ def load_object(place: str, what: str) -> Any:
         raise ValueError(f"{what} must be module:name, but there is no module {module!r}: {error}") from error
     except AttributeError as error:
         raise ValueError(f"{what} must be module:name, but {module} has no {name!r}; name one it has") from error
+
+
+#: What the commands pass on themselves where they make a track, beside the options.
+_PASSED = ("id", "vectorization_mode", "seed", "levels")
+
+
+def check_options(options: Mapping[str, Any]) -> None:
+    """Refuse options of an environment that the one who makes it gives by itself.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    from estimator.checks import shown
+
+    for name in _PASSED:
+        if name in options:
+            raise ValueError(f"options must not hold {name}, but {name} is {shown(options[name])}; leave it out")
 
 
 def spec_of(env_id: str) -> EnvSpec:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.cli import RIG_TRACK, JsonOptions, check_track, full_id, with_rig
-from agents.loading import spec_of
+from agents.loading import check_options, spec_of
 from agents.policies.learned import CONFIG
 from agents.results import versions, write_json
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
@@ -79,6 +79,7 @@ class TrainConfig(Subject):
         if not isinstance(self.env, str):
             check_track(self.env)
         mapping("options", self.options)
+        check_options(self.options)
         # A run has its rig in itself, and not the name of a file that may change.
         object.__setattr__(self, "options", with_rig(self.options, self.rig))
         object.__setattr__(self, "rig", None)
