@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from estimator.checks import printable
-from estimator.files import write_atomically
+from estimator.files import check_place, write_atomically
 
 
 def show(*parts: Any, width: int = 100) -> None:
@@ -84,24 +84,30 @@ def finite(content: Any) -> Any:
 
 
 def check_file(name: str, path: Path | None) -> None:
-    """Refuse a folder where a file is to be written, before the work begins.
+    """Refuse a folder where a file is to be written, and where none can be, before the work begins.
 
     Raises:
         IsADirectoryError: naming the argument.
+        OSError: naming the path, where it cannot be written.
     """
-    if path is not None and path.is_dir():
+    if path is None:
+        return
+    if path.is_dir():
         raise IsADirectoryError(f"{name} must be a file, but is the folder {path}; name a file in it")
+    check_place(path)
 
 
 def check_folder(name: str, path: Path) -> None:
-    """Refuse a file where a folder is to be, before the work begins.
+    """Refuse a file where a folder is to be, and where none can be written to, before the work begins.
 
     Raises:
         NotADirectoryError: naming the argument.
+        OSError: naming the path, where nothing can be written.
     """
     for place in (path, *path.parents):
         if place.exists() and not place.is_dir():
             raise NotADirectoryError(f"{name} must be a folder, but {place} is a file; name another place")
+    check_place(path)
 
 
 #: What the numbers of a result depend on.

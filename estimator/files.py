@@ -55,6 +55,22 @@ def _target(path: Path) -> tuple[Path, int]:
     return target, stat.S_IMODE(found.st_mode)
 
 
+def check_place(path: Path) -> None:
+    """Refuse a place where no file can be written, or a folder in which none can, before the work for it begins.
+
+    Nothing is left there; what has to be made on the way is not made yet.
+
+    Raises:
+        OSError: as `write_atomically`.
+    """
+    with writing(path):
+        within = path if path.is_dir() else _target(path)[0].parent
+        while not within.exists():
+            within = within.parent
+        with tempfile.TemporaryFile(dir=within):
+            pass
+
+
 def write_atomically(path: Path, content: bytes | str) -> None:
     """Write a file under a temporary name beside its place, then rename it.
 

@@ -36,7 +36,7 @@ def check(path: Path, name: str) -> set[str]:
 
     Raises:
         ValueError: as `read`; or for a name of the board that ships, whose entry a report would show no longer.
-        OSError: for a folder, or a file where its folder is to be.
+        OSError: for a folder, a file where its folder is to be, or a place where nothing can be written.
     """
     check_folder("folder of board", path.parent)
     check_file("board", path)

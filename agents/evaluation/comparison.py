@@ -13,7 +13,7 @@ from agents.evaluation.rollout import Evaluation, evaluate
 from agents.loading import spec_of
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import load_policy
-from agents.results import check_folder, spinner
+from agents.results import check_file, check_folder, spinner
 from duffing_env.silverbox import record_available
 from estimator.extras import how_to_get, is_missing, need
 
@@ -51,11 +51,12 @@ def compare(
 
     Raises:
         ModuleNotFoundError: for a report without matplotlib. Figures are left out without it.
-        NotADirectoryError: where the folder is a file.
+        OSError: where the folder is a file, or nothing can be written there, before a policy plays.
     """
     if report:
         need("matplotlib")
     check_folder("report" if report else "output", folder)
+    check_file("evaluation.json", folder / "evaluation.json")
     with spinner("Evaluating") as say:
         evaluations = evaluate(policies, env_id, systems, seed, options, lambda name: say(f"Evaluating {name}"))
     title = f"{env_id}, {systems} systems"

@@ -16,7 +16,7 @@ import numpy as np
 
 from agents.policies.learned import CARD, CONFIG
 from agents.policies.saving import write_policy
-from agents.results import write_json
+from agents.results import check_folder, write_json
 from agents.stopping import Stopper, telling
 from agents.training import family
 from agents.training.algorithms import OnPolicySettings
@@ -105,11 +105,13 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
 
     Raises:
         ValueError: where it is no run folder, or the run is finished.
+        OSError: where nothing can be written there.
     """
     if not (folder / CONFIG).is_file():
         raise ValueError(f"resume must be a run folder, which holds {CONFIG}, but {folder} is not one; name a run's")
     if (folder / CARD).exists():
         raise ValueError(f"resume must be a run that was stopped, but {folder} is finished; it holds its policy")
+    check_folder("resume", folder)
     with telling(lambda said: said or _left(folder)):
         return _Training(read_config(folder), folder, on_evaluation).run()
 

@@ -14,6 +14,7 @@ import agents.evaluation.comparison
 import agents.evaluation.metrics
 import agents.evaluation.rollout
 from agents import make_policy
+from agents.evaluation import board
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.comparison import compare, usual_policies
 from agents.evaluation.oracle import Systems
@@ -536,6 +537,25 @@ def test_a_file_in_place_of_the_folder_is_found_before_the_work(tmp_path):
     with pytest.raises(NotADirectoryError, match=r"output must be a folder, but .*file is a file; name another place"):
         compare(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "file" / "below")
     assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_a_place_that_cannot_be_written_is_found_before_the_work(tmp_path, monkeypatch):
+    (tmp_path / "board.jsonl").touch()
+    (tmp_path / "board.jsonl").chmod(0o444)
+    with pytest.raises(
+        PermissionError, match=r"read-only; allow to write there, or name another place: '.*board.jsonl'"
+    ):
+        board.check(tmp_path / "board.jsonl", "mine")
+
+    def refuse(dir):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("agents.evaluation.comparison.evaluate", lambda *_: pytest.fail("it was measured first"))
+    with pytest.raises(PermissionError, match=r"allow to write there, or name another place: '.*out'"):
+        compare(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "out")
+    with pytest.raises(PermissionError, match=r"allow to write there, or name another place: '.*'"):
+        board.check(tmp_path / "new.jsonl", "mine")
 
 
 @pytest.mark.parametrize("shown", [{"observation": "history"}, {"observation": "history", "history": 1}])

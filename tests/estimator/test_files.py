@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from estimator.files import append_atomically, write_atomically
+from estimator.files import append_atomically, check_place, write_atomically
 
 
 def names(folder):
@@ -116,3 +116,30 @@ def test_a_link_is_followed_and_a_mode_is_kept(tmp_path, write):
     assert target.read_text() == ("second" if write is write_atomically else "firstsecond")
     assert stat.S_IMODE(target.stat().st_mode) == 0o640
     assert names(tmp_path / "there") == ["file"]
+
+
+def test_a_place_that_can_be_written_is_left_as_it_was(tmp_path):
+    (tmp_path / "file").write_text("old")
+    for place in (tmp_path, tmp_path / "file", tmp_path / "new", tmp_path / "on the way" / "to" / "new"):
+        check_place(place)
+    assert names(tmp_path) == ["file"]
+    assert (tmp_path / "file").read_text() == "old"
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_it_is(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    (tmp_path / "file").chmod(0o444)
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "file", tmp_path / "pipe", tmp_path / "pipe" / "new"):
+        with pytest.raises(OSError, match="name another place"):
+            check_place(place)
+
+    def refuse(dir):
+        raise PermissionError(13, "Permission denied", f"{dir}/a temporary name")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    for place in (tmp_path, tmp_path / "new", tmp_path / "on the way" / "new"):
+        with pytest.raises(PermissionError) as told:
+            check_place(place)
+        message = "[Errno 13] Permission denied; allow to write there, or name another place"
+        assert str(told.value) == f"{message}: '{place}'"
