@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -54,7 +55,7 @@ class Init:
         write_atomically(self.path, text)
         print(f"Wrote {self.path}: read it, and correct what is not so.")
         data = "data.csv" if self.source is None or self.source in SHIPPED else self.source
-        print(printable(f"Next: duffing-env identify {self.path} {data}"))
+        print(printable(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}"))
 
 
 @dataclass(frozen=True)

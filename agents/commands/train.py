@@ -1,5 +1,6 @@
 """``duffing-env train``: a policy that chooses the input."""
 
+import shlex
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -65,7 +66,8 @@ class Config(TrainConfig):
             with telling(lambda said: _THE_SAME):
                 best = tune(self, self.tune, on_ray=self.ray)
             print(f"The best hyperparameters are in {best}")
-            print(f"To train with them: the same command, with --settings {best} in place of --tune and --output")
+            given = shlex.quote(str(best))
+            print(f"To train with them: the same command, with --settings {given} in place of --tune and --output")
             return
         if self.seeds > 1:
             with telling(lambda said: _THE_SAME):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -127,7 +128,7 @@ def carry_on(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, fo
 
 def _left(folder: Path) -> str:
     """What is left of a training that is being stopped, and how to go on."""
-    command = f"duffing-env train --resume {folder}"
+    command = shlex.join(["duffing-env", "train", "--resume", str(folder)])
     if latest_checkpoint(folder) is not None:
         return f"go on with: {command}"
     return "nothing was kept" + (f"; begin again with: {command}" if (folder / CONFIG).exists() else "")

@@ -193,8 +193,10 @@ def test_a_rig_takes_what_a_record_tells(run, tmp_path, monkeypatch, head, step,
 
 def test_a_step_can_be_given(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("r.csv").write_text("1 2\n2 3\n3 4\n")
-    assert run("rig", "init", "--from", "r.csv", "--step", "2e-6")[0] == 0
+    Path("a record.csv").write_text("1 2\n2 3\n3 4\n")
+    status, told, _ = run("rig", "init", "--from", "a record.csv", "--step", "2e-6")
+    assert status == 0
+    assert "Next: duffing-env identify rig.toml 'a record.csv'" in told
     assert Rig.from_file("rig.toml") == Rig(2e-6)
 
 

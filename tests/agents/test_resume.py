@@ -294,8 +294,8 @@ def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, mon
 
 
 def test_a_stop_before_the_first_update_of_a_resumed_run_says_how_to_go_on(tmp_path, monkeypatch):
-    folder = stopped("ppo", tmp_path / "run", at=400)
+    folder = stopped("ppo", tmp_path / "my run", at=400)
     monkeypatch.setattr("agents.training.runs._Training._learn", lambda self: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Stopped) as caught:
         resume(folder)
-    assert caught.value.left == f"go on with: duffing-env train --resume {folder}"
+    assert caught.value.left == f"go on with: duffing-env train --resume '{folder}'"
