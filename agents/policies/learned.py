@@ -142,9 +142,10 @@ class LearnedPolicy:
         """
         shown = observation_of(env)
         if None not in (self._shown, shown) and shown != self._shown:
+            wanted = "your function" if self._shown == "own" else repr(self._shown)
             raise ValueError(
                 f"env must show the observation {self._shown!r}, which the policy learned from, but shows {shown!r}; "
-                f"make it with the option observation={self._shown!r}"
+                f"make it with the option observation={wanted}"
             )
         if self._is_common:
             if self.card["foresight"].get("drives"):

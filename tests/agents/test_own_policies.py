@@ -102,6 +102,13 @@ def test_policies_in_a_file_are_found_by_module_and_name(tmp_path, monkeypatch):
         evaluate([Push(0), Push(1)], **SHORT)
 
 
+def test_a_policy_of_an_observation_by_a_function_says_what_it_needs(tmp_path):
+    env = gym.make("duffing_env/Short-v0", observation=lambda beliefs: beliefs.coefficients_mean)
+    save_policy(tmp_path / "mine", PPO("MlpPolicy", env, device="cpu"))
+    with pytest.raises(ValueError, match=r"make it with the option observation=your function$"):
+        evaluate([str(tmp_path / "mine")], **SHORT)
+
+
 class Forgetful:
     """Takes two arguments only."""
 
