@@ -108,7 +108,7 @@ def bounds_of(experiment: Experiment) -> FloatArray:
 
 def _called(function: Any, records: FloatArray, experiment: Experiment) -> FloatArray:
     seen = np.asarray(function(Beliefs(experiment.model, records, experiment.scales)), dtype=np.float64)
-    if seen.ndim != 2 or len(seen) != len(records) or not np.isfinite(seen).all():
+    if seen.ndim != 2 or len(seen) != len(records) or not seen.shape[1] or not np.isfinite(seen).all():
         raise ValueError(
             f"observation must give finite numbers of shape (n, entries) for the beliefs of n environments, but gave "
             f"{seen!r:.200} for {len(records)}"
@@ -242,4 +242,9 @@ class Own:
             seen = np.concatenate([observations, true], axis=1)
         else:
             seen = _called(self._chosen, self._batch.records(ended), self._batch.experiment)
+            if seen.shape[1] != len(self._low):
+                raise ValueError(
+                    f"observation must give as many entries every time, but gave {len(self._low)} at first and "
+                    f"{seen.shape[1]} now; keep their number"
+                )
         return np.clip(seen, self._low, self._high).astype(np.float32)

@@ -206,15 +206,15 @@ def roll_out(
     state, episode_start = None, np.ones(systems, dtype=np.bool_)
     deciding: list[float] = []
     for t in range(horizon):
-        if t % hold == 0:
-            started = time.process_time()
-            try:
+        try:
+            if t % hold == 0:
+                started = time.process_time()
                 actions, state = policy.predict(observations, state, episode_start, deterministic=True)
-            except ValueError as error:
-                raise ValueError(f"policy {title_of(name)} does not play {env_id}: {error}") from error
-            deciding.append(time.process_time() - started)
-            episode_start = np.zeros(systems, dtype=np.bool_)
-        observations, _, terminated, truncated, infos = envs.step(actions)
+                deciding.append(time.process_time() - started)
+                episode_start = np.zeros(systems, dtype=np.bool_)
+            observations, _, terminated, truncated, infos = envs.step(actions)
+        except ValueError as error:
+            raise ValueError(f"policy {title_of(name)} does not play {env_id}: {error}") from error
         curve[t + 1] = curve[t] + np.where(running, infos["log_posterior_gain"], 0.0)
         jumped_at[running & (jumped_at == horizon) & (getattr(envs.truth, first) != getattr(began, first))] = t
         inputs[t, running] = envs.max_input * observations[running, last_input]

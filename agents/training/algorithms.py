@@ -6,6 +6,7 @@ batches, few gradient steps. `agents/hyperparameters/ALGORITHM.toml` has what di
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
@@ -49,6 +50,8 @@ class AlgorithmSettings(ABC):
             least = 0 if name in _FROM_ZERO else 1
             if (type(value) is int or name in _FROM_ZERO) and value < least:
                 raise ValueError(f"{name} must be at least {least}, but is {value}")
+            if type(value) is float and not math.isfinite(value):
+                raise ValueError(f"{name} must be finite, but is {value}; give a number")
             if name in _POSITIVE and value <= 0:
                 raise ValueError(f"{name} must be positive, but is {value}")
             if name in _SHARES and not 0 <= value <= 1:

@@ -131,6 +131,23 @@ def test_what_a_policy_refuses_is_told_with_its_name(monkeypatch):
         evaluate([Picky()], **SHORT)
 
 
+@pytest.mark.parametrize(
+    ("actions", "told"),
+    [
+        (np.full((4, 1), np.nan, dtype=np.float32), "must be finite, but row 0 is nan"),
+        (np.zeros(4, dtype=np.float32), r"must have shape \(4, 1\), but have \(4,\)"),
+    ],
+    ids=["nan", "shape"],
+)
+def test_whose_actions_are_none_is_told_with_its_name(actions, told):
+    class Broken(Push):
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return actions, state
+
+    with pytest.raises(ValueError, match=f"policy Broken does not play duffing_env/Short-v0: actions {told}"):
+        evaluate([Broken(0.5)], **SHORT)
+
+
 def normalised_model(kind=PPO, **settings):
     envs = VecNormalize(VecCheckNan(DuffingVecEnv("duffing_env/Short-v0", 4, seed=0)), clip_obs=2.0)
     steps = {"n_steps": 8} if kind in (PPO, A2C) else {"learning_starts": 4, "buffer_size": 100}

@@ -278,6 +278,7 @@ def test_senseless_settings_are_refused_before_anything_is_written(tmp_path, set
         ({"batch_size": 1}, "must be at least 2"),
         ({"num_envs": 1, "n_steps": 1}, "must be at least 2"),
         ({"hidden": (8, 0)}, r"hidden\[1\] must be at least 1, but is 0"),
+        ({"learning_rate": float("nan")}, "learning_rate must be finite, but is nan; give a number"),
         ({"learning_rate": 0.0}, "learning_rate must be positive, but is 0.0"),
         ({"gamma": 1.5}, r"gamma must be in \[0, 1\], but is 1.5"),
         ({"gae_lambda": -0.1}, r"gae_lambda must be in \[0, 1\], but is -0.1"),

@@ -147,6 +147,7 @@ def test_privileged_shows_the_true_coefficients():
             {"observation": lambda beliefs: beliefs.mean[0]},
             r"observation must give finite numbers of shape \(n, entries\)",
         ),
+        ({"observation": lambda beliefs: np.zeros((len(beliefs.mean), 0))}, r"finite numbers of shape \(n, entries\)"),
         ({"history": 0}, "history must be a whole number from 1"),
         (
             {"reward": gain, "terminal": True},
@@ -161,6 +162,15 @@ def test_privileged_shows_the_true_coefficients():
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         DuffingEnv(**options)
+
+
+def test_an_observation_keeps_its_number_of_entries():
+    width = 3
+    env = DuffingEnv(observation=lambda beliefs: np.zeros((len(beliefs.mean), width)))
+    env.reset(seed=0)
+    width = 4
+    with pytest.raises(ValueError, match="observation must give as many entries every time, but gave 3 at first and 4"):
+        env.step([0.5])
 
 
 @pytest.mark.parametrize("given", [0.0, np.full(3, np.nan), np.zeros((3, 1))], ids=str)
