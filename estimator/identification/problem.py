@@ -192,7 +192,9 @@ def _recounted(model: Model, mean: FloatArray, cov: FloatArray, origin: float) -
     names = list(model.coefficients)
     turned[names.index("force"), names.index("stiffness")] = -origin
     offset[names.index("output_offset")] = -origin
-    return turned @ mean + offset, turned @ cov @ turned.T
+    moved = turned @ cov @ turned.T
+    # An inverse of what is nearly singular, such as what few samples tell, is symmetric to fewer digits than it has.
+    return turned @ mean + offset, (moved + moved.T) / 2
 
 
 def _stacked(series: list[FloatArray], columns: int) -> FloatArray:

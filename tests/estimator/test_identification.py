@@ -13,6 +13,7 @@ from estimator.identification.motions import motions
 from estimator.identification.problem import LATEST, Problem, explicable
 from estimator.models.duffing import KINDS, duffing
 from estimator.physical import coefficients_of
+from estimator.rig_prior import about
 from estimator.units import Scales
 
 
@@ -89,6 +90,19 @@ def test_records_may_begin_in_any_motion(kind, delay):
     assert np.abs(deviations(result, SOFT[0])).max() < 4.5
     assert all(std < 0.02 * abs(SOFT[0][name]) for name, (_, std) in list(result.parameters.items())[:4])
     assert result.warnings == ()
+
+
+def test_what_few_samples_tell_is_a_covariance_in_spite_of_rounding():
+    """Two offsets that show as one leave a covariance that is symmetric to nine digits."""
+    u, y = simulated(SOFT)
+    rig = rig_of(SOFT)
+    problem = Problem(rig, rig.scales, (u,), (y,))
+    std = np.array([1e-3, 1e-2, 1e-4, 5e-2, 5e-2, 1e-1])
+    shape = np.eye(6)
+    shape[3, 4], shape[4, 3] = -1.0 + 1e-9, -1.0 + 1e-9 + 4e-9
+    mean, cov = problem.outward(np.array([0.1, 0.2, 0.3, 0.4, 0.0, 0.0]), np.outer(std, std) * shape)
+    np.testing.assert_array_equal(cov, cov.T)
+    assert about(rig, rig.scales, mean, cov).coefficients()
 
 
 @pytest.mark.parametrize("kind", KINDS)
