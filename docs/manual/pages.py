@@ -21,6 +21,14 @@ from agents.evaluation import board
 from agents.policies import TRAINED, trained_policies
 from duffing_env import TRACKS, rewards
 
+#: What docs/*.md point to in the repository, to the page that is made of it.
+MADE_OF = {
+    "duffing_env/tracks.py": "tracks/index.md",
+    "duffing_env/rewards.py": "rewards.md",
+    "agents/policies/__init__.py": "reference/policies.md",
+    "agents/leaderboard.jsonl": "leaderboard.md",
+}
+
 #: Page of the reference to the objects that stand on it.
 REFERENCE = {
     "estimator": [f"estimator.{name}" for name in importlib.import_module("estimator").__all__],
@@ -74,7 +82,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Show sessions as such: a reader of the file itself is served better by ``python``."""
+    """Show sessions as such, and point to the pages that are made here.
+
+    A reader of the file itself is served better by ``python``, and by the code that such a page is made of.
+    """
+    for source, page in MADE_OF.items():
+        markdown = markdown.replace(f"](../{source})", f"]({page})")
     return markdown.replace("```python\n>>>", "```pycon\n>>>")
 
 
