@@ -21,7 +21,7 @@ class Design:
 
     rig: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RIG")]
     """Rig file, with input.limit and output.range, or the name of a rig that ships."""
-    posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="POSTERIOR")] = None
+    posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[POSTERIOR]")] = None
     """What is known: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
     policy: str = "efe"
     """The planner, a signal, or a policy that ships, such as ppo/universal."""

@@ -298,3 +298,8 @@ def test_a_signal_is_one_line_and_its_exit_status(tmp_path, number, status):
     assert asking.returncode == status
     assert messages.strip() == "duffing-env: stopped"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_can_be_left_out_stands_in_brackets(run):
+    _, told, _ = run("design", "--help")
+    assert "RIG [POSTERIOR]" in told
