@@ -23,6 +23,9 @@ from estimator.rig import Rig
 #: No file of a record is larger [bytes].
 _LARGEST_FILE = 2**30
 
+#: A file of that size is read in less [s]; a damaged one might be read for ever.
+_PATIENCE = 300.0
+
 #: A level of the output is a stop where the signal comes to it this often, and so many times as often as to the next.
 _OFTEN, _MORE = 3, 4
 
@@ -197,7 +200,14 @@ def read(path: str | Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
 
 def _read_mat(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
     names = (rig.input.column or "u", rig.output.column or "y")
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", _MAT_READER, path, *names], capture_output=True)
+    # With -P no file beside the record, such as a numpy.py, is taken for a module.
+    command = [sys.executable, "-P", "-W", "ignore", "-c", _MAT_READER, str(path), *names]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=_PATIENCE)
+    except subprocess.TimeoutExpired as error:
+        raise ValueError(
+            f"{path} must be a MAT file that can be read within {_PATIENCE:g} s, but was not; save u and y anew"
+        ) from error
     if done.returncode != 0:
         told = done.stderr.decode(errors="replace").strip().splitlines() or ["the reader died of it"]
         raise ValueError(f"{path} must be a sound MAT file up to version 7.2, but is not: {told[-1]:.200}")

@@ -213,6 +213,20 @@ def test_units_in_another_way_of_writing_and_times_of_another_name_are_taken(tmp
         read(tmp_path / "r.csv", rig)
 
 
+def test_a_mat_file_is_read_by_nothing_that_lies_beside_it_and_not_for_ever(tmp_path, monkeypatch):
+    from scipy.io import savemat
+
+    u, y = simulated(SOFT, samples=400)
+    savemat(tmp_path / "r.mat", {"u": u, "y": y})
+    monkeypatch.chdir(tmp_path)
+    for name in ("numpy", "io", "scipy"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user was executed')")
+    np.testing.assert_array_equal(read("r.mat", Rig(0.01))[1], y)
+    monkeypatch.setattr("estimator.identification.records._PATIENCE", 0.01)
+    with pytest.raises(ValueError, match=r"r\.mat must be a MAT file that can be read within 0\.01 s, but was not"):
+        read("r.mat", Rig(0.01))
+
+
 def copies(u, y):
     """What a user may give together by mistake, and from which sample on the second has the samples of the first."""
     again = np.concatenate([u, [np.nan], u]), np.concatenate([y, [np.nan], y])
