@@ -278,6 +278,9 @@ def number_of(method: str, given: Any) -> float:
         TypeError: for what is neither a number nor an array that holds one.
     """
     try:
-        return float(given.item() if isinstance(given, np.ndarray) else given)
+        number = given.item() if isinstance(given, np.ndarray) else given
+        if isinstance(number, str | bytes):  # float() reads text, too
+            raise TypeError
+        return float(number)
     except (TypeError, ValueError):
         raise TypeError(f"{method} must give one number, but gave {shown(given)}") from None

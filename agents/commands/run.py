@@ -31,7 +31,7 @@ class Run:
     """What makes the plant: factory(rig, **instrument), with the table [instrument] of the rig file."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
     """New folder for the samples and the manifest."""
-    posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="POSTERIOR")] = None
+    posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[POSTERIOR]")] = None
     """What is known before: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=Plan)
     """What to do."""

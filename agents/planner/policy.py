@@ -21,9 +21,10 @@ that Student's t exceeds with probability ``risk`` in a whole episode of outputs
 (`agents.planner.imagination.margin`); it narrows as the noises become known. Few are at it, so much less comes true.
 The standard deviation is what is expected two samples before: near its limit a plan may brake as hard as it can
 already, and cannot make up for what one more output tells. Where it could brake harder, most of what that would move
-the output is taken off the margin, down to the deviations that are expected one sample before (not on a rig). Where an input comes to act in full only a sample later,
-because it goes linearly from the last one to the new, the noise of the sample between moves the next output about as
-much again, and no input makes up for it: the margin is then twice as wide.
+the output is taken off the margin, down to the deviations that are expected one sample before (not on a rig). Where an
+input comes to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the
+sample between moves the next output about as much again, and no input makes up for it: the margin is then twice as
+wide.
 
 Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
 nothing helps: on a rig the limit is lower by what a swing at it can hide.

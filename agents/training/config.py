@@ -34,7 +34,7 @@ class Subject:
     env: str = "duffing_env/Amplitude-v0"
     """Track, such as Short-v0; or family, the oscillators of all kinds that ppo/universal is trained on."""
     rig: str | None = None
-    """Rig file; the track is then Rig-v0."""
+    """Rig file, or the name of a rig that ships; the track is then Rig-v0."""
     settings: Path | None = None
     """File of hyperparameters, TOML; the one that comes with the package where it is not given."""
 
