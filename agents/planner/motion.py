@@ -321,9 +321,10 @@ def shaken_of(experiment: Any, swing: Swing) -> float:
 def reach_of(experiment: Any, view: View, swing: Swing) -> float:
     """What of `Swing.moved` plans count on to make up for what the output before tells (`Terms.reach`); 0 for none.
 
-    None where an input acts in full only a sample later, or is held or changed slowly, where another sensor tells of a
-    kick before the first one shows it, and on a rig, where leaving the limit may cost more than information.
+    None where an input acts in full only a sample later, is held or changed slowly, or has little energy, where another
+    sensor tells of a kick before the first one shows it, and on a rig, where leaving the limit may cost more than
+    information.
     """
     setup = experiment.setup
-    slow = view.degree or view.lag or swing.pace > 1 or np.isfinite(setup.max_slew)
+    slow = view.degree or view.lag or swing.pace > 1 or np.isfinite(setup.max_slew) or np.isfinite(setup.budget)
     return 0.0 if slow or is_of_rig(experiment) or experiment.model.n_outputs > 1 else _SURE * swing.moved

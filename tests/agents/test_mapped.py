@@ -78,7 +78,10 @@ def reference(belief, task, words):
         shaken = max((S @ gain)[0] ** 2 * variance, terms.shaken * q)
         variance = P[0, 0] + r
         gain, deviation = P[:, 0] / variance, np.sqrt(variance + shaken)
-        near = max(0.0, abs(moved[0]) + min(terms.margin * deviation, 0.5 * L) - L) / deviation
+        # What braking harder than planned makes up for.
+        spared = terms.reach * (terms.amplitude + u if moved[0] > 0 else terms.amplitude - u)
+        margin = max(terms.margin * np.sqrt(variance), terms.margin * deviation - spared)
+        near = max(0.0, abs(moved[0]) + min(margin, 0.5 * L) - L) / deviation
         cost = 1e4 / L * max(0.0, abs(moved[0]) - L) + 0.05 * near**4
         return moved, P - np.outer(gain, P[0]), gain, variance, cost
 
