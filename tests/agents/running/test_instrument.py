@@ -60,7 +60,7 @@ def test_a_run_by_samples(scpi, tmp_path):
     result = play(scpi, tmp_path / "run", samples=80)
     assert (result.ended, result.exit_status) == ("complete", 0)
     wait_for(lambda: scpi.lines[-1] == "OUTP OFF", 5.0)  # the instrument reads when it comes to it
-    assert scpi.applied == 0.0
+    wait_for(lambda: scpi.applied == 0.0, 5.0)
     assert scpi.lines.index("WDOG 2.0") < scpi.lines.index("OUTP ON")
     assert scpi.lines.index("MEAS?") < scpi.lines.index("OUTP ON"), "the output is looked at before arming"
     # How near depends on how punctual a busy machine is; tests/agents/running/test_running.py judges the intervals.
@@ -109,7 +109,7 @@ def test_late_samples_are_counted_marked_and_kept_from_the_estimator(scpi, tmp_p
     ticks = [int(row["sample"]) for row in rows(tmp_path / "run")]
     assert ticks == list(range(len(ticks)))
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["late"] == result.late
-    assert scpi.applied == 0.0
+    wait_for(lambda: scpi.applied == 0.0, 5.0)
 
 
 def command(scpi, folder, *more):
@@ -173,7 +173,7 @@ def test_signals_zero_the_input_and_give_parameters(scpi, tmp_path, number, stat
     out, err = process.communicate(timeout=60)
     assert process.returncode == status, err
     assert scpi.lines[-1] == "OUTP OFF"
-    assert scpi.applied == 0.0
+    wait_for(lambda: scpi.applied == 0.0, 5.0)
     assert "90 % interval" in out
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["how"] == number.name
 
