@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drag import DRAG
 
 from agents.planner.design import Known, designer
 from agents.planner.imagination import Terms, mind
@@ -37,17 +38,6 @@ def pendulum_rates(z, p, u):
     rates = np.array([w, torque * u - friction * w - gravity * np.sin(q)])
     by_state = np.array([[0.0, 1.0], [-gravity * np.cos(q), -friction]])
     return rates, by_state, np.array([[0.0] * 3, [-np.sin(q), -w, u]])
-
-
-DRAG = Model(
-    name="drag",
-    states={"x": "V", "v": "V"},
-    coefficients={"stiffness": "1", "drag": "1", "gain": "1"},
-    rates=("v", "gain*u - stiffness*x - drag*v*sqrt(v**2)"),
-    noise=("0", "sqrt(3)"),
-    outputs={"y": "x"},
-    substeps=4,
-)
 
 
 def drag_rates(z, p, u):

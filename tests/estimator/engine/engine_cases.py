@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import drag
 import numpy as np
 from engine_reference import EPS, Belief, Plant
 
@@ -26,15 +27,7 @@ VAN_DER_POL = Model(
 )
 
 #: Drag, which is quadratic in the speed, and a sensor that shows no sign.
-DRAG = Model(
-    name="drag",
-    states={"x": "V", "v": "V"},
-    coefficients={"stiffness": "1", "drag": "1", "gain": "1"},
-    rates=("v", "gain*u - stiffness*x - drag*v*sqrt(v**2)"),
-    noise=("0", "sqrt(3)"),
-    outputs={"y": "abs(x)"},
-    substeps=4,
-)
+DRAG = replace(drag.DRAG, outputs={"y": "abs(x)"})
 
 
 @dataclass(frozen=True)
