@@ -30,7 +30,8 @@ Between two samples a rig goes further than what is seen of it, and a plan that 
 nothing helps: on a rig the limit is lower by what a swing at it can hide.
 
 The search (`agents.planner.search`) builds a plan move by move, by the best ways through the plane of the
-model's first two states, and improves it by steps of the whole plan and by small changes. Horizon 1 is myopic.
+model's first two states, and improves it, the last plan and the next best one then, by steps of the whole plan and by
+small changes. Horizon 1 is myopic.
 
 Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
 climbs by gradient (`agents.planner.pursuit`): then the question is when to spend, which no short horizon can answer.
@@ -59,6 +60,7 @@ class PlannerState(NamedTuple):
 
     Attributes:
         plans: (n, horizon) the last plans [V].
+        others: (n, horizon) the next best ones [V].
         rates: (n, K, K) what plans taught per sample.
         words: (n, 4) the streams of random numbers.
         last: (n,) the last inputs [V].
@@ -68,6 +70,7 @@ class PlannerState(NamedTuple):
     """
 
     plans: FloatArray
+    others: FloatArray
     rates: FloatArray
     words: npt.NDArray[np.uint64]
     last: FloatArray
@@ -109,8 +112,8 @@ class Planner:
         horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
             by default 50, and the whole episode sample by sample where the energy is limited. No more than 24 of the
             last 48 of an episode.
-        rounds: of steps and changed copies, at most, two blocks of `estimator.lanes.LANES` each; one that brings less
-            than 0.001 nats is the last. Of no effect on a plan of the whole episode.
+        rounds: of steps and changed copies of each of up to three plans, at most, two blocks of `estimator.lanes.LANES`
+            each; one that brings less than 0.001 nats is the last. Of no effect on a plan of the whole episode.
         risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
         goal: mean of the goal prior of what the first sensor shows, within its limit.
         goal_std: its standard deviation; no goal where it is None.
@@ -219,20 +222,21 @@ class Planner:
             streams = map(np.random.SFC64, np.random.SeedSequence(self.seed).spawn(n))
             words = np.array([stream.state["state"]["state"] for stream in streams])
             plans, rates, held = np.zeros((n, self.horizon)), np.zeros((n, k, k)), np.zeros(n, dtype=np.int64)
-            state = PlannerState(plans, rates, words, np.zeros(n), np.zeros(n), held, np.ones_like(held))
-        plans, rates, words = state.plans.copy(), state.rates.copy(), state.words.copy()
+            state = PlannerState(plans, plans, rates, words, np.zeros(n), np.zeros(n), held, np.ones_like(held))
+        plans, others = state.plans.copy(), state.others.copy()
+        rates, words = state.rates.copy(), state.words.copy()
         before, chosen = state.last.copy(), state.chosen.copy()
         held, paces = state.held.copy(), state.paces.copy()
-        plans[begun], rates[begun], before[begun], held[begun] = 0.0, 0.0, 0.0, 0
+        plans[begun], others[begun], rates[begun], before[begun], held[begun] = 0.0, 0.0, 0.0, 0.0, 0
         at = places(self.view.model)
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
         last = terms.amplitude * rows[:, at.last_input]
         due = np.flatnonzero(held == 0)
         inputs = np.empty(len(due))
-        searched = plans[due], rates[due], words[due]
+        searched = plans[due], others[due], rates[due], words[due]
         if self._energy is not None:
             energies = rows[:, at.budget_left] * self._energy
-            self._pursue(records, left, energies, terms, last, *searched[::2], inputs)
+            self._pursue(records, left, energies, terms, last, searched[0], searched[3], inputs)
         else:
             lasts = np.stack([last, before], axis=1)[due]
             moves = paces[due]
@@ -241,10 +245,10 @@ class Planner:
             )
             held[due] = paces[due] = moves
             held -= 1
-        plans[due], rates[due], words[due] = searched
+        plans[due], others[due], rates[due], words[due] = searched
         chosen[due] = inputs
         actions = (chosen / terms.amplitude).astype(np.float32)
-        state = PlannerState(plans, rates, words, last, chosen, held, paces)
+        state = PlannerState(plans, others, rates, words, last, chosen, held, paces)
         return actions.reshape(*np.shape(observation)[:-1], 1), state
 
     def asked(

@@ -5,11 +5,15 @@ is known. So the plan is built move by move, as the best way through the map of 
 (`agents.planner.mapped`). An input is held for `agents.planner.imagination.Terms.pace` samples, a *move*. Towards the
 end of an episode moves become shorter, by whole numbers: so the last plan, which kept the limit, can go on as it was.
 
-The best way is then compared with the last plan, begun one sample ago. The better one is improved in rounds, by steps
-that change all of it (`agents.planner.steps`), and by small changes at random, until a round brings little. Plans are
-compared by what is known, on average, when parts of them have been followed: judged by its end alone, the best plan may
-be to wait for a move, and so at every decision anew. The first part is as long as a third of what it takes to swing to
-the limit.
+The best way, the last plan and the next best one then, both begun one sample ago, each lead to a summit of their own:
+by rounds of steps that change all of a plan (`agents.planner.steps`) and of small changes at random, until a round
+brings little. The highest summit is followed. Were only the best of the three improved, the last plan would nearly
+always be, as it has been improved before, and the search would keep to its summit. Those behind are given up as soon as
+they do not catch up at the pace of their last round.
+
+Plans are compared by what is known, on average, when parts of them have been followed: judged by its end alone, the
+best plan may be to wait for a move, and so at every decision anew. The first part is as long as a third of what it
+takes to swing to the limit.
 """
 
 from __future__ import annotations
@@ -25,21 +29,35 @@ from agents.planner.imagination import mind, terms_of
 from agents.planner.mapped import Task, mapped
 from agents.planner.steps import nudge, rivals_for, step
 from estimator.arrays import copy, fill, highest
-from estimator.lanes import LANES, kernel, part
+from estimator.lanes import LANES, jit, kernel, part
 from estimator.models.model import Model
 
-#: Ways through the map that are followed, at most, and far ahead: there fewer tell as much, but not on rigs.
-_WAYS, _FEWER = 3 * LANES, 2 * LANES
+#: Of so many cells of the map, one way that leads into them is followed, in so many blocks at least, and at most. Far
+#: ahead a block less tells as much, but not on rigs.
+_CELLS_PER_WAY, _FEWEST_BLOCKS, _MOST_BLOCKS = 10, 2, 4
 
 #: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: so many ways are
 #: followed then, and plans look no further than so many moves.
 _LATE, _LATE_WAYS, _LATE_HORIZON = 48, 6 * LANES, 24
 
-#: For so many first moves all inputs are tried, and up to so many some of them.
-_FINEST, _FINE = 3, 7
+#: All inputs are tried for so many first moves, over the map's cells along an axis, and some of them for so many: the
+#: coarser a map, the fewer ways lead through it, and the more can be tried of each.
+_FINEST, _FINE = 125, 250
 
-#: A round of steps and changed copies that brings less [nats] is the last one of a decision.
+#: Plans that are improved in a decision, one after the other: the last one, the next best, and the best way.
+_STARTS = 3
+
+#: One this much [nats] worse than the best of them is not improved at all.
+_HOPELESS = 0.5
+
+#: A round of steps and changed copies that brings less [nats] is the last one of a plan.
 _LITTLE = 0.001
+
+#: A plan is given up that so many rounds as good as its last would not make the best.
+_PATIENCE = 0.7
+
+#: The next best plan has an input that differs by so much of the largest, among the first so many moves.
+_APART, _NEAR = 0.3, 20
 
 #: Part of what a plan teaches per sample that goes into the running mean.
 _REFRESHED = 0.2
@@ -49,17 +67,18 @@ class Search(NamedTuple):
     """The search for a model, compiled.
 
     Attributes:
-        plan: ``plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, paces)`` searches the
-            best next inputs of n environments:
+        plan: ``plan(records, left, horizon, rounds, terms, lasts, plans, others, rates, words, actions, paces)``
+            searches the best next inputs of n environments:
 
             - ``records`` (n, size): their beliefs;
             - ``left`` (n,): samples left in their episodes;
             - ``horizon``: moves to plan, at most;
-            - ``rounds``: of steps and changed copies, at most, two blocks of `LANES` each; one that brings little is
-              the last;
+            - ``rounds``: of steps and changed copies of each plan that is improved, at most, two blocks of `LANES`
+              each; one that brings little is the last;
             - ``terms``: `agents.planner.imagination.Terms` of the whole episode;
             - ``lasts`` (n, 2): the inputs that were applied last, newest first;
             - ``plans`` (n, horizon): the last plans, begun one move ago; overwritten by the new ones;
+            - ``others`` (n, horizon): the next best ones then; overwritten as well;
             - ``rates`` (n, K, K): information per sample that plans have brought, a running mean; zeros where there was
               none yet; overwritten;
             - ``words`` (n, 4): streams of random numbers; overwritten;
@@ -141,6 +160,41 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         return rivals.worths[winner]
 
     @inner
+    def ascend(W, task, rivals, plan, score, after, rounds, top, words):
+        """Improve a plan (horizon,) in rounds, until one brings little, or it is given up; gives its score."""
+        for _ in range(rounds):
+            so_far = score
+            first = nudge(rivals, plan, task.steps, task.terms.amplitude)
+            score = compete(W, task, rivals, first, plan, score, after, words)
+            first = step(rivals, task.steps, task.terms.amplitude)
+            score = compete(W, task, rivals, first, plan, score, after, words)
+            gained = score - so_far
+            if gained < _LITTLE or score + _PATIENCE * gained < top:
+                break
+        return score
+
+    @inner
+    def lead(W, task, rivals, starts, scores, afters, words):
+        """Replace each start by the best of its changed copies, and find its score and the precision at its end."""
+        candidates = rivals.candidates
+        for j in range(LANES):
+            copy(candidates[j], 0, starts[j % _STARTS], len(starts[0]))
+            if j >= _STARTS:
+                change(candidates[j], task.steps, task.terms.amplitude, words)
+        fill(candidates[LANES - 1], 0.0)  # rest keeps the limit, where nothing else may
+        for j in range(LANES):
+            bound(candidates[j], task.steps, task.lasts[0], task.terms)
+        weigh(W, task, rivals)
+        for s in range(_STARTS):
+            leader = s
+            for j in range(s, LANES, _STARTS):
+                if rivals.worths[j] > rivals.worths[leader]:
+                    leader = j
+            scores[s] = rivals.worths[leader]
+            copy(starts[s], 0, candidates[leader], len(starts[0]))
+            precision(W, leader, afters[s])
+
+    @inner
     def refresh(W, task, after, rate):
         """Let the information per sample of a plan into the running mean; the first one is taken as it is."""
         before = np.empty((k, k))
@@ -156,39 +210,49 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                     rate[a, b] += share * ((after[a, b] - before[a, b]) / (task.steps * task.pace) - rate[a, b])
 
     @inner
-    def improve(memory, rivals, record, left, rounds, terms, lasts, best, rate, words, before):
-        """Improve the plan ``best`` (horizon,), begun one move of so many samples ago, and ``rate``; gives its pace."""
-        candidates, W = rivals.candidates, memory.ways[0]
+    def improve(memory, rivals, record, left, rounds, terms, lasts, best, other, rate, words, before):
+        """Improve the plans ``best`` and ``other`` (horizon,), and ``rate``; gives the samples of their moves.
+
+        They began one move of so many samples ago.
+        """
+        W = memory.ways[0]
         moves = min(len(best), _LATE_HORIZON)
-        ways, fewer = _WAYS, _WAYS if terms.firm > 0.0 else _FEWER
+        ways = ways_for(terms.cells)
+        fewer = ways if terms.firm > 0.0 else ways - LANES
         pace = pace_for(left, moves, terms.pace)
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
             ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
-        sizes = terms.cells, _FINEST, _FINE, ways, fewer
+        sizes = terms.cells, _FINEST // terms.cells, _FINE // terms.cells, ways, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         follow_up(best, steps, before, pace)
-        copy(candidates[0], 0, best, len(best))
-        fill(candidates[1], 0.0)
-        find_way(memory, task, candidates[2], words)
-        for j in range(3, LANES):
-            copy(candidates[j], 0, candidates[2 * (j % 2)], len(best))
-            change(candidates[j], steps, terms.amplitude, words)
-        after = np.zeros((k, k))
-        score = compete(W, task, rivals, LANES, best, -np.inf, after, words)
-        for _ in range(rounds):
-            so_far = score
-            first = nudge(rivals, best, steps, terms.amplitude)
-            score = compete(W, task, rivals, first, best, score, after, words)
-            first = step(rivals, steps, terms.amplitude)
-            score = compete(W, task, rivals, first, best, score, after, words)
-            if score < so_far + _LITTLE:
+        follow_up(other, steps, before, pace)
+        starts, scores, afters = np.empty((_STARTS, len(best))), np.empty(_STARTS), np.zeros((_STARTS, k, k))
+        copy(starts[0], 0, best, len(best))
+        copy(starts[1], 0, other, len(best))
+        find_way(memory, task, starts[2], words)
+        lead(W, task, rivals, starts, scores, afters, words)
+        waiting, top = scores.copy(), -np.inf
+        for _ in range(_STARTS):
+            s = highest(waiting, _STARTS)
+            if waiting[s] < top - _HOPELESS:
                 break
+            waiting[s] = -np.inf
+            scores[s] = ascend(W, task, rivals, starts[s], scores[s], afters[s], rounds, top, words)
+            top = max(top, scores[s])
+        winner = highest(scores, _STARTS)
+        copy(best, 0, starts[winner], len(best))
+        fill(other, 0.0)
+        second = -np.inf
+        for s in range(_STARTS):
+            if scores[s] > second and gap(starts[s], best, min(steps, _NEAR)) > _APART * terms.amplitude:
+                copy(other, 0, starts[s], len(best))
+                second = scores[s]
         # Where the coefficients walk, what is learned later does not add to what is learned now.
         if not (terms.walk > 0.0).any():
-            refresh(W, task, after, rate)
+            refresh(W, task, afters[winner], rate)
         return pace
 
     @inner
@@ -202,23 +266,23 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         lasts[1], lasts[0] = lasts[0], u
 
     @entry
-    def plan(records, left, horizon, rounds, terms, lasts, plans, rates, words, actions, paces):
-        kept_memory, rivals = memory(horizon, max(_WAYS, _LATE_WAYS)), rivals_for(horizon)
+    def plan(records, left, horizon, rounds, terms, lasts, plans, others, rates, words, actions, paces):
+        kept_memory, rivals = memory(horizon, _LATE_WAYS), rivals_for(horizon)
         for i in range(len(records)):
-            others = rounds, terms_of(terms, left[i]), lasts[i], plans[i], rates[i], words[i], paces[i]
-            paces[i] = improve(kept_memory, rivals, records[i], max(1, left[i]), *others)
+            own = rounds, terms_of(terms, left[i]), lasts[i], plans[i], others[i], rates[i], words[i], paces[i]
+            paces[i] = improve(kept_memory, rivals, records[i], max(1, left[i]), *own)
             actions[i] = plans[i, 0]
 
     @entry
     def play(record, first, horizon, rounds, terms, u, words):
-        kept_memory, rivals = memory(horizon, max(_WAYS, _LATE_WAYS)), rivals_for(horizon)
-        best, rate, W = np.zeros(horizon), np.zeros((k, k)), np.empty(size)
+        kept_memory, rivals = memory(horizon, _LATE_WAYS), rivals_for(horizon)
+        best, other, rate, W = np.zeros(horizon), np.zeros(horizon), np.zeros((k, k)), np.empty(size)
         lasts, held, pace = np.zeros(2), 0, 1
         for t in range(len(u)):
             if t >= first:
                 if held == 0:
-                    others = rounds, terms, lasts, best, rate, words, pace
-                    held = pace = improve(kept_memory, rivals, record, len(u) - t, *others)
+                    own = rounds, terms, lasts, best, other, rate, words, pace
+                    held = pace = improve(kept_memory, rivals, record, len(u) - t, *own)
                 u[t] = best[0]
                 held -= 1
             go_on(W, record, u[t], lasts, terms)
@@ -235,3 +299,24 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         find_way(memory(left, ways), task, u[first:], words)
 
     return Search(plan, play, through)
+
+
+@jit
+def ways_for(cells):
+    """How many ways are followed through a map with so many cells along an axis: whole blocks.
+
+    Example:
+        >>> [ways_for(cells) for cells in (22, 25, 35, 38)]
+        [64, 64, 128, 128]
+    """
+    blocks = round(cells * cells / (_CELLS_PER_WAY * LANES))
+    return LANES * max(_FEWEST_BLOCKS, min(blocks, _MOST_BLOCKS))
+
+
+@jit
+def gap(one, other, moves):
+    """By how much the inputs of two plans differ, at most, among so many first moves."""
+    largest = 0.0
+    for h in range(moves):
+        largest = max(largest, abs(one[h] - other[h]))
+    return largest

@@ -329,10 +329,12 @@ def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
         rng = np.random.default_rng(seed)
         belief = random_belief(model, rng)
         rate = 0.1 * np.linalg.inv(belief.coefficients_cov)
-        rates, plans, words = rate[None].copy(), np.zeros((1, horizon)), rng.integers(1, 2**63, (1, 4), dtype=np.uint64)
+        plans, others = np.zeros((2, 1, horizon))
+        rates, words = rate[None].copy(), rng.integers(1, 2**63, (1, 4), dtype=np.uint64)
         episode = terms(model, margin=np.full(left, 2.0))
         arguments = belief.record[None].copy(), np.array([left]), horizon, 60, episode, np.zeros((1, 2))
-        search(model).plan(*arguments, plans, rates, words, np.empty(1), np.empty(1, dtype=np.int64))
+        searched = plans, others, rates, words
+        search(model).plan(*arguments, *searched, np.empty(1), np.empty(1, dtype=np.int64))
 
         def worth(inputs, belief=belief, rate=rate):
             known = []
