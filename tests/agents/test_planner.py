@@ -54,6 +54,33 @@ def test_rows_do_not_depend_on_the_batch(track):
     np.testing.assert_array_equal(few, many[:, :2])
 
 
+def test_the_next_best_plan_is_another_one_and_is_followed_where_it_is_the_best():
+    n, envs = 64, make("Amplitude", 64)
+    planner = Planner(envs)
+    observations, _ = envs.reset(seed=0)
+    state, start = None, np.ones(n, dtype=bool)
+    for _ in range(30):
+        actions, state = planner.predict(observations, state, start)
+        observations, _, terminated, truncated, _ = envs.step(actions)
+        start = terminated | truncated
+
+    def gap(plans, others):
+        return np.abs(plans - others)[:, 1:20].max(axis=1) / envs.max_input
+
+    there = state.others.any(axis=1)
+    assert there.mean() > 0.9
+    assert (np.abs(state.plans - state.others)[there, :20].max(axis=1) > 0.3 * envs.max_input).all()
+
+    def followed(**changed):
+        _, after = planner.predict(observations, state._replace(**changed), start)
+        return (gap(after.plans, np.roll(state.plans, -1, axis=1)) < 0.3).mean()
+
+    none = np.zeros_like(state.plans)
+    anew = followed(plans=none, others=none)
+    assert followed(plans=none, others=state.plans) > anew + 0.15
+    assert followed(plans=state.others, others=state.plans) > anew + 0.15
+
+
 def test_the_seed_is_that_of_the_search():
     first, *_ = roll_out("Amplitude", 2, seed=3, steps=20)
     assert not np.array_equal(first, roll_out("Amplitude", 2, seed=4, steps=20)[0])
