@@ -33,7 +33,7 @@ from estimator.lanes import LANES, jit, kernel, part
 from estimator.models.model import Model
 
 #: Of so many cells of the map, one way that leads into them is followed, in so many blocks at least, and at most. Far
-#: ahead a block less tells as much, but not on rigs.
+#: ahead a block less tells as much. On rigs it does not, and as many ways as may be are followed throughout.
 _CELLS_PER_WAY, _FEWEST_BLOCKS, _MOST_BLOCKS = 10, 2, 4
 
 #: Towards the end of an episode, when so many moves are left, no later plan mends what a plan misses: so many ways are
@@ -60,7 +60,7 @@ _PATIENCE = 0.7
 _APART, _NEAR = 0.3, 20
 
 #: Part of what a plan teaches per sample that goes into the running mean.
-_REFRESHED = 0.2
+_REFRESHED = 0.05
 
 
 class Search(NamedTuple):
@@ -217,7 +217,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         """
         W = memory.ways[0]
         moves = min(len(best), _LATE_HORIZON)
-        ways = ways_for(terms.cells)
+        ways = _MOST_BLOCKS * LANES if terms.firm > 0.0 else ways_for(terms.cells)
         fewer = ways if terms.firm > 0.0 else ways - LANES
         pace = pace_for(left, moves, terms.pace)
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
