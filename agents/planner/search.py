@@ -229,7 +229,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         follow_up(best, steps, before, pace)
         follow_up(other, steps, before, pace)
-        starts, scores, afters = np.empty((_STARTS, len(best))), np.empty(_STARTS), np.zeros((_STARTS, k, k))
+        starts, scores, afters = np.zeros((_STARTS, len(best))), np.empty(_STARTS), np.zeros((_STARTS, k, k))
         copy(starts[0], 0, best, len(best))
         copy(starts[1], 0, other, len(best))
         find_way(memory, task, starts[2], words)
