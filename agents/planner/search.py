@@ -51,7 +51,7 @@ _STARTS = 3
 _HOPELESS = 0.5
 
 #: A round of steps and changed copies that brings less [nats] is the last one of a plan.
-_LITTLE = 0.0004
+_LITTLE = 0.001
 
 #: A plan is given up that so many rounds as good as its last would not make the best.
 _PATIENCE = 0.7
