@@ -20,7 +20,7 @@ import numpy as np
 from agents.planner.design import factorise
 from agents.planner.imagination import Terms, mind, terms_of
 from agents.planner.motion import View, places
-from agents.policies.ways import FIRST, SIMPLE, Task, ways
+from agents.policies.ways import FIRST, LONGEST, SIMPLE, Task, ways
 from estimator.arrays import copy
 from estimator.engine.motion import motion
 from estimator.lanes import LANES, jit, kernel, part
@@ -41,8 +41,8 @@ FEATURES = (
 #: Largest size of a feature; what a difference of one nat counts for before arcsinh.
 BOUND, _NAT = 10.0, 20.0
 
-#: Moves that are looked ahead, at least and at most; in parts of what a swing takes to build, and of the episode.
-_LEAST, _MOST, _BUILT, _PART = 8, 36, 2 / 3, 1 / 3
+#: Moves that are looked ahead, at least; in parts of what a swing takes to build, and of the episode.
+_LEAST, _BUILT, _PART = 8, 2 / 3, 1 / 3
 
 #: No fewer samples are looked ahead than so many times the outputs that tell of a state together.
 _TOGETHER = 3.0
@@ -91,7 +91,7 @@ def look_ahead(built: float, moves: float) -> tuple[int, int]:
         >>> look_ahead(5.0, 256), look_ahead(18.0, 256), look_ahead(float("inf"), 256), look_ahead(float("inf"), 48)
         ((8, 36), (12, 36), (36, 36), (16, 16))
     """
-    most = int(np.clip(_PART * moves, _LEAST, _MOST))
+    most = int(np.clip(_PART * moves, _LEAST, LONGEST))
     return int(np.clip(_BUILT * built, _LEAST, most)), most
 
 

@@ -11,8 +11,9 @@ The best way of a first move begins as the best through the map of the state (`a
 these. On the map several sizes of the first push are tried, each with what then follows best: near the limit a push
 that is right together with the next ones is not found by changing it alone. The best of all is changed a little in some
 rounds: some pushes are turned over, or one or two become harder or softer, the first ones more often than those far
-ahead. The first push keeps its direction; where a move lasts several samples it is played in full, and stays so. Where
-bursts (`agents.policies.bursts`) say how hard to push, there is no map.
+ahead. The first push keeps its direction; where a move lasts several samples it is played in full, and stays so. The
+longer ways are, the more of them are followed on the map, and the more rounds there are. Where bursts
+(`agents.policies.bursts`) say how hard to push, there is no map.
 
 What a way is worth is in nats, as the planner imagines it: by belief propagation (`agents.planner.imagination`), so
 that what one sample teaches is not counted again by the next, with what the rest of the episode will bring anyway. It
@@ -49,11 +50,14 @@ _MARKS = (0.5, 0.75, 1.0)
 #: Moves of the longest pace in which an output can still be kept within the limit: nearly a period.
 _IN_REACH = 8
 
-#: Rounds of changes of a way that begins with a push, and fewer where bursts say how hard to push. One that begins with
-#: none has one round.
+#: Moves of the longest way, and of a *stretch* of a way, of which the last may be shorter.
+LONGEST, _STRETCH = 36, 12
+
+#: For each stretch, rounds of changes of a way that begins with a push; and rounds, fewer, where bursts say how hard to
+#: push. One that begins with none has one round.
 ROUNDS, _BESIDE_BURSTS = 8, 2
 
-#: Cells of the map along each axis, moves for which half pushes are tried, and ways that are followed.
+#: Cells of the map along each axis, moves for which half pushes are tried, and ways that are followed for each stretch.
 _CELLS, _FINE, _FOLLOWED = 35, 7, LANES
 
 #: The part of the changes that turn pushes over, and how many pushes at most.
@@ -93,14 +97,14 @@ class Task(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """Changes of ways, (ROUNDS, LANES) each.
+    """Changes of ways, (rounds, LANES) each.
 
     In every round the first lane is left as it is, and in the first one the simple ways are, too.
 
     Attributes:
         where: the first move that is changed, in parts of a way.
         turned: moves that are turned over.
-        moved: (ROUNDS, LANES, 2) how much harder that push becomes and the next one, in parts of a push.
+        moved: (rounds, LANES, 2) how much harder that push becomes and the next one, in parts of a push.
     """
 
     where: FloatArray
@@ -109,16 +113,23 @@ class Changes(NamedTuple):
 
 
 def _draw_changes() -> Changes:
-    """They are always the same."""
+    """For the longest way; they are always the same."""
     rng = np.random.default_rng(5)
+    each = [_changes_of_stretch(rng) for _ in range(LONGEST // _STRETCH)]
+    where, turned, moved = (np.concatenate(parts) for parts in zip(*each, strict=True))
+    turned[:, 0], moved[:, 0] = 0, 0.0
+    turned[0, : len(SIMPLE) + 1], moved[0, : len(SIMPLE) + 1] = 0, 0.0
+    return Changes(where, turned, moved)
+
+
+def _changes_of_stretch(rng: np.random.Generator) -> tuple[FloatArray, Any, FloatArray]:
+    """Those of so many rounds as a stretch has."""
     turns = rng.random((ROUNDS, LANES)) < _TURN
     where = rng.random((ROUNDS, LANES)) ** np.where(turns, 1, _SOON)
     turned = turns * rng.integers(1, _MOST_TURNED + 1, turns.shape)
     moved = _BY * rng.uniform(-1.0, 1.0, (*turns.shape, 2)) * ~turns[..., None]
     moved[..., 1] *= rng.random(turns.shape) < 0.5
-    turned[:, 0], moved[:, 0] = 0, 0.0
-    turned[0, : len(SIMPLE) + 1], moved[0, : len(SIMPLE) + 1] = 0, 0.0
-    return Changes(where, turned, moved)
+    return where, turned, moved
 
 
 CHANGES = _draw_changes()
@@ -189,8 +200,12 @@ def ways(view: View) -> Ways:
     map_memory, find_way = mapped.mapped(*view)
 
     @inner
+    def stretches_in(moves):
+        return -(-moves // _STRETCH)
+
+    @inner
     def best(moves):
-        kept, words = map_memory(moves, _FOLLOWED), np.empty(4, np.uint64)
+        kept, words = map_memory(moves, stretches_in(moves) * _FOLLOWED), np.empty(4, np.uint64)
         return Best(kept, words, np.empty((LANES, moves)), np.empty(moves), np.empty(3))
 
     @inner
@@ -259,14 +274,16 @@ def ways(view: View) -> Ways:
     def find(W, task, first, sign, simple, best):
         _, words, candidates, plan, known = best
         t, direction, push = task, FIRST[first], task.terms.amplitude
+        stretches = stretches_in(t.moves)
         for a in range(4):
             words[a] = WORDS[a]
         copy(plan, 0, simple[0], t.moves)
         if not t.has_bursts:
-            to_come, sizes = int(t.to_come + 0.5), (_CELLS, 0, _FINE, _FOLLOWED, _FOLLOWED, direction, sign)
+            to_come, ways = int(t.to_come + 0.5), stretches * _FOLLOWED
+            sizes = _CELLS, 0, _FINE, ways, ways, direction, sign
             through = mapped.Task(t.record, to_come, t.moves, t.pace, t.terms, t.lasts, t.M, *sizes)
             find_way(best.memory, through, plan[: t.moves], words)
-        rounds = 1 if direction == 0.0 else _BESIDE_BURSTS if t.has_bursts else ROUNDS
+        rounds = 1 if direction == 0.0 else _BESIDE_BURSTS if t.has_bursts else stretches * ROUNDS
         least, worths, peaks = _LEAST * push if t.pace == 1 else push, np.empty((2, LANES)), np.empty(LANES)
         known[1] = -np.inf
         for r in range(rounds):

@@ -110,6 +110,8 @@ def reference(belief, seen, ahead, terms, least=0.0):
 
         return follow(push)
 
+    stretches = -(-moves // 12)
+
     def mapped(first, sign):
         """The inputs of the best way through the map of the state."""
         words, cells = np.array(WORDS), 35
@@ -135,8 +137,8 @@ def reference(belief, seen, ahead, terms, least=0.0):
                     score = worth(D, max(0, int(to_come + 0.5) - (t + 1) * pace)) - price
                     if score > entered.get(cell(to), (-np.inf,))[0]:
                         entered[cell(to)] = score, (to, D, told, spread, price, [*inputs, size * A])
-            enough = enough_for(np.array([score for score, _ in entered.values()]), 32)
-            kept = [found for found in entered.values() if found[0] >= enough][:32]
+            enough = enough_for(np.array([score for score, _ in entered.values()]), 32 * stretches)
+            kept = [found for found in entered.values() if found[0] >= enough][: 32 * stretches]
             followed = [way for _, way in kept]
         return followed[int(np.argmax([score for score, _ in kept]))][-1]
 
@@ -146,7 +148,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
         has_bursts = ahead.energy < np.inf
         start = ways[0] if has_bursts else mapped(first, sign)
         best = None
-        for r in range(1 if first == 1 else 2 if has_bursts else ROUNDS):
+        for r in range(1 if first == 1 else 2 if has_bursts else ROUNDS * stretches):
             tries = []
             for j in range(32):
                 plan = np.array(ways[j - 1] if r == 0 and 0 < j <= 3 else start if r == 0 else best[3])
