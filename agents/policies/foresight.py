@@ -150,7 +150,7 @@ class CommonForesight:
     of the systems that a policy was trained on. So with that alone a policy plays any environment. Beside the
     observation itself it tells more of one model, and a policy plays environments of that. Outputs keep a margin
     (`agents.planner.imagination.margin`) from the planner's limit (`agents.planner.motion.limit_of`): on a rig the
-    planner's own, else one for a risk of 2 % in place of 0.2 %.
+    planner's own, else one for a risk of 2 % in place of 0.1 %.
 
     An action is a push. Where the energy is limited it is how much harder to push than the best burst, and the features
     of what is best tell what harder, as hard and softer ways bring, in place of a push up, none and a push down.
