@@ -9,7 +9,8 @@ The best way, the last plan and the next best one then, both begun one sample ag
 by rounds of steps that change all of a plan (`agents.planner.steps`) and of small changes at random, until a round
 brings little. The highest summit is followed. Were only the best of the three improved, the last plan would nearly
 always be, as it has been improved before, and the search would keep to its summit. Those behind are given up as soon as
-they do not catch up at the pace of their last round.
+they do not catch up at the pace of their last round. Where plans reach the end of the episode there are two maps, and
+the best way of each climbs.
 
 Plans are compared by what is known, on average, when parts of them have been followed: judged by its end alone, the
 best plan may be to wait for a move, and so at every decision anew. The first part is as long as a third of what it
@@ -44,8 +45,9 @@ _LATE, _LATE_WAYS, _LATE_HORIZON = 48, 6 * LANES, 24
 #: coarser a map, the fewer ways lead through it, and the more can be tried of each.
 _FINEST, _FINE = 125, 250
 
-#: Plans that are improved in a decision, one after the other: the last one, the next best, and the best way.
-_STARTS = 3
+#: Plans that are improved in a decision, one after the other: so many that are kept, the last one and the next best,
+#: and the best way through a map, or through so many maps where plans reach the end of the episode.
+_KEPT, _LATE_MAPS = 2, 2
 
 #: One this much [nats] worse than the best of them is not improved at all.
 _HOPELESS = 0.5
@@ -59,8 +61,12 @@ _PATIENCE = 0.7
 #: The next best plan has an input that differs by so much of the largest, among the first so many moves.
 _APART, _NEAR = 0.3, 20
 
-#: Part of what a plan teaches per sample that goes into the running mean.
-_REFRESHED = 0.05
+#: Part of what a plan teaches per sample that goes into the running mean; and the part of the plan, from its beginning,
+#: that is not counted: in it a swing may still have to be built.
+_REFRESHED, _BUILDING = 0.05, 0.5
+
+#: Part of that mean that is expected after a plan: plans promise more than is kept.
+_KEEPS = 0.8
 
 
 class Search(NamedTuple):
@@ -79,8 +85,8 @@ class Search(NamedTuple):
             - ``lasts`` (n, 2): the inputs that were applied last, newest first;
             - ``plans`` (n, horizon): the last plans, begun one move ago; overwritten by the new ones;
             - ``others`` (n, horizon): the next best ones then; overwritten as well;
-            - ``rates`` (n, K, K): information per sample that plans have brought, a running mean; zeros where there was
-              none yet; overwritten;
+            - ``rates`` (n, K, K): information per sample of the second halves of plans, a running mean; zeros where
+              there was none yet; overwritten;
             - ``words`` (n, 4): streams of random numbers; overwritten;
             - ``actions`` (n,): receives the first input of the best plan;
             - ``paces`` (n,): samples of a move of the last plans; overwritten by those of the new ones.
@@ -178,16 +184,16 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         """Replace each start by the best of its changed copies, and find its score and the precision at its end."""
         candidates = rivals.candidates
         for j in range(LANES):
-            copy(candidates[j], 0, starts[j % _STARTS], len(starts[0]))
-            if j >= _STARTS:
+            copy(candidates[j], 0, starts[j % len(starts)], len(starts[0]))
+            if j >= len(starts):
                 change(candidates[j], task.steps, task.terms.amplitude, words)
         fill(candidates[LANES - 1], 0.0)  # rest keeps the limit, where nothing else may
         for j in range(LANES):
             bound(candidates[j], task.steps, task.lasts[0], task.terms)
         weigh(W, task, rivals)
-        for s in range(_STARTS):
+        for s in range(len(starts)):
             leader = s
-            for j in range(s, LANES, _STARTS):
+            for j in range(s, LANES, len(starts)):
                 if rivals.worths[j] > rivals.worths[leader]:
                     leader = j
             scores[s] = rivals.worths[leader]
@@ -195,11 +201,17 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             precision(W, leader, afters[s])
 
     @inner
-    def refresh(W, task, after, rate):
+    def refresh(W, task, plan, after, rate):
         """Let the information per sample of a plan into the running mean; the first one is taken as it is."""
-        before = np.empty((k, k))
+        before, built = np.empty((k, k)), int(_BUILDING * task.steps)
         begin(W, task.record, task.lasts)
+        for h in range(built):
+            for j in range(LANES):
+                W[U + j] = plan[h]
+            for _ in range(task.pace):
+                advance(W, task.record, task.terms)
         precision(W, 0, before)
+        samples = (task.steps - built) * task.pace
         share, is_finite = _REFRESHED if rate[0, 0] > 0.0 else 1.0, True
         for a in range(k):
             for b in range(k):
@@ -207,7 +219,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         for a in range(k):
             for b in range(k):
                 if is_finite:
-                    rate[a, b] += share * ((after[a, b] - before[a, b]) / (task.steps * task.pace) - rate[a, b])
+                    rate[a, b] += share * ((after[a, b] - before[a, b]) / samples - rate[a, b])
 
     @inner
     def improve(memory, rivals, record, left, rounds, terms, lasts, best, other, rate, words, before):
@@ -224,35 +236,37 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         if left <= _LATE * pace:
             ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
-        factorise(rate, M)
+        factorise(_KEEPS * rate, M)
         sizes = terms.cells, _FINEST // terms.cells, _FINE // terms.cells, ways, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         follow_up(best, steps, before, pace)
         follow_up(other, steps, before, pace)
-        starts, scores, afters = np.zeros((_STARTS, len(best))), np.empty(_STARTS), np.zeros((_STARTS, k, k))
+        n = _KEPT + (_LATE_MAPS if left <= _LATE_HORIZON * pace else 1)
+        starts, scores, afters = np.zeros((n, len(best))), np.empty(n), np.zeros((n, k, k))
         copy(starts[0], 0, best, len(best))
         copy(starts[1], 0, other, len(best))
-        find_way(memory, task, starts[2], words)
+        for s in range(_KEPT, n):
+            find_way(memory, task, starts[s], words)
         lead(W, task, rivals, starts, scores, afters, words)
         waiting, top = scores.copy(), -np.inf
-        for _ in range(_STARTS):
-            s = highest(waiting, _STARTS)
+        for _ in range(n):
+            s = highest(waiting, n)
             if waiting[s] < top - _HOPELESS:
                 break
             waiting[s] = -np.inf
             scores[s] = ascend(W, task, rivals, starts[s], scores[s], afters[s], rounds, top, words)
             top = max(top, scores[s])
-        winner = highest(scores, _STARTS)
+        winner = highest(scores, n)
         copy(best, 0, starts[winner], len(best))
         fill(other, 0.0)
         second = -np.inf
-        for s in range(_STARTS):
+        for s in range(n):
             if scores[s] > second and gap(starts[s], best, min(steps, _NEAR)) > _APART * terms.amplitude:
                 copy(other, 0, starts[s], len(best))
                 second = scores[s]
         # Where the coefficients walk, what is learned later does not add to what is learned now.
         if not (terms.walk > 0.0).any():
-            refresh(W, task, afters[winner], rate)
+            refresh(W, task, best, afters[winner], rate)
         return pace
 
     @inner
