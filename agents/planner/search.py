@@ -61,12 +61,9 @@ _PATIENCE = 0.7
 #: The next best plan has an input that differs by so much of the largest, among the first so many moves.
 _APART, _NEAR = 0.3, 20
 
-#: Part of what a plan teaches per sample that goes into the running mean; and the part of the plan, from its beginning,
-#: that is not counted: in it a swing may still have to be built.
-_REFRESHED, _BUILDING = 0.05, 0.5
-
-#: Part of that mean that is expected after a plan: plans promise more than is kept.
-_KEEPS = 0.8
+#: Part of what a plan teaches per sample that goes into the running mean; and of how many of its last moves. Before
+#: them a swing may still have to be built.
+_REFRESHED, _LAST = 0.05, 25
 
 
 class Search(NamedTuple):
@@ -85,8 +82,8 @@ class Search(NamedTuple):
             - ``lasts`` (n, 2): the inputs that were applied last, newest first;
             - ``plans`` (n, horizon): the last plans, begun one move ago; overwritten by the new ones;
             - ``others`` (n, horizon): the next best ones then; overwritten as well;
-            - ``rates`` (n, K, K): information per sample of the second halves of plans, a running mean; zeros where
-              there was none yet; overwritten;
+            - ``rates`` (n, K, K): information per sample of the last moves of plans, a running mean; zeros where there
+              was none yet; overwritten;
             - ``words`` (n, 4): streams of random numbers; overwritten;
             - ``actions`` (n,): receives the first input of the best plan;
             - ``paces`` (n,): samples of a move of the last plans; overwritten by those of the new ones.
@@ -203,7 +200,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     @inner
     def refresh(W, task, plan, after, rate):
         """Let the information per sample of a plan into the running mean; the first one is taken as it is."""
-        before, built = np.empty((k, k)), int(_BUILDING * task.steps)
+        before, built = np.empty((k, k)), max(0, task.steps - _LAST)
         begin(W, task.record, task.lasts)
         for h in range(built):
             for j in range(LANES):
@@ -236,7 +233,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         if left <= _LATE * pace:
             ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
-        factorise(_KEEPS * rate, M)
+        factorise(rate, M)
         sizes = terms.cells, _FINEST // terms.cells, _FINE // terms.cells, ways, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         follow_up(best, steps, before, pace)
