@@ -13,6 +13,7 @@ from agents.planner.policy import Planner
 from agents.policies import make_policy
 from duffing_env.experiment import SimulatedExperiment
 from estimator import Channel, Rig
+from estimator.belief import covariance_places
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -302,3 +303,30 @@ def test_moves_become_shorter_towards_the_end():
     assert (np.diff(lengths[:, 0]) <= 0).all()
     assert set(lengths[:, 0].tolist()) == {1, 3}
     assert lengths[:, 0].sum() == envs.horizon
+
+
+@pytest.mark.parametrize(("track", "moves"), [("Amplitude-v0", 50), ("Short-v0", 24)])
+def test_what_is_expected_after_a_plan_is_what_its_last_moves_bring(track, moves):
+    """Against Eq. (2) in matrices: what 25 moves bring, or all where there are fewer."""
+    envs = make(track, 3)
+    policy = make_policy("efe", envs, seed=0)
+    observations, _ = envs.reset(seed=4)
+    _, state = policy.predict(observations)
+    for i, plan in enumerate(state.plans):
+        belief = envs.belief(i)
+        P, z, theta = belief.record[covariance_places(belief.model)], belief.state_mean, belief.coefficients_mean
+        q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
+        known = []
+        for u in plan[:moves]:
+            known.append(np.linalg.inv(P[2:, 2:]))
+            S = np.eye(6)
+            S[0] = [theta[0] + 3 * theta[1] * z[0] ** 2, theta[2], z[0], z[0] ** 3, z[1], u]
+            S[1] = [1, 0, 0, 0, 0, 0]
+            P = S @ P @ S.T
+            P[0, 0] += q
+            gain = P[:, 0] / (P[0, 0] + r)
+            P = P - np.outer(gain, P[0])
+            z = np.array([theta @ [z[0], z[0] ** 3, z[1], u], z[0]])
+        known.append(np.linalg.inv(P[2:, 2:]))
+        counted = min(25, moves)
+        np.testing.assert_allclose(state.rates[i], (known[-1] - known[-1 - counted]) / counted, rtol=1e-6)
