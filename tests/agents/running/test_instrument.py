@@ -57,7 +57,7 @@ def near_truth(parameters, share):
 
 
 def test_a_run_by_samples(scpi, tmp_path):
-    result = play(scpi, tmp_path / "run", samples=80)
+    result = play(scpi, tmp_path / "run", samples=160)  # of which a busy machine may be late for half
     assert (result.ended, result.exit_status) == ("complete", 0)
     wait_for(lambda: scpi.lines[-1] == "OUTP OFF", 5.0)  # the instrument reads when it comes to it
     wait_for(lambda: scpi.applied == 0.0, 5.0)
