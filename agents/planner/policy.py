@@ -112,7 +112,7 @@ class Planner:
         horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
             by default 50, and the whole episode sample by sample where the energy is limited. No more than 24 of the
             last 48 of an episode.
-        rounds: of steps and changed copies of each of up to three plans, at most, two blocks of `estimator.lanes.LANES`
+        rounds: of steps and changed copies of each plan that climbs, at most, two blocks of `estimator.lanes.LANES`
             each; one that brings less than 0.001 nats is the last. Of no effect on a plan of the whole episode.
         risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
         goal: mean of the goal prior of what the first sensor shows, within its limit.
