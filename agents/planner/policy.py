@@ -10,9 +10,9 @@ with C_0 the covariance of the coefficients now and C_H the one after the H outp
 propagation: the joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample
 teaches is not counted again by the next. The teaching part then telescopes: a plan of the whole episode would be
 Bayesian D-optimal. J is the information that the rest of the episode after H will bring anyway, at the rate of the last
-plans; so a plan looks for what will be lacking at the end. Plans are compared by the mean of G after parts of them, the
-last of which is H (`agents.planner.search`). Where the coefficients walk (``drift``) J is 0, and the walk
-is imagined too.
+plans; so a plan looks for what will be lacking at the end. Plans that do not reach the end of the episode are compared
+by a mean of G after each of their moves, in which what a move adds counts the less the later it is
+(`agents.planner.search`). Where the coefficients walk (``drift``) J is 0, and the walk is imagined too.
 
 What the first sensor shows should stay within the limit by a margin of standard deviations of the output that is then
 predicted; plans that do not are the worse the further they go within it, as fast as the chance of an early end grows,
@@ -80,7 +80,7 @@ class PlannerState(NamedTuple):
 
 
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
-_HORIZON = 50
+_HORIZON = 40
 
 #: Rounds of a decision, at most: three are usual.
 _ROUNDS = 12
@@ -90,9 +90,6 @@ _LEAST_MOVES = 24
 
 #: Moves of a plan, at most.
 _MOST_MOVES = 100_000
-
-#: The first part of a plan that counts, in parts of the moves that a swing takes to come near the limit.
-_SOON = 1 / 3
 
 #: Cells of the map, times the third root of the moves that a swing takes to come near the limit, and their bounds: the
 #: less a move does beside the limit, the finer the map.
@@ -195,7 +192,6 @@ class Planner:
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
             firm=float(is_of_rig(experiment)),
-            soon=int(np.clip(_SOON * swing.built / swing.pace, 1, _MOST_MOVES)),
             reach=reach_of(experiment, self.view, swing),
             cells=int(np.clip(_CELLS * np.cbrt(swing.built / swing.pace), _FEWEST_CELLS, _MOST_CELLS)),
         )

@@ -12,9 +12,10 @@ always be, as it has been improved before, and the search would keep to its summ
 they do not catch up at the pace of their last round. Where plans reach the end of the episode there are two maps, and
 the best way of each climbs.
 
-Plans are compared by what is known, on average, when parts of them have been followed: judged by its end alone, the
-best plan may be to wait for a move, and so at every decision anew. The first part is as long as a third of what it
-takes to swing to the limit.
+What a move teaches counts the less the later it is in the plan, as the plan is made anew at each move, and later ones
+will be others; with a noisy sensor, by which a move teaches late, it fades more slowly. Were all to count alike, the
+best plan might be to wait for a move, and so at every decision anew. Of plans that reach the end of the episode all
+moves count alike.
 """
 
 from __future__ import annotations
@@ -49,11 +50,15 @@ _FINEST, _FINE = 125, 250
 #: and the best way through a map, or through so many maps where plans reach the end of the episode.
 _KEPT, _LATE_MAPS = 2, 2
 
+#: So many moves later, what a plan teaches counts e times less; and how many more for each sample over which the
+#: filter averages its outputs: with a noisy sensor, what a move teaches comes late. Chosen on the branch `validation`.
+_FADED, _AVERAGED = 6.0, 4.0
+
 #: One this much [nats] worse than the best of them is not improved at all.
-_HOPELESS = 0.5
+_HOPELESS = 0.05
 
 #: A round of steps and changed copies that brings less [nats] is the last one of a plan.
-_LITTLE = 0.001
+_LITTLE = 0.0001
 
 #: A plan is given up that so many rounds as good as its last would not make the best.
 _PATIENCE = 0.7
@@ -104,7 +109,7 @@ class Search(NamedTuple):
 def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     """The search for a model; arguments as `estimator.engine.imagination.imagination`."""
     imagined = mind(model, degree, lag)
-    size, U, SCORE, NEAR = imagined.size, imagined.u, imagined.score, imagined.near
+    size, U, SCORE, NEAR, NOISE = imagined.size, imagined.u, imagined.score, imagined.near, imagined.noise
     begin, advance, appraise = imagined.fill, imagined.advance, imagined.appraise
     collect, precision = imagined.collect, imagined.precision
     memory, find_way = mapped(model, degree, lag)
@@ -116,16 +121,13 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
     def weigh(W, task, rivals):
         """Find what rivals are worth, and how near to the limit they lead.
 
-        They are worth what is known at the end of the episode; if they do not reach it, the sum of what is known after
-        ``terms.soon`` moves, or half of them, after twice as many, and so on, and at the end.
+        They are worth the mean of what is known after each move, with the weights by which what moves teach fades.
         """
         steps, (candidates, worths, near, weights, _, _) = task.steps, rivals
         record, terms, M, pace = task.record, task.terms, task.M, task.pace  # once: each time they would be counted
-        mark = steps if task.left <= steps * pace else max(1, min(terms.soon, steps // 2))
         begin(W, record, task.lasts)
         fill(worths, 0.0)
         for h in range(steps):
-            weights[h] = 0.0
             for j in range(LANES):
                 W[U + j] = candidates[j, h]
                 near[h, j] = -np.inf
@@ -133,14 +135,11 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                 advance(W, record, terms)
                 for j in range(LANES):
                     near[h, j] = max(near[h, j], W[NEAR + j])
-            if h + 1 == mark or h + 1 == steps:
-                mark *= 2
-                weights[h] = 1.0
+            share = weights[h] - (weights[h + 1] if h + 1 < steps else 0.0)
+            if share > 0.0:
                 appraise(W, M, np.sqrt(max(0, task.left - (h + 1) * pace)))
                 for j in range(LANES):
-                    worths[j] += W[SCORE + j]
-        for h in range(steps - 2, -1, -1):
-            weights[h] += weights[h + 1]
+                    worths[j] += share * W[SCORE + j]
 
     @inner
     def compete(W, task, rivals, first, best, score, after, words):
@@ -234,6 +233,9 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
+        faded = faded_by(record[NOISE - 1] / record[NOISE - 2], record[NOISE + 1] / record[NOISE], pace)
+        for h in range(steps):
+            rivals.weights[h] = 1.0 if left <= steps * pace else np.exp(-h / faded)
         sizes = terms.cells, _FINEST // terms.cells, _FINE // terms.cells, ways, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         follow_up(best, steps, before, pace)
@@ -322,6 +324,19 @@ def ways_for(cells):
     """
     blocks = round(cells * cells / (_CELLS_PER_WAY * LANES))
     return LANES * max(_FEWEST_BLOCKS, min(blocks, _MOST_BLOCKS))
+
+
+@jit
+def faded_by(process, sensor, pace):
+    """Moves later in a plan that what it teaches counts e times less, from the variances of process noise and sensor.
+
+    A filter averages outputs over about the fourth root of their ratio, in samples.
+
+    Example:
+        >>> [round(faded_by(1.0, ratio, 1), 1) for ratio in (0.0, 1.0, 625.0)]
+        [6.0, 10.0, 26.0]
+    """
+    return _FADED + _AVERAGED * (sensor / max(process, 1e-300)) ** 0.25 / pace
 
 
 @jit

@@ -6,7 +6,7 @@ from it. So the first inputs u of a plan are changed together, by a model of wha
     J(u + d) ≈ J(u) + gᵀ d - K Σ_h w_h [max(0, z_h + Z_hᵀ d)⁴ - max(0, z_h)⁴] - ½ λ |d|²
 
 with z_h how many standard deviations the output of move h is within its margin (`agents.planner.imagination`), Z_h its
-derivative, w_h how often that counts, and g the derivative of what the plan teaches. Derivatives are differences: each
+derivative, w_h how much that counts, and g the derivative of what the plan teaches. Derivatives are differences: each
 lane of a block imagines the plan with one input nudged. The smaller λ, the longer the step. For one λ after another,
 the next step is the last one and an iteration of Newton's, within the largest input. Which step is best is then
 imagined.
@@ -44,7 +44,7 @@ class Rivals(NamedTuple):
         candidates: (LANES, horizon) the plans.
         worths: (LANES,) what they are worth.
         near: (horizon, LANES) standard deviations by which the output of a move is within its margin.
-        weights: (horizon,) how often what that costs counts.
+        weights: (horizon,) how much what a move teaches and costs counts.
         plan: (horizon,) the one that was nudged.
         nudges: (`_CHANGED`,) of its inputs; that of input i is in lane i + 1.
     """
