@@ -80,7 +80,7 @@ class PlannerState(NamedTuple):
 
 
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
-_HORIZON = 40
+_HORIZON = 48
 
 #: Rounds of a decision, at most: three are usual.
 _ROUNDS = 12
@@ -110,7 +110,7 @@ class Planner:
             by default 50, and the whole episode sample by sample where the energy is limited. No more than 24 of the
             last 48 of an episode.
         rounds: of steps and changed copies of each plan that climbs, at most, two blocks of `estimator.lanes.LANES`
-            each; one that brings less than 0.001 nats is the last. Of no effect on a plan of the whole episode.
+            each; one that brings less than 0.00005 nats is the last. Of no effect on a plan of the whole episode.
         risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
         goal: mean of the goal prior of what the first sensor shows, within its limit.
         goal_std: its standard deviation; no goal where it is None.

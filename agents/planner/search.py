@@ -58,7 +58,7 @@ _FADED, _AVERAGED = 6.0, 4.0
 _HOPELESS = 0.05
 
 #: A round of steps and changed copies that brings less [nats] is the last one of a plan.
-_LITTLE = 0.0001
+_LITTLE = 0.00005
 
 #: A plan is given up that so many rounds as good as its last would not make the best.
 _PATIENCE = 0.7
