@@ -80,7 +80,7 @@ class PlannerState(NamedTuple):
 
 
 #: Moves to plan under an amplitude limit: some periods of the oscillator.
-_HORIZON = 48
+_HORIZON = 44
 
 #: Rounds of a decision, at most: three are usual.
 _ROUNDS = 12
