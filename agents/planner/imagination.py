@@ -74,6 +74,8 @@ class Terms(NamedTuple):
         goal_weight: half its precision; 0 for no goal.
         firm: 1 where the margin is as the limit itself, which a shield needs that calls unsafe what leads into it; 0
             where it yields.
+        faded: moves later in a plan that what it teaches counts e times less, with a sensor without noise
+            (`agents.planner.search`).
         cells: of the map of the state along each axis, from minus a state's scale to plus (`agents.planner.mapped`).
         reach: by how much an input of 1 over a sample moves what the first sensor shows after it, as far as that can be
             counted on to make up for what the output before tells; 0 where it cannot.
@@ -91,6 +93,7 @@ class Terms(NamedTuple):
     goal: float = 0.0
     goal_weight: float = 0.0
     firm: float = 0.0
+    faded: float = 6.0
     cells: int = 24
     reach: float = 0.0
 
@@ -100,7 +103,7 @@ def terms_of(episode, left):
     """The terms of a plan from those of an episode of which so many samples are left: with the margin of the next."""
     e, size = episode, len(episode.margin)
     margin = e.margin[min(max(0, size - left), size - 1)]
-    judged = e.walk, e.scales, e.pace, e.shaken, e.price, e.goal, e.goal_weight, e.firm, e.cells, e.reach
+    judged = e.walk, e.scales, e.pace, e.shaken, e.price, e.goal, e.goal_weight, e.firm, e.faded, e.cells, e.reach
     return Terms(e.amplitude, e.slew, e.limit, margin, *judged)
 
 

@@ -50,9 +50,9 @@ _FINEST, _FINE = 125, 250
 #: and the best way through a map, or through so many maps where plans reach the end of the episode.
 _KEPT, _LATE_MAPS = 2, 2
 
-#: So many moves later, what a plan teaches counts e times less; and how many more for each sample over which the
-#: filter averages its outputs: with a noisy sensor, what a move teaches comes late. Chosen on the branch `validation`.
-_FADED, _AVERAGED = 6.0, 4.0
+#: How many more moves later what a plan teaches counts e times less, for each sample over which the filter averages its
+#: outputs: with a noisy sensor, what a move teaches comes late. Chosen on the branch `validation`.
+_AVERAGED = 4.0
 
 #: One this much [nats] worse than the best of them is not improved at all.
 _HOPELESS = 0.05
@@ -233,7 +233,8 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
-        faded = faded_by(record[NOISE - 1] / record[NOISE - 2], record[NOISE + 1] / record[NOISE], pace)
+        process, sensor = record[NOISE - 1] / record[NOISE - 2], record[NOISE + 1] / record[NOISE]
+        faded = terms.faded + delayed_by(process, sensor) / pace
         for h in range(steps):
             rivals.weights[h] = 1.0 if left <= steps * pace else np.exp(-h / faded)
         sizes = terms.cells, _FINEST // terms.cells, _FINE // terms.cells, ways, fewer
@@ -327,16 +328,16 @@ def ways_for(cells):
 
 
 @jit
-def faded_by(process, sensor, pace):
-    """Moves later in a plan that what it teaches counts e times less, from the variances of process noise and sensor.
+def delayed_by(process, sensor):
+    """Samples that a noisy sensor delays what a plan teaches by, from the variances of process noise and sensor.
 
-    A filter averages outputs over about the fourth root of their ratio, in samples.
+    A filter averages outputs over about the fourth root of their ratio.
 
     Example:
-        >>> [round(faded_by(1.0, ratio, 1), 1) for ratio in (0.0, 1.0, 625.0)]
-        [6.0, 10.0, 26.0]
+        >>> [round(delayed_by(1.0, ratio), 1) for ratio in (0.0, 1.0, 625.0)]
+        [0.0, 4.0, 20.0]
     """
-    return _FADED + _AVERAGED * (sensor / max(process, 1e-300)) ** 0.25 / pace
+    return _AVERAGED * (sensor / max(process, 1e-300)) ** 0.25
 
 
 @jit

@@ -105,7 +105,7 @@ def pushed(terms, push):
     """The same terms with another largest input."""
     t = terms
     judged = t.margin, t.walk, t.scales, t.pace, t.shaken, t.price, t.goal, t.goal_weight, t.firm
-    return Terms(push, t.slew, t.limit, *judged, t.cells, t.reach)
+    return Terms(push, t.slew, t.limit, *judged, t.faded, t.cells, t.reach)
 
 
 @cache
