@@ -111,7 +111,7 @@ class Planner:
             its steps, with its observations.
         seed: of the search.
         horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
-            by default 50, and the whole episode sample by sample where the energy is limited. No more than 24 of the
+            by default 44, and the whole episode sample by sample where the energy is limited. No more than 24 of the
             last 48 of an episode.
         rounds: of steps and changed copies of each plan that climbs, at most, two blocks of `estimator.lanes.LANES`
             each; one that brings less than 0.00005 nats is the last. Of no effect on a plan of the whole episode.

@@ -306,7 +306,24 @@ def test_moves_become_shorter_towards_the_end():
     assert lengths[:, 0].sum() == envs.horizon
 
 
-@pytest.mark.parametrize(("track", "moves"), [("Amplitude-v0", 50), ("Short-v0", 24)])
+def precisions(belief, plan):
+    """(moves + 1, 4, 4) inverse covariances of the coefficients of Eq. (2) before and after each move, in matrices."""
+    P, z, theta = belief.record[covariance_places(belief.model)], belief.state_mean, belief.coefficients_mean
+    q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
+    known = [np.linalg.inv(P[2:, 2:])]
+    for u in plan:
+        S = np.eye(6)
+        S[0] = [theta[0] + 3 * theta[1] * z[0] ** 2, theta[2], z[0], z[0] ** 3, z[1], u]
+        S[1] = [1, 0, 0, 0, 0, 0]
+        P = S @ P @ S.T
+        P[0, 0] += q
+        P = P - np.outer(P[:, 0], P[0]) / (P[0, 0] + r)
+        z = np.array([theta @ [z[0], z[0] ** 3, z[1], u], z[0]])
+        known.append(np.linalg.inv(P[2:, 2:]))
+    return np.array(known)
+
+
+@pytest.mark.parametrize(("track", "moves"), [("Amplitude-v0", 44), ("Short-v0", 24)])
 def test_what_is_expected_after_a_plan_is_what_its_last_moves_bring(track, moves):
     """Against Eq. (2) in matrices: what 25 moves bring, or all where there are fewer."""
     envs = make(track, 3)
@@ -314,21 +331,7 @@ def test_what_is_expected_after_a_plan_is_what_its_last_moves_bring(track, moves
     observations, _ = envs.reset(seed=4)
     _, state = policy.predict(observations)
     for i, plan in enumerate(state.plans):
-        belief = envs.belief(i)
-        P, z, theta = belief.record[covariance_places(belief.model)], belief.state_mean, belief.coefficients_mean
-        q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
-        known = []
-        for u in plan[:moves]:
-            known.append(np.linalg.inv(P[2:, 2:]))
-            S = np.eye(6)
-            S[0] = [theta[0] + 3 * theta[1] * z[0] ** 2, theta[2], z[0], z[0] ** 3, z[1], u]
-            S[1] = [1, 0, 0, 0, 0, 0]
-            P = S @ P @ S.T
-            P[0, 0] += q
-            gain = P[:, 0] / (P[0, 0] + r)
-            P = P - np.outer(gain, P[0])
-            z = np.array([theta @ [z[0], z[0] ** 3, z[1], u], z[0]])
-        known.append(np.linalg.inv(P[2:, 2:]))
+        known = precisions(envs.belief(i), plan[:moves])
         counted = min(25, moves)
         np.testing.assert_allclose(state.rates[i], (known[-1] - known[-1 - counted]) / counted, rtol=1e-6)
 
@@ -344,22 +347,11 @@ def test_what_moves_teach_counts_the_less_the_later():
     others = 0
     for i, found in enumerate(state.plans):
         belief = envs.belief(i)
-        theta, start = belief.coefficients_mean, belief.record[covariance_places(belief.model)]
         q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
         weights = np.append(np.exp(-np.arange(8) / (6 + 4 * (r / q) ** 0.25)), 0.0)
 
-        def known(plan, z=belief.state_mean, P=start, theta=theta, q=q, r=r):
-            after = []
-            for u in plan:
-                S = np.eye(6)
-                S[0] = [theta[0] + 3 * theta[1] * z[0] ** 2, theta[2], z[0], z[0] ** 3, z[1], u]
-                S[1] = [1, 0, 0, 0, 0, 0]
-                P = S @ P @ S.T
-                P[0, 0] += q
-                P = P - np.outer(P[:, 0], P[0]) / (P[0, 0] + r)
-                z = np.array([theta @ [z[0], z[0] ** 3, z[1], u], z[0]])
-                after.append(-0.5 * np.linalg.slogdet(P[2:, 2:])[1])
-            return np.array(after)
+        def known(plan, belief=belief):
+            return 0.5 * np.linalg.slogdet(precisions(belief, plan)[1:])[1]
 
         tried = np.array(
             [known(plan) for plan in itertools.product(policy.terms.amplitude * np.array([-1, 1]), repeat=8)]
