@@ -75,7 +75,7 @@ class Terms(NamedTuple):
         firm: 1 where the margin is as the limit itself, which a shield needs that calls unsafe what leads into it; 0
             where it yields.
         faded: moves later in a plan that what it teaches counts e times less, with a sensor without noise
-            (`agents.planner.search`).
+            (`agents.planner.fading`).
         cells: of the map of the state along each axis, from minus a state's scale to plus (`agents.planner.mapped`).
         reach: by how much an input of 1 over a sample moves what the first sensor shows after it, as far as that can be
             counted on to make up for what the output before tells; 0 where it cannot.

@@ -46,6 +46,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.asked import check_rows, starts
+from agents.planner.fading import faded_of
 from agents.planner.imagination import RISK, Terms, margin
 from agents.planner.motion import View, is_of_rig, limit_of, places, reach_of, shaken_of, swing_of
 from agents.planner.pursuit import pursuit
@@ -90,10 +91,6 @@ _LEAST_MOVES = 24
 
 #: Moves of a plan, at most.
 _MOST_MOVES = 100_000
-
-#: What a plan teaches counts e times less so many moves later, or so much of the moves that a swing takes to come near
-#: the limit, and at most so many: where a swing has to be built for long, it pays late. Chosen on `validation`.
-_FADED, _BUILT, _MOST_FADED = 6.0, 1 / 3.5, 36.0
 
 #: Cells of the map, times the third root of the moves that a swing takes to come near the limit, and their bounds: the
 #: less a move does beside the limit, the finer the map.
@@ -196,7 +193,7 @@ class Planner:
             goal=float(goal),
             goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
             firm=float(is_of_rig(experiment)),
-            faded=float(np.clip(_BUILT * swing.built / swing.pace, _FADED, _MOST_FADED)),
+            faded=faded_of(swing),
             reach=reach_of(experiment, self.view, swing),
             cells=int(np.clip(_CELLS * np.cbrt(swing.built / swing.pace), _FEWEST_CELLS, _MOST_CELLS)),
         )

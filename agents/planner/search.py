@@ -12,10 +12,7 @@ always be, as it has been improved before, and the search would keep to its summ
 they do not catch up at the pace of their last round. Where plans reach the end of the episode there are two maps, and
 the best way of each climbs.
 
-What a move teaches counts the less the later it is in the plan, as the plan is made anew at each move, and later ones
-will be others; with a noisy sensor, by which a move teaches late, it fades more slowly. Were all to count alike, the
-best plan might be to wait for a move, and so at every decision anew. Of plans that reach the end of the episode all
-moves count alike.
+What a move teaches counts the less the later it is in the plan (`agents.planner.fading`).
 """
 
 from __future__ import annotations
@@ -27,6 +24,7 @@ import numpy as np
 
 from agents.planner.candidates import bound, change, follow_up, pace_for
 from agents.planner.design import factorise
+from agents.planner.fading import delayed_by, fade, share_of
 from agents.planner.imagination import mind, terms_of
 from agents.planner.mapped import Task, mapped
 from agents.planner.steps import nudge, rivals_for, step
@@ -49,10 +47,6 @@ _FINEST, _FINE = 125, 250
 #: Plans that are improved in a decision, one after the other: so many that are kept, the last one and the next best,
 #: and the best way through a map, or through so many maps where plans reach the end of the episode.
 _KEPT, _LATE_MAPS = 2, 2
-
-#: How many more moves later what a plan teaches counts e times less, for each sample over which the filter averages its
-#: outputs: with a noisy sensor, what a move teaches comes late. Chosen on the branch `validation`.
-_AVERAGED = 4.0
 
 #: One this much [nats] worse than the best of them is not improved at all.
 _HOPELESS = 0.05
@@ -135,7 +129,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
                 advance(W, record, terms)
                 for j in range(LANES):
                     near[h, j] = max(near[h, j], W[NEAR + j])
-            share = weights[h] - (weights[h + 1] if h + 1 < steps else 0.0)
+            share = share_of(weights, h, steps)
             if share > 0.0:
                 appraise(W, M, np.sqrt(max(0, task.left - (h + 1) * pace)))
                 for j in range(LANES):
@@ -235,8 +229,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         factorise(rate, M)
         process, sensor = record[NOISE - 1] / record[NOISE - 2], record[NOISE + 1] / record[NOISE]
         faded = terms.faded + delayed_by(process, sensor) / pace
-        for h in range(steps):
-            rivals.weights[h] = 1.0 if left <= steps * pace else np.exp(-h / faded)
+        fade(rivals.weights, steps, np.inf if left <= steps * pace else faded, 1.0)
         sizes = terms.cells, _FINEST // terms.cells, _FINE // terms.cells, ways, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         follow_up(best, steps, before, pace)
@@ -325,19 +318,6 @@ def ways_for(cells):
     """
     blocks = round(cells * cells / (_CELLS_PER_WAY * LANES))
     return LANES * max(_FEWEST_BLOCKS, min(blocks, _MOST_BLOCKS))
-
-
-@jit
-def delayed_by(process, sensor):
-    """Samples that a noisy sensor delays what a plan teaches by, from the variances of process noise and sensor.
-
-    A filter averages outputs over about the fourth root of their ratio.
-
-    Example:
-        >>> [round(delayed_by(1.0, ratio), 1) for ratio in (0.0, 1.0, 625.0)]
-        [0.0, 4.0, 20.0]
-    """
-    return _AVERAGED * (sensor / max(process, 1e-300)) ** 0.25
 
 
 @jit
