@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from agents.planner.fading import faded_of
 from agents.planner.imagination import RISK, Terms, margin
 from agents.planner.motion import View, is_of_rig, limit_of, places, reach_of, shaken_of, survey, swing_of
 from agents.policies.bursts import burster, drawn
@@ -194,6 +195,7 @@ class CommonForesight:
             swing.pace,
             shaken_of(experiment, swing),
             firm=1.0,
+            faded=faded_of(slow),
             reach=reach_of(experiment, self._view, swing),
         )
         at, model = places(self._view.model), self._view.model

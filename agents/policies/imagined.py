@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner.design import factorise
+from agents.planner.fading import delayed_by, fade
 from agents.planner.imagination import Terms, mind, terms_of
 from agents.planner.motion import View, places
 from agents.policies.ways import FIRST, LONGEST, SIMPLE, Task, ways
@@ -46,6 +47,11 @@ _LEAST, _BUILT, _PART = 8, 2 / 3, 1 / 3
 
 #: No fewer samples are looked ahead than so many times the outputs that tell of a state together.
 _TOGETHER = 3.0
+
+#: What a way teaches fades in this part of the moves in which a plan of the planner's does, and by the power of a
+#: Gaussian: as ways are shorter, their first moves count alike. Of so many moves at the end of an episode none fades.
+#: Chosen on the branch `validation`.
+_FADED, _POWER, _LAST = 0.8, 2.0, 32
 
 #: Moves of a way where the episode ends sooner.
 _SHORTEST = 4
@@ -125,6 +131,7 @@ def imaginer(view: View) -> Any:
     found = mind(*view)
     size, SCORE, begin, appraise, precision = found.size, found.score, found.fill, found.appraise, found.precision
     advance, SPREAD, NOISE = found.advance, found.spread, found.noise
+    PROCESS = NOISE - 2
     best_of, follow, find = ways(view)
     at, width = places(model), len(motion(*view).layout)
     k, d = model.n_coefficients, model.n_states + model.n_coefficients
@@ -166,6 +173,7 @@ def imaginer(view: View) -> Any:
         M, none, lasts, peaks = np.zeros((k, k)), np.zeros((k, k)), np.zeros(2), np.empty(LANES)
         worths, plans = np.empty((len(PARTS), LANES)), np.empty((LANES, ahead.most))
         nats, heights = np.empty((3, len(PARTS), len(FIRST))), np.empty((3, len(FIRST)))
+        weights = np.empty(ahead.most)
         shared, free, now, rate = np.empty(len(FIRST)), np.empty((3, 3)), np.empty((k, k)), np.empty((k, k))
         for i in range(len(observations)):
             record, seen, told = records[i], observations[i], features[i]
@@ -191,7 +199,10 @@ def imaginer(view: View) -> Any:
             pace = min(terms.pace, max(1, int(left / moves + 0.5)))
             moves = max(_SHORTEST, min(moves, -(-int(left + 0.5) // pace)))
             has_bursts, to_come = ahead.energy < np.inf, share * ahead.samples
-            task = Task(record, lasts, moves, has_bursts, pace, left, to_come, M, pushed(terms, push))
+            process, sensor = record[PROCESS + 1] / record[PROCESS], record[NOISE + 1] / record[NOISE]
+            faded = _FADED * (terms.faded + delayed_by(process, sensor) / pace)
+            fade(weights, moves, np.inf if left <= max(moves, _LAST) * pace else faded, _POWER)
+            task = Task(record, lasts, moves, has_bursts, pace, left, to_come, M, weights, pushed(terms, push))
             follow(W, still, task, worths, peaks, plans, free)
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
             signs[i] = sign

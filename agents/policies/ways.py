@@ -16,10 +16,9 @@ longer ways are, the more of them are followed on the map, and the more rounds t
 (`agents.policies.bursts`) say how hard to push, there is no map.
 
 What a way is worth is in nats, as the planner imagines it: by belief propagation (`agents.planner.imagination`), so
-that what one sample teaches is not counted again by the next, with what the rest of the episode will bring anyway. It
-is the mean of what is known when a half, three quarters and all of it have been followed. Judged only at its end,
-waiting for a move can look best at every decision, for ever. A way that reaches the end of the episode is worth what is
-known then.
+that what one sample teaches is not counted again by the next, with what the rest of the episode will bring anyway. What
+a move teaches counts the less the later it is (`agents.planner.fading`), so that waiting for a move does not look best
+at every decision, for ever. Near the end of the episode all moves count alike.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner import mapped
+from agents.planner.fading import share_of
 from agents.planner.imagination import mind
 from agents.planner.motion import View
 from estimator.arrays import copy, fill
@@ -43,9 +43,6 @@ FIRST = (1.0, 0.0, -1.0)
 
 #: How simple ways go on; that of first move f is in lane ``len(SIMPLE) f`` and the next ones.
 SIMPLE = ("pump", "brake", "rest")
-
-#: Parts of a way after which it counts what is known; the first is what is known when half of it has been followed.
-_MARKS = (0.5, 0.75, 1.0)
 
 #: Moves of the longest pace in which an output can still be kept within the limit: nearly a period.
 _IN_REACH = 8
@@ -82,6 +79,7 @@ class Task(NamedTuple):
         left: samples left in the episode.
         to_come: samples that bring information at the usual rate from now on.
         M: (K, K) factor of that rate.
+        weights: (moves,) how much what a move teaches counts.
         terms: `agents.planner.imagination.Terms`, whose amplitude is how hard pushes are.
     """
 
@@ -93,6 +91,7 @@ class Task(NamedTuple):
     left: float
     to_come: float
     M: Any
+    weights: Any
     terms: Any
 
 
@@ -234,15 +233,13 @@ def ways(view: View) -> Ways:
             if sample < min(task.left, _IN_REACH * task.terms.pace):
                 for j in range(LANES):
                     peaks[j] = max(peaks[j], abs(W[shown + j]) + W[MARGIN + j])
-        for mark in range(len(_MARKS)):
-            if t + 1 == int(_MARKS[mark] * task.moves + 0.5):
-                appraise(W, task.M, np.sqrt(max(0.0, task.to_come - (t + 1) * task.pace)))
-                ends = task.left <= task.moves * task.pace
-                weight = 1.0 / len(_MARKS) if not ends else 1.0 if mark == len(_MARKS) - 1 else 0.0
-                for j in range(LANES):
-                    worths[1, j] += weight * W[SCORE + j]
-                    if mark == 0:
-                        worths[0, j] = W[SCORE + j]
+        share, is_half = share_of(task.weights, t, task.moves), 2 * (t + 1) == task.moves + task.moves % 2
+        if share > 0.0 or is_half:
+            appraise(W, task.M, np.sqrt(max(0.0, task.to_come - (t + 1) * task.pace)))
+            for j in range(LANES):
+                worths[1, j] += share * W[SCORE + j]
+                if is_half:
+                    worths[0, j] = W[SCORE + j]
 
     @inner
     def follow(W, still, task, worths, peaks, plans, free):
