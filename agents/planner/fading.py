@@ -1,4 +1,4 @@
-"""How much less counts what a plan teaches, the later it teaches it.
+"""What a plan teaches counts the less, the later it teaches it.
 
 A plan is made anew at each move, and its later moves will be others. So what move h of a plan teaches counts
 
@@ -6,15 +6,16 @@ A plan is made anew at each move, and its later moves will be others. So what mo
 
 and a plan is worth the mean of what is known after each of its moves, after move h with the weight w_h - w_{h+1}, and
 with the rest of the weight at its end. Were all moves to count alike, the best plan might be to wait for a move, and so
-at every decision anew. Of plans that reach the end of the episode all do count alike: ``faded`` is infinite.
+at every decision anew. Of plans that reach the end of the episode all do count alike: ``faded`` is infinite. The power
+is 1 for the planner's plans, and 2 for the shorter ways of foresight (`agents.policies.imagined`), of which the first
+moves count alike.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from agents.planner.motion import Swing
 from estimator.lanes import jit
 
 #: What a plan teaches counts e times less so many moves later, or so much of the moves that a swing takes to come near
@@ -26,8 +27,8 @@ _FADED, _BUILT, _MOST_FADED = 6.0, 1 / 3.5, 36.0
 _AVERAGED = 4.0
 
 
-def faded_of(swing: Any) -> float:
-    """Moves in which what a plan teaches fades by e, with a sensor without noise, of `agents.planner.motion.Swing`."""
+def faded_of(swing: Swing) -> float:
+    """Moves in which what a plan teaches fades by e, with a sensor without noise."""
     return float(np.clip(_BUILT * swing.built / swing.pace, _FADED, _MOST_FADED))
 
 
