@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner.design import factorise
-from agents.planner.fading import delayed_by, fade
+from agents.planner.fading import fade, faded_with
 from agents.planner.imagination import Terms, mind, terms_of
 from agents.planner.motion import View, places
 from agents.policies.ways import FIRST, LONGEST, SIMPLE, Task, ways
@@ -131,7 +131,6 @@ def imaginer(view: View) -> Any:
     found = mind(*view)
     size, SCORE, begin, appraise, precision = found.size, found.score, found.fill, found.appraise, found.precision
     advance, SPREAD, NOISE = found.advance, found.spread, found.noise
-    PROCESS = NOISE - 2
     best_of, follow, find = ways(view)
     at, width = places(model), len(motion(*view).layout)
     k, d = model.n_coefficients, model.n_states + model.n_coefficients
@@ -199,8 +198,7 @@ def imaginer(view: View) -> Any:
             pace = min(terms.pace, max(1, int(left / moves + 0.5)))
             moves = max(_SHORTEST, min(moves, -(-int(left + 0.5) // pace)))
             has_bursts, to_come = ahead.energy < np.inf, share * ahead.samples
-            process, sensor = record[PROCESS + 1] / record[PROCESS], record[NOISE + 1] / record[NOISE]
-            faded = _FADED * (terms.faded + delayed_by(process, sensor) / pace)
+            faded = _FADED * faded_with(record, NOISE, terms.faded, pace)
             fade(weights, moves, np.inf if left <= max(moves, _LAST) * pace else faded, _POWER)
             task = Task(record, lasts, moves, has_bursts, pace, left, to_come, M, weights, pushed(terms, push))
             follow(W, still, task, worths, peaks, plans, free)
