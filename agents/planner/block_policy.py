@@ -33,10 +33,12 @@ class BlockState(NamedTuple):
     Attributes:
         plans: (n, block) the blocks.
         played: (n,) samples of these that were played.
+        left: (n,) samples that were left of the episodes; where more are left now, another one has begun.
     """
 
     plans: FloatArray
     played: npt.NDArray[np.int64]
+    left: npt.NDArray[np.int64]
 
 
 class BlockPlanner:
@@ -80,17 +82,18 @@ class BlockPlanner:
         """The next inputs of the blocks, which are planned where one is at its end; as `Planner.predict`."""
         rows, begun = self._planner.asked(observation, state, BlockState, episode_start)
         records, n, at = self._env.records, len(rows), places(self._planner.view.model)
-        if state is None:
-            state = BlockState(np.zeros((n, self.block)), np.full(n, self.block))
-        plans, played = state.plans.copy(), state.played.copy()
-        played[begun] = self.block
         left = np.rint(rows[:, at.time_left] * self._env.horizon).astype(np.int64)
-        for i in np.flatnonzero(played >= self.block):
+        if state is None:
+            state = BlockState(np.zeros((n, self.block)), np.zeros(n, dtype=np.int64), left)
+        plans, played = state.plans.copy(), state.played.copy()
+        # An episode that is over is shown once more where the next step only begins the next one: no block goes there.
+        due = begun | (left >= state.left) | (played >= self.block)
+        plans[due], played[due] = 0.0, 0
+        for i in np.flatnonzero(due & (left > 0)):
             last = self._planner.terms.amplitude * rows[i, at.last_input]
-            plans[i] = self._plan(records[i], int(max(1, left[i])), float(last), int(i))
-            played[i] = 0
+            plans[i] = self._plan(records[i], int(left[i]), float(last), int(i))
         actions = (plans[np.arange(n), played] / self._planner.terms.amplitude).astype(np.float32)
-        return actions.reshape(*np.shape(observation)[:-1], 1), BlockState(plans, played + 1)
+        return actions.reshape(*np.shape(observation)[:-1], 1), BlockState(plans, played + 1, left)
 
     def bound(self, left: int) -> float:
         """The part of the risk that the block takes which begins so many samples before the end."""

@@ -62,3 +62,21 @@ def test_blocks_share_the_risk_of_an_episode(block, parts):
     shares = [policy.bound(left) / 0.004 for left in range(256, 0, -block)]
     assert shares == pytest.approx(parts)
     assert sum(shares) == pytest.approx(1.0)
+
+
+def test_blocks_begin_with_the_episode_in_a_batch():
+    """Where a step only begins the next episode, no block goes into it."""
+    envs = gym.make_vec("duffing_env/Short-v0", 2, vectorization_mode="vector_entry_point", horizon=24)
+    policy = make_policy("efe-block-16", envs)
+    observations, _ = envs.reset(seed=0)
+    state, played = None, []
+    for _ in range(2 * 25):
+        actions, state = policy.predict(observations, state)
+        observations, _, terminated, _, _ = envs.step(actions)
+        assert not terminated.any()
+        played.append(actions[:, 0])
+    first, over, second = np.split(np.array(played), [24, 25])
+    np.testing.assert_array_equal(over, 0.0)
+    for episode in (first, second[:24]):
+        assert (np.abs(episode).max(axis=0) > 0.5).all()
+        assert (np.count_nonzero(episode[:16], axis=0) > 12).all()
