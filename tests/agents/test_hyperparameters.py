@@ -29,11 +29,13 @@ def test_every_file_is_sound_for_every_track(algo, env_id):
 
 
 def test_ppo_is_as_its_class_says_where_its_file_is_silent():
-    assert read_settings("ppo", "duffing_env/Rig-v0") == PPOSettings()
+    assert read_settings("ppo", "duffing_env/WienerHammerstein-v0") == PPOSettings()
     assert (read_settings("ppo", "family").levels, read_settings("ppo", "family").hidden) == (5, (128, 128))
     amplitude = read_settings("ppo", "duffing_env/Amplitude-v0")
     assert read_settings("ppo", "duffing_env/Amplitude-v1") == amplitude
     assert (amplitude.foresight, amplitude.levels, amplitude.gamma) == (True, 3, 1.0)
+    rig = read_settings("ppo", "duffing_env/Rig-v0")
+    assert (rig.foresight, rig.levels, rig.gamma) == (True, 3, 1.0)
     assert TrainConfig(env="duffing_env/Amplitude-v0").hyperparameters == amplitude
 
 
