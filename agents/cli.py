@@ -104,6 +104,16 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[str | Pat
             taken[path.resolve()] = f"so is {name}"
 
 
+def check_new(name: str, path: Path | None, force: bool) -> None:
+    """Refuse to replace a file that is there, but by force: it may be a measurement.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    if path is not None and not force and path.exists():
+        raise ValueError(f"{name} must be a new file, but there is {path}; name another, or add --force")
+
+
 def full_id(env: Any) -> Any:
     """The id of a track by its name, without the module that registers it; anything else as it is.
 

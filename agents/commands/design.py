@@ -35,16 +35,20 @@ class Design:
     """CSV file for the signal, in the rig's units."""
     figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """Picture (PNG) of the signal, and of what the sensor is expected to show."""
+    force: bool = False
+    """Replace the files where there are some."""
 
     def run(self) -> None:
         """Design, print what is to be expected, and write the signal."""
-        from agents.cli import check_outputs
+        from agents.cli import check_new, check_outputs
         from agents.results import spinner
         from agents.running.experiment import design
         from estimator.extras import need
         from estimator.saving import load_estimator
 
         check_outputs({"output": self.output, "figure": self.figure}, [self.rig, *filter(None, [self.posterior])])
+        check_new("output", self.output, self.force)
+        check_new("figure", self.figure, self.force)
         if self.figure is not None:
             need("matplotlib")
             if self.figure.suffix.lower() != ".png":

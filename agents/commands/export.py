@@ -31,15 +31,19 @@ class Export:
     """The largest root mean square in volts."""
     seed: int = 0
     """Seed of the draw."""
+    force: bool = False
+    """Replace the file where there is one."""
 
     def run(self) -> None:
         """Write it, and say what it is."""
         import numpy as np
 
+        from agents.cli import check_new
         from agents.policies.export import export_signal
         from estimator.parameters import SAMPLING_STEP
 
-        limits = {name: value for name, value in vars(self).items() if name not in ("name", "output")}
+        check_new("output", self.output, self.force)
+        limits = {name: value for name, value in vars(self).items() if name not in ("name", "output", "force")}
         volts = export_signal(self.name, self.output, **limits)
         peak, rms = np.abs(volts).max(), np.sqrt(np.mean(volts**2))
         seconds = volts.size * SAMPLING_STEP

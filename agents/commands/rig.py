@@ -36,13 +36,13 @@ class Init:
 
     def run(self) -> None:
         """Write it."""
+        from agents.cli import check_new
         from agents.commands.rig_file import ask, from_record, text_of
         from estimator.checks import printable
         from estimator.files import write_atomically
         from estimator.rig import SHIPPED
 
-        if self.path.exists() and not self.force:
-            raise ValueError(f"path must be a new file, but there is {self.path}; name another, or add --force")
+        check_new("path", self.path, self.force)
         for name in ("step", "input", "output"):
             if getattr(self, name) is not None and (self.source is None or self.source in SHIPPED):
                 raise ValueError(f"{name} goes with a record; add --from data.csv, or leave it out")

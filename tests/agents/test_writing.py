@@ -53,8 +53,8 @@ SHORT = "duffing_env/Short-v0"
 #: Every command that writes, and the files that it writes over what is there; none where it asks for a new folder.
 WRITERS = {
     "rig init rig.toml --from beam --force": ["rig.toml"],
-    "export prbs --output signal.csv": ["signal.csv"],
-    "design bench.toml --policy prbs --samples 64 -o next.csv": ["next.csv"],
+    "export prbs --output signal.csv --force": ["signal.csv"],
+    "design bench.toml --policy prbs --samples 64 -o next.csv --force": ["next.csv"],
     "identify bench.toml record.csv --save known.npz": ["known.npz"],
     "identify bench.toml record.csv --report page.html": ["page.html"],
     "report --output board.html": ["board.html"],
