@@ -33,7 +33,7 @@ class Config:
     """Ship the median of the training seeds."""
 
     name: str
-    """What it ships as: ALGORITHM/TRACK, such as ppo/amplitude."""
+    """What it ships as: ALGORITHM/TRACK, such as ppo/amplitude; what ships under that name is replaced."""
     runs: tuple[Path, ...]
     """Run folders of one recipe, which differ by their seeds only."""
     systems: int = 256
@@ -50,10 +50,13 @@ def ship(config: Config) -> Path:
     """Evaluate, choose and write; the folder that the policy ships in.
 
     Raises:
-        ValueError: for runs that are not policy folders, are of several recipes, or have a seed in common.
+        ValueError: for runs that are not policy folders, are of several recipes, or have a seed in common; for a name
+            of another algorithm, or one under which a policy of another track ships.
     """
     cards = [card_of(run) for run in config.runs]
     env, options, seeds = _recipe(config.runs, cards)
+    folder = policies.TRAINED / config.name
+    _check_name(config.name, cards[0].get("algorithm"), env, folder / CARD)
     evaluations = evaluate([str(run) for run in config.runs], env, config.systems, options=options)
     together = pooled(config.name, evaluations)
     scores = summarise(together)
@@ -71,11 +74,18 @@ def ship(config: Config) -> Path:
             **{name: entry for name, entry in scores.items() if name != "decision_time"},
         },
     }
-    folder = policies.TRAINED / config.name
     put(folder, config.runs[chosen], card)
     print_table([together], f"{env}, {config.systems} systems")
     print(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
     return folder
+
+
+def _check_name(name: str, algorithm: str | None, env: str, card: Path) -> None:
+    """Refuse a name that is of other runs."""
+    if name.partition("/")[0] != algorithm:
+        raise ValueError(f"name must begin with the runs' algorithm, {algorithm}, but is {name!r}")
+    if card.is_file() and (of := json.loads(card.read_text())["track"]) != env:
+        raise ValueError(f"name must be one for {env}, but {name!r} is of {of}; ship the runs under another")
 
 
 def median_index(values: list[float]) -> int:

@@ -21,8 +21,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from agents.cli import followed, run_script
+from agents.cli import RIG_TRACK, followed, run_script
 from agents.evaluation.batch import TESTED, make
+from agents.evaluation.entries import check_policies
 from agents.policies import TRAINED, make_policy
 from agents.policies.learned import CARD
 from agents.results import show, table, write_json
@@ -64,7 +65,7 @@ def unseen(count: int, seed: int = 0) -> list[Member]:
 
 def play(member: Member, policy: str, seed: int) -> tuple[float, float, float]:
     """An episode: the information gained, 1 where a limit ended it, and the share of 90 % intervals with the truth."""
-    envs = make("duffing_env/Rig-v0", 1, member.options | TESTED)
+    envs = make(RIG_TRACK, 1, member.options | TESTED)
     chosen = make_policy(policy, envs, seed=seed)
     observations, _ = envs.reset(seed=seed)
     state, start = None, np.ones(1, dtype=np.bool_)
@@ -107,6 +108,7 @@ def main(config: Config) -> None:
     """Play, and print the table."""
     members = unseen(config.systems, config.seed)
     names = (PLANNER, *config.policies)
+    check_policies(names, RIG_TRACK, members[0].options, config.seed)
     gains, ended, covered = np.empty((3, len(names), len(members)))
     tasks = [(f"{name}, {member.kind}", (p, i)) for p, name in enumerate(names) for i, member in enumerate(members)]
     for p, i in followed(tasks):

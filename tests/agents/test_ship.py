@@ -90,6 +90,15 @@ def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
     assert not shelf.exists()
 
 
+def test_runs_ship_under_their_own_name(runs, shelf):
+    with pytest.raises(ValueError, match="name must begin with the runs' algorithm, ppo, but is 'sac/short'"):
+        ship(Config("sac/short", runs))
+    (shelf / "ppo" / "amplitude").mkdir(parents=True)
+    (shelf / "ppo" / "amplitude" / CARD).write_text('{"track": "duffing_env/Amplitude-v0"}')
+    with pytest.raises(ValueError, match=f"name must be one for {SHORT}, but 'ppo/amplitude' is of duffing_env/Amp"):
+        ship(Config("ppo/amplitude", runs))
+
+
 def test_the_median_of_an_even_number_is_the_lower_one():
     assert median_index([3.0, 1.0, 2.0]) == 2
     assert median_index([4.0, 1.0, 3.0, 2.0]) == 3
