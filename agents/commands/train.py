@@ -1,6 +1,7 @@
 """``duffing-env train``: a policy that chooses the input."""
 
 import shlex
+import sys
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -29,6 +30,9 @@ $ duffing-env train --resume runs/ppo-amplitude-v0-0   go on after a stop
 
 #: How several trainings go on: each of them alone would be finished without the others.
 _THE_SAME = "the same command goes on with what is left"
+
+#: Updates that teach too little to make up for what exploring unlearns.
+_FEW = 4
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,12 @@ class Config(TrainConfig):
 
     def run(self) -> None:
         """Train, compare, and say where everything is."""
+        each = self.hyperparameters.samples_per_update
         if self.resume is None and self.samples > self.steps:
-            each = self.hyperparameters.samples_per_update
             print(f"An update takes {each:,} samples, so {self.samples:,} will be learned from, not {self.steps:,}.")
+        if self.resume is None and (updates := self.samples // each) < _FEW:
+            said = f"a training of {updates} update{'s' * (updates > 1)} may leave a policy worse than it began"
+            print(f"duffing-env: warning: {said}; take more steps than {self.steps:,}", file=sys.stderr)
         if self.tune:
             with telling(lambda said: _THE_SAME):
                 best = tune(self, self.tune, on_ray=self.ray)
