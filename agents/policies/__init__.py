@@ -100,11 +100,11 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             policy, or `env` is not one of duffing_env.
     """
     whole("seed", seed, MOST_SEED, 0)
-    if env is not None and not hasattr(env, "unwrapped"):
-        raise ValueError(f"env must be an environment, but is {shown(env)}; pass what gym.make or gym.make_vec returns")
     name = str(name) if isinstance(name, Path) else name
     if not isinstance(name, str):
         return own_policy(name, env, seed, options)
+    if env is not None and not hasattr(env, "unwrapped"):
+        raise ValueError(f"env must be an environment, but is {shown(env)}; pass what gym.make or gym.make_vec returns")
     if name in POLICIES:
         make = POLICIES[name]
         known = [o for o in inspect.signature(make).parameters if o not in ("regime", "env", "seed")]
