@@ -46,13 +46,13 @@ def delayed_by(process, sensor):
 
 
 @jit
-def faded_with(record, noise, faded, pace):
-    """Moves of so many samples in which what a plan teaches fades by e, with the noises of a belief.
+def delay_with(record, noise, pace):
+    """Moves of so many samples that the noises of a belief delay what a plan teaches by.
 
     ``noise`` is where its record has the shape of the sensor's precision (`agents.planner.imagination.Mind`).
     """
     process, sensor = record[noise - 1] / record[noise - 2], record[noise + 1] / record[noise]
-    return faded + delayed_by(process, sensor) / pace
+    return delayed_by(process, sensor) / pace
 
 
 @jit

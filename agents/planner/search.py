@@ -24,7 +24,7 @@ import numpy as np
 
 from agents.planner.candidates import bound, change, follow_up, pace_for
 from agents.planner.design import factorise
-from agents.planner.fading import fade, faded_with, share_of
+from agents.planner.fading import delay_with, fade, share_of
 from agents.planner.imagination import mind, terms_of
 from agents.planner.mapped import Task, mapped
 from agents.planner.steps import nudge, rivals_for, step
@@ -227,7 +227,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
             ways, fewer, steps = _LATE_WAYS, _LATE_WAYS, min(steps, _LATE_HORIZON)
         M = np.zeros((k, k))
         factorise(rate, M)
-        faded = faded_with(record, NOISE, terms.faded, pace)
+        faded = terms.faded + delay_with(record, NOISE, pace)
         fade(rivals.weights, steps, np.inf if left <= steps * pace else faded, 1.0)
         sizes = terms.cells, _FINEST // terms.cells, _FINE // terms.cells, ways, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planner.design import factorise
-from agents.planner.fading import fade, faded_with
+from agents.planner.fading import delay_with, fade
 from agents.planner.imagination import Terms, mind, terms_of
 from agents.planner.motion import View, places
-from agents.policies.ways import FIRST, LONGEST, SIMPLE, Task, ways
+from agents.policies.ways import FIRST, FURTHER, LONGEST, SIMPLE, Task, ways
 from estimator.arrays import copy
 from estimator.engine.motion import motion
 from estimator.lanes import LANES, jit, kernel, part
@@ -48,10 +48,10 @@ _LEAST, _BUILT, _PART = 8, 2 / 3, 1 / 3
 #: No fewer samples are looked ahead than so many times the outputs that tell of a state together.
 _TOGETHER = 3.0
 
-#: What a way teaches fades in this part of the moves in which a plan of the planner's does, and by the power of a
-#: Gaussian: as ways are shorter, their first moves count alike. Of so many moves at the end of an episode none fades.
-#: Chosen on the branch `validation`.
-_FADED, _POWER, _LAST = 0.8, 2.0, 32
+#: What a way teaches fades in this part of the moves in which a plan of the planner's does, and so many times as much
+#: later with a noisy sensor; and by the power of a Gaussian: as ways are shorter, their first moves count alike. Of so
+#: many moves at the end of an episode none fades. Chosen on the branch `validation`.
+_FADED, _DELAYED, _POWER, _LAST = 0.4, 1.4, 2.0, 32
 
 #: Moves of a way where the episode ends sooner.
 _SHORTEST = 4
@@ -198,9 +198,10 @@ def imaginer(view: View) -> Any:
             pace = min(terms.pace, max(1, int(left / moves + 0.5)))
             moves = max(_SHORTEST, min(moves, -(-int(left + 0.5) // pace)))
             has_bursts, to_come = ahead.energy < np.inf, share * ahead.samples
-            faded = _FADED * faded_with(record, NOISE, terms.faded, pace)
+            faded = _FADED * terms.faded + _DELAYED * delay_with(record, NOISE, pace)
             fade(weights, moves, np.inf if left <= max(moves, _LAST) * pace else faded, _POWER)
-            task = Task(record, lasts, moves, has_bursts, pace, left, to_come, M, weights, pushed(terms, push))
+            further = max(1, min(FURTHER, -(-moves // ahead.moves)))
+            task = Task(record, lasts, moves, further, has_bursts, pace, left, to_come, M, weights, pushed(terms, push))
             follow(W, still, task, worths, peaks, plans, free)
             sign = 1.0 if free[0, 1] >= 0.0 else -1.0
             signs[i] = sign

@@ -54,8 +54,9 @@ LONGEST, _STRETCH = 36, 12
 #: push. One that begins with none has one round.
 ROUNDS, _BESIDE_BURSTS = 8, 2
 
-#: Cells of the map along each axis, moves for which half pushes are tried, and ways that are followed for each stretch.
-_CELLS, _FINE, _FOLLOWED = 35, 7, LANES
+#: Cells of the map along each axis, moves for which half pushes are tried, and ways that are followed for each stretch;
+#: so many times as many at most where a noisy sensor makes it look that much further.
+_CELLS, _FINE, _FOLLOWED, FURTHER = 35, 7, LANES, 3
 
 #: The part of the changes that turn pushes over, and how many pushes at most.
 _TURN, _MOST_TURNED = 0.5, 3
@@ -74,6 +75,7 @@ class Task(NamedTuple):
         record: the belief.
         lasts: (2,) the inputs that were applied last, newest first.
         moves: of a way.
+        further: how many times more these are than with a sensor without noise, whole and at most `FURTHER`.
         has_bursts: whether these say how hard to push (`agents.policies.bursts`).
         pace: samples of a move.
         left: samples left in the episode.
@@ -86,6 +88,7 @@ class Task(NamedTuple):
     record: Any
     lasts: Any
     moves: int
+    further: int
     has_bursts: bool
     pace: int
     left: float
@@ -204,7 +207,7 @@ def ways(view: View) -> Ways:
 
     @inner
     def best(moves):
-        kept, words = map_memory(moves, stretches_in(moves) * _FOLLOWED), np.empty(4, np.uint64)
+        kept, words = map_memory(moves, stretches_in(moves) * FURTHER * _FOLLOWED), np.empty(4, np.uint64)
         return Best(kept, words, np.empty((LANES, moves)), np.empty(moves), np.empty(3))
 
     @inner
@@ -276,7 +279,7 @@ def ways(view: View) -> Ways:
             words[a] = WORDS[a]
         copy(plan, 0, simple[0], t.moves)
         if not t.has_bursts:
-            to_come, ways = int(t.to_come + 0.5), stretches * _FOLLOWED
+            to_come, ways = int(t.to_come + 0.5), stretches * t.further * _FOLLOWED
             sizes = _CELLS, 0, _FINE, ways, ways, direction, sign
             through = mapped.Task(t.record, to_come, t.moves, t.pace, t.terms, t.lasts, t.M, *sizes)
             find_way(best.memory, through, plan[: t.moves], words)

@@ -75,7 +75,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
     moves = min(int(max(wanted, ahead.moves)), ahead.most)
     pace = min(terms.pace, max(1, int(left / moves + 0.5)))
     moves = max(4, min(moves, int(np.ceil(round(left) / pace))))
-    faded = 0.8 * (terms.faded + 4 * (r / q) ** 0.25 / pace) if left > max(moves, 32) * pace else np.inf
+    faded = 0.4 * terms.faded + 1.4 * 4 * (r / q) ** 0.25 / pace if left > max(moves, 32) * pace else np.inf
     weights = -np.diff(np.append(np.exp(-((np.arange(moves) / faded) ** 2)), 0.0))
     names = ("pump", "brake", "rest")
 
@@ -110,6 +110,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
         return follow(push)
 
     stretches = -(-moves // 12)
+    followed_most = 32 * stretches * max(1, min(3, -(-moves // ahead.moves)))
 
     def mapped(first, sign):
         """The inputs of the best way through the map of the state."""
@@ -136,8 +137,8 @@ def reference(belief, seen, ahead, terms, least=0.0):
                     score = worth(D, max(0, int(to_come + 0.5) - (t + 1) * pace)) - price
                     if score > entered.get(cell(to), (-np.inf,))[0]:
                         entered[cell(to)] = score, (to, D, told, spread, price, [*inputs, size * A])
-            enough = enough_for(np.array([score for score, _ in entered.values()]), 32 * stretches)
-            kept = [found for found in entered.values() if found[0] >= enough][: 32 * stretches]
+            enough = enough_for(np.array([score for score, _ in entered.values()]), followed_most)
+            kept = [found for found in entered.values() if found[0] >= enough][:followed_most]
             followed = [way for _, way in kept]
         return followed[int(np.argmax([score for score, _ in kept]))][-1]
 
