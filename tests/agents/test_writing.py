@@ -63,7 +63,7 @@ WRITERS = {
     "evaluate --protocol Short-v0 --policies uniform --submit noise --board board.jsonl": ["board.jsonl"],
     "run bench.toml --plant agents.running.simulated:plant --policy prbs --samples 16 --out new": [],
     "ship --name ppo/mine --runs run --systems 4": ["ppo/mine/policy.json", "ppo/mine/policy.safetensors"],
-    "train --env duffing_env/Short-v0 --steps 16 --systems 0 --output new --ppo.num-envs 2 --ppo.n-steps 8 "
+    "train --env duffing_env/Short-v0 --steps 64 --systems 0 --output new --ppo.num-envs 2 --ppo.n-steps 8 "
     "--ppo.batch-size 16": [],
 }
 
