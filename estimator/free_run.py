@@ -26,31 +26,37 @@ def free_run(
     state: npt.ArrayLike | None = None,
     interpolation: str = "zero_order",
 ) -> FloatArray:
-    """What the first sensor shows over a series of inputs.
+    """What the first sensor shows over a series of inputs; of one system, or of S at once.
 
     Args:
         model: the equation.
-        coefficients: (K,), time counted in samples.
-        u: (T,) inputs; the t-th acts over the sample that ends with the t-th output. Before the first there was none.
-        state: (n,) where it starts; at rest where it is None.
+        coefficients: (K,) or (S, K), time counted in samples.
+        u: (T,) or (S, T) inputs; the t-th acts over the sample that ends with the t-th output. Before the first there
+            was none.
+        state: (n,) or (S, n) where it starts; at rest where it is None.
         interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
 
     Returns:
-        (T,) outputs; inf or NaN from where the model blows up.
+        (T,) outputs, or (S, T) where any argument is of S systems; inf or NaN from where the model blows up.
 
     Raises:
         ValueError: for shapes that do not fit, or what is no numbers.
     """
     c, inputs = numbers("coefficients", coefficients), numbers("u", u)
     start = np.zeros(model.n_states) if state is None else numbers("state", state)
-    if c.shape != (model.n_coefficients,) or inputs.ndim != 1 or start.shape != (model.n_states,):
+    systems = {len(given) for given in (c, inputs, start) if given.ndim == 2}
+    is_odd = len(systems) > 1 or any(given.ndim not in (1, 2) for given in (c, inputs, start))
+    if is_odd or c.shape[-1] != model.n_coefficients or start.shape[-1] != model.n_states:
         raise ValueError(
-            f"coefficients, u and state must have shapes {(model.n_coefficients,)}, (T,) and {(model.n_states,)}, but "
-            f"have {c.shape}, {inputs.shape} and {start.shape}"
+            f"coefficients, u and state must have shapes {(model.n_coefficients,)}, (T,) and {(model.n_states,)}, or "
+            f"one more axis, of systems, but have {c.shape}, {inputs.shape} and {start.shape}"
         )
-    outputs = np.empty(len(inputs))
+    begun = np.empty((*systems, model.n_states + model.n_coefficients))
+    begun[..., : model.n_states], begun[..., model.n_states :] = start, c
+    inputs = np.broadcast_to(inputs, (*systems, inputs.shape[-1])).copy()
+    outputs = np.empty_like(inputs)
     run, _ = _compiled(model, input_degree(model, interpolation))
-    run(np.concatenate([start, c]), inputs, outputs)
+    run(np.atleast_2d(begun), np.atleast_2d(inputs), np.atleast_2d(outputs))
     return outputs
 
 
@@ -69,7 +75,7 @@ def shown_at(model: Model, coefficients: FloatArray, state: FloatArray, u: float
 
 @cache
 def _compiled(model: Model, degree: int) -> tuple[Any, Any]:
-    """``run(start, u, y)`` and ``look(start, u)`` of a model; ``start`` holds states and coefficients."""
+    """``run(starts, u, y)`` of S systems and ``look(start, u)`` of one; a start holds states and coefficients."""
     place = rows(*model.names, *input_rows(model, degree), "SHOWN")
 
     def make() -> str:
@@ -88,18 +94,19 @@ def _compiled(model: Model, degree: int) -> tuple[Any, Any]:
     feed = feeder(model, degree, [place[row] for row in input_rows(model, degree)], 1)
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}")
-    def run(start, u, y):
+    def run(starts, u, y):
         W = np.zeros(size)
-        copy(W, 0, start, n)
-        for t in range(len(u)):
-            feed(W, 0, u[t], u[t - 1] if t > 0 else 0.0, u[t - 2] if t > 1 else 0.0)
-            if continuous:
-                for s in range(steps):
-                    move(W, s / steps)
-            else:
-                move(W)
-            sense(W)
-            y[t] = W[shown]
+        for i in range(len(starts)):
+            copy(W, 0, starts[i], n)
+            for t in range(u.shape[1]):
+                feed(W, 0, u[i, t], u[i, t - 1] if t > 0 else 0.0, u[i, t - 2] if t > 1 else 0.0)
+                if continuous:
+                    for s in range(steps):
+                        move(W, s / steps)
+                else:
+                    move(W)
+                sense(W)
+                y[i, t] = W[shown]
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}")
     def look(start, u):

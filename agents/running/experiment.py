@@ -167,7 +167,7 @@ def design(
         )  # fmt: skip
     gain = worth + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1])
     after = _expected_deviations(belief, systems, covs)
-    outputs = np.array([futures.shown(u, draw) for draw in range(_SHOWN)])
+    outputs = futures.shown(u, slice(_SHOWN))
     outputs = np.clip(np.nan_to_num(outputs, nan=2 * limit), -2 * limit, 2 * limit)  # a system may run away
     shown = belief.scales.output * np.quantile(outputs, _QUANTILES, axis=0)
     return Designed(rig, policy, u * belief.scales.input, shown, belief, after, gain, share, probability, in_period)

@@ -87,6 +87,24 @@ def test_a_free_run_is_of_numbers(name):
         free_run(Model(**TANK), **{**given, name: [1j]})
 
 
+def test_free_runs_of_many_systems_are_those_of_each():
+    model = Model(**TANK)
+    c, u = np.array([[0.4], [0.1], [0.7]]), np.linspace(0.0, 1.0, 12).reshape(3, 4)
+    state = np.array([[1.0], [2.0], [0.5]])
+    each = [free_run(model, *system) for system in zip(c, u, state, strict=True)]
+    np.testing.assert_array_equal(free_run(model, c, u, state), each)
+    np.testing.assert_array_equal(free_run(model, c[0], u[0], state), [free_run(model, c[0], u[0], x) for x in state])
+    assert free_run(model, c, u[0]).shape == (3, 4)
+
+
+@pytest.mark.parametrize(
+    ("c", "u", "state"), [((2, 1), (3, 4), (1,)), ((1,), (), (1,)), ((2,), (4,), (1,)), ((1,), (4,), (2, 3))]
+)
+def test_a_free_run_names_the_shapes_that_do_not_fit(c, u, state):
+    with pytest.raises(ValueError, match="or one more axis, of systems, but have"):
+        free_run(Model(**TANK), np.ones(c), np.ones(u), np.ones(state))
+
+
 def test_the_information_of_powers_is_that_of_differences():
     model = Model(**{**TANK, "rates": ("u - loss*x**1.5",)})
     u = np.repeat([0.5, 0.1], 20)
