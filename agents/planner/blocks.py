@@ -16,17 +16,18 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from agents.planner.ascent import Limits, project
 from agents.planner.design import Known, designer
 from agents.planner.futures import Futures
+from agents.planner.mean_design import Systems, mean_designer
 from agents.planner.motion import View
 from agents.planner.policy import Planner
 from agents.planner.search import search
-from estimator.arrays import copy, fill
+from estimator.arrays import copy
 from estimator.belief import Belief
 from estimator.engine.motion import coarsened
 from estimator.lanes import kernel
@@ -57,24 +58,6 @@ _PENALTY = 3e4
 
 #: The second candidate in parts of the first, and the standard deviation of candidates of noise in parts of the limit.
 _WEAKER, _WEAK = 0.6, 0.3
-
-
-class Systems(NamedTuple):
-    """Drawn systems, as compiled code takes them.
-
-    Attributes:
-        coefficients: (S, K).
-        starts: (S, size) what their paths start with (`agents.planner.design`).
-        noises: (S, 1 + sensors) variances.
-        shakes: (S, T) what process noise adds to the input.
-        precision: (K, K) what is known of the coefficients before.
-    """
-
-    coefficients: FloatArray
-    starts: FloatArray
-    noises: FloatArray
-    shakes: FloatArray
-    precision: FloatArray
 
 
 def systems_of(view: View, belief: Belief, futures: Futures, samples: int, last: float = 0.0) -> Systems:
@@ -111,41 +94,30 @@ def _joined(systems: Systems, futures: Futures, more: list[int]) -> Systems:
 @cache
 def _climber(model: Model, degree: int) -> Any:
     """``ascend(systems, limits, iterations, u)``: climb from u (T,); the best met overwrites it. Gives its J."""
-    found = designer(model, degree)
-    climb, memory_for, as_noises = found.climb, found.memory, found.code.noises
+    memory_for, climb = mean_designer(model, degree)
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}")
     def ascend(systems, limits, iterations, u):
-        T, S = len(u), len(systems.coefficients)
-        memory, best, total, shaken = memory_for(T), np.empty(T), np.empty(T), np.empty(T)
+        T, memory = len(u), memory_for(len(u))
+        gradient, best, moving = memory.gradient, np.empty(T), np.zeros(T)
         copy(best, 0, u, T)
-        moving = np.zeros(T)
         most = -np.inf
         radius = min(np.sqrt(limits.energy), limits.amplitude * np.sqrt(T))
         for i in range(iterations + 1):
-            fill(total, 0.0)
-            value = 0.0
-            for k in range(S):
-                for t in range(T):
-                    shaken[t] = u[t] + systems.shakes[k, t]
-                known = Known(systems.coefficients[k], systems.precision, as_noises(systems.noises[k]))
-                told, _ = climb(known, limits.aim, _PENALTY, systems.starts[k], shaken, memory)
-                value += told / S
-                for t in range(T):
-                    total[t] += memory.gradient[t]
+            value = climb(systems, limits.aim, _PENALTY, u, memory)
             if value > most:
                 most = value
                 copy(best, 0, u, T)
             power = 0.0
             for t in range(T):
-                if abs(u[t]) >= limits.amplitude and u[t] * total[t] > 0.0:
-                    total[t] = 0.0  # the limit holds it where it is
-                power += total[t] * total[t]
+                if abs(u[t]) >= limits.amplitude and u[t] * gradient[t] > 0.0:
+                    gradient[t] = 0.0  # the limit holds it where it is
+                power += gradient[t] * gradient[t]
             if i == iterations or not power > 0.0:
                 break
             stride = _RATE * (1.0 - (1.0 - _LAST) * i / iterations) * radius / np.sqrt(power)
             for t in range(T):
-                moving[t] = _KEPT * moving[t] + stride * total[t]
+                moving[t] = _KEPT * moving[t] + stride * gradient[t]
                 u[t] += moving[t]
             project(u, limits.amplitude, limits.energy)
         copy(u, 0, best, T)

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from agents.planner.blocks import MOST_PLANNED, Systems, best_block, drafts, expected, systems_of
+from agents.planner.blocks import MOST_PLANNED, best_block, drafts, expected, systems_of
 from agents.planner.futures import Futures, drawn_at_rest, draws_for, rests
+from agents.planner.mean_design import Systems
 from agents.planner.motion import View, frequency
 from agents.planner.policy import Planner
 from agents.policies import make_policy

@@ -106,16 +106,27 @@ def _reverse(
     uniform: Sequence[str] = (),
     added: Sequence[str] = (),
 ) -> str:
-    """Source of the reverse of assignments: adjoints of what stands before them, from those of the results.
+    """Source of the reverse of assignments (`reversed_lines`), which returns adjoints by tuple, those of ``groups``."""
+    from estimator.engine import emit
+
+    back, found = reversed_lines(lines, results, [row for group in groups for row in group], added)
+    outcome = [[found[f"G_{row}"] for row in group] for group in groups]
+    return emit.scalar_function(name, back, outcome, held, uniform, "The reverse derivative.")
+
+
+def reversed_lines(
+    lines: Any, results: Mapping[str, str], wanted: Sequence[str], added: Sequence[str] = ()
+) -> tuple[Any, dict[str, str]]:
+    """Assignments, then their reverse: adjoints of what stands before them, from those of the results.
 
     Args:
-        name: of the function.
         lines: forward.
-        results: row to the name that holds its value.
-        groups: rows whose adjoints are returned, by tuple.
-        held: arguments, see `emit.scalar_function`; adjoints are named ``G_<row>``.
-        uniform: further arguments.
-        added: of the rows, those whose adjoints have come from elsewhere already.
+        results: row to the name that holds its value. The adjoint of a row is ``G_<row>``.
+        wanted: rows whose adjoints are asked for.
+        added: of these, those whose adjoints have come from elsewhere already.
+
+    Returns:
+        All lines, and the names that hold the adjoints that are asked for.
     """
     from estimator.engine import derive, emit
 
@@ -130,7 +141,6 @@ def _reverse(
             copied = derive.sp.Float(float(value)) if emit.is_number(value) else derive.symbol(value)
             forward.append((f"{row}_copy", copied))
             seeds[f"{row}_copy"] = f"G_{row}"
-    wanted = [row for group in groups for row in group]
     back = derive.reverse(forward, wanted, seeds)
     before = {f"G_{row}": f"BG_{row}" for row in wanted}
     split = len(back) - len(wanted)  # the adjoints that are wanted come last, and have names of their own from here on
@@ -138,9 +148,7 @@ def _reverse(
         (before[target], e + (derive.symbol(target) if target.removeprefix("G_") in added else 0))
         for target, e in back[split:]
     ]
-    outcome = [[before[f"G_{row}"] for row in group] for group in groups]
-    lines = [*forward, *back[:split], *ends]
-    return emit.scalar_function(name, lines, outcome, held, uniform, "The reverse derivative.")
+    return [*forward, *back[:split], *ends], before
 
 
 def _frame(model: Model, degree: int, carried: list[str], path_rows: list[str], information: list[str]) -> str:
