@@ -27,8 +27,9 @@ class Paths:
 
     Attributes:
         follow: ``follow(W, tape, t)``: sample t of every lane.
-        back: ``back(W, A, tape, t)``: in ``A`` the path's rows and what the first sensor shows have their adjoints
-            after sample t, and receive those before it; the rows of the input receive theirs.
+        back: ``back(W, A, tape, t)``: the reverse of sample t, whose input is in ``W``. In ``A`` the path's rows have
+            the adjoints after it, and receive those before it; the information's rows and what the first sensor shows
+            have theirs; the rows of the input receive theirs.
         layout: rows of a block, as `estimator.engine.tasks.Path` has them.
         n_tape: numbers of one sample on the tape.
     """
@@ -40,15 +41,15 @@ class Paths:
 
 
 @cache
-def paths(model: Model, degree: int = 0, lanes: int = LANES) -> Paths:
-    """The paths of a model in so many lanes, along the response without noise."""
+def paths(model: Model, degree: int = 0) -> Paths:
+    """The paths of a model, along the response without noise; ``degree`` as in `estimator.engine.gradient.pieces`."""
     place = path_layout(model, degree, observed=False)
-    key = repr((model.digest, degree, lanes))
-    code = stored.load(model.name, "gradient-lanes", key, lambda: _source(model, degree, place, lanes), NAMES)
+    key = repr((model.digest, degree))
+    code = stored.load(model.name, "gradient-lanes", key, lambda: _source(model, degree, place), NAMES)
     return Paths(code.follow, code.back, place, code.n_tape)
 
 
-def _source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> str:
+def _source(model: Model, degree: int, place: Mapping[str, int]) -> str:
     from estimator.engine import derive, emit, sensitivity
     from estimator.engine.path import path_sample
 
@@ -57,21 +58,21 @@ def _source(model: Model, degree: int, place: Mapping[str, int], lanes: int) -> 
     more, results = path_sample(model, moved, degree, observed=False)
     lines = [*lines, *more]
     shown = f"SHOWN_{next(iter(model.outputs))}"
-    source = emit.lane_loop("finish", lines, results, place, lanes, doc="Predict and see.")
+    source = emit.lane_loop("finish", lines, results, place, LANES, doc="Predict and see.")
     told = [row for row in results if row.startswith("F_")]
     followed = {row: results[row] for row in (*path_rows, *told, shown) if row in results}
     wanted = [*path_rows, *carried, *inputs]
     back, adjoints = reversed_lines(lines, followed, wanted)
-    source += emit.lane_loop("finish_back", back, adjoints, place, lanes, doc="The reverse derivative.")
+    source += emit.lane_loop("finish_back", back, adjoints, place, LANES, doc="The reverse derivative.")
     n, m, steps = len(path_rows), len(carried), model.substeps
     if carried:
-        source += sensitivity.motion_source(model, degree, place, lanes)
+        source += sensitivity.motion_source(model, degree, place, LANES)
         step, ends = sensitivity.motion_step(model, degree), {name: f"{name}_E" for name in carried}
         back, adjoints = reversed_lines(step, ends, [*carried, *inputs], inputs)
-        source += emit.lane_loop("move_back", back, adjoints, place, lanes, ("T",), "The reverse of a step.")
+        source += emit.lane_loop("move_back", back, adjoints, place, LANES, ("T",), "The reverse of a step.")
         started = {f"G_{i}": f"G_M_{i}" for i in model.states}
-        source += emit.lane_loop("begin_back", [], started, place, lanes, doc="The reverse of begin.")
-    return source + _frame(n * lanes, m * lanes, place[carried[0]] * lanes if carried else 0, steps)
+        source += emit.lane_loop("begin_back", [], started, place, LANES, doc="The reverse of begin.")
+    return source + _frame(n * LANES, m * LANES, place[carried[0]] * LANES if carried else 0, steps)
 
 
 def _frame(path: int, carried: int, at: int, steps: int) -> str:
