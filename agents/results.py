@@ -16,14 +16,25 @@ import numpy as np
 from estimator.checks import printable
 from estimator.files import check_place, write_atomically
 
+#: Of a table for the manual [characters].
+_WIDEST = 10_000
+
 
 def show(*parts: Any, width: int = 100) -> None:
-    """Print texts and tables, as wide as the terminal but at least so many characters."""
+    """Print texts and tables, as wide as the terminal but at least so many characters.
+
+    A table for the manual is as wide as its cells.
+    """
+    from rich.box import MARKDOWN
     from rich.console import Console
+    from rich.measure import Measurement
 
     console = Console(highlight=False, markup=False, emoji=False)
-    console.width = max(console.width, width)
+    width = max(console.width, width)
     for part in parts:
+        is_whole = getattr(part, "box", None) is MARKDOWN
+        options = console.options.update(max_width=_WIDEST)
+        console.width = max(width, Measurement.get(console, options, part).maximum) if is_whole else width
         console.print(printable(part, "\n") if isinstance(part, str) else part)
 
 

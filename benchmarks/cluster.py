@@ -136,7 +136,7 @@ def main() -> int:
         "lost",
         f"weights after {STEPS:,}, without Ray",
     )
-    show(table(titles, lines, markdown=True), f"A checkpoint every {INTERVAL:,} samples.", width=130)
+    show(table(titles, lines, markdown=True), f"A checkpoint every {INTERVAL:,} samples.")
     return wrong
 
 

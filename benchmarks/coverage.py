@@ -281,10 +281,10 @@ def main(config: Config) -> None:
             continue
         found = [evaluate(case, config.systems, config.seed) for case in track(cases, description=title)]
         rows = [cells(case, one) for case, one in zip(cases, found, strict=True)]
-        show(f"\n{title}", table(list(rows[0]), [list(row.values()) for row in rows], markdown=True), width=200)
+        show(f"\n{title}", table(list(rows[0]), [list(row.values()) for row in rows], markdown=True))
         if cases[0].hypotheses > 1:
             noises = [noise_cells(case, one) for case, one in zip(cases, found, strict=True)]
-            show(table(_NOISES, noises, markdown=True), width=200)
+            show(table(_NOISES, noises, markdown=True))
         results[title] = [
             dataclasses.asdict(case) | dataclasses.asdict(one)
             | {"wilson": {name: wilson(hits, one.kept) for name, hits in one.hits.items()}}

@@ -78,7 +78,7 @@ def main(config: Config) -> None:
             found[name] = filtered(name, config.steps) if name in FILTERS else soak(name, config.steps)
     rows = [[name, *(f"{value:,}" for value in counts.values())] for name, counts in found.items()]
     heads = ("run", "samples", "episodes", "not finite", "out of bounds", "not a covariance", "growth / kB")
-    show(table(heads, rows, markdown=True), width=120)
+    show(table(heads, rows, markdown=True))
     if config.json is not None:
         config.json.write_text(json.dumps(found, indent=2))
     bad = [name for name, c in found.items() if c["not finite"] + c["out of bounds"] + c["not a covariance"]]

@@ -76,7 +76,7 @@ def main(config: Config) -> None:
         rows.append([name, then, f"{found[SAMPLE - 1].std():.2f}", last, str(early)])
     rows += [[f"published: {name}", f"{mean:.2f}", f"{std:.2f}", "", ""] for name, (mean, std) in PUBLISHED.items()]
     titles = "policy", f"gain of {SAMPLE} samples / nat", "std over systems", "gain of 50 / nat", "ended early"
-    show(table(titles, rows, markdown=True), width=120)
+    show(table(titles, rows, markdown=True))
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ def main(config: Config) -> None:
     rows.append(["90 % intervals that cover", "", *(f"{c.mean():.3f}" for c in covered)])
     rows.append(["information / nat", "", *(f"{g.mean():.2f}" for g in gains)])
     heading = "D-efficiency beside efe: median / 10 % quantile"
-    show(heading, table(("oscillators", "number", *names), rows, markdown=True), width=150)
+    show(heading, table(("oscillators", "number", *names), rows, markdown=True))
     if config.output is not None:
         config.output.mkdir(parents=True, exist_ok=True)
         told = {"gains": gains.tolist(), "ended": ended.tolist(), "covered": covered.tolist()}

@@ -74,7 +74,7 @@ def main(config: Config) -> None:
             [name, str(told["kills"]), lost, str(told["half-written"]), f"{told['resumed']} of {told['kills']}", equal]
         )
     heads = ("command", "kills", "lost at most", "half-written files", "goes on", "equal")
-    show(table(heads, rows, markdown=True), width=150)
+    show(table(heads, rows, markdown=True))
     for told in found.values():
         for fault in told["faults"]:
             print(fault, file=sys.stderr)

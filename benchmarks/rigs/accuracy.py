@@ -7,7 +7,7 @@ import numpy as np
 
 from agents import results
 from benchmarks.rigs.catalogue import BENCHES, PARAMETERS
-from benchmarks.rigs.judge import POOLED, WIDTH, Cell, Outcome, calibrated, identified, in_processes
+from benchmarks.rigs.judge import POOLED, Cell, Outcome, calibrated, identified, in_processes
 from benchmarks.rigs.records import guess, record
 
 #: With a guess and without; and without one, from so many pieces of the record, of which all but the first begin in
@@ -66,7 +66,6 @@ def show(cells: Sequence[Cell]) -> dict[str, Any]:
         f"{'PASS' if verdict['accurate'] else 'MISS'}: median errors at most 0.3 %, or 1.2 times the median bound\n"
         f"{'PASS' if is_calibrated else 'MISS'}: calibrated; pooled coverage {pooled:.3f} "
         f"({POOLED[0]} to {POOLED[1]}), {verdict['cells outside']} of {len(meets)} cells outside of 0.85 to 0.95",
-        width=WIDTH,
     )
     return verdict
 

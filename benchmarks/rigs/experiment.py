@@ -8,7 +8,7 @@ import numpy as np
 
 from agents import results
 from benchmarks.rigs.catalogue import PARAMETERS
-from benchmarks.rigs.judge import LEVEL, WIDTH, binomial_interval, in_processes, judged
+from benchmarks.rigs.judge import LEVEL, binomial_interval, in_processes, judged
 from benchmarks.rigs.loop import ASKED, SAMPLES, BenchPlant, described, held
 from benchmarks.rigs.records import record
 
@@ -88,7 +88,7 @@ def show(found: dict[tuple[str, str], list[Trial]]) -> dict[str, Any]:
         ))  # fmt: skip
     titles = ("rig", "policy", "times narrower, expected", "stated / expected", "RMS error / expected",
               "coverage of 90 %", "left its range")  # fmt: skip
-    results.show(results.table(titles, rows, markdown=True), width=WIDTH)
+    results.show(results.table(titles, rows, markdown=True))
     every = [one for trials in found.values() for one in trials]
     ratios = np.array([one.after for one in every]) / np.array([one.expected for one in every])
     left = sum(one.left for one in every)

@@ -10,7 +10,7 @@ import numpy as np
 from agents import results
 from benchmarks.rigs.accuracy import remarks
 from benchmarks.rigs.catalogue import A, E
-from benchmarks.rigs.judge import WIDTH, Outcome, identified, in_processes
+from benchmarks.rigs.judge import Outcome, identified, in_processes
 from benchmarks.rigs.records import Record, generator, guess, record
 
 BENCHES = {"a": A, "e": E}
@@ -96,5 +96,5 @@ def show(found: dict[tuple[str, str], list[Outcome]]) -> dict[str, Any]:
         rows.append((fault, name, right, f"{share:.2f}", verdict, remarks(outcomes)))
         written[f"{fault}, {name}"] = {"share": share, "verdict": verdict, "outcomes": [vars(o) for o in outcomes]}
     titles = ("fault", "rig", "right name", "share", "verdict", "all warnings and failures")
-    results.show(results.table(titles, rows, markdown=True), width=WIDTH)
+    results.show(results.table(titles, rows, markdown=True))
     return written

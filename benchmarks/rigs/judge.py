@@ -18,9 +18,6 @@ from benchmarks.rigs.simulator import FloatArray
 LEVEL, POOLED, CELL = 0.9, (0.87, 0.93), (0.85, 0.95)
 LEAST_BAR, OVER_BOUND = 0.003, 1.2
 
-#: Of the tables: rows are not broken.
-WIDTH = 300
-
 
 @dataclass(frozen=True)
 class Outcome:

@@ -11,7 +11,7 @@ import numpy as np
 from agents import results
 from benchmarks.rigs.accuracy import percents
 from benchmarks.rigs.catalogue import BENCHES, PARAMETERS, Bench
-from benchmarks.rigs.judge import LEVEL, WIDTH, binomial_interval, calibrated, in_processes, judged
+from benchmarks.rigs.judge import LEVEL, binomial_interval, calibrated, in_processes, judged
 from benchmarks.rigs.records import generator, guess
 from benchmarks.rigs.simulator import KINDS, FloatArray, simulate
 from estimator.belief import Belief
@@ -184,7 +184,7 @@ def show(runs: dict[tuple[str, str, str], list[Run]]) -> dict[str, Any]:
         ))  # fmt: skip
     titles = ("rig", "played by", "policy", "gained, nats", "median error of m, c, a, b, %", "coverage of 90 %",
               "times narrower", "left its range", "refused")  # fmt: skip
-    results.show(results.table(titles, rows, markdown=True), width=WIDTH)
+    results.show(results.table(titles, rows, markdown=True))
     verdicts = {way: verdict(runs, way) for way in dict.fromkeys(way for *_, way in runs)}
     results.show(verdicts, width=175)
     return verdicts

@@ -10,7 +10,7 @@ import numpy as np
 from agents import results
 from benchmarks.rigs.accuracy import percents, remarks
 from benchmarks.rigs.catalogue import PARAMETERS, A, Bench
-from benchmarks.rigs.judge import WIDTH, Cell, Outcome, calibrated, identified, in_processes
+from benchmarks.rigs.judge import Cell, Outcome, calibrated, identified, in_processes
 from benchmarks.rigs.records import guess, record
 
 PER_PERIOD = (6, 12, 25, 50, 100, 200, 400, 800)
@@ -101,5 +101,5 @@ def show(cells: Sequence[Cell]) -> dict[str, Any]:
         f"within reach, denied: {sum(all_wrong)} of {len(all_wrong)}": sum(all_wrong) <= MOST_FALSE * len(all_wrong),
     }
     verdicts = (f"{'PASS' if good else 'MISS'}: {text}" for text, good in lines.items())
-    results.show(results.table(titles, rows, markdown=True), *verdicts, width=WIDTH)
+    results.show(results.table(titles, rows, markdown=True), *verdicts)
     return {text: bool(good) for text, good in lines.items()}
