@@ -51,7 +51,7 @@ _TOGETHER = 3.0
 #: What a way teaches fades in this part of the moves in which a plan of the planner's does, and so many times as much
 #: later with a noisy sensor; and by the power of a Gaussian: as ways are shorter, their first moves count alike. Of so
 #: many moves at the end of an episode none fades. Chosen on the branch `validation`.
-_FADED, _DELAYED, _POWER, _LAST = 0.4, 1.4, 2.0, 32
+_FADED, _DELAYED, _POWER, _LAST = 0.6, 1.1, 2.0, 32
 
 #: Moves of a way where the episode ends sooner.
 _SHORTEST = 4

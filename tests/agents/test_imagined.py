@@ -75,7 +75,7 @@ def reference(belief, seen, ahead, terms, least=0.0):
     moves = min(int(max(wanted, ahead.moves)), ahead.most)
     pace = min(terms.pace, max(1, int(left / moves + 0.5)))
     moves = max(4, min(moves, int(np.ceil(round(left) / pace))))
-    faded = 0.4 * terms.faded + 1.4 * 4 * (r / q) ** 0.25 / pace if left > max(moves, 32) * pace else np.inf
+    faded = 0.6 * terms.faded + 1.1 * 4 * (r / q) ** 0.25 / pace if left > max(moves, 32) * pace else np.inf
     weights = -np.diff(np.append(np.exp(-((np.arange(moves) / faded) ** 2)), 0.0))
     names = ("pump", "brake", "rest")
 
