@@ -23,6 +23,10 @@ _MOST = 4096
 #: No block is asked to be safer: systems that tell it must be drawn.
 _FINEST = 5e-4
 
+#: Standard deviations of what is drawn, in parts of what is believed: a block that leaves the range with 5e-4 of these
+#: leaves it with some 2e-5 of the belief's own (of a Gaussian), which would take too many draws to count.
+_SPREAD = 1.25
+
 #: Of these, those that must be safe, too: what a block has begun the next one can stop only then.
 _MOMENTUM = 3
 
@@ -48,8 +52,9 @@ class BlockPlanner:
         env: as of `agents.planner.policy.Planner`.
         seed: of the search, and of the systems that are drawn.
         block: samples of a block.
-        risk: upper bound of the probability that an episode leaves its range. Each block takes half of what is left of
-            it, for the first ones know least, and the last one all.
+        risk: probability that an episode leaves its range, of systems that deviate a quarter more than is believed.
+            Each block takes half of what is left of it, for the first ones know least, and the last one all; none takes
+            less than 5e-4.
 
     Raises:
         ValueError: as `Planner`; for a design or a run, which plan blocks of ``efe``; for a block below 1 or above
@@ -109,7 +114,7 @@ class BlockPlanner:
         (belief,) = self._env.experiment.believed.with_records(record[None])
         bound = self.bound(left)
         records, weights = self._env.mixture(i)
-        drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound, MOST_PLANNED))
+        drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound, MOST_PLANNED), _SPREAD)
         futures = Futures(view.model, drawn, self._limit, rng, degree=view.degree)
         systems = systems_of(view, belief, futures, seen, last)
         u, *_ = best_block(

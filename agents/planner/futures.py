@@ -40,18 +40,22 @@ def draws_for(bound: float, planned: int) -> int:
 
 
 def drawn_from_records(
-    model: Model, records: FloatArray, weights: FloatArray, rng: np.random.Generator, draws: int = DRAWS
-) -> Drawn:
-    """Systems from a mixture of beliefs, records (n, size) as `estimator.Belief` keeps them, with weights (n,)."""
+    model: Model, records: FloatArray, weights: FloatArray, rng: np.random.Generator, draws: int = DRAWS,
+    spread: float = 1.0,
+) -> Drawn:  # fmt: skip
+    """Systems from a mixture of beliefs, records (n, size) as `estimator.Belief` keeps them, with weights (n,).
+
+    Deviations from a belief's means, and of the noises, are ``spread`` times what is believed.
+    """
     weights = np.where(np.isfinite(records).all(axis=1), weights, 0.0)
     counts = rng.multinomial(draws, weights / weights.sum())
     d, places = len(model.names), covariance_places(model)
     drawn, noises = [], []
     for record, count in zip(records, counts.tolist(), strict=True):
         if count:
-            drawn.append(rng.multivariate_normal(record[:d], record[places], count, method="eigh"))
+            drawn.append(rng.multivariate_normal(record[:d], spread**2 * record[places], count, method="eigh"))
             shapes, rates = record[-2 * (1 + model.n_outputs) :].reshape(-1, 2).T
-            noises.append(1.0 / np.sqrt(rng.gamma(shapes, 1.0 / rates, (count, len(shapes)))))
+            noises.append(spread / np.sqrt(rng.gamma(shapes, 1.0 / rates, (count, len(shapes)))))
     return np.concatenate(drawn), np.concatenate(noises)
 
 

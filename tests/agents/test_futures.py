@@ -23,6 +23,16 @@ def test_every_sensor_has_its_own_noise():
     np.testing.assert_allclose(noises, np.tile(stds, (200, 1)), rtol=0.01)
 
 
+def test_a_spread_widens_deviations_and_noises():
+    record = Belief.of(PENDULUM, np.arange(1.0, 6.0), 0.01 * np.eye(5), (2.0, 3.0), [(4.0, 5.0)] * 2).record
+    one, wide = (
+        drawn_from_records(PENDULUM, record[None], np.ones(1), np.random.default_rng(0), 50, spread)
+        for spread in (1.0, 1.25)
+    )
+    np.testing.assert_allclose(wide[0] - np.arange(1.0, 6.0), 1.25 * (one[0] - np.arange(1.0, 6.0)), atol=1e-12)
+    np.testing.assert_allclose(wide[1], 1.25 * one[1])
+
+
 @pytest.mark.parametrize(
     ("model", "name", "unit"),
     [(duffing(), "gain", np.sqrt(3)), (duffing(offsets=True), "gain", np.sqrt(3)), (difference(), "eta", 1.0),
