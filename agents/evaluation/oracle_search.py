@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agents.cli import JsonOptions, run_script
+from agents.cli import JsonOptions, followed, run_script
 from agents.evaluation.oracle import LEVELS, Oracle, Systems, as_stored
 from agents.planner import search as planning
 from agents.planner.ascent import Limits, climber
@@ -143,7 +143,7 @@ def check(oracle: Oracle, tries: int, seed: int) -> str:
     """What searches from fresh starts, twice as long, gain over what is stored, in words."""
     none = np.empty((0, oracle.systems.samples))
     values, apart = np.empty((2, len(oracle.values)))
-    for row in range(len(values)):
+    for row in followed((f"system {row}", row) for row in range(len(values))):
         rng = np.random.default_rng([seed, row, 1])  # not [seed, row, 0], which is the same as [seed, row]
         _, values[row], apart[row] = search(oracle.systems, row, none, rng, 2 * tries)
     gained = np.maximum(values - oracle.values, 0.0)
@@ -190,7 +190,7 @@ def main(config: Config) -> None:
         return
     count = max(config.systems, Oracle.stored(systems))
     oracle = begun(Systems.of(config.env, count, config.options))
-    for row in range(config.first, config.systems):
+    for row in followed((f"system {row}", row) for row in range(config.first, config.systems)):
         starts = oracle.inputs[row : row + 1] if np.isfinite(oracle.values[row]) else oracle.inputs[:0]
         rng = np.random.default_rng([config.seed, row])
         found, value, _ = search(oracle.systems, row, starts, rng, config.tries)
