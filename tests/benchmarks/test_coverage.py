@@ -23,6 +23,7 @@ TAIL = 1e-4  # chance that a calibrated posterior misses one bound of one check
 PHYSICAL = {"m", "c", "a", "b"}
 CALIBRATED = ("structured", "offset", "three-tap", "cubic", "ode", "ensemble", "track, ode")  # tables
 SAME = (5e-4, 5e-4)  # both noises
+STAYS = 0.94  # share of the records of 2,048 samples of `cubic` that stay in range: 15,037 of 16,000
 
 
 def assert_calibrated(result):
@@ -229,7 +230,7 @@ def test_wilson_interval_of_a_textbook_example():
 )
 def test_full_coverage(case):
     result = evaluate(case, 500, 1)
-    assert result.kept >= (460 if case.population == "cubic" else 490)
+    assert result.kept >= (binom.ppf(TAIL, 500, STAYS) if case.population == "cubic" else 490)
     for name, hits in result.hits.items():
         assert 0.85 <= hits / result.kept <= 0.95, name
     assert_calibrated(result)
