@@ -170,7 +170,13 @@ def test_the_command_stores_what_is_better_and_nothing_else(empty_folder, capsys
     assert len(Oracle.of(Systems.of(SHORT, 4)).values) == 3
     capsys.readouterr()
     main(Config(env=SHORT, systems=2, tries=2, check=True))
-    assert "the best three fresh starts differ by" in capsys.readouterr().out
+    both = capsys.readouterr().out.splitlines()
+    assert "the best three fresh starts differ by" in both[3]
+    main(Config(env=SHORT, systems=2, first=1, tries=2, check=True))
+    one = capsys.readouterr().out.splitlines()
+    assert one[0] == both[1]
+    assert one[0].startswith("system 1: gained 0.")
+    assert one[1].startswith("1 systems")
 
 
 @pytest.mark.slow  # as above
