@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 from agents.planner.blocks import MOST_PLANNED, best_block, drafts, systems_of
 from agents.planner.futures import Futures, drawn_from_records, draws_for, force_of_noise
@@ -20,15 +21,27 @@ _AFTER = 9
 #: Samples of a block, at most.
 _MOST = 4096
 
-#: No block is asked to be safer: systems that tell it must be drawn.
-_FINEST = 5e-4
-
-#: Standard deviations of what is drawn, in parts of what is believed: a block that leaves the range with 5e-4 of these
-#: leaves it with some 2e-5 of the belief's own (of a Gaussian), which would take too many draws to count.
-_SPREAD = 1.25
+#: The least probability that is counted in draws. A smaller one is that of draws with larger deviations.
+_COUNTED = 5e-4
 
 #: Of these, those that must be safe, too: what a block has begun the next one can stop only then.
 _MOMENTUM = 3
+
+
+def counted(probability: float) -> tuple[float, float]:
+    """A probability that can be counted in draws, and by how much these must deviate more than believed.
+
+    What is beyond so many standard deviations of a Gaussian is as probable in the belief as asked, if it has the
+    probability that is returned in these draws:
+
+    >>> counted(0.01)
+    (0.01, 1.0)
+    >>> bound, spread = counted(2e-5)
+    >>> bound, round(spread, 3)
+    (0.0005, 1.248)
+    """
+    bound = max(probability, _COUNTED)
+    return bound, float(ndtri(probability) / ndtri(bound))
 
 
 class BlockState(NamedTuple):
@@ -52,9 +65,8 @@ class BlockPlanner:
         env: as of `agents.planner.policy.Planner`.
         seed: of the search, and of the systems that are drawn.
         block: samples of a block.
-        risk: probability that an episode leaves its range, of systems that deviate a quarter more than is believed.
-            Each block takes half of what is left of it, for the first ones know least, and the last one all; none takes
-            less than 5e-4.
+        risk: probability, as believed, that an episode leaves its range. Blocks share half of it equally. Of the other
+            half each takes half of what is left, for the first ones know least, and the last one all.
 
     Raises:
         ValueError: as `Planner`; for a design or a run, which plan blocks of ``efe``; for a block below 1 or above
@@ -62,7 +74,7 @@ class BlockPlanner:
             its input does.
     """
 
-    def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 0.004) -> None:
+    def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 5e-4) -> None:
         self._planner = Planner(env, seed, risk=risk)
         whole("block", block, _MOST)
         if not hasattr(env, "mixture"):
@@ -103,7 +115,7 @@ class BlockPlanner:
     def bound(self, left: int) -> float:
         """The part of the risk that the block takes which begins so many samples before the end."""
         begun, blocks = (self._env.horizon - left) // self.block, -(-self._env.horizon // self.block)
-        return max(_FINEST, self._risk * 0.5 ** min(begun + 1, blocks - 1))
+        return self._risk * (0.5 / blocks + 0.5 ** (min(begun + 1, blocks - 1) + 1))
 
     def _plan(self, record: FloatArray, left: int, last: float, i: int) -> FloatArray:
         """A block (block,), zeros beyond the end of the episode."""
@@ -112,9 +124,9 @@ class BlockPlanner:
         seen = min(left, samples + _AFTER * terms.pace)
         rng = np.random.default_rng([planner.seed, i, left])
         (belief,) = self._env.experiment.believed.with_records(record[None])
-        bound = self.bound(left)
+        bound, spread = counted(self.bound(left))
         records, weights = self._env.mixture(i)
-        drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound, MOST_PLANNED), _SPREAD)
+        drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound, MOST_PLANNED), spread)
         futures = Futures(view.model, drawn, self._limit, rng, degree=view.degree)
         systems = systems_of(view, belief, futures, seen, last)
         u, *_ = best_block(

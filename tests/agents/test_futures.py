@@ -3,8 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from agents.planner.block_policy import BlockPlanner
+from agents.planner.block_policy import BlockPlanner, counted
 from agents.planner.futures import drawn_from_records, force_of_noise
 from agents.policies import make_policy
 from estimator import Belief
@@ -64,14 +65,21 @@ def test_blocks_play_a_model_of_two_sensors():
 
 
 @pytest.mark.parametrize(
-    ("block", "parts"), [(256, [1]), (64, [1 / 2, 1 / 4, 1 / 8, 1 / 8]), (100, [1 / 2, 1 / 4, 1 / 4])]
+    ("block", "parts"), [(256, [1]), (64, [3 / 8, 1 / 4, 3 / 16, 3 / 16]), (100, [5 / 12, 7 / 24, 7 / 24])]
 )
 def test_blocks_share_the_risk_of_an_episode(block, parts):
     env = gym.make("duffing_env/Amplitude-v1").unwrapped
     policy = BlockPlanner(env, block=block)
-    shares = [policy.bound(left) / 0.004 for left in range(256, 0, -block)]
+    shares = [policy.bound(left) / 5e-4 for left in range(256, 0, -block)]
     assert shares == pytest.approx(parts)
     assert sum(shares) == pytest.approx(1.0)
+
+
+def test_rare_events_are_counted_with_larger_deviations():
+    for probability in (1e-2, 5e-4, 1e-4, 1e-5):
+        bound, spread = counted(probability)
+        assert bound == max(probability, 5e-4)
+        assert norm.sf(spread * norm.isf(bound)) == pytest.approx(probability)
 
 
 def test_blocks_begin_with_the_episode_in_a_batch():
