@@ -18,14 +18,14 @@ from estimator.parameters import FloatArray
 #: Moves after a block that are planned with it, so that it ends where the next can go on.
 _AFTER = 9
 
+#: Of these, those that must be safe, too: what a block has begun the next one can stop only then.
+_MOMENTUM = 3
+
 #: Samples of a block, at most.
 _MOST = 4096
 
 #: The least probability that is counted in draws. A smaller one is that of draws with larger deviations.
 _COUNTED = 5e-4
-
-#: Of these, those that must be safe, too: what a block has begun the next one can stop only then.
-_MOMENTUM = 3
 
 
 def counted(probability: float) -> tuple[float, float]:
@@ -40,8 +40,9 @@ def counted(probability: float) -> tuple[float, float]:
     >>> bound, round(spread, 3)
     (0.0005, 1.248)
     """
-    bound = max(probability, _COUNTED)
-    return bound, float(ndtri(probability) / ndtri(bound))
+    if probability >= _COUNTED:
+        return probability, 1.0
+    return _COUNTED, float(ndtri(probability) / ndtri(_COUNTED))
 
 
 class BlockState(NamedTuple):
