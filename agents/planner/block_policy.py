@@ -75,7 +75,7 @@ class BlockPlanner:
             its input does.
     """
 
-    def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 5e-4) -> None:
+    def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 2.5e-4) -> None:
         self._planner = Planner(env, seed, risk=risk)
         whole("block", block, _MOST)
         if not hasattr(env, "mixture"):

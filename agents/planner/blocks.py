@@ -7,8 +7,9 @@ A block is planned for systems that are drawn from the belief, not for its means
 by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. Several
 hundred further draws tell whether a block is safe: whether so few of them leave the limit that the probability is below
 a bound, with a confidence of 95 % (`agents.planner.futures`). Until then, some of those that leave join the systems
-that are planned for, and no longer count; and the *aim* falls a bit. There are many summits. So several candidates
-climb, among them the planner's own plan for the belief's means; the best of what is safe is taken.
+that are planned for, and no longer count; and the *aim* falls, more from time to time. Once the block is safe, aims
+between the last two are tried. There are many summits. So several candidates climb, among them the planner's own plan
+for the belief's means; the best of what is safe is taken.
 """
 
 from __future__ import annotations
@@ -49,6 +50,9 @@ _RATE, _KEPT, _LAST = 0.05, 0.8, 0.05
 #: last number. Each time so many systems that leave the limit are added to those that are planned for.
 _AIM, _AIMS, _ADDED = 0.998, 16, 8
 _FALL, _FASTER, _FASTEST = 0.005, 1.5, 0.05
+
+#: How often the last fall is halved, once a block is safe: it was too far by half of it on average.
+_HALVINGS = 2
 
 #: Draws that a block is planned for, at most.
 MOST_PLANNED = SYSTEMS + _AIMS * _ADDED
@@ -156,21 +160,38 @@ def best_block(
 def _summit(
     view: View, systems: Systems, futures: Futures, amplitude: float, bound: float, played: int | None, u: FloatArray
 ) -> tuple[FloatArray, float, float]:
-    """As `best_block`, from one candidate (T,), which is overwritten."""
+    """As `best_block`, from one candidate (T,)."""
     ascend = _climber(coarsened(view.model), view.degree)  # how safe a block is, is judged with all steps
-    limits = Limits(futures.limit, _AIM * futures.limit, amplitude, np.inf)
-    ascend(systems, limits, min(_MOST_STEPS, _STEPS + len(u)), u)
     planned = set(range(SYSTEMS))
-    for k in range(_AIMS):
+
+    def climbed(u: FloatArray, aim: float, iterations: int) -> FloatArray:
+        u = u.copy()
+        ascend(systems, Limits(futures.limit, aim, amplitude, np.inf), iterations, u)
+        return u
+
+    def judged(u: FloatArray) -> tuple[list[int], float]:
         enough = futures.enough(bound, len(planned))
         leaving = futures.leaving(u[:played], max(_ADDED, enough), planned)
-        probability = futures.chance(len(leaving), len(planned))
+        return leaving, futures.chance(len(leaving), len(planned))
+
+    too_high = aim = _AIM * futures.limit
+    u = climbed(u, aim, min(_MOST_STEPS, _STEPS + len(u)))
+    for k in range(_AIMS):
+        leaving, probability = judged(u)
         if probability < bound:
+            for _ in range(_HALVINGS if k else 0):
+                middle = (aim + too_high) / 2
+                tried = climbed(u, middle, _MORE)
+                chance = judged(tried)[1]
+                if chance < bound:
+                    u, probability, aim = tried, chance, middle
+                else:
+                    too_high = middle
             return u, 1.0, probability
         planned.update(leaving[:_ADDED])
         systems = _joined(systems, futures, leaving[:_ADDED])
-        limits = limits._replace(aim=limits.aim * (1 - min(_FALL * _FASTER**k, _FASTEST)))
-        ascend(systems, limits, _MORE, u)
+        too_high, aim = aim, aim * (1 - min(_FALL * _FASTER**k, _FASTEST))
+        u = climbed(u, aim, _MORE)
     share, probability = futures.share(u[:played], bound)
     return share * u, share, probability
 

@@ -70,7 +70,7 @@ def test_blocks_play_a_model_of_two_sensors():
 def test_blocks_share_the_risk_of_an_episode(block, parts):
     env = gym.make("duffing_env/Amplitude-v1").unwrapped
     policy = BlockPlanner(env, block=block)
-    shares = [policy.bound(left) / 5e-4 for left in range(256, 0, -block)]
+    shares = [policy.bound(left) / 2.5e-4 for left in range(256, 0, -block)]
     assert shares == pytest.approx(parts)
     assert sum(shares) == pytest.approx(1.0)
 
