@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from agents.planner import block_policy, blocks
 from agents.planner.block_policy import BlockPlanner, counted
 from agents.planner.futures import drawn_from_records, force_of_noise
 from agents.policies import make_policy
@@ -80,6 +81,27 @@ def test_rare_events_are_counted_with_larger_deviations():
         bound, spread = counted(probability)
         assert bound == max(probability, 5e-4)
         assert norm.sf(spread * norm.isf(bound)) == pytest.approx(probability)
+
+
+def test_a_safe_block_is_tried_nearer_to_the_limit(monkeypatch):
+    """It tells more then, and is as safe."""
+    env = gym.make("duffing_env/Amplitude-v1").unwrapped
+    observation, _ = env.reset(seed=0)
+    told = {}
+
+    def best_block(view, systems, futures, candidates, amplitude, bound, played):
+        found = blocks.best_block(view, systems, futures, candidates, amplitude, bound, played)
+        told[blocks._HALVINGS] = blocks.expected(view, systems, futures.limit, found[0])[0]
+        assert found[1] == 1.0
+        assert found[2] < bound
+        return found
+
+    monkeypatch.setattr(block_policy, "best_block", best_block)
+    for halvings in (0, blocks._HALVINGS):
+        monkeypatch.setattr(blocks, "_HALVINGS", halvings)
+        BlockPlanner(env, block=64).predict(observation)
+    never, often = told.values()
+    assert often > never + 0.05
 
 
 def test_blocks_begin_with_the_episode_in_a_batch():
