@@ -7,7 +7,7 @@ A block is planned for systems that are drawn from the belief, not for its means
 by the gradient (`agents.planner.design`), each system k with coefficients, state and process noise of its own. Several
 hundred further draws tell whether a block is safe: whether so few of them leave the limit that the probability is below
 a bound, with a confidence of 95 % (`agents.planner.futures`). Until then, some of those that leave join the systems
-that are planned for, and no longer count; and the *aim* falls, more from time to time. Once the block is safe, aims
+that are planned for, and no longer count; and the *aim* falls, each time by more. Once the block is safe, aims
 between the last two are tried. There are many summits. So several candidates climb, among them the planner's own plan
 for the belief's means; the best of what is safe is taken.
 """
@@ -152,7 +152,7 @@ def best_block(
     futures.disturbances(candidates.shape[1])  # drawn before the threads share them
     climb = partial(_summit, view, systems, futures, amplitude, bound, played)
     with ThreadPoolExecutor() as pool:
-        found = list(pool.map(climb, candidates.copy()))
+        found = list(pool.map(climb, candidates))
     told = [expected(view, systems, futures.limit, u)[0] for u, *_ in found]
     return found[int(np.argmax(told))]
 
