@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.rigs import accuracy, experiment, faults, loop, peer_rows, peers, sweep
+from benchmarks.rigs import accuracy, drawn, experiment, faults, loop, peer_rows, peers, sweep
 from benchmarks.rigs.catalogue import BENCHES
 from estimator.files import write_atomically
 
@@ -133,6 +133,24 @@ class Experiment(Spread):
         return {"verdict": experiment.show(found), "trials": written}
 
 
+@dataclass(frozen=True)
+class Drawn(Spread):
+    """Rigs drawn at random and situations of other people's records, each without a guess."""
+
+    classes: tuple[str, ...] = ("rigs",)
+    """Classes: rigs, sines, pairs, hammer, wells-velocity, wells-acceleration."""
+    count: int = 180
+    """Seeds of each class."""
+    first: int = 0
+    """The first seed."""
+
+    def run(self) -> dict[str, Any]:
+        """Run, print, and return what goes into the file."""
+        found = drawn.run(self.classes, self.count, self.first, self.workers)
+        answers = {name: [vars(one) for one in of_class] for name, of_class in found.items()}
+        return {"rows": drawn.show(found, self.first), "answers": answers}
+
+
 Part = (
     Annotated[Accuracy, tyro.conf.subcommand("accuracy")]
     | Annotated[Faults, tyro.conf.subcommand("faults")]
@@ -140,6 +158,7 @@ Part = (
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Loop, tyro.conf.subcommand("loop")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]
+    | Annotated[Drawn, tyro.conf.subcommand("drawn")]
 )
 
 
