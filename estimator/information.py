@@ -247,6 +247,8 @@ def follow(
     noises: FloatArray,
     cov: FloatArray,
     mean: FloatArray | float = 0.0,
+    spans: FloatArray | None = None,
+    forecasts: FloatArray | None = None,
 ) -> Followed:
     """Run the filter over n series.
 
@@ -258,6 +260,8 @@ def follow(
         noises: (1 + p,) or (n, 1 + p) variances of the process noise and of each sensor's.
         cov: (n_states, n_states) of the states at the start.
         mean: (n, n_states) of the states at the start; at rest where it is 0.
+        spans: (n, T) length of each sample of a differential equation, in sampling steps; all 1 where it is None.
+        forecasts: (n, T, p, 2), to be filled with mean and variance of each output before it was seen.
     """
     k = model.n_coefficients
     lengths = lengths_of(inputs[:, :, 0])
@@ -267,7 +271,11 @@ def follow(
     outputs = np.zeros((0, 0, 0)) if y is None else y
     strengths = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs)).copy()
     degree = inputs.shape[2] - 1 if model.is_continuous else 0
-    follower(model, degree, y is not None)(points, inputs, outputs, lengths, begin, strengths, totals)
+    timed = spans is not None
+    lasting = np.zeros((0, 0)) if spans is None else spans
+    kept = np.zeros((0, 0, 0, 0)) if forecasts is None else forecasts
+    run = follower(model, degree, y is not None, timed)
+    run(points, inputs, outputs, lasting, lengths, begin, strengths, totals, kept)
     information = np.empty((len(inputs), k, k))
     upper = _upper(k)
     information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
@@ -285,18 +293,21 @@ _LANES = 8
 
 
 @cache
-def follower(model: Model, degree: int, observed: bool) -> Any:
+def follower(model: Model, degree: int, observed: bool, timed: bool = False) -> Any:
     """The compiled loop of `follow`, with totals (n, 2 + K + K (K + 1)/2) packed."""
-    task = path(model, degree, observed=observed, lanes=_LANES)
+    task = path(model, degree, observed=observed, lanes=_LANES, timed=timed)
     sample, at, size = task.sample, task.layout, len(task.layout)
     n, k, p = model.n_states, model.n_coefficients, model.n_outputs
     first_total, first_coefficient, live = at["LOSS"], at[next(iter(model.coefficients))], at["LIVE"]
     first_input, first_noise = at["U_0"], at["Q"]
     shown, n_totals = at[f"Y_{next(iter(model.outputs))}"] if observed else -1, len(path_results(model))
+    first_sensor = next(iter(model.outputs))
+    foreseen, spread = (at[f"{what}_{first_sensor}"] if observed else -1 for what in ("SHOWN", "SPREAD"))
+    span = at["SPAN"] if timed else -1
     moments = n + n * (n + 1) // 2
 
-    @kernel(kind=f"{model.name}_{model.digest}_{degree}_{int(observed)}")
-    def run(points, inputs, y, lengths, begin, noises, totals):
+    @kernel(kind=f"{model.name}_{model.digest}_{degree}_{int(observed)}_{int(timed)}")
+    def run(points, inputs, y, spans, lengths, begin, noises, totals, forecasts):
         W = np.empty(size * _LANES)
         for first in range(0, len(inputs), _LANES):
             lanes = min(_LANES, len(inputs) - first)
@@ -318,6 +329,8 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
                     runs = t < lengths[i]
                     for c in range(inputs.shape[2]):
                         W[(first_input + c) * _LANES + j] = inputs[i, t, c] if runs else 0.0
+                    if timed:
+                        W[span * _LANES + j] = spans[i, t] if runs else 1.0
                     if observed:
                         whole = True
                         for c in range(p):
@@ -328,6 +341,10 @@ def follower(model: Model, degree: int, observed: bool) -> Any:
                         W[live * _LANES + j] = 1.0 if whole else 0.0
                 sample(W)
                 for j in range(lanes):
+                    if observed and len(forecasts) and t < lengths[first + j]:
+                        for c in range(p):
+                            forecasts[first + j, t, c, 0] = W[(foreseen + c) * _LANES + j]
+                            forecasts[first + j, t, c, 1] = W[(spread + c) * _LANES + j] + noises[first + j, 1 + c]
                     if t + 1 == lengths[first + j]:
                         for c in range(n_totals):
                             totals[first + j, c] = W[(first_total + c) * _LANES + j]

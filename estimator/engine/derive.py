@@ -191,7 +191,9 @@ def moved(model: Model) -> tuple[Assignments, Moved]:
     return ([], carried_at_end(model)) if model.is_continuous else difference_step(model)
 
 
-def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assignments:
+def runge_kutta(
+    names: Sequence[str], stage: Assignments, substeps: int, span: sp.Expr = sp.S.One
+) -> Assignments:
     """One step of order 4, of a ``substeps``-th of a sample: from ``names`` to ``<name>_E``.
 
     What belongs to its four stages ends with ``_A`` to ``_D``, which no name of a model does.
@@ -200,8 +202,9 @@ def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int) -> Assi
         names: what moves.
         stage: assignments of its derivatives ``K_<name>`` in the names and the input ``u``.
         substeps: per sample.
+        span: length of the sample, in sampling steps.
     """
-    h = sp.Rational(1, substeps)
+    h = span * sp.Rational(1, substeps)
     lines: Assignments = []
     rates: list[dict[str, sp.Expr]] = []
     for k, part in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):

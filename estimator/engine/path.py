@@ -58,7 +58,8 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
         shown = put(f"Y{tag}", found.outputs[k].xreplace(here))
         h = [slope.xreplace(here) for slope in found.readouts[k]]
         c = {i: put(f"C{tag}_{i}", sum((h[m] * at(i, states[m]) for m in range(n)), ZERO)) for i in states}
-        variance = put(f"S{tag}", sum((h[m] * c[states[m]] for m in range(n)), symbol(f"R_{sensor}")))
+        spread = put(f"G{tag}", sum((h[m] * c[states[m]] for m in range(n)), ZERO))
+        variance = put(f"S{tag}", spread + symbol(f"R_{sensor}"))
         weight = put(f"L{tag}", 1 / variance)
         told = {
             name: put(f"T{tag}_{name}", sum((h[m] * sense[states[m], name] for m in range(n)), h[n + b]))
@@ -76,10 +77,10 @@ def path_sample(model: Model, moved: Moved, degree: int, observed: bool) -> tupl
             totals["MISFIT"] += misfit
             for name in coefficients:
                 totals[f"SLOPE_{name}"] -= weighed[name] * error
-        else:
-            results[f"SHOWN_{sensor}"] = text_of(shown)
-            if k == 0:
-                results["SPREAD"] = text_of(variance)
+            results[f"SPREAD_{sensor}"] = text_of(spread)
+        elif k == 0:
+            results["SPREAD"] = text_of(variance)
+        results[f"SHOWN_{sensor}"] = text_of(shown)
         gain = {i: put(f"K{tag}_{i}", weight * c[i]) for i in states}
         mean = {i: put(f"J{tag}_{i}", mean[i] + gain[i] * error) for i in states}
         sense = {(i, name): put(f"O{tag}_{i}_{name}", sense[i, name] - gain[i] * told[name]) for i, name in sense}

@@ -76,8 +76,10 @@ def path_results(model: Model) -> list[str]:
     return ["LOSS", *(f"SLOPE_{c}" for c in model.coefficients), *pairs("F", model.coefficients), "MISFIT"]
 
 
-def path_layout(model: Model, degree: int, observed: bool) -> dict[str, int]:
-    """Rows of a path's block."""
-    shown = [f"Y_{y}" for y in model.outputs] if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
+def path_layout(model: Model, degree: int, observed: bool, timed: bool = False) -> dict[str, int]:
+    """Rows of a path's block; ``SPAN`` is the length of a sample, where each has its own."""
+    seen = [f"{what}_{y}" for what in ("Y", "SHOWN", "SPREAD") for y in model.outputs]
+    shown = seen if observed else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
     given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE", "Q", *(f"R_{y}" for y in model.outputs)]
+    given += ["SPAN"] if timed else []
     return rows(*path_names(model), *path_results(model), *given, *carried_names(model))

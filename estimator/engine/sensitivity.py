@@ -45,6 +45,7 @@ def motion_source(
     place: Mapping[str, int],
     lanes: int,
     given: Mapping[str, Any] | None = None,
+    span: sp.Expr = sp.S.One,
 ) -> str:
     """Source of ``begin(W)`` and ``move(W, T)``, which carry a state over a sample.
 
@@ -54,23 +55,24 @@ def motion_source(
         place: rows of the block.
         lanes: systems in it.
         given: the input ``U_k`` in other rows.
+        span: length of the sample, in sampling steps.
     """
     if not model.is_continuous:
         return ""
     start = {name: emit.text_of(value) for name, value in derive.carried_at_start(model).items()}
     moved = {name: f"{name}_E" for name in carried_names(model)}
-    step = derive.renamed(motion_step(model, degree), given or {})
+    step = derive.renamed(motion_step(model, degree, span), given or {})
     source = emit.lane_loop("begin", [], start, place, lanes, doc="The point that moves, at the mean.")
     told = "One Runge-Kutta step, from T in [0, 1) of a sample on."
     return source + emit.lane_loop("move", step, moved, place, lanes, ("T",), told)
 
 
-def motion_step(model: Model, degree: int) -> Assignments:
+def motion_step(model: Model, degree: int, span: sp.Expr = sp.S.One) -> Assignments:
     """One step of all that is carried (`estimator.engine.rows.carried_names`), from ``<name>`` to ``<name>_E``."""
-    states, h = list(model.states), sp.Rational(1, model.substeps)
+    states, h = list(model.states), span * sp.Rational(1, model.substeps)
     stage, slopes = _stage(model)
     moving = [f"M_{i}" for i in states] + ([] if model.held else pairs("N", states))
-    lines = Lines(input_over_step(degree, model.substeps) + runge_kutta(moving, stage, model.substeps))
+    lines = Lines(input_over_step(degree, model.substeps) + runge_kutta(moving, stage, model.substeps, span))
     total: _Slopes = dict.fromkeys(slopes, sp.S.Zero)
     through: _Slopes = {}
     for tag in "DCBA":

@@ -170,7 +170,7 @@ class Path:
 
 
 @cache
-def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -> Path:
+def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES, timed: bool = False) -> Path:
     """The path of a model (`estimator.engine.path.path_sample`).
 
     Args:
@@ -178,18 +178,21 @@ def path(model: Model, degree: int = 0, *, observed: bool, lanes: int = LANES) -
         degree: of the input's polynomial over a sample.
         observed: whether the filter follows outputs.
         lanes: systems in a block.
+        timed: whether each sample of a differential equation has a length of its own, in the row ``SPAN``.
     """
-    place = path_layout(model, degree, observed)
+    place = path_layout(model, degree, observed, timed)
 
     def make() -> str:
         from estimator.engine import derive, emit, sensitivity
+        from estimator.engine.algebra import ONE
         from estimator.engine.path import path_sample
 
         lines, moved = derive.moved(model)
         more, results = path_sample(model, moved, degree, observed)
-        source = sensitivity.motion_source(model, degree, place, lanes)
+        span = derive.symbol("SPAN") if timed else ONE
+        source = sensitivity.motion_source(model, degree, place, lanes, span=span)
         source += emit.lane_loop("finish", lines + more, results, place, lanes, doc="Predict and see.")
         return source + emit.sample("sample(W)", model, "finish(W)")
 
-    key = repr((model.digest, degree, observed, lanes))
+    key = repr((model.digest, degree, observed, lanes, timed))
     return Path(stored.load(model.name, "path", key, make, NAMES).sample, place, lanes)
