@@ -56,7 +56,6 @@ def from_record(path: Path, step: float | None = None, source: str | None = None
         step = float(f"{own:.6g}")
     output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement", column=sink)
     rig = Rig(step, input=Channel(table.unit(table.u) or "1", column=source), output=output)
-    table.check_step(rig.step)
     told = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
     return text_of(rig, f", from {printable(path.name)}{told}")
 

@@ -191,9 +191,7 @@ def moved(model: Model) -> tuple[Assignments, Moved]:
     return ([], carried_at_end(model)) if model.is_continuous else difference_step(model)
 
 
-def runge_kutta(
-    names: Sequence[str], stage: Assignments, substeps: int, span: sp.Expr = sp.S.One
-) -> Assignments:
+def runge_kutta(names: Sequence[str], stage: Assignments, substeps: int, span: sp.Expr = sp.S.One) -> Assignments:
     """One step of order 4, of a ``substeps``-th of a sample: from ``names`` to ``<name>_E``.
 
     What belongs to its four stages ends with ``_A`` to ``_D``, which no name of a model does.

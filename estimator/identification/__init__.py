@@ -11,15 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from estimator.belief import Belief
-from estimator.identification.beliefs import contraction, posterior
+from estimator.identification.beliefs import contraction, foreseen, posterior
 from estimator.identification.checks import examine
 from estimator.identification.problem import LATEST, Problem, explicable
 from estimator.identification.records import Record, records_of
 from estimator.identification.result import Result
 from estimator.identification.search import search
 from estimator.models.duffing import KINDS
-from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
 from estimator.units import Scales
@@ -73,12 +71,12 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         u = tuple(one.u / scales.input for one in read)
         y = tuple(explicable(one.y, rig, LATEST) / scales.output for one in read)
         origin = _origin(rig, y)
-        found = search(Problem(rig, scales, u, tuple(one - origin for one in y), origin), tell)
+        times = None if all(one.times is None for one in read) else tuple(one.counted(rig.step) for one in read)
+        found = search(Problem(rig, scales, u, tuple(one - origin for one in y), origin, times=times), tell)
         problem = found.fitter.problem
         belief, noises = posterior(problem, found)
         tell("checking the result")
-        begun = found.motions + np.array([origin, 0.0])
-        forecasts = tuple(_forecast(belief, rig, one, motion) for one, motion in zip(read, begun, strict=True))
+        forecasts = foreseen(found, belief)
         parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
         warnings = examine(problem, found, parameters, noises["input"], read, forecasts)
     history = partial(contraction, problem, found, parameters)
@@ -100,17 +98,6 @@ def _origin(rig: Rig, outputs: Sequence[FloatArray]) -> float:
     seen = np.concatenate(outputs)
     mean = float(np.nanmean(seen))
     return mean if KINDS[rig.output.kind] == 0 and abs(mean) > np.nanstd(seen) else 0.0
-
-
-def _forecast(belief: Belief, rig: Rig, record: Record, motion: FloatArray) -> FloatArray:
-    """(T, 2) mean and variance of each output before it was seen, with coefficients and noises at their means.
-
-    The record begins in a motion (2,).
-    """
-    numbers = belief.record.copy()
-    numbers[: belief.model.n_states] = motion
-    estimator = OnlineEstimator(belief.model, replace(belief, record=numbers), rig)
-    return estimator.forecast(record.u, explicable(record.y, rig))
 
 
 @contextmanager

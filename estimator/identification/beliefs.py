@@ -13,6 +13,7 @@ from estimator.identification.fit import Fitter, Hypothesis, Prior
 from estimator.identification.motions import motions
 from estimator.identification.problem import Problem, explicable
 from estimator.identification.search import Found, settle
+from estimator.information import follow
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -66,6 +67,30 @@ def _with_start(belief: Belief, problem: Problem) -> FloatArray:
         place = n + list(belief.model.coefficients).index("output_offset")
         cov[0, 0] += cov[place, place]
     return cov
+
+
+def foreseen(found: Found, belief: Belief, given: int | None = None) -> tuple[FloatArray, ...]:
+    """Of each record (T, 2): mean and variance of each output before it was seen, in the rig's units.
+
+    Coefficients and noises are at their means, and a record begins in the motion that was found.
+
+    Args:
+        found: the result of the search.
+        belief: its posterior.
+        given: outputs that are shown to the filter; all where it is None. The others it foresees from the inputs.
+    """
+    problem, best = found.fitter.problem, found.best
+    shown = tuple(y if given is None else np.where(np.arange(len(y)) < given, y, np.nan) for y in problem.y)
+    inputs, outputs, spans, places = replace(problem, y=shown).samples_of(best.interpolation, best.delay)
+    noises = belief.noises[1::2] / belief.noises[::2]
+    forecasts = np.empty((*outputs.shape, 2))
+    points = np.tile(found.mean, (len(inputs), 1))
+    follow(problem.model, points, inputs, outputs, noises, problem.start, found.motions, spans, forecasts)
+    size = problem.scales.output
+    return tuple(
+        np.stack([(one[at, 0, 0] + problem.origin) * size, one[at, 0, 1] * size**2], axis=1)
+        for one, at in zip(forecasts, places, strict=True)
+    )
 
 
 def _spread(weights: FloatArray, values: FloatArray, shapes: FloatArray) -> float:

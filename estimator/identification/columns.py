@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 #: Names of columns, in lower case, up to the first character that is not a letter.
@@ -15,10 +15,17 @@ KINDS = {
     "acceleration": ("acceleration", "acc", "a"),
 }
 _OUTPUTS = ("y", "output", "out", "response", "x", *(word for words in KINDS.values() for word in words))
-_TIMES = ("t", "time")
+_TIMES = ("t", "time", "timestamp", "datetime", "clock", "zeit", "seconds", "sec", "msec")
 
 #: What a time column may be in [s].
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+SECONDS |= {"sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "msec": 1e-3, "usec": 1e-6, "milliseconds": 1e-3}
+
+#: Units that a name may end with, without brackets: ``force_N``, ``x/mm``.
+_PREFIX = "[kmMµμun]?"
+_UNITS = re.compile(
+    rf"{_PREFIX}(N|V|A|Pa|g|m)|lbf?|in|ft|cm|dm|{_PREFIX}m/s(\^?2|²|/s)?|mps2?|{_PREFIX}V/V|{_PREFIX}N[ ·*]?m|rad|deg|°"
+)
 
 #: What stands in place of a unit where there is none.
 _NONE = ("", "-")
@@ -31,9 +38,47 @@ def word_of(name: str) -> str:
 
 
 def unit_of(name: str) -> str | None:
-    """What stands in brackets behind the name of a column, as N in ``force [N]``; None where nothing does."""
-    found = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
+    """The unit that the name of a column holds; None where it holds none.
+
+    Example:
+        >>> [unit_of(name) for name in ("force [N]", "Time/ms", "disp_mm", "Time in ms", "t {s}", "CH1", "x_rel")]
+        ['N', 'ms', 'mm', 'ms', 's', None, None]
+    """
+    if found := re.search(r"(?:\[\s*([^\]]+?)\s*\]|\(\s*([^)]+?)\s*\)|\{\s*([^}]+?)\s*\}|<\s*([^>]+?)\s*>)\s*$", name):
+        return next(group for group in found.groups() if group)
+    patterns = [r"\s+in\s+(\S+)\s*$", r"\w\s*/\s*(\S.*?)\s*$"]
+    if word_of(name) in (*_TIMES, *_INPUTS, *_OUTPUTS):  # and not Channel A
+        patterns.append(r"[^\W_](?:_+|\s+)(\S+)\s*$")
+    found = next((one for one in (re.search(p, name) for p in patterns) if one and is_unit(one.group(1))), None)
     return found.group(1) if found else None
+
+
+def is_unit(word: str) -> bool:
+    """Whether a word, which may stand in brackets, is a unit, or stands for none."""
+    bare = re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", word.strip())
+    return bare != word.strip() or bare in _NONE or bare in SECONDS or bool(_UNITS.fullmatch(bare))
+
+
+def time_unit(path: Path, name: str) -> float:
+    """Seconds in the unit of a column of times.
+
+    Raises:
+        ValueError: where the name holds more than the time, and no unit that is known.
+    """
+    unit, bare = unit_of(name), name.strip().lower()
+    if unit is None and word_of(name) in SECONDS and bare not in _TIMES[:1]:
+        unit = word_of(name)
+    if unit is None:
+        rest = re.sub(r"^[^\W_]+", "", bare).strip(" _-/.:")
+        if not rest or rest in ("value", "stamp", "base", "axis"):
+            return 1.0
+        unit = rest
+    if unit not in SECONDS:
+        raise ValueError(
+            f"{path}: the unit of the times must be one of {', '.join(list(SECONDS)[:8])}, but {name!r:.60} says "
+            f"{unit!r:.40}; rename the column, such as 'time [ms]'"
+        )
+    return SECONDS[unit]
 
 
 def plain(unit: str) -> str:
@@ -49,14 +94,19 @@ def with_unit(path: Path, name: str, unit: str) -> str:
     Raises:
         ValueError: where the name has another.
     """
-    told, below = unit_of(name), re.sub(r"^[\[(]\s*(.*?)\s*[\])]$", r"\1", unit.strip())
+    told, below = unit_of(name), re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", unit.strip())
     if told and below not in _NONE and plain(told) != plain(below):
         raise ValueError(f"{path}: {name!r:.60} must have one unit, but {below!r:.40} stands below; mend one")
     return name if told or below in _NONE else f"{name} [{below}]"
 
 
 def chosen(
-    path: Path, names: Sequence[str], count: int, source: str | None, sink: str | None
+    path: Path,
+    names: Sequence[str],
+    count: int,
+    source: str | None,
+    sink: str | None,
+    stamped: Collection[int] = (),
 ) -> tuple[int | None, int, int]:
     """Places of time (or None), input and output.
 
@@ -66,6 +116,7 @@ def chosen(
         count: of its columns.
         source: name of the input's column; one of the usual names where it is None.
         sink: of the output's, likewise.
+        stamped: columns of dates or times of day.
 
     Raises:
         ValueError: where they are not told, or not by one column each.
@@ -83,7 +134,9 @@ def chosen(
     if wished[0] and wished[0] == wished[1]:
         raise ValueError(f"{path} must have two columns, but the rig names {source!r} for input and output; mend one")
     free = [k for k in range(len(names)) if [k] not in wished]
-    time, u, y = ([k for k in free if word_of(names[k]) in known] for known in (_TIMES, _INPUTS, _OUTPUTS))
+    time = [k for k in free if k in stamped] or [k for k in free if names[k].strip().lower() == "x_value"]
+    time = time or [k for k in free if word_of(names[k]) in _TIMES]
+    u, y = ([k for k in free if k not in time and word_of(names[k]) in known] for known in (_INPUTS, _OUTPUTS))
     u, y = wished[0] or u, wished[1] or y
     time = time or [k for k in free if unit_of(names[k]) in SECONDS]
     if len(u) != 1 or len(y) != 1 or len(time) > 1:
@@ -110,7 +163,8 @@ def _named(path: Path, names: Sequence[str], wish: str | None, table: str) -> li
 
 def _is(name: str, wish: str) -> bool:
     """Whether a column is the one that is wished, with or without the unit behind its name."""
-    bare = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", name)
+    unit = unit_of(name)
+    bare = name if unit is None else re.sub(r"(?:\s+in\s+|[\s_/\[({<])*$", "", name[: name.rindex(unit)])
     return wish.strip().lower() in (name.strip().lower(), bare.strip().lower())
 
 

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.identification.problem import Problem
+from estimator.identification.problem import Problem, Samples
 from estimator.information import follow
 from estimator.parameters import FloatArray
 
@@ -103,6 +103,40 @@ class Fits:
         return Fits(kept, self.mean[chosen], self.cov[chosen], self.level[chosen], self.free_energy[chosen])
 
 
+class _Held(NamedTuple):
+    """What does not move in a fit of H hypotheses of G kinds: how the input went, and with which delay.
+
+    Attributes:
+        kinds: (H,) of each.
+        inputs: (G, records, N, rows).
+        outputs: (G, records, N, 1).
+        spans: (G, records, N), or None.
+        ratios: (H,).
+        motions: (H, records, 2).
+    """
+
+    kinds: npt.NDArray[np.intp]
+    inputs: FloatArray
+    outputs: FloatArray
+    spans: FloatArray | None
+    ratios: FloatArray
+    motions: FloatArray
+
+    def of(self, chosen: npt.NDArray[np.intp]) -> _Held:
+        """That of some hypotheses."""
+        return self._replace(kinds=self.kinds[chosen], ratios=self.ratios[chosen], motions=self.motions[chosen])
+
+
+def _longer(series: FloatArray, samples: int, rows: int | None = None) -> FloatArray:
+    """(records, N, ...) made longer with NaN, and wider with zeros."""
+    more = samples - series.shape[1]
+    if rows is not None:
+        series = np.pad(series, ((0, 0), (0, 0), (0, rows - series.shape[2])))
+    return (
+        np.pad(series, ((0, 0), (0, more), *([(0, 0)] * (series.ndim - 2))), constant_values=np.nan) if more else series
+    )
+
+
 class Fitter:
     """Fits hypotheses about a problem.
 
@@ -114,7 +148,7 @@ class Fitter:
     def __init__(self, problem: Problem, prior: Prior) -> None:
         self.problem, self.prior = problem, prior
         self._scale = 1 / np.sqrt(np.diag(prior.precision))
-        self._inputs: dict[tuple[str, int], FloatArray] = {}
+        self._samples: dict[tuple[str, int], Samples] = {}
 
     def on(self, problem: Problem) -> Fitter:
         """The same for other records."""
@@ -151,7 +185,7 @@ class Fitter:
             step = -solved(damped, slope[at])
             promised = -0.5 * np.einsum("hk,hk->h", slope[at], step)
             trial = points[at] + self._scale * step
-            found = self._appraise(trial, tuple(values[at] for values in held), levels[at])
+            found = self._appraise(trial, held.of(at), levels[at])
             better = found[0] <= loss[at]  # False for what is not finite
             gained = np.where(better, loss[at] - found[0], promised)
             kept = at[better]
@@ -168,26 +202,31 @@ class Fitter:
         energies = np.where(np.isfinite(cov).all(axis=(1, 2)), self._energy(loss, curvature), np.inf)
         return Fits(tuple(hypotheses), points, cov, levels, energies)
 
-    def _held(self, hypotheses: Sequence[Hypothesis]) -> tuple[FloatArray, ...]:
-        """(H, records, T, rows) inputs, (H,) ratios and (H, records, 2) motions."""
+    def _held(self, hypotheses: Sequence[Hypothesis]) -> _Held:
         rest = np.zeros((len(self.problem.u), 2))
-        return (
-            np.array([self._driven(h) for h in hypotheses]),
+        kinds = list(dict.fromkeys((h.interpolation, h.delay) for h in hypotheses))
+        for kind in kinds:
+            if kind not in self._samples:
+                self._samples[kind] = self.problem.samples_of(*kind)
+        series = [self._samples[kind] for kind in kinds]
+        longest = max(one.inputs.shape[1] for one in series)
+        rows = max(one.inputs.shape[2] for one in series)
+        lengths = [_longer(one.spans, longest) for one in series if one.spans is not None]
+        return _Held(
+            np.array([kinds.index((h.interpolation, h.delay)) for h in hypotheses]),
+            np.array([_longer(one.inputs, longest, rows) for one in series]),
+            np.array([_longer(one.outputs, longest, 1) for one in series]),
+            np.array(lengths) if lengths else None,
             np.array([h.ratio for h in hypotheses]),
             np.array([rest if h.motions is None else h.motions for h in hypotheses]),
         )
 
-    def _driven(self, hypothesis: Hypothesis) -> FloatArray:
-        key = hypothesis.interpolation, hypothesis.delay
-        if key not in self._inputs:
-            self._inputs[key] = self.problem.inputs(*key)
-        return self._inputs[key]
-
     def _appraise(
-        self, points: FloatArray, held: tuple[FloatArray, ...], levels: FloatArray
+        self, points: FloatArray, held: _Held, levels: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Loss (H,), its slope (H, K) and curvature (H, K, K) in units of the prior, and the best levels (H,)."""
-        (inputs, ratios, motions), problem = held, self.problem
+        problem, ratios, motions = self.problem, held.ratios, held.motions
+        inputs = held.inputs[held.kinds]
         count, records = len(points), len(problem.u)
         n = problem.samples - records * problem.model.n_states
         noises = np.stack([(ratios * levels) ** 2, levels**2], axis=1)
@@ -195,10 +234,11 @@ class Fitter:
             problem.model,
             np.repeat(points, records, axis=0),
             inputs.reshape(-1, *inputs.shape[2:]),
-            np.tile(problem.outputs, (count, 1, 1)),
+            held.outputs[held.kinds].reshape(-1, *held.outputs.shape[2:]),
             np.repeat(noises, records, axis=0),
             problem.start,
             motions.reshape(-1, 2),
+            None if held.spans is None else held.spans[held.kinds].reshape(-1, held.spans.shape[2]),
         )
         total = lambda values: values.reshape(count, records, *values.shape[1:]).sum(axis=1)  # noqa: E731
         with np.errstate(all="ignore"):

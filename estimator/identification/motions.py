@@ -102,7 +102,8 @@ def _judge(
 
     Each of the S series is a record at one of the points (P, K).
     """
-    inputs, ratio = problem.inputs(hypothesis.interpolation, hypothesis.delay), hypothesis.ratio
+    inputs, outputs, spans, _ = problem.samples_of(hypothesis.interpolation, hypothesis.delay)
+    ratio = hypothesis.ratio
     at = np.repeat(points, len(inputs), axis=0)
 
     def losses(candidates: FloatArray, sensor: float) -> FloatArray:
@@ -112,10 +113,11 @@ def _judge(
             problem.model,
             np.tile(at, (count, 1)),
             np.tile(inputs, (times, 1, 1)),
-            np.tile(problem.outputs, (times, 1, 1)),
+            np.tile(outputs, (times, 1, 1)),
             np.array([(ratio * sensor) ** 2, sensor**2]),
             cov,
             candidates.reshape(-1, 2),
+            None if spans is None else np.tile(spans, (times, 1)),
         ).loss
         return np.where(np.isfinite(loss), loss, np.inf).reshape(count, series)
 

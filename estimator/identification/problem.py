@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from estimator.identification.timing import laid
 from estimator.inputs import feed
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
@@ -26,6 +28,22 @@ EXTRA = ("cubic_damping", "quintic")
 _BRIDGED = 16
 
 
+class Samples(NamedTuple):
+    """Records as a filter takes them; a shorter one ends with NaN.
+
+    Attributes:
+        inputs: (records, N, rows) what acts over each sample.
+        outputs: (records, N, 1) at its end.
+        spans: (records, N) its length in sampling steps; None where all are one step.
+        places: of each record, (T,) the sample that ends with each of its outputs.
+    """
+
+    inputs: FloatArray
+    outputs: FloatArray
+    spans: FloatArray | None
+    places: tuple[npt.NDArray[np.intp], ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Records to identify a rig from.
@@ -38,6 +56,9 @@ class Problem:
         origin: where outputs are counted from, in parts of their scale: about their middle, where that is far from 0.
         substeps: steps of integration a sample.
         terms: of the equation, beside those of Eq. (1) and the offsets; some of `EXTRA`.
+        times: of the samples of each record, in sampling steps from its first on; None where these are one step apart.
+        part: of a step, by which the input acts later than the whole steps of the delay.
+        lag: time constant of a first-order lag of the input, in sampling steps.
     """
 
     rig: Rig
@@ -47,6 +68,9 @@ class Problem:
     origin: float = 0.0
     substeps: int = 2
     terms: tuple[str, ...] = ()
+    times: tuple[FloatArray, ...] | None = None
+    part: float = 0.0
+    lag: float = 0.0
 
     @cached_property
     def model(self) -> Model:
@@ -67,16 +91,47 @@ class Problem:
         return int(sum(np.isfinite(y).sum() for y in self.y))
 
     @cached_property
-    def outputs(self) -> FloatArray:
-        """(records, T, 1) outputs; a shorter record ends with NaN."""
-        return _stacked([y[:, None] for y in self.y], 1)
+    def is_even(self) -> bool:
+        """Whether every sample is one step long, and the input changes with the outputs alone."""
+        return self.times is None and not self.part and not self.lag
 
-    def inputs(self, interpolation: str, delay: int) -> FloatArray:
-        """(records, T, rows) what acts over each sample, if the input went so; a shorter record ends with NaN."""
-        rows = 1 + INTERPOLATIONS["spline" if INTERPOLATIONS[self.rig.interpolation] > 1 else "linear"]
-        # A record's first output comes before its first input acts, however the input goes.
-        rig = replace(self.rig, interpolation=interpolation, delay=delay)
-        return _stacked([driven(self.model, rig, u) for u in self.u], rows)
+    def samples_of(self, interpolation: str, delay: int) -> Samples:
+        """The records, if the input went so."""
+        rows = 1 + max(INTERPOLATIONS[name] for name in ("linear", self.rig.interpolation, interpolation))
+        if self.is_even:
+            # A record's first output comes before its first input acts, however the input goes.
+            rig = replace(self.rig, interpolation=interpolation, delay=delay)
+            inputs = _stacked([driven(self.model, rig, u) for u in self.u], rows)
+            places = tuple(np.arange(len(y)) for y in self.y)
+            return Samples(inputs, _stacked([y[:, None] for y in self.y], 1), None, places)
+        found = [
+            laid(times, u, y, interpolation, delay + self.part, self.lag)
+            for times, u, y in zip(self.counted, self.u, self.y, strict=True)
+        ]
+        rows = max(rows, *(one.inputs.shape[1] for one in found))
+        spans = _stacked([one.spans[:, None] for one in found], 1)[:, :, 0]
+        return Samples(
+            _stacked([one.inputs for one in found], rows),
+            _stacked([one.outputs[:, None] for one in found], 1),
+            spans,
+            tuple(one.places for one in found),
+        )
+
+    @property
+    def counted(self) -> tuple[FloatArray, ...]:
+        """Times of the samples of each record, in sampling steps."""
+        return self.times or tuple(np.arange(len(u), dtype=np.float64) for u in self.u)
+
+    def evened(self) -> Problem:
+        """The same with outputs and inputs in between, one step apart: enough to find a start."""
+        if self.is_even:
+            return self
+        u, y = [], []
+        for times, inputs, outputs in zip(self.counted, self.u, self.y, strict=True):
+            at, seen = np.arange(int(times[-1]) + 1.0), np.isfinite(outputs)
+            u.append(inputs[np.clip(np.searchsorted(times, at, side="right") - 1, 0, None)])
+            y.append(np.interp(at, times[seen], outputs[seen]))
+        return replace(self, u=tuple(u), y=tuple(y), times=None, part=0.0, lag=0.0)
 
     def inward(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Moments (K,) and (K, K) of the model's coefficients, where outputs are counted from the origin."""
@@ -88,7 +143,9 @@ class Problem:
 
     def shortened(self, samples: int) -> Problem:
         """The same with the first samples of each record only."""
-        return replace(self, u=tuple(u[:samples] for u in self.u), y=tuple(y[:samples] for y in self.y))
+        cut = lambda series: tuple(one[:samples] for one in series)  # noqa: E731
+        times = None if self.times is None else cut(self.times)
+        return replace(self, u=cut(self.u), y=cut(self.y), times=times)
 
     @cached_property
     def size(self) -> float:
@@ -105,7 +162,7 @@ class Problem:
     def frequency(self) -> float:
         """Where the outputs have their power: the mean angular frequency [rad per sample], robust to white noise."""
         power = total = 0.0
-        for y in self.y:
+        for y in self.evened().y:
             whole = bridged(y, _BRIDGED)
             whole = np.where(np.isfinite(whole), whole, np.nanmean(y))
             spectrum = np.abs(np.fft.rfft(whole - whole.mean())) ** 2

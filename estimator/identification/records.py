@@ -6,7 +6,7 @@ import io
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.checks import series
+from estimator.extras import need
 from estimator.files import whole_file
 from estimator.identification.shared import shared
 from estimator.identification.tables import read_table
@@ -36,13 +37,27 @@ _FEWEST, _SHORTEST = 50, 8
 #: Reads a MAT file in a process of its own: SciPy's reader is ended by a segmentation fault at some damaged ones.
 _MAT_READER = """
 import io, sys
-import numpy, scipy.io
+import numpy
 path, *names = sys.argv[1:]
-held = scipy.io.loadmat(path, squeeze_me=True, variable_names=names)
+with open(path, "rb") as file:
+    is_hdf5 = file.read(10) == b"MATLAB 7.3"
+if is_hdf5:
+    import h5py
+    with h5py.File(path, "r") as file:
+        held = {name: numpy.squeeze(numpy.asarray(file[name]).T) for name in names if name in file}
+else:
+    import scipy.io
+    held = scipy.io.loadmat(path, squeeze_me=True, variable_names=names)
 buffer = io.BytesIO()
 numpy.savez(buffer, **{name: held[name] for name in names if name in held})
 sys.stdout.buffer.write(buffer.getvalue())
 """
+
+#: Where most steps between times are alike to this part of them, a leap of whole steps is of lines that were lost.
+_ALIKE, _MOST = 0.05, 0.8
+
+#: Some record has the rig's sampling step to this part of it.
+_OTHER = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +68,10 @@ class Record:
         name: of its file, or its number; of a later piece with the sample where it begins.
         u: (T,) inputs.
         y: (T,) outputs; NaN where one is missing or was clipped.
-        clipped: outputs that were clipped.
+        clipped: outputs that were clipped, or over range.
         missing: outputs that were not there.
+        times: (T,) of the samples [s], where these are not the rig's step apart.
+        over_range: (T,) whether an output was over range, in a record that is whole.
     """
 
     name: str
@@ -62,6 +79,14 @@ class Record:
     y: FloatArray
     clipped: int = 0
     missing: int = 0
+    times: FloatArray | None = None
+    over_range: npt.NDArray[np.bool_] | None = field(default=None, repr=False)
+
+    def counted(self, step: float) -> FloatArray:
+        """(T,) times in sampling steps, from the first sample on."""
+        if self.times is None:
+            return np.arange(len(self.u), dtype=np.float64)
+        return np.asarray((self.times - self.times[0]) / step)
 
 
 def records_of(given: Any, rig: Rig) -> list[Record]:
@@ -72,7 +97,7 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
     may records or the pieces of one share samples (`estimator.identification.shared.shared`): these would count twice.
 
     Args:
-        given: what the caller has.
+        given: what the caller has; to a pair of arrays the times of its samples [s] may be added, which may be uneven.
         rig: whose sampling step a file's times must have, and whose units and kind of output the names of its columns.
 
     Raises:
@@ -88,28 +113,37 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
         raise ValueError("records must hold at least one pair (u, y) or file name, but are empty")
     found, whole = list[Record](), list[Record]()
     for number, one in enumerate(listed):
-        name = str(one) if isinstance(one, str | Path) else f"record {number}"
+        name = f"record {number}"
         if isinstance(one, str | Path):
-            u, y = read(one, rig)
+            given_here = read(one, rig)
         elif _is_pair(one):
-            u, y = (series(f"{part} of {name}", values, missing=True) for part, values in zip("uy", one, strict=True))
+            given_here = [_record(name, one, rig.step)]
         else:
             raise ValueError(
                 f"{name} must be a pair (u, y) or a file name, but is {one!r:.60}; pass (u, y) as one tuple"
             )
-        if len(u) != len(y):
-            raise ValueError(f"u and y of {name} must have one length, but have {len(u)} and {len(y)}; cut the longer")
-        whole.append(Record(name, u, y))
-        if first := next((earlier.name for earlier in whole[:-1] if _are_same(earlier, whole[-1])), None):
-            raise ValueError(f"{name} must be a record of its own, but has the samples of {first}; leave one out")
-        pieces = _cut(whole[-1])
-        if not pieces:
-            count = int((np.isfinite(u) & np.isfinite(y)).sum())
-            raise ValueError(
-                f"{name} must have {_SHORTEST} outputs or more between missing inputs, but of its {len(u)} samples "
-                f"{count} have both input and output; add samples, or leave it out"
-            )
-        found += pieces
+        for record in given_here:
+            name, u, y = record.name, record.u, record.y
+            if len(u) != len(y):
+                raise ValueError(
+                    f"u and y of {name} must have one length, but have {len(u)} and {len(y)}; cut the longer"
+                )
+            whole.append(record)
+            if first := next((earlier.name for earlier in whole[:-1] if _are_same(earlier, record)), None):
+                raise ValueError(f"{name} must be a record of its own, but has the samples of {first}; leave one out")
+            pieces = _cut(record)
+            if not pieces:
+                count = int((np.isfinite(u) & np.isfinite(y)).sum())
+                raise ValueError(
+                    f"{name} must have {_SHORTEST} outputs or more between missing inputs, but of its {len(u)} samples "
+                    f"{count} have both input and output; add samples, or leave it out"
+                )
+            found += pieces
+    steps = [float(np.median(np.diff(one.times))) for one in whole if one.times is not None]
+    if len(steps) == len(whole) and all(abs(step / rig.step - 1) > _OTHER for step in steps):
+        raise ValueError(
+            f"{whole[0].name}: times are {steps[0]:.6g} s apart, but the step is {rig.step:.6g} s; mend one of them"
+        )
     count = sum(int(np.isfinite(one.y).sum()) for one in found)
     if count < _FEWEST:
         raise ValueError(f"records must have at least {_FEWEST} outputs in all, but have {count}; add samples")
@@ -125,7 +159,21 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
 
 
 def _is_pair(one: Any) -> bool:
-    return isinstance(one, tuple) and len(one) == 2 and not any(isinstance(part, str | Path) for part in one)
+    return isinstance(one, tuple) and len(one) in (2, 3) and not any(isinstance(part, str | Path) for part in one)
+
+
+def _record(name: str, given: tuple[Any, ...], step: float) -> Record:
+    """A record from arrays: (u, y), or (u, y, times)."""
+    u, y = (series(f"{part} of {name}", values, missing=True) for part, values in zip("uy", given[:2], strict=True))
+    if len(given) == 2:
+        return Record(name, u, y)
+    times = series(f"times of {name}", given[2])
+    if len(times) != len(u):
+        raise ValueError(f"times of {name} must be as many as u, {len(u)}, but are {len(times)}; cut the longer")
+    for k in np.flatnonzero(np.diff(times) <= 0)[:1]:
+        raise ValueError(f"times of {name} must grow, but {times[k + 1]:.9g} s comes after {times[k]:.9g} s; sort them")
+    even = np.ptp(times - step * np.arange(len(times))) < 0.01 * step
+    return Record(name, u, y, times=None if even else times)
 
 
 def _are_same(one: Record, other: Record) -> bool:
@@ -143,7 +191,9 @@ def _seen(values: FloatArray) -> FloatArray:
 def _cut(record: Record) -> list[Record]:
     """Pieces between missing inputs, without what has no output, and with what is clipped taken out."""
     stops = clipped(record.y)
-    missing = np.isnan(record.y)
+    beyond = np.zeros(len(record.y), dtype=np.bool_) if record.over_range is None else record.over_range
+    missing = np.isnan(record.y) & ~beyond
+    stops = stops | beyond
     y = np.where(stops, np.nan, record.y)
     pieces = []
     for piece in _runs(np.isfinite(record.u)):
@@ -151,10 +201,20 @@ def _cut(record: Record) -> list[Record]:
         if len(seen) < _SHORTEST:
             continue
         part = slice(piece.start, piece.start + seen[-1] + 1)
+        times = None if record.times is None else record.times[part].copy()
         told = int(stops[part].sum()), int(missing[part].sum())
         name = f"{record.name}, from sample {piece.start}" if piece.start else record.name
         pieces.append(
-            replace(record, name=name, u=record.u[part].copy(), y=y[part].copy(), clipped=told[0], missing=told[1])
+            replace(
+                record,
+                name=name,
+                u=record.u[part].copy(),
+                y=y[part].copy(),
+                clipped=told[0],
+                missing=told[1],
+                times=times,
+                over_range=None,
+            )
         )
     return pieces
 
@@ -184,22 +244,27 @@ def clipped(y: FloatArray) -> npt.NDArray[np.bool_]:
     return found
 
 
-def read(path: str | Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
-    """Inputs and outputs of a CSV or MAT file.
+def read(path: str | Path, rig: Rig) -> list[Record]:
+    """The records of a text or MAT file, whole: gaps are NaN, and so is what is over the range of the instrument.
 
-    A CSV is as `estimator.identification.tables.read_table` says. A MAT file holds the variables ``u`` and ``y``, or
-    those that the rig names as columns.
+    A text file is as `estimator.identification.tables.read_table` says; where its times are not the rig's step apart,
+    the record has them. A MAT file, of version 7.3 too, holds the variables ``u`` and ``y``, or those that the rig
+    names as columns: (T,), or (T, n) for n records.
 
     Raises:
         ValueError: naming the file, the line and what is wrong.
         FileNotFoundError: if there is no such file.
+        ModuleNotFoundError: for a MAT file of version 7.3 without h5py.
     """
-    place = whole_file(path, "record must be a CSV or MAT file", _LARGEST_FILE)
-    return _read_mat(place, rig) if place.suffix.lower() == ".mat" else _read_csv(place, rig)
+    place = whole_file(path, "record must be a text or MAT file, such as CSV", _LARGEST_FILE)
+    return _read_mat(place, rig) if place.suffix.lower() == ".mat" else [_read_text(place, rig)]
 
 
-def _read_mat(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
+def _read_mat(path: Path, rig: Rig) -> list[Record]:
     names = (rig.input.column or "u", rig.output.column or "y")
+    with path.open("rb") as file:
+        if file.read(10) == b"MATLAB 7.3":
+            need("h5py")
     # With -P no file beside the record, such as a numpy.py, is taken for a module.
     command = [sys.executable, "-P", "-W", "ignore", "-c", _MAT_READER, str(path), *names]
     try:
@@ -210,7 +275,7 @@ def _read_mat(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
         ) from error
     if done.returncode != 0:
         told = done.stderr.decode(errors="replace").strip().splitlines() or ["the reader died of it"]
-        raise ValueError(f"{path} must be a sound MAT file up to version 7.2, but is not: {told[-1]:.200}")
+        raise ValueError(f"{path} must be a sound MAT file, but is not: {told[-1]:.200}")
     try:
         with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
             held = {name: arrays[name] for name in arrays.files}
@@ -222,15 +287,60 @@ def _read_mat(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
             f"{path} must hold the variables {names[0]} and {names[1]}, but lacks {' and '.join(sorted(lacking))}; "
             f"mend the names, there or as column = '...' in the rig's [input] and [output]"
         )
-    u, y = (series(f"{name} of {path}", held[name], missing=True) for name in names)
-    return u, y
+    u, y = (np.asarray(held[name]) for name in names)
+    if u.ndim <= 1 and y.ndim <= 1:
+        first, second = (series(f"{name} of {path}", held[name], missing=True) for name in names)
+        return [_ranged(str(path), first, second)]
+    columns = max(one.shape[1] if one.ndim == 2 else 1 for one in (u, y))
+    if u.ndim > 2 or y.ndim > 2 or len(u) != len(y) or any(one.ndim == 2 and one.shape[1] != columns for one in (u, y)):
+        raise ValueError(
+            f"{path} must hold {names[0]} and {names[1]} of shapes (T,) or (T, n), for n records, but holds {u.shape} "
+            f"and {y.shape}; transpose or cut them"
+        )
+    found = []
+    for k in range(columns):
+        name = f"{path}, column {k + 1}"
+        pair = [one if one.ndim == 1 else one[:, k] for one in (u, y)]
+        first, second = (series(f"{n} of {name}", one, missing=True) for n, one in zip(names, pair, strict=True))
+        found.append(_ranged(name, first, second))
+    return found
 
 
-def _read_csv(path: Path, rig: Rig) -> tuple[FloatArray, FloatArray]:
+def _read_text(path: Path, rig: Rig) -> Record:
     table = read_table(path, rig.input.column, rig.output.column)
-    table.check_step(rig.step)
     table.check(rig.input, rig.output)
-    return table.columns[table.u], table.columns[table.y]
+    return _ranged(str(path), table.columns[table.u], table.columns[table.y], table.times(rig.step), rig.step)
+
+
+def _ranged(name: str, u: FloatArray, y: FloatArray, times: FloatArray | None = None, step: float = 0.0) -> Record:
+    """A record of a file, without what is over range, and with the lines that its times say were lost."""
+    beyond = np.isinf(y)
+    u, y = np.where(np.isfinite(u), u, np.nan), np.where(np.isfinite(y), y, np.nan)
+    if times is not None:
+        u, y, beyond, times = _with_lost(u, y, beyond, times, step)
+    return Record(name, u, y, over_range=beyond, times=times)
+
+
+def _with_lost(
+    u: FloatArray, y: FloatArray, beyond: npt.NDArray[np.bool_], times: FloatArray, step: float
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], FloatArray | None]:
+    """With a missing line wherever even times leap by whole steps; times are None where they are then even."""
+    steps = np.diff(times)
+    usual = np.nanmedian(steps)
+    leaps = np.round(steps / usual)
+    alike = np.abs(steps - np.maximum(leaps, 1) * usual) < _ALIKE * usual
+    if not np.isfinite(steps).all() or np.mean(np.abs(steps - usual) < _ALIKE * usual) < _MOST or not alike.all():
+        return u, y, beyond, times
+    places = np.concatenate([[0], np.cumsum(np.maximum(leaps, 1)).astype(np.intp)])
+    wide = lambda values, fill: np.full(places[-1] + 1, fill, dtype=values.dtype)  # noqa: E731
+    filled = []
+    for values, fill in ((u, np.nan), (y, np.nan), (beyond, False)):
+        one = wide(values, fill)
+        one[places] = values
+        filled.append(one)
+    even = abs(float(np.mean(steps[leaps <= 1])) / step - 1) < 0.01
+    grid = times[0] + usual * np.arange(places[-1] + 1)
+    return filled[0], filled[1], filled[2], None if even else grid
 
 
 def residuals(y: FloatArray, forecast: FloatArray) -> FloatArray:

@@ -39,7 +39,8 @@ def starts(problem: Problem) -> list[FloatArray]:
     and the rig's offset. None where the records are too short.
     """
     names = list(problem.model.coefficients)
-    inputs = problem.inputs(problem.rig.interpolation, problem.rig.delay)
+    problem = problem.evened()
+    inputs = problem.samples_of(problem.rig.interpolation, problem.rig.delay).inputs
     found = []
     integrates = KINDS[problem.rig.output.kind] > 0
     middles = _middles(problem)

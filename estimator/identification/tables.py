@@ -1,30 +1,44 @@
-"""CSV files: columns of time, input and output, found by the names in the first line."""
+"""Text files of instruments: columns of time, input and output, found by the names above the numbers."""
 
 from __future__ import annotations
 
 import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.identification.columns import KINDS, SECONDS, chosen, plain, unit_of, with_unit, word_of
+from estimator.identification.columns import (
+    KINDS,
+    chosen,
+    is_unit,
+    plain,
+    time_unit,
+    unit_of,
+    with_unit,
+    word_of,
+)
+from estimator.identification.fields import WITH_COMMAS, number, stamp, text_of
 from estimator.parameters import FloatArray
 from estimator.rig import Channel
 from estimator.units import kind_of
 
-#: What stands for a missing number, in lower case.
-_MISSING = ("", "na", "n/a", "#n/a", "null", "none", "-")
+#: Times may be off an even grid by this part of a step, or by their last digit, and are even all the same.
+_EVEN = 0.005
 
-#: What separates fields in files whose numbers may have a decimal comma.
-_WITH_COMMAS = (";", "\t")
+#: Where most steps are alike to this part of them, a leap of whole steps is of lines that were lost.
+_ALIKE, _MOST = 0.05, 0.8
 
-#: Steps of a time column may be uneven by so much, which rounding does.
-_UNEVEN = 0.2
+#: A step is no longer than this many usual ones; what is longer is a gap.
+_LEAP = 3.0
+
+#: Lines that show where the numbers begin.
+_SHOWN = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +53,7 @@ class Table:
         time: which column is the time; None where there is none.
         u: which column is the input.
         y: which column is the output.
+        stamped: whether the times were dates or times of day, and are seconds from the first on.
     """
 
     path: Path
@@ -48,29 +63,51 @@ class Table:
     time: int | None
     u: int
     y: int
-
-    def check_step(self, step: float) -> None:
-        """Refuse times that are not a sampling step [s] apart, to 1 %; `step` says what else."""
-        own = self.step()
-        if own is not None and abs(own / step - 1) > 0.01:
-            raise ValueError(
-                f"{self.path}: times are {own:.6g} s apart, but the step is {step:.6g} s; mend one of them"
-            )
+    stamped: bool = False
 
     def step(self) -> float | None:
-        """Sampling step [s], of the time column; None where there is none.
+        """Usual sampling step [s], of the time column; None where there is none.
 
         Times are those of the lines that have an input, and may leap where an input is missing: there a record is cut.
 
         Raises:
-            ValueError: for times that are missing, do not grow, are unevenly spaced, or in a unit that is unknown.
+            ValueError: for times that are missing or do not grow, or in a unit that is unknown.
         """
         if self.time is None:
             return None
-        unit = self.unit(self.time) or "s"
-        if unit not in SECONDS:
-            raise ValueError(f"{self.path}: times must be in one of {', '.join(SECONDS)}, but are in {unit!r:.40}")
-        time, driven = self.columns[self.time] * SECONDS[unit], np.isfinite(self.columns[self.u])
+        time, later = self._times()
+        steps = time[later] - time[later - 1]
+        usual = float(np.median(steps))
+        alike = np.abs(steps - usual) < _ALIKE * usual
+        return float(steps[alike if alike.mean() > _MOST else steps < _LEAP * usual].mean())
+
+    def times(self, step: float) -> FloatArray | None:
+        """(T,) times [s] of the lines, where these are not ``step`` apart; None where they are, or there are none.
+
+        Times are even where they are on a grid of that step up to their last digit. Lines without an input have none.
+
+        Raises:
+            ValueError: as `step`.
+        """
+        own = self.step()
+        if own is None:
+            return None
+        time, later = self._times()
+        begins = np.setdiff1d(np.flatnonzero(np.isfinite(self.columns[self.u])), later)
+        ends = np.append(begins[1:], len(time))
+        digit = self._last_digit(time)
+        for begin, end in zip(begins, ends, strict=True):
+            part = time[begin:end][np.isfinite(self.columns[self.u][begin:end])]
+            off = part - part[0] - step * np.arange(len(part))
+            if np.ptp(off) > 2 * _EVEN * step + 1.01 * digit:
+                return time
+        return None
+
+    def _times(self) -> tuple[FloatArray, npt.NDArray[np.intp]]:
+        """(T,) times [s], and the lines that have an input as the line before them has."""
+        assert self.time is not None
+        unit = time_unit(self.path, self.names[self.time]) if self.names and not self.stamped else 1.0
+        time, driven = self.columns[self.time] * unit, np.isfinite(self.columns[self.u])
         for k in np.flatnonzero(driven & np.isnan(time))[:1]:
             raise ValueError(
                 f"{self._line(k)}: there must be a time beside the input, but there is none; fill it in, or remove "
@@ -81,20 +118,23 @@ class Table:
             raise ValueError(
                 f"{self.path} must have two samples in a row with time and input, but has none; add samples"
             )
-        steps = time[later] - time[later - 1]
-        for k in later[steps <= 0][:1]:
+        for k in later[time[later] <= time[later - 1]][:1]:
             raise ValueError(
                 f"{self._line(k)}: times must grow, but {time[k]:.9g} s comes after {time[k - 1]:.9g} s; mend the "
                 f"line, or set records apart by an empty row"
             )
-        usual = np.median(steps)
-        for k in later[np.abs(steps - usual) > _UNEVEN * usual][:1]:
-            raise ValueError(
-                f"{self._line(k)}: samples must be evenly spaced, by {usual:.6g} s, but this one comes "
-                f"{time[k] - time[k - 1]:.6g} s after the last; give every lost sample a line with empty fields, or "
-                f"resample"
-            )
-        return float(steps.mean())
+        return time, later
+
+    def _last_digit(self, time: FloatArray) -> float:
+        """What the last digit of the times is worth [s]: the largest power of ten of which all are multiples."""
+        seen = time[np.isfinite(time)]
+        seen = seen - seen[0]
+        for digits in range(-2, 13):
+            if np.abs(seen * 10.0**digits - np.round(seen * 10.0**digits)).max() < 1e-3 * max(
+                1.0, 10.0 ** (digits - 9)
+            ):
+                return float(10.0**-digits)
+        return 0.0
 
     def _line(self, row: np.int64) -> str:
         """The file, and the line of a row."""
@@ -143,13 +183,14 @@ class Table:
 
 
 def read_table(path: Path, source: str | None = None, sink: str | None = None) -> Table:
-    """Read a CSV file.
+    """Read a text file as instruments write it, such as CSV or LabVIEW's .lvm.
 
     Fields stand between commas, or semicolons or tabs (then 0,5 is a number, in a file without points), or blanks.
-    Empty ones are missing, and NaN, NA, N/A, null, none or - in them. Lines that begin with # are passed over; one of
-    separators alone sets records apart. The first line may hold names, such as ``u,y`` or ``time [ms],force [N],x
-    [mm]``, and the next one units, such as ``ms,N,mm``; of numbers alone there are the columns u and y, or time in
-    seconds, u and y. A column in a unit of time is the time, whatever its name.
+    Empty ones are missing, and NaN, NA, N/A, null, none or - in them; ∞ and inf are over range. Lines that begin with #
+    are passed over; one of separators alone sets records apart. The line above the numbers may hold names, such as
+    ``u,y``, ``time [ms],force [N],x [mm]`` or ``time_ms,force_N,x_mm``; or names stand above a line of units, such as
+    ``ms,N,mm``. Lines before these are passed over. Of numbers alone there are the columns u and y, or time in seconds,
+    u and y. A column in a unit of time, or of dates or times of day, is the time, whatever its name.
 
     Args:
         path: of the file.
@@ -159,80 +200,164 @@ def read_table(path: Path, source: str | None = None, sink: str | None = None) -
     Raises:
         ValueError: naming the file, the line and what is wrong.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} must be text in UTF-8, but is not: {error}; save it as CSV UTF-8") from error
-    kept = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
-    numbers, lines = [number for number, _ in kept], [line for _, line in kept]
-    separator = _separator(lines)
-    rows, places = list[list[float]](), list[int]()
-    names: tuple[str, ...] = ()
-    units: tuple[str, ...] = ()
-    width, mark = 0, ""
-    for place, words in enumerate(_fields(lines, separator)):
-        number = numbers[place]
-        if not any(word.strip() for word in words):
-            if rows:
-                rows.append([math.nan] * width)
-                places.append(place)
-            continue
-        values = [_number(word, separator) for word in words]
-        if not width and None in values:
-            names, width = tuple(word.strip() for word in words), len(words)
-            continue
-        width = width or len(words)
-        if len(words) != width:
-            where, remedy = ("", "mend the line")
-            if not rows:
-                where, remedy = " as the names", "begin lines before the names with #, or mend the line"
-            raise ValueError(f"{path}, line {number}: must have {width} columns{where}, but has {len(words)}; {remedy}")
-        if None in values and not rows and not units and not any(map(_told, values)):
-            units = tuple(words)
-            continue
-        if None in values:
-            bad = words[values.index(None)]
-            remedy = _remedy(bad) if rows else "begin lines before the names with #, or mend the line"
-            raise ValueError(f"{path}, line {number}: {bad!r:.40} must be a number; {remedy}")
-        for word in words if separator in _WITH_COMMAS else ():
-            mark = mark or next((one for one in ",." if one in word), "")
-            if mark and {",": ".", ".": ","}[mark] in word:
-                raise ValueError(
-                    f"{path}, line {number}: {word!r:.40} must have the decimal mark {mark!r} alone, as before; leave "
-                    f"out marks of thousands"
-                )
-        regular = None if rows else _regular(lines[place:], separator, width)
-        if regular is not None:
-            rows, places = regular, list(range(place, len(lines)))
-            break
-        rows.append([value for value in values if value is not None])
-        places.append(place)
-    if not rows:
+    lines = text_of(path).splitlines()
+    kept = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    if kept and (told := re.fullmatch(r"\s*\"?sep=(.)\"?\s*", kept[0][1])):  # a spreadsheet's
+        kept.pop(0)
+    separator = told.group(1) if kept and told else _separator([line for _, line in kept])
+    numbers, fields = [k for k, _ in kept], _fields([line for _, line in kept], separator)
+    first = _first_row(fields, separator)
+    if first is None:
         raise ValueError(f"{path} must hold numbers, but holds none")
-    if units:
-        pairs = zip(names, units, strict=True)
-        names = tuple(with_unit(path, name, unit) if _number(unit) is None else name for name, unit in pairs)
-    columns = np.array(rows).T
-    return Table(path, names, columns, np.array(numbers)[places], *chosen(path, names, len(columns), source, sink))
+    width = len(fields[first])
+    names, units = _heads(path, fields[:first], numbers, width, separator)
+    regular = _regular([line for _, line in kept[first:]], separator, width)
+    rows = _rows(path, fields[first:], numbers[first:], separator) if regular is None else regular
+    columns, stamped = _seconds(path, rows, numbers[first:], names)
+    names = tuple(with_unit(path, name, unit) for name, unit in zip(names, units, strict=True)) if units else names
+    places = chosen(path, names, len(columns), source, sink, stamped)
+    return Table(path, names, columns, np.array(numbers[first:]), *places, stamped=places[0] in stamped)
 
 
 def _separator(lines: Sequence[str]) -> str | None:
-    """What stands between the fields; None for blanks."""
-    first = "".join(lines[:2])
-    return next((mark for mark in "\t;," if mark in first), None)
+    """What stands between the fields, of the last lines, which hold numbers; None for blanks."""
+    last = "".join(lines[-2:])
+    return next((mark for mark in "\t;," if mark in last), None)
 
 
-def _fields(lines: Sequence[str], separator: str | None) -> Iterator[list[str]]:
-    """The fields of each line."""
+def _fields(lines: Sequence[str], separator: str | None) -> list[list[str]]:
+    """The fields of each line; empty ones at the end of all lines are left out."""
     if separator is None:
-        yield from (line.split() for line in lines)
-        return
-    yield from csv.reader(lines, delimiter=separator)
+        return [line.split() for line in lines]
+    return list(csv.reader(lines, delimiter=separator))
+
+
+def _is_row(words: Sequence[str], separator: str | None) -> bool:
+    """Whether a line holds numbers, and nothing else that is not missing."""
+    values = [number(word, separator) for word in words]
+    return any(value is not None and math.isfinite(value) for value in values) and all(
+        value is not None or stamp(word) for word, value in zip(words, values, strict=True)
+    )
+
+
+def _first_row(fields: Sequence[Sequence[str]], separator: str | None) -> int | None:
+    """Where the numbers begin: the first of some lines in a row that hold numbers, in as many columns."""
+    for k, words in enumerate(fields):
+        following = [one for one in fields[k : k + 2 * _SHOWN] if any(word.strip() for word in one)][:_SHOWN]
+        if _is_row(words, separator) and all(
+            len(one) == len(words) and _is_row(one, separator) for one in following[: max(1, len(following))]
+        ):
+            return k
+    # A file of few lines, or with a bad one among the first.
+    return next((k for k, words in enumerate(fields) if _is_row(words, separator)), None)
+
+
+def _heads(
+    path: Path, fields: Sequence[list[str]], numbers: Sequence[int], width: int, separator: str | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units above the numbers, in ``width`` columns; empty where there are none.
+
+    Raises:
+        ValueError: for a line above the numbers that is neither.
+    """
+    heads = list[tuple[list[str], int]]()
+    for words, line in zip(reversed(fields), reversed(numbers[: len(fields)]), strict=True):
+        bare = [word.strip() for word in words]
+        while len(bare) > width and not bare[-1]:
+            bare.pop()
+        values = [number(word, separator) for word in bare]
+        if any(value is not None and not math.isnan(value) for value in values):
+            if not heads and len(bare) == width:
+                bad = bare[values.index(None)] if None in values else bare[0]
+                raise ValueError(f"{path}, line {line}: {bad!r:.40} must be a number; {_remedy(bad)}")
+            break
+        heads.append((bare, line))
+        if len(heads) == 1 and len(bare) == width and all(map(is_unit, bare)):
+            continue
+        break
+    if not heads:
+        return (), ()
+    (words, line), *above = heads
+    units: tuple[str, ...] = ()
+    if above and len(above[0][0]) >= width:
+        units, (words, line) = tuple(words), above[0]
+    if len(words) < width:
+        raise ValueError(f"{path}, line {line}: must have {width} names, but has {len(words)}; mend the line")
+    return tuple(words[:width]), units
+
+
+def _rows(path: Path, fields: Sequence[list[str]], numbers: Sequence[int], separator: str | None) -> list[list[Any]]:
+    """Numbers, or stamps, of each line.
+
+    Raises:
+        ValueError: naming the line, for a field that is neither, or another number of them.
+    """
+    width, mark, rows = len(fields[0]), "", list[list[Any]]()
+    for line, words in zip(numbers, fields, strict=True):
+        if not any(word.strip() for word in words):
+            rows.append([math.nan] * width)
+            continue
+        if len(words) > width and not any(word.strip() for word in words[width:]):
+            words = words[:width]
+        if len(words) != width:
+            raise ValueError(f"{path}, line {line}: must have {width} columns, but has {len(words)}; mend the line")
+        row = [value if (value := number(word, separator)) is not None else stamp(word) for word in words]
+        if None in row:
+            bad = words[row.index(None)]
+            raise ValueError(f"{path}, line {line}: {bad!r:.40} must be a number; {_remedy(bad)}")
+        for word, field in zip(words, row, strict=True) if separator in WITH_COMMAS else ():
+            if isinstance(field, tuple):
+                continue
+            mark = mark or next((one for one in ",." if one in word), "")
+            if mark and {",": ".", ".": ","}[mark] in word:
+                raise ValueError(
+                    f"{path}, line {line}: {word!r:.40} must have the decimal mark {mark!r} alone, as before; leave "
+                    f"out marks of thousands"
+                )
+        rows.append(row)
+    return rows
+
+
+def _seconds(
+    path: Path, rows: Sequence[Sequence[Any]], numbers: Sequence[int], names: Sequence[str]
+) -> tuple[FloatArray, frozenset[int]]:
+    """(C, T) columns, stamps as seconds from the first on, and which columns hold stamps.
+
+    Raises:
+        ValueError: for a column in which some fields are stamps and some numbers.
+    """
+    first = rows[0]
+    if not any(isinstance(value, tuple) for row in rows[:1] for value in row):
+        for line, row in zip(numbers, rows, strict=True):
+            if any(isinstance(value, tuple) for value in row):
+                raise ValueError(f"{path}, line {line}: must hold numbers as the lines before, but holds a time of day")
+        return np.array(rows, dtype=np.float64).T, frozenset()
+    stamped = frozenset(k for k, value in enumerate(first) if isinstance(value, tuple))
+    columns = np.empty((len(first), len(rows)))
+    for k in range(len(first)):
+        before = days = 0
+        for t, row in enumerate(rows):
+            value = row[k]
+            if k not in stamped or not isinstance(value, tuple):
+                if isinstance(value, tuple) or (k in stamped and not math.isnan(value)):
+                    name = names[k] if names else f"column {k + 1}"
+                    raise ValueError(
+                        f"{path}, line {numbers[t]}: {name!r:.40} must hold dates or times of day throughout, or "
+                        f"numbers; mend the line"
+                    )
+                columns[k, t] = value
+                continue
+            whole, rest = value
+            if whole < 86400 and before - whole > 43200:  # past midnight, without a date
+                days += 86400
+            before = whole
+            columns[k, t] = (whole + days - first[k][0]) + (rest - first[k][1])
+    return columns, stamped
 
 
 def _regular(lines: Sequence[str], separator: str | None, width: int) -> list[list[float]] | None:
     """The numbers of lines that hold nothing but finite ones, in many times less time; None of other lines."""
-    if separator in _WITH_COMMAS and any("," in line for line in lines):
+    if separator in WITH_COMMAS and any("," in line for line in lines):
         if any("." in line for line in lines):
             return None
         lines = [line.replace(",", ".") for line in lines]
@@ -243,21 +368,6 @@ def _regular(lines: Sequence[str], separator: str | None, width: int) -> list[li
     return values.tolist() if values.shape[1] == width and np.isfinite(values).all() else None
 
 
-def _number(word: str, separator: str | None = None) -> float | None:
-    """The number that a field holds, NaN where it is missing; None where it is no finite number."""
-    if word.strip().lower() in _MISSING:
-        return math.nan
-    if "_" in word:  # Python's
-        return None
-    if separator in _WITH_COMMAS:
-        word = word.replace(",", ".")
-    try:
-        value = float(word)
-    except ValueError:
-        return None
-    return None if math.isinf(value) else value
-
-
 def _remedy(bad: str) -> str:
     """What to do about a field that is no number."""
     if {",", "."} <= set(bad):
@@ -265,8 +375,3 @@ def _remedy(bad: str) -> str:
     if re.fullmatch(r"\s*[-+]?\d+,\d+\s*", bad):
         return "beside decimal commas let semicolons or tabs separate the fields"
     return "leave it empty where it is missing"
-
-
-def _told(value: float | None) -> bool:
-    """Whether a field holds a number that is not missing."""
-    return value is not None and not math.isnan(value)
