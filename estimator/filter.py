@@ -183,7 +183,7 @@ class Filter:
             return self.known().follow(u, y)[:, :, 0]
         t1, t2, t3, eta = self.belief.coefficients_mean
         predicted, last = y.copy(), y[1:-1, 0]
-        acting = np.concatenate([np.zeros(self.rig.delay), u])[2 : len(y)]
+        acting = np.concatenate([np.zeros(self.rig.whole_delay), u])[2 : len(y)]
         predicted[2:, 0] = t1 * last + t2 * last**3 + t3 * y[:-2, 0] + eta * acting
         return predicted
 

@@ -67,16 +67,21 @@ class Feed:
 
 
 def feed(model: Model, rig: Rig) -> Feed:
-    """The way of a model's input in a rig."""
+    """The way of a model's input in a rig.
+
+    Raises:
+        ValueError: for a delay in parts of a sample, or a lag, which only `identify` follows.
+    """
+    delay = rig.whole_delay
     if not model.is_continuous:
-        return _feed(np.eye(model.taps)[::-1], rig.delay)
+        return _feed(np.eye(model.taps)[::-1], delay)
     if rig.interpolation == "zero_order":
-        return _feed(np.ones((1, 1)), rig.delay + 1)
+        return _feed(np.ones((1, 1)), delay + 1)
     if rig.interpolation == "linear":
-        return _feed(np.array([[1.0, 0.0], [-1.0, 1.0]]), rig.delay)
+        return _feed(np.array([[1.0, 0.0], [-1.0, 1.0]]), delay)
     if rig.interpolation == "look_ahead":
-        return _feed(_look_ahead(), rig.delay - 1, fills=True)
-    return Feed(np.eye(_DEGREE + 1), 0, fills=True, at_once=True, delay=rig.delay)
+        return _feed(_look_ahead(), delay - 1, fills=True)
+    return Feed(np.eye(_DEGREE + 1), 0, fills=True, at_once=True, delay=delay)
 
 
 def lengths_of(series: FloatArray) -> npt.NDArray[np.int64]:

@@ -21,6 +21,9 @@ from estimator.units import SIZES, Scales, kind_of
 #: How the input goes between samples, and the degree of the polynomial that each takes.
 INTERPOLATIONS = {"zero_order": 0, "linear": 1, "look_ahead": 5, "spline": 5}
 
+#: Those of which the input may act a part of a sample later.
+PARTS = ("zero_order", "linear", "spline")
+
 #: More samples of delay are a record that was not aligned.
 LONGEST_DELAY = 1000
 
@@ -46,6 +49,8 @@ class Channel:
             value of what stays unknown; None: nothing is known of it.
         offset: first value of the offset, which stays unknown. `identify` takes outputs that lie far from 0 as they
             are; a rig that is played has a range about 0.
+        lag: of an input: time constant [s] of a first-order lag between what is recorded and what acts, such as of a
+            voice coil. For `identify` alone. None: none.
         column: its name in CSV files, with or without the unit behind it, or in MAT files. None stands for the usual
             names (`estimator.identification.tables.read_table`).
 
@@ -60,13 +65,14 @@ class Channel:
     noise: float | None = None
     offset: float = 0.0
     column: str | None = None
+    lag: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.unit, str) or not self.unit.strip() or len(self.unit) > 40:
             raise ValueError(f"unit must be a short text such as 'N', but is {self.unit!r:.60}; '1' is a pure number")
         if printable(self.unit) != self.unit or set(self.unit) & set(',;"[]'):  # it stands in heads of CSV files
             raise ValueError(f"unit must hold no control codes, commas, quotes or brackets, but is {self.unit!r:.60}")
-        for name in ("limit", "range", "noise"):
+        for name in ("limit", "range", "noise", "lag"):
             value = getattr(self, name)
             if value is not None:
                 number(name, value, *SIZES, "leave it out where it is not known")
@@ -93,7 +99,7 @@ class Rig:
             is given at once. Before their first input it was the same.
         delay: samples by which the input acts later than that. A difference equation's newest tap acts on y[k] with
             u[k - delay]: 1 for the paper's in recorded data. -1 is for ``zero_order`` alone, where pairs are those of
-            an environment: u[k] acted before y[k].
+            an environment: u[k] acted before y[k]. `identify` takes parts of a sample, from above -1 on.
         input: its unit, limit, noise and offset.
         output: its unit, kind, range, noise and offset.
         guess: parameter m, c, a, b to the central 90 % interval of what is believed of it, in the units of the
@@ -111,7 +117,7 @@ class Rig:
 
     step: float
     interpolation: str = "zero_order"
-    delay: int = 0
+    delay: float = 0
     input: Channel = field(default_factory=Channel)
     output: Channel = field(default_factory=Channel)
     guess: Mapping[str, tuple[float, float]] | None = None
@@ -120,7 +126,11 @@ class Rig:
         number("step", self.step, *SIZES, "give the seconds between samples")
         one_of("interpolation", self.interpolation, INTERPOLATIONS)
         least = -1 if self.interpolation == "zero_order" else 0
-        whole(f"delay (for {self.interpolation})", self.delay, LONGEST_DELAY, least)
+        if isinstance(self.delay, float) and self.delay != int(min(max(self.delay, -9), 9e9)):
+            number(f"delay (for {self.interpolation})", self.delay, -0.999, LONGEST_DELAY)
+            one_of("interpolation (for a delay in parts of a sample)", self.interpolation, PARTS)
+        else:
+            whole(f"delay (for {self.interpolation})", self.delay, LONGEST_DELAY, least)
         for name, other in (("input", "range"), ("output", "limit")):
             channel = getattr(self, name)
             if isinstance(channel, Mapping):
@@ -131,6 +141,10 @@ class Rig:
             if getattr(channel, other) is not None:
                 right = "limit" if other == "range" else "range"
                 raise ValueError(f"{name} must have no {other}, but has {getattr(channel, other)}; use {right}")
+        if self.output.lag is not None:
+            raise ValueError(f"output must have no lag, but has {self.output.lag}; a lag is of the input")
+        if self.input.lag is not None:
+            one_of("interpolation (for an input with a lag)", self.interpolation, PARTS[:2])
         if self.input.kind != "displacement":
             raise ValueError(f"input must have no kind, but has {self.input.kind!r}; kind is of the output")
         if (told := kind_of(self.output.unit)) not in (None, self.output.kind):
@@ -245,6 +259,19 @@ class Rig:
         for name in ("input", "output"):
             described[name] = {key: value for key, value in described[name].items() if value is not None}
         return {key: value for key, value in described.items() if value is not None}
+
+    @property
+    def whole_delay(self) -> int:
+        """The delay, for those that follow the input sample by sample.
+
+        Raises:
+            ValueError: for a delay in parts of a sample, or a lag of the input, which `identify` alone follows.
+        """
+        if self.input.lag is not None:
+            raise ValueError(f"input must have no lag but for identify, but has {self.input.lag} s; leave it out")
+        if self.delay != int(self.delay):
+            raise ValueError(f"delay must be whole samples but for identify, but is {self.delay}; round it")
+        return int(self.delay)
 
     @property
     def scales(self) -> Scales:

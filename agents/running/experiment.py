@@ -138,7 +138,7 @@ def design(
     rng = np.random.default_rng(seed)
     view, limit = View.of(observed.experiment), float(observed.experiment.max_output)
     drawn = drawn_at_rest(belief, rng, draws_for(bound, MOST_PLANNED))
-    futures = Futures(view.model, drawn, limit, rng, max(0, rig.delay), view.degree)
+    futures = Futures(view.model, drawn, limit, rng, max(0, rig.whole_delay), view.degree)
     systems = systems_of(view, belief, futures, int(samples))
     chooser = make_policy(policy, observed, seed=seed)  # type: ignore[arg-type]
     if isinstance(chooser, Planner):

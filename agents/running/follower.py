@@ -93,7 +93,7 @@ class Follower:
                 "rig must have a guess of m, c, a and b for a run, but has none; add one, or go on from a posterior"
             )
         # What came before an output is given with it: so the belief is that of the tick, before the next input.
-        self.delay, paired = rig.delay, replace(rig, delay=rig.delay - 1)
+        self.delay, paired = rig.whole_delay, replace(rig, delay=rig.whole_delay - 1)
         prior = rig_prior(rig) if prior is None else begun_again(prior)
         self._paused = 0
         self._starts: list[tuple[float, FloatArray, FloatArray]] = []

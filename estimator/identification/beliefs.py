@@ -81,7 +81,7 @@ def foreseen(found: Found, belief: Belief, given: int | None = None) -> tuple[Fl
     """
     problem, best = found.fitter.problem, found.best
     shown = tuple(y if given is None else np.where(np.arange(len(y)) < given, y, np.nan) for y in problem.y)
-    inputs, outputs, spans, places = replace(problem, y=shown).samples_of(best.interpolation, best.delay)
+    inputs, outputs, spans, places = replace(problem, y=shown).samples_of(*best.path)
     noises = belief.noises[1::2] / belief.noises[::2]
     forecasts = np.empty((*outputs.shape, 2))
     points = np.tile(found.mean, (len(inputs), 1))
@@ -143,7 +143,7 @@ def refit(
         return start, cov
     q, r = near.noises[1] / near.noises[0], near.noises[3] / near.noises[2]
     fitter = Fitter(problem, Prior.of(prior.coefficients_mean, prior.coefficients_cov))
-    hypothesis = Hypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)))
+    hypothesis = Hypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)), lag=problem.lag)
     level = float(np.sqrt(r))
     hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start[None], level)[0])
     try:

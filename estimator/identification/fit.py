@@ -43,15 +43,22 @@ class Hypothesis:
     Attributes:
         interpolation: of the input.
         delay: of the input, in samples.
+        lag: time constant of a first-order lag of the input, in samples.
         ratio: σ_w/σ_v inside.
         motions: (records, 2) displacement and velocity a sample before each record, about which the filter is linear at
             its first samples; at rest where it is None.
     """
 
     interpolation: str
-    delay: int
+    delay: float
     ratio: float = 1.0
     motions: FloatArray | None = field(default=None, compare=False)
+    lag: float = 0.0
+
+    @property
+    def path(self) -> tuple[str, float, float]:
+        """How the input went: interpolation, delay and lag."""
+        return self.interpolation, self.delay, self.lag
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +155,7 @@ class Fitter:
     def __init__(self, problem: Problem, prior: Prior) -> None:
         self.problem, self.prior = problem, prior
         self._scale = 1 / np.sqrt(np.diag(prior.precision))
-        self._samples: dict[tuple[str, int], Samples] = {}
+        self._samples: dict[tuple[str, float, float], Samples] = {}
 
     def on(self, problem: Problem) -> Fitter:
         """The same for other records."""
@@ -204,16 +211,18 @@ class Fitter:
 
     def _held(self, hypotheses: Sequence[Hypothesis]) -> _Held:
         rest = np.zeros((len(self.problem.u), 2))
-        kinds = list(dict.fromkeys((h.interpolation, h.delay) for h in hypotheses))
+        kinds = list(dict.fromkeys(h.path for h in hypotheses))
         for kind in kinds:
             if kind not in self._samples:
                 self._samples[kind] = self.problem.samples_of(*kind)
         series = [self._samples[kind] for kind in kinds]
         longest = max(one.inputs.shape[1] for one in series)
         rows = max(one.inputs.shape[2] for one in series)
-        lengths = [_longer(one.spans, longest) for one in series if one.spans is not None]
+        timed = any(one.spans is not None for one in series)
+        ones = lambda one: np.ones(one.inputs.shape[:2]) if one.spans is None else one.spans  # noqa: E731
+        lengths = [_longer(ones(one), longest) for one in series] if timed else []
         return _Held(
-            np.array([kinds.index((h.interpolation, h.delay)) for h in hypotheses]),
+            np.array([kinds.index(h.path) for h in hypotheses]),
             np.array([_longer(one.inputs, longest, rows) for one in series]),
             np.array([_longer(one.outputs, longest, 1) for one in series]),
             np.array(lengths) if lengths else None,

@@ -102,7 +102,7 @@ def _judge(
 
     Each of the S series is a record at one of the points (P, K).
     """
-    inputs, outputs, spans, _ = problem.samples_of(hypothesis.interpolation, hypothesis.delay)
+    inputs, outputs, spans, _ = problem.samples_of(*hypothesis.path)
     ratio = hypothesis.ratio
     at = np.repeat(points, len(inputs), axis=0)
 

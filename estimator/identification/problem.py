@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from estimator.inputs import feed
 from estimator.models.duffing import KINDS, duffing
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
-from estimator.rig import INTERPOLATIONS, Rig
+from estimator.rig import INTERPOLATIONS, Channel, Rig
 from estimator.units import Scales
 
 #: Samples by which the input may be later than the rig says: a check looks for it.
@@ -57,8 +58,6 @@ class Problem:
         substeps: steps of integration a sample.
         terms: of the equation, beside those of Eq. (1) and the offsets; some of `EXTRA`.
         times: of the samples of each record, in sampling steps from its first on; None where these are one step apart.
-        part: of a step, by which the input acts later than the whole steps of the delay.
-        lag: time constant of a first-order lag of the input, in sampling steps.
     """
 
     rig: Rig
@@ -69,8 +68,6 @@ class Problem:
     substeps: int = 2
     terms: tuple[str, ...] = ()
     times: tuple[FloatArray, ...] | None = None
-    part: float = 0.0
-    lag: float = 0.0
 
     @cached_property
     def model(self) -> Model:
@@ -90,22 +87,22 @@ class Problem:
         """Outputs that were seen."""
         return int(sum(np.isfinite(y).sum() for y in self.y))
 
-    @cached_property
-    def is_even(self) -> bool:
-        """Whether every sample is one step long, and the input changes with the outputs alone."""
-        return self.times is None and not self.part and not self.lag
+    @property
+    def lag(self) -> float:
+        """Time constant of the input's lag, in sampling steps, as the rig says."""
+        return (self.rig.input.lag or 0.0) / self.rig.step
 
-    def samples_of(self, interpolation: str, delay: int) -> Samples:
-        """The records, if the input went so."""
+    def samples_of(self, interpolation: str, delay: float, lag: float = 0.0) -> Samples:
+        """The records, if the input went so; every sample is one step long where that is enough."""
         rows = 1 + max(INTERPOLATIONS[name] for name in ("linear", self.rig.interpolation, interpolation))
-        if self.is_even:
+        if self.times is None and delay == int(delay) and not lag:
             # A record's first output comes before its first input acts, however the input goes.
-            rig = replace(self.rig, interpolation=interpolation, delay=delay)
+            rig = replace(self.rig, interpolation=interpolation, delay=int(delay), input=Channel())
             inputs = _stacked([driven(self.model, rig, u) for u in self.u], rows)
             places = tuple(np.arange(len(y)) for y in self.y)
             return Samples(inputs, _stacked([y[:, None] for y in self.y], 1), None, places)
         found = [
-            laid(times, u, y, interpolation, delay + self.part, self.lag)
+            laid(times, u, y, interpolation, delay, lag)
             for times, u, y in zip(self.counted, self.u, self.y, strict=True)
         ]
         rows = max(rows, *(one.inputs.shape[1] for one in found))
@@ -124,14 +121,14 @@ class Problem:
 
     def evened(self) -> Problem:
         """The same with outputs and inputs in between, one step apart: enough to find a start."""
-        if self.is_even:
+        if self.times is None:
             return self
         u, y = [], []
         for times, inputs, outputs in zip(self.counted, self.u, self.y, strict=True):
             at, seen = np.arange(int(times[-1]) + 1.0), np.isfinite(outputs)
             u.append(inputs[np.clip(np.searchsorted(times, at, side="right") - 1, 0, None)])
             y.append(np.interp(at, times[seen], outputs[seen]))
-        return replace(self, u=tuple(u), y=tuple(y), times=None, part=0.0, lag=0.0)
+        return replace(self, u=tuple(u), y=tuple(y), times=None)
 
     def inward(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Moments (K,) and (K, K) of the model's coefficients, where outputs are counted from the origin."""
@@ -223,7 +220,7 @@ def explicable(y: FloatArray, rig: Rig, later: int = 0) -> FloatArray:
         later: samples by which the input may be later than the rig says.
     """
     # An accelerometer shows the force itself, not only what it did.
-    moved = max(0, rig.delay) + later + (KINDS[rig.output.kind] == 2)
+    moved = max(0, math.ceil(rig.delay)) + later + (KINDS[rig.output.kind] == 2)
     left = y.copy()
     left[: min(moved, len(y) - 1)] = np.nan
     return left

@@ -161,7 +161,7 @@ def _look(fitter: Fitter) -> Fits:
             f"some {sum(map(len, problem.y)) / period:.0f} periods; add samples, or a guess to the rig"
         )
     ratios = _RATIOS * problem.frequency ** (2 - problem.scales.order)
-    base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]))
+    base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]), lag=problem.lag)
     level = np.array(0.1 * problem.size)
     begins = motions(short.problem, base, np.array(candidates), float(level))
     moving = [replace(base, motions=begin) for begin in begins]

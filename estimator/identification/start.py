@@ -40,7 +40,7 @@ def starts(problem: Problem) -> list[FloatArray]:
     """
     names = list(problem.model.coefficients)
     problem = problem.evened()
-    inputs = problem.samples_of(problem.rig.interpolation, problem.rig.delay).inputs
+    inputs = problem.samples_of(problem.rig.interpolation, round(problem.rig.delay)).inputs
     found = []
     integrates = KINDS[problem.rig.output.kind] > 0
     middles = _middles(problem)
