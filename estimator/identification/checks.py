@@ -7,32 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.identification.fit import Fitter, Hypothesis
+from estimator.identification.alternatives import EVIDENCE, energies, of_input
+from estimator.identification.fit import Fitter
 from estimator.identification.guesses import astray, leads_astray, of_guess, without_guess
-from estimator.identification.problem import EXTRA, LATEST, Problem, explicable
+from estimator.identification.problem import EXTRA, Problem, explicable
 from estimator.identification.records import Record, residuals
 from estimator.identification.result import Finding
 from estimator.identification.search import Found
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
-from estimator.rig import INTERPOLATIONS, LONGEST_DELAY, Channel
-
-#: Nats by which another hypothesis must be better.
-_EVIDENCE = 7.0
-
-#: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
-_RATIOS = (1.0, 0.1, 0.01)
-
-#: Samples by which the input may be earlier or later than is thought, and many by which it may be later: these are
-#: coarse, and lead to the right one when records are identified again.
-_DELAYS, _LATE = range(-LATEST, LATEST + 1), (5, 8, 12, 16, 20, 25, 30, 40)
-
-#: Steps of a fit of another hypothesis, at most.
-_STEPS = 12
-
-#: Samples of a record on which other hypotheses about the input are tried first, and the nats by which one that is
-#: given up is worse there.
-_SCREENED, _HOPELESS = 1024, 10.0
+from estimator.rig import Channel
 
 #: Probability of a false alarm of a test of the residuals.
 _ALARM = 1e-4
@@ -89,7 +73,7 @@ def examine(
     """
     guess, of_records, noisy = problem.rig.guess, _of_records(problem, records), _error(records, forecasts) > _FINEST
     of_fit = [
-        *(_of_hypotheses(problem, found) if noisy else []),
+        *((of_input(problem, found) or _of_terms(problem, found)) if noisy else []),
         *_of_noise(problem, disturbance),
         *_of_signs(parameters),
         *_of_parameters(problem, found, parameters),
@@ -98,7 +82,7 @@ def examine(
     ]
     if guess is not None and of_fit:
         alone, gain = without_guess(problem, found)
-        if gain > _EVIDENCE and leads_astray(guess, parameters, alone):  # the other checks judge a fit that it spoilt
+        if gain > EVIDENCE and leads_astray(guess, parameters, alone):  # the other checks judge a fit that it spoilt
             kind = problem.rig.output.kind
             return (*of_records, *_of_signs(alone), *astray(guess, parameters, alone, gain, kind))
     return (*of_records, *of_fit)
@@ -161,64 +145,18 @@ def _of_outliers(channel: Channel, records: Sequence[Record]) -> list[Finding]:
     return [Finding("outliers", message)]
 
 
-def _of_hypotheses(problem: Problem, found: Found) -> list[Finding]:
-    """The input's way and delay, and further terms, by their evidence."""
-    rig, own = problem.rig, found.fits.free_energy.min()
-    ways = [name for name in ("zero_order", "linear") if INTERPOLATIONS[rig.interpolation] < 2] or [rig.interpolation]
-    others = [
-        replace(found.best, interpolation=way, delay=rig.delay + later)
-        for way in ways
-        for later in _DELAYS
-        if (way, later) != (rig.interpolation, 0) and rig.delay + later >= (-1 if way == "zero_order" else 0)
-    ]
-    others += [replace(found.best, delay=rig.delay + later) for later in _LATE]
-    others = _screened(problem, found, [other for other in others if other.delay <= LONGEST_DELAY])
-    gains = own - _energies(found.fitter, others, found, own)
-    of_terms = []
+def _of_terms(problem: Problem, found: Found) -> list[Finding]:
+    """Further terms of the equation, by their evidence."""
+    own, gains = float(found.fits.free_energy.min()), []
     for name in EXTRA:
         prior = found.fitter.prior.widened(problem.natural()[name])
         fitter = Fitter(replace(problem, terms=(name,)), prior)
-        of_terms.append(float(own - _energies(fitter, [found.best], found, own)[0]))
-    warnings = []
-    if gains.max(initial=0.0) > _EVIDENCE:
-        best = int(np.argmax(gains))
-        better = others[best]
-        name = "interpolation" if better.interpolation != rig.interpolation else "delay"
-        message = (
-            f"the records speak for interpolation '{better.interpolation}' with delay {better.delay}, by "
-            f"{gains[best]:.0f} nats, and not for '{rig.interpolation}' with delay {rig.delay}; write these into the "
-            f"rig, and identify again"
-        )
-        if rig.output.kind == "acceleration" and (rig.interpolation, better.interpolation) == ("zero_order", "linear"):
-            message += "; or make outputs missing where the input switches, if y shows it just after that"
-        warnings.append(Finding(name, message))
-        return warnings
-    for term, gain in zip(EXTRA, of_terms, strict=True):
-        if gain > _EVIDENCE and gain == max(of_terms):
-            message = f"the records speak for {_TERMS[term]}, by {gain:.0f} nats; m, c, a and b alone do not hold"
-            warnings.append(Finding(term, message))
-    return warnings
-
-
-def _screened(problem: Problem, found: Found, others: list[Hypothesis]) -> list[Hypothesis]:
-    """Those that the first part of the records does not speak against; all, where that is no small part."""
-    part = problem.shortened(_SCREENED)
-    if part.samples > problem.samples / 2:
-        return others
-    fitter = found.fitter.on(part)
-    own = float(_energies(fitter, [found.best], found, np.inf)[0])
-    worse = _energies(fitter, others, found, own) - own
-    return [other for other, nats in zip(others, worse, strict=True) if nats < _HOPELESS]
-
-
-def _energies(fitter: Fitter, hypotheses: Sequence[Hypothesis], found: Found, own: float) -> FloatArray:
-    """(H,) free energies of other hypotheses, each in the best of some ratios of the noises."""
-    if not hypotheses:
-        return np.zeros(0)
-    tried = [replace(h, ratio=h.ratio * part) for h in hypotheses for part in _RATIOS]
-    start = np.append(found.mean, np.zeros(len(fitter.prior.mean) - len(found.mean)))
-    fits = fitter.fit(tried, start, found.level, _STEPS, bar=own)
-    return np.asarray(fits.free_energy.reshape(-1, len(_RATIOS)).min(axis=1))
+        gains.append(float(own - energies(fitter, [found.best], found, own)[0]))
+    if max(gains) <= EVIDENCE:
+        return []
+    term = EXTRA[int(np.argmax(gains))]
+    message = f"the records speak for {_TERMS[term]}, by {max(gains):.0f} nats; m, c, a and b alone do not hold"
+    return [Finding(term, message)]
 
 
 def disturbed(channel: Channel, strength: float, disturbance: float) -> str:
