@@ -78,7 +78,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         tell("checking the result")
         forecasts = foreseen(found, belief)
         parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
-        warnings = examine(problem, found, parameters, noises["input"], read, forecasts)
+        warnings = examine(problem, found, belief, parameters, noises["input"], read, forecasts)
     history = partial(contraction, problem, found, parameters)
     return Result(rig, belief, warnings, tuple(read), forecasts, noises, history)
 

@@ -154,7 +154,7 @@ def energies(fitter: Fitter, hypotheses: Sequence[Hypothesis], found: Found, own
     for k, one in enumerate(hypotheses):
         degree = INTERPOLATIONS["spline" if one.lag else one.interpolation]
         alike.setdefault((max(degree, 1), one.delay == int(one.delay)), []).append(k)
-    start = np.append(found.mean, np.zeros(len(fitter.prior.mean) - len(found.mean)))
+    start = np.append(found.mean, fitter.prior.mean[len(found.mean) :])
     for group in alike.values():
         tried = [replace(hypotheses[k], ratio=hypotheses[k].ratio * part) for k in group for part in _RATIOS]
         fits = fitter.fit(tried, start, found.level, _STEPS, bar=own)

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimator.belief import Belief
 from estimator.identification.alternatives import EVIDENCE, energies, of_input
 from estimator.identification.fit import Fitter
 from estimator.identification.guesses import astray, leads_astray, of_guess, without_guess
 from estimator.identification.problem import EXTRA, Problem, explicable
 from estimator.identification.records import Record, residuals
+from estimator.identification.rest import at_rest
 from estimator.identification.result import Finding
 from estimator.identification.search import Found
 from estimator.parameters import FloatArray
@@ -50,12 +52,14 @@ SLOWEST, ENOUGH = 5.0, 6
 _TERMS = {
     "cubic_damping": "a damping that grows with the cube of the velocity",
     "quintic": "a stiffness of fifth order",
+    "dry_friction": "dry friction, a force against the motion that is the same at every speed",
 }
 
 
 def examine(
     problem: Problem,
     found: Found,
+    belief: Belief,
     parameters: dict[str, tuple[float, float]],
     disturbance: tuple[float, float],
     records: Sequence[Record],
@@ -66,6 +70,7 @@ def examine(
     Args:
         problem: the records, scaled.
         found: the result of the search.
+        belief: its posterior.
         parameters: their means and standard deviations, in the rig's units.
         disturbance: of the force, as a standard deviation in the unit of the input; its mean and standard deviation.
         records: as they were read.
@@ -76,6 +81,8 @@ def examine(
         *((of_input(problem, found) or _of_terms(problem, found)) if noisy else []),
         *_of_noise(problem, disturbance),
         *_of_signs(parameters),
+        *_of_rest(problem, belief),
+        *_of_lag(problem, parameters),
         *_of_parameters(problem, found, parameters),
         *([] if guess is None else of_guess(guess, parameters, problem.rig.output.kind)),
         *(_of_residuals(problem, records, forecasts) if noisy else []),
@@ -149,7 +156,7 @@ def _of_terms(problem: Problem, found: Found) -> list[Finding]:
     """Further terms of the equation, by their evidence."""
     own, gains = float(found.fits.free_energy.min()), []
     for name in EXTRA:
-        prior = found.fitter.prior.widened(problem.natural()[name])
+        prior = found.fitter.prior.widened(problem.prior_of_term(name))
         fitter = Fitter(replace(problem, terms=(name,)), prior)
         gains.append(float(own - energies(fitter, [found.best], found, own)[0]))
     if max(gains) <= EVIDENCE:
@@ -180,6 +187,42 @@ def _of_noise(problem: Problem, disturbance: tuple[float, float]) -> list[Findin
         return []
     because = "either the recorded input is noisy, or the equation lacks something"
     return [Finding("process_noise", f"{disturbed(channel, strength, mean)}; {because}")]
+
+
+def _of_rest(problem: Problem, belief: Belief) -> list[Finding]:
+    """Whether the spring rests beside its inflection, so that a is not its stiffness at rest."""
+    rest = at_rest(belief)
+    if rest is None or rest.is_symmetric:
+        return []
+    scales = problem.scales
+    stiffness, square = scales.unit((1, -1, 0)), scales.unit((1, -2, 0))
+    moved = 3 * problem.displacement * scales.displacement
+    far = f", {abs(rest.place) / moved:.2g} times as far as the oscillator moves" if abs(rest.place) > moved else ""
+    message = (
+        f"the spring is not symmetric about rest: at rest it is {_given(*rest.stiffness)} {stiffness} stiff, with a "
+        f"quadratic stiffness of {_given(*rest.quadratic)} {square}; a and b are those of its inflection, which is "
+        f"{abs(rest.place):.3g} {scales.unit((0, 1, 0))} away{far}"
+    )
+    return [Finding("asymmetric", message)]
+
+
+def _of_lag(problem: Problem, parameters: Mapping[str, tuple[float, float]]) -> list[Finding]:
+    """Whether a lag of the input leaves the mass open: a coil's lag is also that of its own damping."""
+    lag, (m, std), (c, _) = problem.rig.input.lag, parameters["m"], parameters["c"]
+    if lag is None or abs(c) * lag < std:
+        return []
+    message = (
+        f"m may be {abs(c) * lag:.2g} {problem.scales.unit((1, -1, 2))} larger, {100 * abs(c * lag / m):.2g} %: where "
+        f"a coil that is driven by a voltage lags, so does the damping by its own motion, which looks like less mass; "
+        f"record the current in place of the voltage"
+    )
+    return [Finding("lag", message)]
+
+
+def _given(mean: float, std: float) -> str:
+    """A number with the digits that its standard deviation leaves."""
+    digits = max(2, min(12, 2 + int(np.floor(np.log10(max(abs(mean) / max(std, 1e-300), 1.0))))))
+    return f"{mean:.{digits}g} ± {std:.2g}"
 
 
 def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Finding]:

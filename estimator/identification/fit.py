@@ -74,11 +74,12 @@ class Prior:
         scale = np.sqrt(np.diag(cov))
         return cls(mean, np.linalg.inv(cov / np.outer(scale, scale)) / np.outer(scale, scale))
 
-    def widened(self, std: float) -> Prior:
-        """With one more coefficient, of which it is only known that it is about 0."""
-        more = np.zeros((len(self.mean) + 1,) * 2)
-        more[:-1, :-1], more[-1, -1] = self.precision, std**-2
-        return Prior(np.append(self.mean, 0.0), more)
+    def widened(self, more: Sequence[tuple[float, float]]) -> Prior:
+        """With more coefficients, of means and standard deviations."""
+        n, means, stds = len(self.mean), [mean for mean, _ in more], np.array([std for _, std in more])
+        precision = np.zeros((n + len(stds),) * 2)
+        precision[:n, :n], precision[n:, n:] = self.precision, np.diag(stds**-2)
+        return Prior(np.append(self.mean, means), precision)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,11 @@ from estimator.units import Scales
 LATEST = 3
 
 #: Terms that an equation may have beside those of Eq. (1) and the offsets: checks look for them.
-EXTRA = ("cubic_damping", "quintic")
+EXTRA = ("cubic_damping", "quintic", "dry_friction")
 
+
+#: Speed below which dry friction fades, in parts of the usual one.
+_CREEP = 0.05
 
 #: Samples of a gap that is bridged before it is known how long a period is.
 _BRIDGED = 16
@@ -190,7 +193,15 @@ class Problem:
         w, x = self.frequency, self.displacement
         sizes = {"stiffness": w**2, "cubic": w**2 / x**2, "damping": w, "gain": w**2 * x / self.strength}
         sizes |= {"force": w**2 * x, "output_offset": self.size}
-        return sizes | {"cubic_damping": w / (w * x) ** 2, "quintic": w**2 / x**4}
+        return sizes | {"cubic_damping": w / (w * x) ** 2, "quintic": w**2 / x**4, "friction": w**2 * x}
+
+    def prior_of_term(self, term: str) -> list[tuple[float, float]]:
+        """Mean and standard deviation of each coefficient that a term of `EXTRA` brings."""
+        if term != "dry_friction":
+            return [(0.0, self.natural()[term])]
+        # The speed below which friction fades is no matter of the records: a small part of the usual speed.
+        creep = _CREEP * self.frequency * self.displacement
+        return [(0.0, self.natural()["friction"]), (creep, 0.01 * creep)]
 
 
 def bridged(y: FloatArray, longest: float) -> FloatArray:

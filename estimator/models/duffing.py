@@ -32,6 +32,7 @@ def duffing(
     cubic_damping: bool = False,
     quintic: bool = False,
     feedthrough: bool = False,
+    dry_friction: bool = False,
     noise: str = "white",
     sensor: str = "displacement",
 ) -> Model:
@@ -42,6 +43,7 @@ def duffing(
         cubic_damping: a term e x'³ of the damping.
         quintic: a term q x⁵ of the stiffness.
         feedthrough: d u in the output.
+        dry_friction: a force f sign(x'), which is f x'/√(x'² + s²) below the speed s.
         noise: ``white`` in the acceleration, or ``held``: constant over a sample. Of unit strength it would move x by 1
             within a sample, without spring and damper.
         sensor: what it shows: ``displacement``, ``velocity`` or ``acceleration``.
@@ -50,7 +52,8 @@ def duffing(
         ValueError: for another noise or sensor.
     """
     terms = {
-        "offsets": offsets, "cubic_damping": cubic_damping, "quintic": quintic, "feedthrough": feedthrough
+        "offsets": offsets, "cubic_damping": cubic_damping, "quintic": quintic, "feedthrough": feedthrough,
+        "dry_friction": dry_friction,
     }  # fmt: skip
     for name, value in terms.items():
         flag(name, value)
@@ -60,7 +63,9 @@ def duffing(
 
 
 @cache
-def _duffing(offsets: bool, cubic_damping: bool, quintic: bool, feedthrough: bool, noise: str, sensor: str) -> Model:
+def _duffing(
+    offsets: bool, cubic_damping: bool, quintic: bool, feedthrough: bool, dry_friction: bool, noise: str, sensor: str
+) -> Model:
     order = KINDS[sensor]
     # The state is the displacement with its offset, where that is what the sensor shows.
     x = "(x - output_offset)" if offsets and order == 0 else "x"
@@ -87,6 +92,10 @@ def _duffing(offsets: bool, cubic_damping: bool, quintic: bool, feedthrough: boo
     if quintic:
         acceleration += f" - quintic*{x}**5"
         add("quintic", "V⁻⁴", "q", "quintic/gain", (1, -5, 0), "q*step**2/m")
+    if dry_friction:
+        acceleration += " - friction*v/sqrt(v**2 + creep**2)"
+        add("friction", "V", "f", "friction/gain", (1, 0, 0), "f*step**2/m")
+        add("creep", "V", "s", "creep/step", (0, 1, -1), "s*step")
     output = ("x", "v", acceleration)[order]
     if offsets and order:
         output += " + output_offset"
