@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -30,6 +31,10 @@ _CREEP = 0.05
 
 #: Samples of a gap that is bridged before it is known how long a period is.
 _BRIDGED = 16
+
+#: Inputs of a piece are few where they have less than so much of the power of the strongest, and all of them where they
+#: have more than so much.
+_FEW_INPUTS, _ALL_INPUTS = 0.25, 0.98
 
 
 class Samples(NamedTuple):
@@ -143,9 +148,44 @@ class Problem:
 
     def shortened(self, samples: int) -> Problem:
         """The same with the first samples of each record only."""
-        cut = lambda series: tuple(one[:samples] for one in series)  # noqa: E731
-        times = None if self.times is None else cut(self.times)
-        return replace(self, u=cut(self.u), y=cut(self.y), times=times)
+        return self.cut([(record, 0) for record in range(len(self.u))], samples)
+
+    def cut(self, pieces: Sequence[tuple[int, int]], samples: int) -> Problem:
+        """The same with pieces of records in their place, each of so many samples at most.
+
+        Args:
+            pieces: the number of a record, and the sample that the piece begins with.
+            samples: of each.
+        """
+        u, y, times = [], [], []
+        for record, begin in pieces:
+            inside = slice(begin, begin + samples)
+            u.append(self.u[record][inside])
+            y.append(explicable(self.y[record][inside], self.rig, LATEST) if begin else self.y[record][inside])
+            times.append(self.counted[record][inside])
+        evenly = None if self.times is None else tuple(one - one[0] for one in times)
+        return replace(self, u=tuple(u), y=tuple(y), times=evenly)
+
+    def driven_from(self, samples: int) -> list[tuple[int, int]]:
+        """Of each record, its number and the sample that a piece of so many begins with, which shows what an input did.
+
+        It is the first, unless the input is far stronger elsewhere: the last piece that holds the strongest inputs, and
+        some of what was before them.
+        """
+        pieces = []
+        for record, (u, y) in enumerate(zip(self.u, self.y, strict=True)):
+            power = _sliding((u - u.mean()) ** 2, samples) * _sliding(np.isfinite(y).astype(float), samples)
+            begin = 0
+            if power[0] < _FEW_INPUTS * power.max():
+                begin = max(0, int(np.flatnonzero(power > _ALL_INPUTS * power.max())[-1]) - samples // 8)
+            pieces.append((record, begin))
+        return pieces
+
+    def liveliest(self, samples: int) -> tuple[int, int]:
+        """The number of a record, and the sample that a piece of so many begins with, of the largest outputs."""
+        powers = [_sliding(np.nan_to_num(y) ** 2, samples) for y in self.y]
+        record = int(np.argmax([power.max() for power in powers]))
+        return record, int(powers[record].argmax())
 
     @cached_property
     def size(self) -> float:
@@ -218,6 +258,13 @@ def bridged(y: FloatArray, longest: float) -> FloatArray:
         before, after = seen[gap], seen[gap + 1]
         filled[before : after + 1] = np.linspace(y[before], y[after], after - before + 1)
     return filled
+
+
+def _sliding(values: FloatArray, samples: int) -> FloatArray:
+    """Sums of pieces of so many values, one for each place where a piece may begin."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    samples = min(samples, len(values))
+    return np.asarray(sums[samples:] - sums[: len(sums) - samples])
 
 
 def explicable(y: FloatArray, rig: Rig, later: int = 0) -> FloatArray:

@@ -26,6 +26,9 @@ _RATIOS = np.geomspace(1e-2, 1e2, 5)
 #: The first look takes so many periods of a record, and at least and at most so many samples.
 _PERIODS, _SHORTEST, _LONGEST = 25, 1024, 4096
 
+#: The equation is tested with so many periods, where these are more samples.
+_MANY_PERIODS = 40
+
 #: Steps of it, after which so many of its hypotheses are kept.
 _LOOK = ((3, 8), (10, 1))
 
@@ -148,8 +151,10 @@ def _look(fitter: Fitter) -> Fits:
     """The best of all starts and ratios of the noises."""
     problem = fitter.problem
     period = 2 * np.pi / problem.frequency
-    short = fitter.on(problem.shortened(int(np.clip(_PERIODS * period, _SHORTEST, _LONGEST))))
-    candidates = starts(problem.shortened(_LONGEST))
+    samples = int(np.clip(_PERIODS * period, _SHORTEST, _LONGEST))
+    short = fitter.on(problem.cut(problem.driven_from(samples), samples))
+    samples = int(max(_MANY_PERIODS * period, _LONGEST))
+    candidates = starts(problem.cut(problem.driven_from(samples), samples))
     if problem.rig.guess is not None:
         middle = {name: (low + high) / 2 for name, (low, high) in problem.rig.guess.items()}
         middle |= {"u0": problem.rig.input.offset, "y0": problem.rig.output.offset}
@@ -157,8 +162,9 @@ def _look(fitter: Fitter) -> Fits:
         candidates.append(problem.inward(guessed, np.zeros((len(guessed),) * 2))[0])
     if not candidates:
         raise ValueError(
-            f"records must have a few periods without long gaps to find a start, but have {problem.samples} outputs in "
-            f"some {sum(map(len, problem.y)) / period:.0f} periods; add samples, or a guess to the rig"
+            f"records must show what the input does for a few periods without long gaps to find a start, but have "
+            f"{problem.samples} outputs in some {sum(map(len, problem.y)) / period:.0f} periods; add samples, or a "
+            "guess to the rig"
         )
     ratios = _RATIOS * problem.frequency ** (2 - problem.scales.order)
     base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]), lag=problem.lag)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from estimator.identification.problem import Problem, bridged
 from estimator.models.duffing import KINDS
@@ -30,6 +31,15 @@ _BRIDGED = 1 / 6
 
 #: Periods over which an integrated signal loses its drift.
 _PERIODS = (3.0, 10.0, 30.0)
+
+#: A record that begins with so many samples of inputs and outputs below so much of its largest begins at rest.
+_WAITS, _AT_REST = 8, 0.05
+
+#: Coefficients that are drawn lie between so much and so many of their natural sizes: these are those of a motion that
+#: is a sine, of the mean frequency. One that goes from well to well is slower, and has harmonics.
+_SMALLEST, _LARGEST = 0.003, 2.0
+
+_DRAWN = ("gain", "damping", "stiffness", "cubic")
 
 
 def starts(problem: Problem) -> list[FloatArray]:
@@ -71,6 +81,25 @@ def starts(problem: Problem) -> list[FloatArray]:
     return found
 
 
+def scattered(problem: Problem, count: int) -> list[FloatArray]:
+    """Coefficients (K,) of all sizes and signs, always the same: to begin with where `starts` lead nowhere.
+
+    A spring without force at its middle has two wells, or one; one that softens for ever has none, and is left out.
+    """
+    names, natural, rng = list(problem.model.coefficients), problem.natural(), np.random.default_rng(0)
+    found = []
+    for offset in np.resize(_middles(problem), count):
+        sizes = {name: natural[name] * np.exp(rng.uniform(*np.log([_SMALLEST, _LARGEST]))) for name in _DRAWN}
+        sizes["stiffness"] *= rng.choice([-1.0, 1.0])
+        if sizes["stiffness"] > 0:
+            sizes["cubic"] *= rng.choice([-1.0, 1.0])
+        sizes["gain"] *= rng.choice([-1.0, 1.0])
+        values = dict.fromkeys(names, 0.0) | sizes
+        values |= {"force": offset * values["stiffness"], "output_offset": offset}
+        found.append(np.array([values[name] for name in names]))
+    return found
+
+
 def _middles(problem: Problem) -> list[float]:
     """Places, counted as the outputs are, where the spring may be without force; just 0 where these have no origin."""
     if not problem.origin:
@@ -89,7 +118,8 @@ def _equations(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, p
     bump = base**_POWER
     first = -2 * _POWER * s * base ** (_POWER - 1) / half
     second = (-2 * _POWER * base ** (_POWER - 1) + 4 * _POWER * (_POWER - 1) * s**2 * base ** (_POWER - 2)) / half**2
-    over = lambda test, values: np.convolve(values, test[::-1], mode="valid")  # noqa: E731
+    stride = max(1, half // 4)
+    over = lambda test, values: sliding_window_view(values, len(test))[::stride] @ test  # noqa: E731
     seen = bridged(y, _BRIDGED * 2 * np.pi / problem.frequency)
     missing = ~np.isfinite(seen)
     seen = np.where(missing, np.nanmean(y), seen)
@@ -106,13 +136,19 @@ def _equations(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, p
         (-over(first, shown), over(bump, shown)),
         (over(bump, shown), -over(first, x)),
     )[order]
-    square = over(bump, x**2) if order else np.zeros(count - 2 * half)
+    square = over(bump, x**2) if order else np.zeros(len(velocity))
     forces = -over(bump, x), -over(bump, x**3), over(bump, np.ones(count)), -square
     columns = (acceleration, over(bump, acting), -velocity, *forces)
     clean = over(np.ones(2 * half + 1), missing.astype(float)) < 0.5
-    clean &= np.arange(len(clean)) >= min(2 * np.pi * periods / problem.frequency, count / 4)
-    stride = max(1, half // 4)
-    return np.stack(columns, axis=1)[clean][::stride]
+    if order and not _quiet(acting, shown):
+        clean[: int(np.ceil(min(2 * np.pi * periods / problem.frequency, count / 4) / stride))] = False
+    return np.stack(columns, axis=1)[clean]
+
+
+def _quiet(u: FloatArray, y: FloatArray) -> bool:
+    """Whether a record begins at rest, before anything acts: then an integrated signal has no drift to lose."""
+    onset = int(np.argmax(np.abs(u - u[0]) > _AT_REST * np.abs(u).max()))
+    return onset >= _WAITS and float(np.sqrt(np.mean(y[:onset] ** 2))) < _AT_REST * float(y.std())
 
 
 def _integrated(values: FloatArray, lowest: float) -> FloatArray:
