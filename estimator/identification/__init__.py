@@ -29,7 +29,8 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     The coefficients are the most probable ones under the Kalman filter's likelihood of all records, with a Gaussian
     about them (variational Laplace: `estimator.identification.fit`). The two noises are unknown: hypotheses about their
     ratio, each at its best level, are weighed by their free energies, on a grid that is refined. Without a guess in the
-    rig the search begins at the equation tested with smooth bumps (`estimator.identification.start`).
+    rig the search begins at the equation tested with smooth bumps (`estimator.identification.start`), and where that
+    leads nowhere at coefficients that are drawn, always the same.
 
     Args:
         rig: a `Rig`, a dictionary, or the name of a rig file.

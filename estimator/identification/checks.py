@@ -77,8 +77,11 @@ def examine(
         forecasts: of their outputs.
     """
     guess, of_records, noisy = problem.rig.guess, _of_records(problem, records), _error(records, forecasts) > _FINEST
+    ways = of_input(problem, found) if noisy else []
+    if found.is_lost and not ways:  # the other checks would blame the equation
+        return (*of_records, _lost(found))
     of_fit = [
-        *((of_input(problem, found) or _of_terms(problem, found)) if noisy else []),
+        *(ways or (_of_terms(problem, found) if noisy else [])),
         *_of_noise(problem, disturbance),
         *_of_signs(parameters),
         *_of_rest(problem, belief),
@@ -123,6 +126,15 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
         message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, {ENOUGH} at least"
         warnings.append(Finding("sampling_too_slow", message))
     return warnings
+
+
+def _lost(found: Found) -> Finding:
+    message = (
+        f"the search may have failed: what it found leaves a disturbance of {100 * found.disturbance:.2g} % of the "
+        "input, and no two of its starts led to the same; m, c, a and b may be anything. Add a guess to the rig, or "
+        "identify from several records, of small motions too"
+    )
+    return Finding("search_failed", message)
 
 
 def _of_outliers(channel: Channel, records: Sequence[Record]) -> list[Finding]:

@@ -3,7 +3,7 @@
 The filter of a fit is linear about where it believes the oscillator to be. A record may begin anywhere, and an
 accelerometer or a strong resonance does not tell where at once: a filter that begins at rest takes the difference for
 noise, and its coefficients are wrong. So it begins at the most probable motion, at the coefficients of the fit before;
-unless all of the record is explained far better by where it began then, or by rest.
+unless all of the record is explained far better by where it began then, or by rest, in each of the wells too.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from estimator.identification.fit import Hypothesis
 from estimator.identification.problem import Problem
+from estimator.identification.start import rests
 from estimator.information import follow
 from estimator.parameters import FloatArray
 
@@ -72,7 +73,8 @@ def motions(problem: Problem, hypothesis: Hypothesis, points: FloatArray, level:
         found = np.where((tried[best, series] < around[0])[:, None], candidates[best, series], found)
     rest = np.zeros_like(found)
     before = rest if hypothesis.motions is None else np.tile(hypothesis.motions, (len(points), 1))
-    choice = np.stack([unit * found, before, rest])
+    wells = np.repeat(rests(problem, points), len(problem.u), axis=1)
+    choice = np.stack([unit * found, before, rest, *(np.stack([x, np.zeros_like(x)], axis=1) for x in wells)])
     chosen = _judge(problem, hypothesis, points, problem.start)(choice, level)
     chosen[0] -= _BETTER
     return np.asarray(choice[chosen.argmin(axis=0), series]).reshape(len(points), -1, 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from estimator.ensemble import half_cauchy
 from estimator.identification.fit import Fits, Fitter, Hypothesis, Prior, with_ratios
 from estimator.identification.motions import motions
 from estimator.identification.problem import Problem
-from estimator.identification.start import starts
+from estimator.identification.start import effect, scattered, starts
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
 from estimator.rig_prior import rig_prior
@@ -31,6 +32,16 @@ _MANY_PERIODS = 40
 
 #: Steps of it, after which so many of its hypotheses are kept.
 _LOOK = ((3, 8), (10, 1))
+
+#: Where the disturbance is more than so much of the input, so many times so many starts are drawn. They are fitted to
+#: pieces of so many periods, and of so many samples at least, which grow by a factor until they are all.
+_POOR, _TRIES, _DRAWS, _PIECE, _LEAST, _LONGER = 0.05, 3, 192, 4, 128, 4
+
+#: Steps of each of these fits; how many results are kept of what was drawn, of pieces, and of all records.
+_STEPS, _KEPT = 8, (48, 12, 3)
+
+#: Nats by which the free energies of results that are the same differ at most.
+_SAME = 5.0
 
 #: Steps of a fit to all records, from what the first look found and from where it began, of which the best is kept.
 _FEW = 3
@@ -60,11 +71,13 @@ class Found:
         fits: hypotheses about the noises that share the records, interpolation, delay and terms.
         weights: (H,) their probabilities.
         fitter: that made them.
+        is_lost: whether they explain the records badly, and no other start leads to them.
     """
 
     fits: Fits
     weights: FloatArray
     fitter: Fitter
+    is_lost: bool = False
 
     @property
     def mean(self) -> FloatArray:
@@ -92,6 +105,11 @@ class Found:
     def level(self) -> float:
         """σ_v of the most probable hypothesis."""
         return float(self.fits.level[np.argmax(self.weights)])
+
+    @property
+    def disturbance(self) -> float:
+        """σ_w of the most probable hypothesis, in parts of what the inputs do."""
+        return self.best.ratio * self.level / max(effect(self.fitter.problem, self.mean), 1e-300)
 
     @property
     def noises(self) -> tuple[FloatArray, FloatArray]:
@@ -124,9 +142,43 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
     fitter = Fitter(replace(problem, substeps=coarse), prior_of(problem))
     tell("looking for a start")
     looked = _look(fitter)
-    start, level, hypothesis, reach = looked.mean[0], float(looked.level[0]), looked.hypotheses[0], 30.0
-    substeps = enough_substeps(problem, start, looked.cov[0])
+    if not len(looked.mean):
+        raise ValueError(
+            "records must be of an oscillator that Eq. (1) can follow, and show what the input does for a few periods, "
+            "but every start ran away; check units, columns and the sampling step, or add a guess to the rig"
+        )
     tell("fitting coefficients and noises")
+    found = _settled(fitter, looked)
+    if problem.rig.guess is None and found.disturbance > _POOR:
+        tell("looking for another start")
+        found = _settled_again(fitter, found)
+    return found
+
+
+def _settled_again(fitter: Fitter, found: Found) -> Found:
+    """The best of what was found and of what other starts lead to.
+
+    Where these come to the same it is not the start that is wrong, and none is sought after one that is not poor.
+    """
+    energy = lambda end: float(end.fits.free_energy.min())  # noqa: E731
+    ends = [found]
+    for seed in range(_TRIES):
+        others = _look_again(fitter, seed)
+        for k in range(len(others.mean)):
+            with suppress(ValueError):  # it ran away
+                ends.append(_settled(fitter, others.where(np.array([k]))))
+            ends.sort(key=energy)
+            same = len(ends) > 1 and energy(ends[1]) < energy(ends[0]) + _SAME
+            if same or ends[0].disturbance < _POOR:
+                return ends[0]
+    return replace(ends[0], is_lost=True)
+
+
+def _settled(fitter: Fitter, looked: Fits) -> Found:
+    """What the best of some fits comes to, with as many steps of integration and the motions that it needs."""
+    problem, hypothesis = fitter.problem, looked.hypotheses[0]
+    start, level, reach = looked.mean[0], float(looked.level[0]), 30.0
+    substeps = enough_substeps(problem, start, looked.cov[0])
     for _ in range(_ROUNDS):
         problem = replace(problem, substeps=substeps)
         hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start[None], level)[0])
@@ -148,7 +200,7 @@ def _begins_otherwise(found: Found) -> bool:
 
 
 def _look(fitter: Fitter) -> Fits:
-    """The best of all starts and ratios of the noises."""
+    """The best of all starts and ratios of the noises; of none where all ran away."""
     problem = fitter.problem
     period = 2 * np.pi / problem.frequency
     samples = int(np.clip(_PERIODS * period, _SHORTEST, _LONGEST))
@@ -161,11 +213,7 @@ def _look(fitter: Fitter) -> Fits:
         guessed = coefficients_of(problem.model, middle, problem.scales)
         candidates.append(problem.inward(guessed, np.zeros((len(guessed),) * 2))[0])
     if not candidates:
-        raise ValueError(
-            f"records must show what the input does for a few periods without long gaps to find a start, but have "
-            f"{problem.samples} outputs in some {sum(map(len, problem.y)) / period:.0f} periods; add samples, or a "
-            "guess to the rig"
-        )
+        return _look_again(fitter)
     ratios = _RATIOS * problem.frequency ** (2 - problem.scales.order)
     base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]), lag=problem.lag)
     level = np.array(0.1 * problem.size)
@@ -181,12 +229,48 @@ def _look(fitter: Fitter) -> Fits:
         # The first periods may tell little of a coefficient, which then is anywhere: all records judge.
         points = np.array([*fits.mean, *candidates])
         fits = fitter.fit(list(fits.hypotheses) * len(points), points, fits.level[0], _FEW).best(1)
-    if not np.isfinite(fits.free_energy).any():
-        raise ValueError(
-            "records must be of an oscillator that Eq. (1) can follow, but every start ran away; check units, columns "
-            "and the sampling step, or add a guess to the rig"
-        )
-    return fits
+    return fits if np.isfinite(fits.free_energy).any() else _look_again(fitter)
+
+
+def _look_again(fitter: Fitter, seed: int = 0) -> Fits:
+    """The best that many starts lead to, which are drawn and fitted to pieces of the records that grow."""
+    problem = fitter.problem
+    ratios = _RATIOS * problem.frequency ** (2 - problem.scales.order)
+    base = Hypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[2]), lag=problem.lag)
+    shortest = max(_LEAST, round(_PIECE * 2 * np.pi / problem.frequency))
+    points = np.array(scattered(problem, _DRAWS, seed))
+    shape, levels = (_DRAWS, *np.diag(points[0]).shape), np.full(_DRAWS, 0.1 * problem.size)
+    drawn = Fits((base,) * _DRAWS, points, np.zeros(shape), levels, np.zeros(_DRAWS))
+    found = []
+    for piece in dict.fromkeys([problem.liveliest(shortest), *problem.driven_from(shortest)[:1]]):
+        samples, (many, few, _) = shortest, _KEPT
+        fits = _moving(fitter.on(problem.cut([piece], samples)), drawn, ratios[[1, 3]], many)
+        while samples < max(map(len, problem.u)):
+            fits = _moving(fitter.on(problem.cut([piece], samples)), fits, ratios, few)
+            samples *= _LONGER
+        found.append(fits)
+    names = ("mean", "cov", "level", "free_energy")
+    both = (np.concatenate([getattr(fits, name) for fits in found]) for name in names)
+    return _moving(fitter, Fits(tuple(h for fits in found for h in fits.hypotheses), *both), ratios, _KEPT[2])
+
+
+def _moving(fitter: Fitter, fits: Fits, ratios: FloatArray, kept: int) -> Fits:
+    """The best of fits from where others came to, of records that begin in motion, each at the best of the ratios."""
+    if not len(fits.mean):
+        return fits
+    base = replace(fits.hypotheses[0], motions=None)
+    begins = motions(fitter.problem, base, fits.mean, float(np.median(fits.level)))
+    hypotheses = [one for begin in begins for one in with_ratios(replace(base, motions=begin), ratios)]
+    points, levels = np.repeat(fits.mean, len(ratios), axis=0), np.repeat(fits.level, len(ratios))
+    tried = fitter.fit(hypotheses, points, levels, _STEPS)
+    of_each = tried.free_energy.reshape(-1, len(ratios)).argmin(axis=1)
+    return _apart(tried.where(len(ratios) * np.arange(len(of_each)) + of_each), kept)
+
+
+def _apart(fits: Fits, count: int) -> Fits:
+    """The best of those that did not come to the same."""
+    finite = fits.where(np.isfinite(fits.free_energy))
+    return finite.where(np.unique(np.round(finite.free_energy), return_index=True)[1][:count])
 
 
 def enough_substeps(problem: Problem, mean: FloatArray, cov: FloatArray) -> int:

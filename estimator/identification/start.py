@@ -39,6 +39,7 @@ _WAITS, _AT_REST = 8, 0.05
 #: is a sine, of the mean frequency. One that goes from well to well is slower, and has harmonics.
 _SMALLEST, _LARGEST = 0.003, 2.0
 
+#: Coefficients that are drawn; the others begin at 0.
 _DRAWN = ("gain", "damping", "stiffness", "cubic")
 
 
@@ -81,12 +82,12 @@ def starts(problem: Problem) -> list[FloatArray]:
     return found
 
 
-def scattered(problem: Problem, count: int) -> list[FloatArray]:
-    """Coefficients (K,) of all sizes and signs, always the same: to begin with where `starts` lead nowhere.
+def scattered(problem: Problem, count: int, seed: int) -> list[FloatArray]:
+    """Coefficients (K,) of all sizes and signs, the same for a seed: to begin with where `starts` lead nowhere.
 
-    A spring without force at its middle has two wells, or one; one that softens for ever has none, and is left out.
+    A spring that pushes away from its middle hardens, because nothing would hold the oscillator else.
     """
-    names, natural, rng = list(problem.model.coefficients), problem.natural(), np.random.default_rng(0)
+    names, natural, rng = list(problem.model.coefficients), problem.natural(), np.random.default_rng(seed)
     found = []
     for offset in np.resize(_middles(problem), count):
         sizes = {name: natural[name] * np.exp(rng.uniform(*np.log([_SMALLEST, _LARGEST]))) for name in _DRAWN}
@@ -98,6 +99,25 @@ def scattered(problem: Problem, count: int) -> list[FloatArray]:
         values |= {"force": offset * values["stiffness"], "output_offset": offset}
         found.append(np.array([values[name] for name in names]))
     return found
+
+
+def effect(problem: Problem, mean: FloatArray) -> float:
+    """Root mean square of what the inputs do to the motion at coefficients (K,), in the unit of the process noise."""
+    return abs(float(mean[list(problem.model.coefficients).index("gain")])) * problem.strength
+
+
+def rests(problem: Problem, points: FloatArray) -> FloatArray:
+    """(n, P) displacements at which the spring of some of the coefficients (P, K) is without force, beside its middle.
+
+    None where no spring has two wells; 0 for one that has not.
+    """
+    names = list(problem.model.coefficients)
+    stiffness, cubic = points[:, names.index("stiffness")], points[:, names.index("cubic")]
+    two = (stiffness < 0) & (cubic > 0)
+    if not two.any():
+        return np.empty((0, len(points)))
+    away = np.sqrt(np.divide(-stiffness, cubic, out=np.zeros(len(points)), where=two))
+    return np.stack([away, -away])
 
 
 def _middles(problem: Problem) -> list[float]:

@@ -1,5 +1,7 @@
 """Oscillators that tests identify: their records, and their rigs."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from estimator import Channel, Rig
@@ -12,6 +14,9 @@ from estimator.units import Scales
 #: that the input is held for.
 BENCH = ({"m": 0.4, "c": 0.6, "a": 2500.0, "b": 4e7}, 1e-3, 6.0, 5e-6, 8)
 SOFT = ({"m": 1.0, "c": 0.5, "a": 400.0, "b": -4000.0}, 1e-2, 6.0, 1e-4, 4)
+
+#: Two wells, 8 mm off the hill between them, that the motion leaves again and again.
+WELLS = ({"m": 0.4, "c": 0.6, "a": -2500.0, "b": 4e7}, 1e-3, 6.0, 2e-6, 16)
 
 
 def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3, start=0.0):
@@ -32,6 +37,20 @@ def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3, start
     y = np.concatenate([[start], y[:-1]])
     sensor = noise if kind == "displacement" else 2e-3 * y.std()
     return u, y + sensor * rng.standard_normal(samples)
+
+
+def struck(blows, rate, kind, lasting, seconds=2.0):
+    """Rig and record of a bench of 0.35 kg that blows (times) strike which last so long [s]."""
+    truth, scales = {"m": 0.35, "c": 0.8, "a": 1800.0, "b": 3e7}, Scales(1 / rate, 100.0, 1e-2, KINDS[kind])
+    times, u = np.arange(int(seconds * rate)) / rate, np.zeros(int(seconds * rate))
+    for begin in blows:
+        inside = (times > begin) & (times < begin + lasting)
+        u[inside] = 100.0 * np.sin(np.pi * (times[inside] - begin) / lasting) ** 2
+    model = duffing(offsets=True, sensor=kind)
+    known = coefficients_of(model, {p: truth.get(p, 0.0) for p in model.physical}, scales)
+    y = scales.output * free_run(model, known, u / 100.0, interpolation="linear")
+    rig = replace(rig_of((truth, 1 / rate), kind), interpolation="linear")
+    return truth, rig, (u, y + 2e-3 * y.std() * np.random.default_rng(0).standard_normal(len(y)))
 
 
 def rig_of(case, kind="displacement", **others):

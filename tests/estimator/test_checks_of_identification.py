@@ -1,11 +1,12 @@
 """What `identify` warns of: each check names its fault. benchmarks/rigs says how often, and that good records pass."""
 
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from oscillators import BENCH, SOFT, deviations, rig_of, simulated
+from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated
 
 from estimator import Channel, Rig, identify
 from estimator.identification.checks import _of_outliers
@@ -171,3 +172,17 @@ def test_a_bench_s_own_disturbance_is_no_fault_of_a_weak_input():
     for limit, names in ((None, {"not_identified", "process_noise"}), (6.0, {"not_identified"})):
         rig = Rig(BENCH[1], input=Channel("N", limit=limit), output=Channel("m"))
         assert {warning.name for warning in identify(rig, records).warnings} == names
+
+
+def test_a_search_that_failed_is_no_wrong_equation(monkeypatch):
+    record = simulated(WELLS, 7, kind="acceleration", start=np.sqrt(2500.0 / 4e7))
+    monkeypatch.setattr(sys.modules["estimator.identification.search"], "_TRIES", 0)
+    (warning,) = identify(rig_of(WELLS, "acceleration"), record).warnings
+    assert warning.name == "search_failed"
+    assert "the search may have failed" in warning.message
+
+
+def test_a_wrong_equation_is_no_search_that_failed():
+    u, y = simulated(BENCH)
+    noisy = u + 0.15 * u.std() * np.random.default_rng(0).standard_normal(len(u))
+    assert [one.name for one in identify(rig_of(BENCH), (noisy, y)).warnings] == ["process_noise"]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oscillators import BENCH, SOFT, deviations, rig_of, simulated
+from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated, struck
 
 from estimator import Channel, Rig, identify
 from estimator.free_run import free_run
@@ -229,3 +229,29 @@ def test_a_record_that_begins_weakly_is_judged_as_a_whole():
         result = identify(rig, (u, x + 0.01 * x.std() * np.random.default_rng(seed).standard_normal(6000)))
         assert np.abs(deviations(result, truth)).max() < 4.5
         assert result.warnings == ()
+
+
+@pytest.mark.parametrize("kind", ["velocity", "acceleration"])
+@pytest.mark.parametrize("blows", [(0.02, 0.9, 1.4), (0.7, 1.3), (0.05,)])
+def test_blows_are_found_wherever_they_are(kind, blows):
+    truth, rig, record = struck(blows, 8e3, kind, 3e-3)
+    result = identify(rig, record)
+    assert np.abs(deviations(result, truth)).max() < 4.5
+    assert result.warnings == ()
+
+
+@pytest.mark.parametrize("kind", ["velocity", "acceleration"])
+def test_two_wells_are_found_by_a_sensor_that_does_not_show_them(kind):
+    # The accelerometer's frequency is four times that of the motion, and its first look found no wells for 5, 7 and 9.
+    for seed in (1, 5, 7, 9):
+        result = identify(rig_of(WELLS, kind), simulated(WELLS, seed, kind=kind, start=np.sqrt(2500.0 / 4e7)))
+        assert np.abs(deviations(result, WELLS[0])).max() < 4.5
+        assert result.warnings == ()
+
+
+def test_a_start_is_found_where_gaps_are_everywhere():
+    u, y = simulated(BENCH)
+    y[np.arange(len(y)) % 60 < 30] = np.nan
+    result = identify(rig_of(BENCH), (u, y))
+    assert np.abs(deviations(result, BENCH[0])).max() < 4.5
+    assert result.warnings == ()
