@@ -18,7 +18,7 @@ from estimator.identification.result import Finding
 from estimator.identification.search import Found
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
-from estimator.rig import Channel
+from estimator.rig import Channel, Rig
 
 #: Probability of a false alarm of a test of the residuals.
 _ALARM = 1e-4
@@ -45,6 +45,10 @@ _FINEST = 1e-6
 
 #: How far off a gross outlier is: in parts of what 99 % of all are off, and of those beside it.
 _GROSS, _ALONE = 10.0, 5.0
+
+#: An input rests within so much of its largest. Blows are inputs that act for less than so much of the time; so few
+#: samples see them badly, and so many well.
+_QUIET, _SELDOM, _BRIEF, _SEEN = 0.02, 0.1, 5, 10
 
 #: Fewest samples in a period that pass without a word, and as many as are asked for where there are fewer.
 SLOWEST, ENOUGH = 5.0, 6
@@ -108,7 +112,8 @@ def _error(records: Sequence[Record], forecasts: Sequence[FloatArray]) -> float:
 
 
 def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
-    rig, warnings = problem.rig, _of_outliers(problem.rig.output, records)
+    rig = problem.rig
+    warnings = [*_of_outliers(rig.output, records), *_of_blows(rig, records)]
     stops = sum(one.clipped for one in records)
     if stops:
         message = f"{stops} outputs stand at a stop and were taken as missing; widen the range, or drive it less"
@@ -126,6 +131,27 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
         message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, {ENOUGH} at least"
         warnings.append(Finding("sampling_too_slow", message))
     return warnings
+
+
+def _of_blows(rig: Rig, records: Sequence[Record]) -> list[Finding]:
+    """Whether the input is blows of so few samples that their impulse is uncertain; not steps that a converter held."""
+    lengths, held, acting = list[int](), list[bool](), 0
+    largest = max(float(np.abs(one.u - np.median(one.u)).max()) for one in records)
+    for one in records:
+        u = one.u - np.median(one.u)
+        acts = np.concatenate([[False], np.abs(u) > _QUIET * largest, [False]])
+        acting += int(acts.sum())
+        for begin, end in np.flatnonzero(acts[1:] != acts[:-1]).reshape(-1, 2):
+            lengths.append(int(end - begin))
+            held.append(rig.interpolation == "zero_order" and float(np.ptp(u[begin:end])) < _QUIET * largest)
+    if not lengths or all(held) or np.median(lengths) > _BRIEF or acting > _SELDOM * sum(len(one.u) for one in records):
+        return []
+    message = (
+        f"the input is blows that {np.median(lengths):.0f} samples see: their impulse, and with it m, c, a and b "
+        "alike, is known to some percent only, whatever the intervals say; sample faster, "
+        f"{_SEEN} times in a blow at least"
+    )
+    return [Finding("short_blows", message)]
 
 
 def _lost(found: Found) -> Finding:

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated
+from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated, struck
 
 from estimator import Channel, Rig, identify
-from estimator.identification.checks import _of_outliers
+from estimator.identification.checks import _of_blows, _of_outliers
 from estimator.identification.records import Record
 
 GUESS = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
@@ -172,6 +172,21 @@ def test_a_bench_s_own_disturbance_is_no_fault_of_a_weak_input():
     for limit, names in ((None, {"not_identified", "process_noise"}), (6.0, {"not_identified"})):
         rig = Rig(BENCH[1], input=Channel("N", limit=limit), output=Channel("m"))
         assert {warning.name for warning in identify(rig, records).warnings} == names
+
+
+@pytest.mark.parametrize(("rate", "named"), [(1e3, True), (8e3, False)])
+def test_blows_that_few_samples_see_are_named(rate, named):
+    _, rig, record = struck((0.1, 0.9), rate, "displacement", 4e-3)
+    messages = [one.message for one in identify(rig, record).warnings if one.name == "short_blows"]
+    assert bool(messages) is named
+    assert all("that 3 samples see" in message for message in messages)
+
+
+def test_short_steps_that_a_converter_held_are_no_blows():
+    _, rig, (u, y) = struck((0.1, 0.9), 1e3, "displacement", 4e-3)
+    held = [Record("held", np.where(np.abs(u) > 0, 100.0, 0.0), y)]
+    assert _of_blows(replace(rig, interpolation="zero_order"), held) == []
+    assert [one.name for one in _of_blows(rig, held)] == ["short_blows"]
 
 
 def test_a_search_that_failed_is_no_wrong_equation(monkeypatch):
