@@ -263,7 +263,7 @@ def show(found: dict[str, list[Answer]], first: int) -> dict[str, Any]:
     for name, answers in rows.items():
         one = kept[name] = summary(answers)
         lines.append((
-            name, one["records"], one["right"], one["refused"], one["warned"], one["silent and wrong"],
+            name, *(str(one[key]) for key in ("records", "right", "refused", "warned", "silent and wrong")),
             f"{one['coverage, silent']:.3f}", ", ".join(f"{100 * e:.2g}" for e in one["median errors"]),
         ))  # fmt: skip
     titles = ("", "n", "right", "refused", "warned", "silent wrong", "cover", "median errors, %")

@@ -120,6 +120,24 @@ def rests(problem: Problem, points: FloatArray) -> FloatArray:
     return np.stack([away, -away])
 
 
+def misfit(problem: Problem) -> float:
+    """What the equation leaves of the acceleration at best, in parts of it, over bumps of some widths."""
+    inputs = problem.samples_of(problem.rig.interpolation, round(problem.rig.delay)).inputs
+    periods = _PERIODS[1] if KINDS[problem.rig.output.kind] > 0 else 0.0
+    left = [1.0]
+    for part in _WIDTHS[:2]:
+        half = max(3, round(part * 2 * np.pi / problem.frequency))
+        rows = [_equations(problem, u, y, half, periods) for u, y in zip(inputs, problem.y, strict=True)]
+        kept = [row for row in rows if row is not None]
+        if not kept or len(equations := np.concatenate(kept)) < 4 * equations.shape[1]:
+            continue
+        scale = np.sqrt(np.mean(equations**2, axis=0))
+        unit = equations / np.where(scale == 0, 1.0, scale)
+        solution = np.linalg.lstsq(unit[:, 1:], unit[:, 0], rcond=1e-8)[0]
+        left.append(float(np.mean((unit[:, 0] - unit[:, 1:] @ solution) ** 2)))
+    return min(left)
+
+
 def _middles(problem: Problem) -> list[float]:
     """Places, counted as the outputs are, where the spring may be without force; just 0 where these have no origin."""
     if not problem.origin:
