@@ -11,11 +11,13 @@ from estimator.belief import Belief
 from estimator.identification.alternatives import EVIDENCE, energies, of_input
 from estimator.identification.fit import Fitter
 from estimator.identification.guesses import astray, leads_astray, of_guess, without_guess
+from estimator.identification.offsets import offset_of
 from estimator.identification.problem import EXTRA, Problem, explicable
 from estimator.identification.records import Record, residuals
 from estimator.identification.rest import at_rest
 from estimator.identification.result import Finding
 from estimator.identification.search import Found
+from estimator.identification.sensors import unfiltered
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
 from estimator.rig import Channel, Rig
@@ -42,6 +44,9 @@ _FAR = 5.0
 #: Smallest errors of the forecasts, in parts of the output, that are judged: smaller ones are those of the integration,
 #: and all that is left of a simulated record without noise.
 _FINEST = 1e-6
+
+#: Corners of a high-pass in the output's channel that are tried, in parts of the mean frequency.
+_CORNERS = (0.002, 0.005, 0.01, 0.02, 0.05)
 
 #: How far off a gross outlier is: in parts of what 99 % of all are off, and of those beside it.
 _GROSS, _ALONE = 10.0, 5.0
@@ -82,6 +87,8 @@ def examine(
     """
     guess, of_records, noisy = problem.rig.guess, _of_records(problem, records), _error(records, forecasts) > _FINEST
     ways = of_input(problem, found) if noisy else []
+    if not ways and (found.is_lost or _of_noise(problem, disturbance)):
+        ways = _of_offset(problem)
     if found.is_lost and not ways:  # the other checks would blame the equation
         return (*of_records, _lost(found))
     of_fit = [
@@ -118,6 +125,7 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
     if stops:
         message = f"{stops} outputs stand at a stop and were taken as missing; widen the range, or drive it less"
         warnings.append(Finding("clipped", message))
+    warnings += _of_stale(records)
     largest = max(np.abs(one.u).max() for one in records)
     widest = max(np.nanmax(np.abs(one.y)) for one in records)
     source, sink = rig.input, rig.output
@@ -130,6 +138,26 @@ def _of_records(problem: Problem, records: Sequence[Record]) -> list[Finding]:
     if 2 * np.pi / problem.frequency < SLOWEST:
         message = f"there are {2 * np.pi / problem.frequency:.1f} samples in a period; sample faster, {ENOUGH} at least"
         warnings.append(Finding("sampling_too_slow", message))
+    return warnings
+
+
+def _of_stale(records: Sequence[Record]) -> list[Finding]:
+    """Whether outputs stood still while the oscillator moved."""
+    warnings = []
+    bursts, count = sum(one.bursts for one in records), sum(one.stale for one in records if one.bursts)
+    if bursts:
+        message = (
+            f"{count} outputs in {bursts} bursts stand still while the oscillator moves, as where a sensor loses its "
+            f"signal; they were taken as missing"
+        )
+        warnings.append(Finding("dropouts", message))
+    repeats = max(one.repeats for one in records)
+    if repeats > 1:
+        message = (
+            f"each output stands {repeats} times, as where a slow sensor is sampled faster than it measures; the first "
+            f"was kept, and the others taken as missing: sample as fast as it measures, for its delay is unknown"
+        )
+        warnings.append(Finding("repeated", message))
     return warnings
 
 
@@ -190,8 +218,22 @@ def _of_outliers(channel: Channel, records: Sequence[Record]) -> list[Finding]:
     return [Finding("outliers", message)]
 
 
+def _of_offset(problem: Problem) -> list[Finding]:
+    """Whether the channels were triggered far apart."""
+    later = offset_of(problem)
+    if later is None:
+        return []
+    delay = problem.rig.delay + later
+    what = (
+        f"the output answers {later} samples after the input; write delay = {delay:g} into the rig"
+        if later > 0
+        else f"the output answers {-later} samples before the input; cut {-later} samples from the start of the inputs"
+    )
+    return [Finding("delay", f"{what}, and identify again: the channels were triggered apart")]
+
+
 def _of_terms(problem: Problem, found: Found) -> list[Finding]:
-    """Further terms of the equation, by their evidence."""
+    """Further terms of the equation, and a high-pass of the sensor, by their evidence."""
     own, gains = float(found.fits.free_energy.min()), []
     for name in EXTRA:
         prior = found.fitter.prior.widened(problem.prior_of_term(name))
@@ -199,6 +241,18 @@ def _of_terms(problem: Problem, found: Found) -> list[Finding]:
         gains.append(float(own - energies(fitter, [found.best], found, own)[0]))
     if max(gains) <= EVIDENCE:
         return []
+    filtered = [
+        replace(problem, y=tuple(unfiltered(y, part * problem.frequency) for y in problem.y)) for part in _CORNERS
+    ]
+    restored = [float(own - energies(found.fitter.on(one), [found.best], found, own)[0]) for one in filtered]
+    if max(restored) > max(gains):
+        corner = _CORNERS[int(np.argmax(restored))] * problem.frequency / (2 * np.pi * problem.rig.step)
+        message = (
+            f"the records speak for a high-pass of some {corner:.2g} Hz in the output's channel, by "
+            f"{max(restored):.0f} nats, as an IEPE sensor or AC coupling has; c is wrong by it: couple the sensor by DC, or take one that "
+            f"reaches lower, because the same filter on the input does not help where the spring is not linear"
+        )
+        return [Finding("high_pass", message)]
     term = EXTRA[int(np.argmax(gains))]
     message = f"the records speak for {_TERMS[term]}, by {max(gains):.0f} nats; m, c, a and b alone do not hold"
     return [Finding(term, message)]

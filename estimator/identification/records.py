@@ -16,6 +16,7 @@ import numpy.typing as npt
 from estimator.checks import series
 from estimator.extras import need
 from estimator.files import whole_file
+from estimator.identification.sensors import stale
 from estimator.identification.shared import shared
 from estimator.identification.tables import read_table
 from estimator.parameters import FloatArray
@@ -70,6 +71,10 @@ class Record:
         y: (T,) outputs; NaN where one is missing or was clipped.
         clipped: outputs that were clipped, or over range.
         missing: outputs that were not there.
+        stale: outputs that stood still while the oscillator moved, in bursts or because each was repeated, and were
+            taken out.
+        bursts: of these.
+        repeats: samples for which each output stood; 1 where none was repeated.
         times: (T,) of the samples [s], where these are not the rig's step apart.
         over_range: (T,) whether an output was over range, in a record that is whole.
     """
@@ -79,6 +84,9 @@ class Record:
     y: FloatArray
     clipped: int = 0
     missing: int = 0
+    stale: int = 0
+    bursts: int = 0
+    repeats: int = 1
     times: FloatArray | None = None
     over_range: npt.NDArray[np.bool_] | None = field(default=None, repr=False)
 
@@ -195,6 +203,8 @@ def _cut(record: Record) -> list[Record]:
     missing = np.isnan(record.y) & ~beyond
     stops = stops | beyond
     y = np.where(stops, np.nan, record.y)
+    stood = stale(y)
+    y = np.where(stood.flags, np.nan, y)
     pieces = []
     for piece in _runs(np.isfinite(record.u)):
         seen = np.flatnonzero(np.isfinite(y[piece]))
@@ -214,6 +224,9 @@ def _cut(record: Record) -> list[Record]:
                 missing=told[1],
                 times=times,
                 over_range=None,
+                stale=int(stood.flags[part].sum()),
+                bursts=stood.bursts,
+                repeats=stood.repeats,
             )
         )
     return pieces
