@@ -54,8 +54,11 @@ def from_record(path: Path, step: float | None = None, source: str | None = None
     if step is None:
         # Times are written with some digits, and their mean difference is off by the last of them.
         step = float(f"{own:.6g}")
-    output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement", column=sink)
-    rig = Rig(step, input=Channel(table.unit(table.u) or "1", column=source), output=output)
+    unit = None if table.u is None else table.unit(table.u)
+    # A name that says nothing was taken by its place, and stands in the file to be seen.
+    shown = [None if place is None or table.is_known(place) else table.names[place] for place in (table.u, table.y)]
+    output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement", column=sink or shown[1])
+    rig = Rig(step, input=Channel(unit or "1", column=source or shown[0]), output=output)
     told = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
     return text_of(rig, f", from {printable(path.name)}{told}")
 

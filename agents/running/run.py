@@ -193,7 +193,7 @@ def _contradiction(rig: Rig, belief: Belief, samples: Path) -> str:
         if sum(1 for _ in lines) <= _FEWEST:
             return ""
     table = read_table(samples, rig.input.column, rig.output.column)
-    u, y = table.columns[table.u], table.columns[table.y]
+    u, y = table.inputs, table.columns[table.y]
     if np.isfinite(y).sum() < _FEWEST:
         return ""
     said = disturbed(rig.input, float(np.sqrt(np.nanmean(u**2))), disturbance(belief))

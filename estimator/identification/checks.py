@@ -249,8 +249,9 @@ def _of_terms(problem: Problem, found: Found) -> list[Finding]:
         corner = _CORNERS[int(np.argmax(restored))] * problem.frequency / (2 * np.pi * problem.rig.step)
         message = (
             f"the records speak for a high-pass of some {corner:.2g} Hz in the output's channel, by "
-            f"{max(restored):.0f} nats, as an IEPE sensor or AC coupling has; c is wrong by it: couple the sensor by DC, or take one that "
-            f"reaches lower, because the same filter on the input does not help where the spring is not linear"
+            f"{max(restored):.0f} nats, as an IEPE sensor or AC coupling has; c is wrong by it: couple the sensor by "
+            f"DC, or take one that reaches lower, because the same filter on the input does not help where the spring "
+            f"is not linear"
         )
         return [Finding("high_pass", message)]
     term = EXTRA[int(np.argmax(gains))]

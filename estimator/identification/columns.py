@@ -37,6 +37,11 @@ def word_of(name: str) -> str:
     return words[0] if words else ""
 
 
+def is_channel(name: str) -> bool:
+    """Whether a column is called as an input or an output is."""
+    return word_of(name) in (*_INPUTS, *_OUTPUTS)
+
+
 def unit_of(name: str) -> str | None:
     """The unit that the name of a column holds; None where it holds none.
 
@@ -107,8 +112,10 @@ def chosen(
     source: str | None,
     sink: str | None,
     stamped: Collection[int] = (),
-) -> tuple[int | None, int, int]:
-    """Places of time (or None), input and output.
+) -> tuple[int | None, int | None, int]:
+    """Places of time (or None), input (None in a free decay) and output.
+
+    Columns whose names say nothing are the input and the output in this order, where there are no others.
 
     Args:
         path: of the file.
@@ -139,6 +146,11 @@ def chosen(
     u, y = ([k for k in free if k not in time and word_of(names[k]) in known] for known in (_INPUTS, _OUTPUTS))
     u, y = wished[0] or u, wished[1] or y
     time = time or [k for k in free if unit_of(names[k]) in SECONDS]
+    rest = [k for k in free if k not in (*time, *u, *y)]
+    if len(rest) == (not u) + (not y):  # in the usual order
+        u, y = u or rest[:1], y or rest[-1:]
+    if not u and len(y) == 1 and len(time) == 1 and not rest:
+        return time[0], None, y[0]
     if len(u) != 1 or len(y) != 1 or len(time) > 1:
         raise ValueError(
             f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename: "

@@ -322,7 +322,7 @@ def _read_mat(path: Path, rig: Rig) -> list[Record]:
 def _read_text(path: Path, rig: Rig) -> Record:
     table = read_table(path, rig.input.column, rig.output.column)
     table.check(rig.input, rig.output)
-    return _ranged(str(path), table.columns[table.u], table.columns[table.y], table.times(rig.step), rig.step)
+    return _ranged(str(path), table.inputs, table.columns[table.y], table.times(rig.step), rig.step)
 
 
 def _ranged(name: str, u: FloatArray, y: FloatArray, times: FloatArray | None = None, step: float = 0.0) -> Record:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from estimator.identification.columns import (
     KINDS,
     chosen,
+    is_channel,
     is_unit,
     plain,
     time_unit,
@@ -51,7 +52,7 @@ class Table:
         columns: (C, T) numbers; NaN where one is missing.
         lines: (T,) of the file.
         time: which column is the time; None where there is none.
-        u: which column is the input.
+        u: which column is the input; None in a free decay.
         y: which column is the output.
         stamped: whether the times were dates or times of day, and are seconds from the first on.
     """
@@ -61,9 +62,14 @@ class Table:
     columns: FloatArray
     lines: npt.NDArray[np.int64]
     time: int | None
-    u: int
+    u: int | None
     y: int
     stamped: bool = False
+
+    @property
+    def inputs(self) -> FloatArray:
+        """(T,) inputs; 0 where there is no column of them."""
+        return np.zeros(self.columns.shape[1]) if self.u is None else np.asarray(self.columns[self.u])
 
     def step(self) -> float | None:
         """Usual sampling step [s], of the time column; None where there is none.
@@ -93,11 +99,11 @@ class Table:
         if own is None:
             return None
         time, later = self._times()
-        begins = np.setdiff1d(np.flatnonzero(np.isfinite(self.columns[self.u])), later)
+        begins = np.setdiff1d(np.flatnonzero(np.isfinite(self.inputs)), later)
         ends = np.append(begins[1:], len(time))
         digit = self._last_digit(time)
         for begin, end in zip(begins, ends, strict=True):
-            part = time[begin:end][np.isfinite(self.columns[self.u][begin:end])]
+            part = time[begin:end][np.isfinite(self.inputs[begin:end])]
             off = part - part[0] - step * np.arange(len(part))
             if np.ptp(off) > 2 * _EVEN * step + 1.01 * digit:
                 return time
@@ -107,7 +113,7 @@ class Table:
         """(T,) times [s], and the lines that have an input as the line before them has."""
         assert self.time is not None
         unit = time_unit(self.path, self.names[self.time]) if self.names and not self.stamped else 1.0
-        time, driven = self.columns[self.time] * unit, np.isfinite(self.columns[self.u])
+        time, driven = self.columns[self.time] * unit, np.isfinite(self.inputs)
         for k in np.flatnonzero(driven & np.isnan(time))[:1]:
             raise ValueError(
                 f"{self._line(k)}: there must be a time beside the input, but there is none; fill it in, or remove "
@@ -144,6 +150,10 @@ class Table:
         """What stands in brackets behind the name of a column, as N in ``force [N]``; None where nothing does."""
         return unit_of(self.names[place]) if self.names else None
 
+    def is_known(self, place: int) -> bool:
+        """Whether the name of a column says what it is; also where there are no names."""
+        return not self.names or is_channel(self.names[place])
+
     def kind(self) -> str | None:
         """What the name of the output, or else its unit, says that it is: a displacement, for one; or None.
 
@@ -167,10 +177,10 @@ class Table:
             ValueError: naming the column, for another unit, or another kind of output.
         """
         for place, channel in ((self.u, source), (self.y, sink)):
-            unit = self.unit(place)
+            unit = None if place is None else self.unit(place)
             if unit and channel.unit != "1" and plain(unit) != plain(channel.unit):
                 raise ValueError(
-                    f"{self.path}: {self.names[place]!r:.60} must be in the rig's unit, {channel.unit}, but is in "
+                    f"{self.path}: {self.names[place or 0]!r:.60} must be in the rig's unit, {channel.unit}, but is in "
                     f"{unit}; convert the column, or write its unit into the rig"
                 )
         word = word_of(self.names[self.y]) if self.names else ""
