@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from estimator.ensemble import half_cauchy
 from estimator.identification.fit import Fits, Fitter, Hypothesis, Prior, with_ratios
 from estimator.identification.motions import motions
 from estimator.identification.problem import Problem
+from estimator.identification.ridges import Ridges, profiled
 from estimator.identification.start import starts
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
@@ -48,6 +49,10 @@ _SUBSTEPS, _TOLERABLE, _ANGLE = (2, 4, 8, 16, 32), 0.02, 0.25
 #: free energy by other motions that asks for one more [nats].
 _ROUNDS, _SMALL = 6, 0.1
 
+#: Noises of a record are other than was thought where they differ by so much in the logarithm, and so many standard
+#: deviations.
+_LOUDER, _SURELY = 0.05, 6.0
+
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -57,27 +62,30 @@ class Found:
         fits: hypotheses about the noises that share the records, interpolation, delay and terms.
         weights: (H,) their probabilities.
         fitter: that made them.
+        ridges: along which the posterior lies where it is no Gaussian; the hypotheses are then also about the
+            coefficients.
     """
 
     fits: Fits
     weights: FloatArray
     fitter: Fitter
+    ridges: Ridges | None = None
 
     @property
     def mean(self) -> FloatArray:
-        """(K,) of the mixture."""
-        return np.asarray(self.weights @ self.fits.mean)
+        """(K,) of the mixture; along a ridge its middle, because a mean may be beside all that is possible."""
+        return np.asarray(self.weights @ self.fits.mean) if self.ridges is None else self.fits.mean[self._chosen]
 
     @property
     def cov(self) -> FloatArray:
-        """(K, K) of the mixture."""
+        """(K, K) of the mixture, about `mean`."""
         away = self.fits.mean - self.mean
         return np.asarray(np.tensordot(self.weights, self.fits.cov, 1) + (away.T * self.weights) @ away)
 
     @property
     def best(self) -> Hypothesis:
-        """The most probable hypothesis."""
-        return self.fits.hypotheses[int(np.argmax(self.weights))]
+        """The most probable hypothesis; along a ridge that in the middle."""
+        return self.fits.hypotheses[self._chosen]
 
     @property
     def motions(self) -> FloatArray:
@@ -87,8 +95,12 @@ class Found:
 
     @property
     def level(self) -> float:
-        """σ_v of the most probable hypothesis."""
-        return float(self.fits.level[np.argmax(self.weights)])
+        """σ_v of that hypothesis."""
+        return float(self.fits.level[self._chosen])
+
+    @property
+    def _chosen(self) -> int:
+        return int(np.argmax(self.weights)) if self.ridges is None else self.ridges.middle
 
     @property
     def noises(self) -> tuple[FloatArray, FloatArray]:
@@ -130,9 +142,26 @@ def search(problem: Problem, tell: Callable[[str], None]) -> Found:
         found = settle(fitter.on(problem), hypothesis, start, level, reach)
         start, level, hypothesis, reach = found.mean, found.level, found.best, 2.0
         substeps = max(substeps, enough_substeps(problem, start, found.cov))
-        if substeps == problem.substeps and not _begins_otherwise(found):
+        loudness = found.fitter.loudness(found.best, start, level)
+        if substeps == problem.substeps and not _louder(problem, loudness) and not _begins_otherwise(found):
             break
+        if _louder(problem, loudness):
+            problem = replace(problem, loudness=loudness)
     return found
+
+
+def _louder(problem: Problem, loudness: FloatArray) -> bool:
+    """Whether the noises of some records are other than was thought, surely and by so much that it matters."""
+    before = np.ones(len(loudness)) if problem.loudness is None else problem.loudness
+    seen = np.array([np.isfinite(y).sum() for y in problem.y])
+    change = np.abs(np.log(np.maximum(loudness, 1e-300) / before))
+    return bool((change > np.maximum(_LOUDER, _SURELY / np.sqrt(2 * np.maximum(seen, 1)))).any())
+
+
+def spread(found: Found, names: Sequence[str]) -> Found:
+    """The same, along the ridge on which the posterior of some parameters lies where it is no Gaussian."""
+    along = profiled(found.fits, int(np.argmax(found.weights)), found.fitter, names)
+    return found if along is None else Found(along[0], along[1], found.fitter, along[2])
 
 
 def _begins_otherwise(found: Found) -> bool:
