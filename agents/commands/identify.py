@@ -102,7 +102,12 @@ def show(result: Result) -> None:
     for name, (mean, _) in result.parameters.items():
         low, high = intervals[name]
         digits = digits_of(low, high, 5)
-        table.add_row(name, f"{mean:.{digits}g}", f"{low:.{digits}g} to {high:.{digits}g}", escape(units[name]))
+        table.add_row(
+            name,
+            "open" if name in result.open else f"{mean:.{digits}g}",
+            f"{low:.{digits}g} to {high:.{digits}g}",
+            escape(units[name]),
+        )
     console.print("m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0", highlight=False)
     console.print(table)
     for warning in result.warnings:

@@ -13,10 +13,10 @@ import numpy as np
 
 from estimator.identification.beliefs import contraction, foreseen, posterior
 from estimator.identification.checks import examine
-from estimator.identification.problem import LATEST, Problem, explicable
+from estimator.identification.problem import JUDGED, LATEST, Problem, explicable
 from estimator.identification.records import Record, records_of
-from estimator.identification.result import Result
-from estimator.identification.search import search
+from estimator.identification.result import Result, deviations_of
+from estimator.identification.search import search, spread
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -75,13 +75,15 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         times = None if all(one.times is None for one in read) else tuple(one.counted(rig.step) for one in read)
         found = search(Problem(rig, scales, u, tuple(one - origin for one in y), origin, times=times), tell)
         problem = found.fitter.problem
-        belief, noises = posterior(problem, found)
+        # Forecasts, and checks that compare the equation with others, are of the most probable place of a ridge.
+        along = spread(found, JUDGED)
+        belief, noises = posterior(problem, along)
         tell("checking the result")
         forecasts = foreseen(found, belief)
-        parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
-        warnings = examine(problem, found, belief, parameters, noises["input"], read, forecasts)
-    history = partial(contraction, problem, found, parameters)
-    return Result(rig, belief, warnings, tuple(read), forecasts, noises, history)
+        parameters = deviations_of(belief, along.ridges)
+        warnings = examine(problem, found, along.ridges, belief, parameters, noises["input"], read, forecasts)
+    history = partial(contraction, problem, along, parameters)
+    return Result(rig, belief, warnings, tuple(read), forecasts, noises, history, along.ridges)
 
 
 def _scales(rig: Rig, records: list[Record]) -> Scales:

@@ -82,10 +82,20 @@ def foreseen(found: Found, belief: Belief, given: int | None = None) -> tuple[Fl
     problem, best = found.fitter.problem, found.best
     shown = tuple(y if given is None else np.where(np.arange(len(y)) < given, y, np.nan) for y in problem.y)
     inputs, outputs, spans, places = replace(problem, y=shown).samples_of(*best.path)
-    noises = belief.noises[1::2] / belief.noises[::2]
+    noises = problem.loud(belief.noises[None, 1::2] / belief.noises[None, ::2])
     forecasts = np.empty((*outputs.shape, 2))
     points = np.tile(found.mean, (len(inputs), 1))
-    follow(problem.model, points, inputs, outputs, noises, problem.start, found.motions, spans, forecasts)
+    follow(
+        problem.model,
+        points,
+        inputs,
+        outputs,
+        noises,
+        problem.start,
+        found.motions,
+        spans,
+        forecasts,
+    )
     size = problem.scales.output
     return tuple(
         np.stack([(one[at, 0, 0] + problem.origin) * size, one[at, 0, 1] * size**2], axis=1)

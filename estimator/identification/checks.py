@@ -12,10 +12,11 @@ from estimator.identification.alternatives import EVIDENCE, energies, of_input
 from estimator.identification.fit import Fitter
 from estimator.identification.guesses import astray, leads_astray, of_guess, without_guess
 from estimator.identification.offsets import offset_of
-from estimator.identification.problem import EXTRA, Problem, explicable
+from estimator.identification.problem import EXTRA, JUDGED, Problem, explicable
 from estimator.identification.records import Record, residuals
 from estimator.identification.rest import at_rest
 from estimator.identification.result import Finding
+from estimator.identification.ridges import ONE, Ridges
 from estimator.identification.search import Found
 from estimator.identification.sensors import unfiltered
 from estimator.parameters import FloatArray
@@ -32,8 +33,9 @@ _DISTURBANCE, _REST, _BEYOND = 0.02, 0.005, 3.0
 #: Standard deviations by which the disturbance is larger than that for sure: with a probability of 95 %, about.
 _SURE = 1.645
 
-#: Largest relative standard deviation of a parameter that is called identified.
-_VAGUE = 1 / 3
+#: Largest relative standard deviation of a parameter that is called identified. Where the posterior is no Gaussian, the
+#: largest width of its central 68 % in parts of the outer end: a factor of five between the ends.
+_VAGUE, _SPAN = 1 / 3, 0.8
 
 #: Largest cubic force, in parts of the linear one, of a spring that is called linear.
 _LINEAR = 0.05
@@ -68,6 +70,7 @@ _TERMS = {
 def examine(
     problem: Problem,
     found: Found,
+    ridges: Ridges | None,
     belief: Belief,
     parameters: dict[str, tuple[float, float]],
     disturbance: tuple[float, float],
@@ -79,7 +82,8 @@ def examine(
     Args:
         problem: the records, scaled.
         found: the result of the search.
-        belief: its posterior.
+        ridges: along which the posterior lies where it is no Gaussian.
+        belief: the posterior.
         parameters: their means and standard deviations, in the rig's units.
         disturbance: of the force, as a standard deviation in the unit of the input; its mean and standard deviation.
         records: as they were read.
@@ -97,7 +101,7 @@ def examine(
         *_of_signs(parameters),
         *_of_rest(problem, belief),
         *_of_lag(problem, parameters),
-        *_of_parameters(problem, found, parameters),
+        *_of_parameters(problem, found, ridges, parameters),
         *([] if guess is None else of_guess(guess, parameters, problem.rig.output.kind)),
         *(_of_residuals(problem, records, forecasts) if noisy else []),
     ]
@@ -330,14 +334,20 @@ def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Finding]:
     return [Finding("sign", message)]
 
 
-def _of_parameters(problem: Problem, found: Found, parameters: dict[str, tuple[float, float]]) -> list[Finding]:
-    vague = [name for name, deviation in _told(problem, found).items() if deviation > _VAGUE]
+def _of_parameters(
+    problem: Problem, found: Found, ridges: Ridges | None, parameters: dict[str, tuple[float, float]]
+) -> list[Finding]:
+    if ridges is None:
+        vague = [name for name, deviation in _told(problem, found).items() if deviation > _VAGUE]
+    else:
+        ends = ridges.interval(ONE)
+        vague = [name for name, (low, high) in ends.items() if high - low > _SPAN * max(abs(low), abs(high))]
     warnings = []
     if vague:
         message = f"{', '.join(vague)}: not identified by this input; the records leave more than a third of it open"
         if "b" in vague and (part := _cubic(problem, parameters)) < _LINEAR:
             message += f"; the spring is linear to {100 * part:.2g} %, as far as the oscillator moved"
-        warnings.append(Finding("not_identified", message))
+        warnings.append(Finding("not_identified", message, tuple(vague)))
     return warnings
 
 
@@ -358,7 +368,7 @@ def _told(problem: Problem, found: Found) -> dict[str, float]:
     alone = (ways / np.maximum(values, 1e-9)) @ ways.T * unit
     parameters, spread = propagate(model, mean, alone)
     deviations = np.sqrt(np.diag(spread)) / np.maximum(np.abs(parameters), 1e-300)
-    return {name: float(value) for name, value in zip(model.physical, deviations, strict=True) if name in "mcab"}
+    return {name: float(value) for name, value in zip(model.physical, deviations, strict=True) if name in JUDGED}
 
 
 def _of_residuals(problem: Problem, records: Sequence[Record], forecasts: Sequence[FloatArray]) -> list[Finding]:

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.identification.problem import Problem, Samples
-from estimator.information import follow
+from estimator.information import Followed, follow
 from estimator.parameters import FloatArray
 
 #: Damping at the start of a fit, its change after a step that fails or succeeds, its least, and where a fit is given
@@ -93,6 +93,7 @@ class Fits:
         level: (H,) σ_v.
         free_energy: (H,) in nats, up to a constant that all share; inf where the numbers ran away, or the records and
             the prior leave a coefficient open.
+        loss: (H,) the part of it that is L.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -100,6 +101,7 @@ class Fits:
     cov: FloatArray
     level: FloatArray
     free_energy: FloatArray
+    loss: FloatArray
 
     def best(self, count: int) -> Fits:
         """Those of the lowest free energies, the lowest first."""
@@ -108,7 +110,14 @@ class Fits:
     def where(self, chosen: npt.NDArray[Any]) -> Fits:
         """Those of some hypotheses, told by their numbers or by flags."""
         kept = tuple(self.hypotheses[i] for i in np.arange(len(self.hypotheses))[chosen])
-        return Fits(kept, self.mean[chosen], self.cov[chosen], self.level[chosen], self.free_energy[chosen])
+        parts = (self.mean, self.cov, self.level, self.free_energy, self.loss)
+        return Fits(kept, *(part[chosen] for part in parts))
+
+    @classmethod
+    def joined(cls, several: Sequence[Fits]) -> Fits:
+        """All of several."""
+        parts = zip(*((f.mean, f.cov, f.level, f.free_energy, f.loss) for f in several), strict=True)
+        return cls(tuple(h for f in several for h in f.hypotheses), *(np.concatenate(part) for part in parts))
 
 
 class _Held(NamedTuple):
@@ -169,6 +178,7 @@ class Fitter:
         level: FloatArray | float,
         iterations: int = 30,
         bar: float = np.inf,
+        pinned: FloatArray | None = None,
     ) -> Fits:
         """Fit each hypothesis by damped Gauss-Newton steps (Levenberg and Marquardt).
 
@@ -178,9 +188,12 @@ class Fitter:
             level: (H,) or one: σ_v to begin with.
             iterations: at most.
             bar: a free energy; a hypothesis that cannot come below it is given up.
+            pinned: (H, K) directions: no step changes their products with the coefficients. Covariances and free
+                energies are as if nothing were pinned.
         """
         count, k = len(hypotheses), len(self._scale)
         points = np.broadcast_to(start, (count, k)).copy()
+        pins = None if pinned is None else pinned * self._scale
         levels = np.broadcast_to(np.asarray(level, dtype=np.float64), count)
         held = self._held(hypotheses)
         loss, slope, curvature, levels = self._appraise(points, held, levels)
@@ -190,7 +203,7 @@ class Fitter:
             if not len(at):
                 break
             damped = curvature[at] + (damping[at, None] * np.einsum("hii->hi", curvature[at]))[:, :, None] * np.eye(k)
-            step = -solved(damped, slope[at])
+            step = -(solved(damped, slope[at]) if pins is None else _solved_across(damped, slope[at], pins[at]))
             promised = -0.5 * np.einsum("hk,hk->h", slope[at], step)
             trial = points[at] + self._scale * step
             found = self._appraise(trial, held.of(at), levels[at])
@@ -208,7 +221,16 @@ class Fitter:
             at = at[~over]
         cov = inverted(curvature) * np.outer(self._scale, self._scale)
         energies = np.where(np.isfinite(cov).all(axis=(1, 2)), self._energy(loss, curvature), np.inf)
-        return Fits(tuple(hypotheses), points, cov, levels, energies)
+        return Fits(tuple(hypotheses), points, cov, levels, energies, loss)
+
+    def loudness(self, hypothesis: Hypothesis, point: FloatArray, level: float) -> FloatArray:
+        """(records,) the noises that each record shows at coefficients (K,), in parts of what they are on the whole."""
+        held, seen = self._held([hypothesis]), [np.isfinite(y).sum() for y in self.problem.y]
+        misfits = self._followed(point[None], held, np.array([level])).misfit
+        parts = np.ones(len(seen)) if self.problem.loudness is None else self.problem.loudness
+        excess = misfits / np.maximum(np.array(seen) - self.problem.model.n_states, 1)
+        found = parts * np.sqrt(excess)
+        return np.asarray(found / np.sqrt(np.average(found**2, weights=seen)))
 
     def _held(self, hypotheses: Sequence[Hypothesis]) -> _Held:
         rest = np.zeros((len(self.problem.u), 2))
@@ -235,21 +257,9 @@ class Fitter:
         self, points: FloatArray, held: _Held, levels: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Loss (H,), its slope (H, K) and curvature (H, K, K) in units of the prior, and the best levels (H,)."""
-        problem, ratios, motions = self.problem, held.ratios, held.motions
-        inputs = held.inputs[held.kinds]
-        count, records = len(points), len(problem.u)
+        problem, count, records = self.problem, len(points), len(self.problem.u)
         n = problem.samples - records * problem.model.n_states
-        noises = np.stack([(ratios * levels) ** 2, levels**2], axis=1)
-        found = follow(
-            problem.model,
-            np.repeat(points, records, axis=0),
-            inputs.reshape(-1, *inputs.shape[2:]),
-            held.outputs[held.kinds].reshape(-1, *held.outputs.shape[2:]),
-            np.repeat(noises, records, axis=0),
-            problem.start,
-            motions.reshape(-1, 2),
-            None if held.spans is None else held.spans[held.kinds].reshape(-1, held.spans.shape[2]),
-        )
+        found = self._followed(points, held, levels)
         total = lambda values: values.reshape(count, records, *values.shape[1:]).sum(axis=1)  # noqa: E731
         with np.errstate(all="ignore"):
             loss, slope, information, misfit = (total(values) for values in found)
@@ -265,6 +275,20 @@ class Fitter:
         whole = np.where(bad, np.inf, whole)
         slope[bad], curvature[bad] = 0.0, np.eye(len(self._scale))
         return whole, slope, curvature, np.where(bad, levels, levels * np.sqrt(np.where(bad, 1.0, excess)))
+
+    def _followed(self, points: FloatArray, held: _Held, levels: FloatArray) -> Followed:
+        """What the filter finds in all records at each of the points (H, K)."""
+        problem, records, inputs = self.problem, len(self.problem.u), held.inputs[held.kinds]
+        return follow(
+            problem.model,
+            np.repeat(points, records, axis=0),
+            inputs.reshape(-1, *inputs.shape[2:]),
+            held.outputs[held.kinds].reshape(-1, *held.outputs.shape[2:]),
+            problem.loud(np.stack([(held.ratios * levels) ** 2, levels**2], axis=1)),
+            problem.start,
+            held.motions.reshape(-1, 2),
+            None if held.spans is None else held.spans[held.kinds].reshape(-1, held.spans.shape[2]),
+        )
 
     def _energy(self, loss: FloatArray, curvature: FloatArray) -> FloatArray:
         """(H,) free energies; inf where they are not finite."""
@@ -286,6 +310,16 @@ def solved(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     """(H, K) solutions; zeros where a matrix is singular."""
     unit, root = _unit(matrices)
     return _row_by_row(np.linalg.solve, 0.0, unit, (vectors / root)[:, :, None])[:, :, 0] / root
+
+
+def _solved_across(matrices: FloatArray, vectors: FloatArray, pins: FloatArray) -> FloatArray:
+    """(H, K) solutions in the planes that are at right angles to the pins (H, K)."""
+    unit, root = _unit(matrices)
+    plane = np.linalg.qr((pins / root)[:, :, None], mode="complete")[0][:, :, 1:]
+    turned = np.swapaxes(plane, 1, 2)
+    return (plane @ solved(turned @ unit @ plane, (turned @ (vectors / root)[:, :, None])[:, :, 0])[:, :, None])[
+        :, :, 0
+    ] / root
 
 
 def inverted(matrices: FloatArray) -> FloatArray:

@@ -116,7 +116,7 @@ def _judge(
             np.tile(at, (count, 1)),
             np.tile(inputs, (times, 1, 1)),
             np.tile(outputs, (times, 1, 1)),
-            np.array([(ratio * sensor) ** 2, sensor**2]),
+            problem.loud(np.tile([(ratio * sensor) ** 2, sensor**2], (times, 1))),
             cov,
             candidates.reshape(-1, 2),
             None if spans is None else np.tile(spans, (times, 1)),

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from estimator.identification.timing import laid
 from estimator.inputs import feed
-from estimator.models.duffing import KINDS, duffing
+from estimator.models.duffing import DIMENSIONS, KINDS, duffing
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.rig import INTERPOLATIONS, Channel, Rig
@@ -21,6 +21,9 @@ from estimator.units import Scales
 
 #: Samples by which the input may be later than the rig says: a check looks for it.
 LATEST = 3
+
+#: Parameters that an identification is for; the others are what a channel adds.
+JUDGED = tuple(DIMENSIONS)
 
 #: Terms that an equation may have beside those of Eq. (1) and the offsets: checks look for them.
 EXTRA = ("cubic_damping", "quintic", "dry_friction")
@@ -66,6 +69,7 @@ class Problem:
         substeps: steps of integration a sample.
         terms: of the equation, beside those of Eq. (1) and the offsets; some of `EXTRA`.
         times: of the samples of each record, in sampling steps from its first on; None where these are one step apart.
+        loudness: of each record, the noises in parts of what they are on the whole; None where they are alike.
     """
 
     rig: Rig
@@ -76,6 +80,7 @@ class Problem:
     substeps: int = 2
     terms: tuple[str, ...] = ()
     times: tuple[FloatArray, ...] | None = None
+    loudness: FloatArray | None = None
 
     @cached_property
     def model(self) -> Model:
@@ -99,6 +104,11 @@ class Problem:
     def lag(self) -> float:
         """Time constant of the input's lag, in sampling steps, as the rig says."""
         return (self.rig.input.lag or 0.0) / self.rig.step
+
+    def loud(self, noises: FloatArray) -> FloatArray:
+        """(series, 2) variances of both noises in every record, of those on the whole (n, 2): record after record."""
+        parts = np.ones(len(self.u)) if self.loudness is None else self.loudness
+        return (noises[:, None] * parts[:, None] ** 2).reshape(-1, noises.shape[1])
 
     def samples_of(self, interpolation: str, delay: float, lag: float = 0.0) -> Samples:
         """The records, if the input went so; every sample is one step long where that is enough."""

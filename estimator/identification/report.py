@@ -80,7 +80,15 @@ def _parameters(result: Result) -> str:
         low, high = intervals[name]
         digits = digits_of(low, high, 6)
         label, interval = f"{name}, {_MEANINGS[name]}", f"{low:.{digits}g} to {high:.{digits}g}"
-        rows.append([label, f"{mean:.{digits}g}", f"{std:.2g}", interval, escape(result.units[name])])
+        rows.append(
+            [
+                label,
+                "open" if name in result.open else f"{mean:.{digits}g}",
+                f"{std:.2g}",
+                interval,
+                escape(result.units[name]),
+            ]
+        )
     for name, what in (("input", "disturbance of the force"), ("output", "noise of the sensor")):
         mean, std = result.noises[name]
         half = HALF_WIDTH * std

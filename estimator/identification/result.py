@@ -12,6 +12,7 @@ import numpy.typing as npt
 from estimator.belief import Belief
 from estimator.identification.beliefs import History
 from estimator.identification.records import Record
+from estimator.identification.ridges import Ridges
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -25,13 +26,21 @@ class Finding:
     Attributes:
         name: of the check, such as ``"delay"``.
         message: what was found, and what to do, in plain words.
+        of: parameters that it is about, where it is about some.
     """
 
     name: str
     message: str
+    of: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.name}: {self.message}"
+
+
+def deviations_of(belief: Belief, ridges: Ridges | None) -> dict[str, tuple[float, float]]:
+    """Parameter to mean and standard deviation of a belief, with the spreads along ridges where there are any."""
+    spreads = {} if ridges is None else ridges.spreads()
+    return {name: (mean, spreads.get(name, std)) for name, (mean, std, _) in belief.parameters().items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +56,7 @@ class Result:
         noises: name to mean and standard deviation: of ``input``, the disturbance of the force as a standard deviation
             per sample, and of ``output``, the sensor's.
         contraction: makes `history`, which takes some fits.
+        ridges: along which the posterior lies where it is no Gaussian; intervals are then taken along them.
     """
 
     rig: Rig
@@ -56,11 +66,17 @@ class Result:
     forecasts: tuple[FloatArray, ...]
     noises: Mapping[str, tuple[float, float]]
     contraction: Callable[[], History]
+    ridges: Ridges | None = None
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
         """Parameter to mean and standard deviation, in the rig's units: m, c, a, b and the offsets u0 and y0."""
-        return {name: (mean, std) for name, (mean, std, _) in self.belief.parameters().items()}
+        return deviations_of(self.belief, self.ridges)
+
+    @property
+    def open(self) -> tuple[str, ...]:
+        """Parameters that the records do not identify: the check ``not_identified`` names them."""
+        return tuple(name for one in self.warnings if one.name == "not_identified" for name in one.of)
 
     @property
     def units(self) -> dict[str, str]:
@@ -73,7 +89,8 @@ class Result:
         Raises:
             ValueError: for a probability that is not between 0 and 1.
         """
-        return self.belief.interval(probability)
+        gaussian = self.belief.interval(probability)
+        return gaussian if self.ridges is None else gaussian | self.ridges.interval(probability)
 
     @cached_property
     def history(self) -> History:
@@ -111,6 +128,7 @@ class Result:
         intervals, units = self.interval(0.9), self.units
         rows = [
             f"{name:>3} = {mean:.{digits}g} {units[name]}, 90 % in [{low:.{digits}g}, {high:.{digits}g}]"
+            f"{', open' if name in self.open else ''}"
             for (name, (mean, _)), (low, high) in zip(self.parameters.items(), intervals.values(), strict=True)
             for digits in [digits_of(low, high, 6)]
         ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -12,6 +12,7 @@ from estimator.ensemble import half_cauchy
 from estimator.identification.fit import Fits, Fitter, Hypothesis, Prior, with_ratios
 from estimator.identification.motions import motions
 from estimator.identification.problem import Problem
+from estimator.identification.ridges import Ridges, profiled
 from estimator.identification.start import effect, scattered, starts
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
@@ -62,6 +63,10 @@ _SUBSTEPS, _TOLERABLE, _ANGLE = (2, 4, 8, 16, 32), 0.02, 0.25
 #: free energy by other motions that asks for one more [nats].
 _ROUNDS, _SMALL = 6, 0.1
 
+#: Noises of a record are other than was thought where they differ by so much in the logarithm, and so many standard
+#: deviations.
+_LOUDER, _SURELY = 0.05, 6.0
+
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -72,28 +77,31 @@ class Found:
         weights: (H,) their probabilities.
         fitter: that made them.
         is_lost: whether they explain the records badly, and no other start leads to them.
+        ridges: along which the posterior lies where it is no Gaussian; the hypotheses are then also about the
+            coefficients.
     """
 
     fits: Fits
     weights: FloatArray
     fitter: Fitter
     is_lost: bool = False
+    ridges: Ridges | None = None
 
     @property
     def mean(self) -> FloatArray:
-        """(K,) of the mixture."""
-        return np.asarray(self.weights @ self.fits.mean)
+        """(K,) of the mixture; along a ridge its middle, because a mean may be beside all that is possible."""
+        return np.asarray(self.weights @ self.fits.mean) if self.ridges is None else self.fits.mean[self._chosen]
 
     @property
     def cov(self) -> FloatArray:
-        """(K, K) of the mixture."""
+        """(K, K) of the mixture, about `mean`."""
         away = self.fits.mean - self.mean
         return np.asarray(np.tensordot(self.weights, self.fits.cov, 1) + (away.T * self.weights) @ away)
 
     @property
     def best(self) -> Hypothesis:
-        """The most probable hypothesis."""
-        return self.fits.hypotheses[int(np.argmax(self.weights))]
+        """The most probable hypothesis; along a ridge that in the middle."""
+        return self.fits.hypotheses[self._chosen]
 
     @property
     def motions(self) -> FloatArray:
@@ -103,8 +111,12 @@ class Found:
 
     @property
     def level(self) -> float:
-        """σ_v of the most probable hypothesis."""
-        return float(self.fits.level[np.argmax(self.weights)])
+        """σ_v of that hypothesis."""
+        return float(self.fits.level[self._chosen])
+
+    @property
+    def _chosen(self) -> int:
+        return int(np.argmax(self.weights)) if self.ridges is None else self.ridges.middle
 
     @property
     def disturbance(self) -> float:
@@ -185,9 +197,26 @@ def _settled(fitter: Fitter, looked: Fits) -> Found:
         found = settle(fitter.on(problem), hypothesis, start, level, reach)
         start, level, hypothesis, reach = found.mean, found.level, found.best, 2.0
         substeps = max(substeps, enough_substeps(problem, start, found.cov))
-        if substeps == problem.substeps and not _begins_otherwise(found):
+        loudness = found.fitter.loudness(found.best, start, level)
+        if substeps == problem.substeps and not _louder(problem, loudness) and not _begins_otherwise(found):
             break
+        if _louder(problem, loudness):
+            problem = replace(problem, loudness=loudness)
     return found
+
+
+def _louder(problem: Problem, loudness: FloatArray) -> bool:
+    """Whether the noises of some records are other than was thought, surely and by so much that it matters."""
+    before = np.ones(len(loudness)) if problem.loudness is None else problem.loudness
+    seen = np.array([np.isfinite(y).sum() for y in problem.y])
+    change = np.abs(np.log(np.maximum(loudness, 1e-300) / before))
+    return bool((change > np.maximum(_LOUDER, _SURELY / np.sqrt(2 * np.maximum(seen, 1)))).any())
+
+
+def spread(found: Found, names: Sequence[str]) -> Found:
+    """The same, along the ridge on which the posterior of some parameters lies where it is no Gaussian."""
+    along = profiled(found.fits, int(np.argmax(found.weights)), found.fitter, names)
+    return found if along is None else replace(found, fits=along[0], weights=along[1], ridges=along[2])
 
 
 def _begins_otherwise(found: Found) -> bool:
@@ -240,7 +269,7 @@ def _look_again(fitter: Fitter, seed: int = 0) -> Fits:
     shortest = max(_LEAST, round(_PIECE * 2 * np.pi / problem.frequency))
     points = np.array(scattered(problem, _DRAWS, seed))
     shape, levels = (_DRAWS, *np.diag(points[0]).shape), np.full(_DRAWS, 0.1 * problem.size)
-    drawn = Fits((base,) * _DRAWS, points, np.zeros(shape), levels, np.zeros(_DRAWS))
+    drawn = Fits((base,) * _DRAWS, points, np.zeros(shape), levels, *np.zeros((2, _DRAWS)))
     found = []
     for piece in dict.fromkeys([problem.liveliest(shortest), *problem.driven_from(shortest)[:1]]):
         samples, (many, few, _) = shortest, _KEPT
@@ -249,7 +278,7 @@ def _look_again(fitter: Fitter, seed: int = 0) -> Fits:
             fits = _moving(fitter.on(problem.cut([piece], samples)), fits, ratios, few)
             samples *= _LONGER
         found.append(fits)
-    names = ("mean", "cov", "level", "free_energy")
+    names = ("mean", "cov", "level", "free_energy", "loss")
     both = (np.concatenate([getattr(fits, name) for fits in found]) for name in names)
     return _moving(fitter, Fits(tuple(h for fits in found for h in fits.hypotheses), *both), ratios, _KEPT[2])
 

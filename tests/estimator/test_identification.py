@@ -255,3 +255,50 @@ def test_a_start_is_found_where_gaps_are_everywhere():
     result = identify(rig_of(BENCH), (u, y))
     assert np.abs(deviations(result, BENCH[0])).max() < 4.5
     assert result.warnings == ()
+
+
+#: A bench that a settled sine, or two, do not move far.
+GENTLE = {"m": 0.35, "c": 0.8, "a": 1800.0, "b": 3e7}
+
+
+def settled(amplitude, frequency, seed=0, samples=4000):
+    """Input and output of a sine [N, Hz] long after it began, with noise of 0.2 % of the output."""
+    before, step, model = 9000, 1e-3, duffing(offsets=True)
+    u = amplitude * np.sin(2 * np.pi * frequency * step * np.arange(before + samples))
+    scales = Scales(step, amplitude, 1e-3, 0)
+    known = {p: GENTLE.get(p, 0.0) for p in model.physical}
+    y = scales.output * free_run(model, coefficients_of(model, known, scales), u / amplitude, [0.0, 0.0])
+    u, y = u[before + 1 :], y[before:-1]
+    return u, y + 2e-3 * y.std() * np.random.default_rng(seed).standard_normal(len(y))
+
+
+@pytest.mark.parametrize(("amplitude", "frequency"), [(0.5, 5.7), (1.5, 14.8), (0.5, 8.0), (0.25, 13.1)])
+def test_a_settled_sine_leaves_mass_and_stiffness_open_and_gives_the_damping(amplitude, frequency):
+    result = identify(Rig(1e-3, input=Channel("N"), output=Channel("m")), settled(amplitude, frequency))
+    assert result.ridges is not None
+    wide = result.interval(0.99)
+    for name, true in GENTLE.items():
+        assert name in result.open or wide[name][0] < true < wide[name][1], name
+    assert {one.name for one in result.warnings} <= {"not_identified"}
+    mean, std = result.parameters["c"]
+    assert "c" not in result.open
+    assert abs(mean - GENTLE["c"]) < 4 * std < 0.05 * GENTLE["c"]
+    # What goes on from here knows it, too.
+    believed, spread, _ = result.belief.parameters()["m"]
+    assert spread > 0.1 * abs(believed)
+
+
+def test_two_amplitudes_tell_all_though_their_noises_differ():
+    records = [settled(amplitude, 9.5, seed) for seed, amplitude in enumerate((0.5, 1.5))]
+    result = identify(Rig(1e-3, input=Channel("N"), output=Channel("m")), records)
+    assert result.warnings == ()
+    assert np.abs(deviations(result, GENTLE)).max() < 4
+    assert all(std < 0.1 * GENTLE[name] for name, (_, std) in result.parameters.items() if name in GENTLE)
+
+
+def test_intervals_along_a_ridge_hold_more_with_a_larger_probability():
+    result = identify(Rig(1e-3, input=Channel("N"), output=Channel("m")), settled(0.5, 5.7))
+    narrow, wide = result.interval(0.5), result.interval(0.95)
+    assert all(wide[p][0] < narrow[p][0] < narrow[p][1] < wide[p][1] for p in wide)
+    assert "m = " in str(result)
+    assert all("], open" in line for line in str(result).splitlines() if line.strip()[:1] in result.open)

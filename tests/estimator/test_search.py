@@ -17,7 +17,7 @@ class Flat:
 
     def fit(self, hypotheses, start, level):
         count = len(hypotheses)
-        return Fits(tuple(hypotheses), np.zeros((count, 1)), np.ones((count, 1, 1)), np.ones(count), np.zeros(count))
+        return Fits(tuple(hypotheses), np.zeros((count, 1)), np.ones((count, 1, 1)), *np.zeros((3, count)))
 
 
 def test_a_grid_that_is_widened_to_the_last_has_the_weights_of_its_last_fits():
