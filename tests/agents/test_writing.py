@@ -33,7 +33,6 @@ from estimator.identification.tables import read_table
 
 resource = pytest.importorskip("resource", reason="this system has no limits of the size of files")
 
-#: Ten milliseconds a sample, so that a run is not late on a busy machine.
 RIG = """step = 1e-2
 [input]
 unit = "N"
@@ -107,7 +106,7 @@ def bench(tmp_path_factory):
 
 
 @pytest.fixture(params=["limit", "disk"])
-def place(request, bench, tmp_path, monkeypatch):
+def place(request, bench, tmp_path, monkeypatch, jumping_clock):
     """The folder, and what makes that nothing more can be written: a limit of 100 bytes, or a full disk of its own."""
     monkeypatch.setattr(protocol, "SYSTEMS", 8)
     folder = tmp_path / "place"
