@@ -247,11 +247,13 @@ def test_train_then_evaluate(script, tmp_path):
         folder=tmp_path,
     )  # fmt: skip
     assert finished.returncode == 0, finished.stderr
-    # On a machine that has not compiled its kernels yet it says so.
-    said = [line for line in finished.stderr.splitlines() if not line.startswith("duffing-env is compiling ")]
-    assert said == [
+    # On a machine that has not compiled its kernels yet it says so, and on a slow one how far it is.
+    lines = finished.stderr.splitlines()
+    said = [line for line in lines if not line.startswith(("duffing-env is compiling ", "Training ", "Evaluating "))]
+    assert " ".join(said) == (
         "duffing-env: warning: a training of 2 updates may leave a policy worse than it began; take more steps than 512"
-    ]
+    )
+    assert max(map(len, (*lines, *finished.stdout.splitlines()))) <= 80
     assert "The run is in made" in finished.stdout
     made = {path.name for path in (tmp_path / "made").iterdir()}
     pictures = {"contraction.png", "excitations.png", "learning_curve.png"}
