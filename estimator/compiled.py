@@ -127,10 +127,8 @@ class Compilation(event.Listener):
 
     def _say(self, function: Callable[..., Any]) -> None:
         self._said = True
-        place = folder()
-        kept = "again in every process, because no folder can be written" if place is None else f"once, into {place}"
-        what = f"{function.__module__}.{function.__name__}"
-        said = f"duffing-env is compiling {what} and what else it needs, which takes seconds to minutes ({kept})"
+        kept = "in every process" if folder() is None else "once"
+        said = f"duffing-env is compiling {function.__name__:.17}: seconds to minutes, {kept}"
         print(said, file=sys.stderr, flush=True)
 
 

@@ -69,7 +69,8 @@ class Channel:
         for name in ("limit", "range", "noise"):
             value = getattr(self, name)
             if value is not None:
-                number(name, value, *SIZES, "leave it out where it is not known")
+                of = {"limit": " of an input", "range": " of an output"}.get(name, "")
+                number(f"{name}{of}", value, *SIZES, "leave it out where it is not known")
         one_of("kind", self.kind, KINDS)
         number("offset", self.offset, -SIZES[1], SIZES[1], "0 where nothing is known")
         if self.column is not None:
@@ -123,14 +124,15 @@ class Rig:
         whole(f"delay (for {self.interpolation})", self.delay, LONGEST_DELAY, least)
         for name, other in (("input", "range"), ("output", "limit")):
             channel = getattr(self, name)
+            right = "limit" if other == "range" else "range"
+            given = channel.get(other) if isinstance(channel, Mapping) else getattr(channel, other, None)
+            if given is not None:
+                raise ValueError(f"{name} must have no {other}, but has {shown(given)}; use {right}")
             if isinstance(channel, Mapping):
                 channel = _built(Channel, channel, name)
                 object.__setattr__(self, name, channel)
             if not isinstance(channel, Channel):
                 raise ValueError(f"{name} must be a Channel, but is {channel!r:.60}; use Channel('N', limit=20)")
-            if getattr(channel, other) is not None:
-                right = "limit" if other == "range" else "range"
-                raise ValueError(f"{name} must have no {other}, but has {getattr(channel, other)}; use {right}")
         if self.input.kind != "displacement":
             raise ValueError(f"input must have no kind, but has {self.input.kind!r}; kind is of the output")
         if (told := kind_of(self.output.unit)) not in (None, self.output.kind):
@@ -296,4 +298,10 @@ def _built(kind: Any, described: object, where: str) -> Any:
             raise ValueError(f"{where} must have keys of {known}, but has {key!r:.60}{hint(key, known)}")
     if kind is Rig and "step" not in described:
         raise ValueError("rig must have a step, but has none; give the seconds between samples")
-    return kind(**described)
+    if kind is Rig:
+        return kind(**described)
+    try:
+        return kind(**described)
+    except ValueError as error:  # which begins with the name of a key
+        key, _, rest = str(error).partition(" ")
+        raise ValueError(f"{where}.{key} {rest.removeprefix(f'of an {where} ')}") from error

@@ -163,7 +163,7 @@ def main(args: Args) -> Path:
     shape = (args.num_steps, args.num_envs)
     obs, acted = torch.zeros((*shape, features)), torch.zeros((*shape, actions))
     logprobs, rewards, dones, values = (torch.zeros(shape) for _ in range(4))
-    begun, iterations = time.time(), args.total_timesteps // (args.num_steps * args.num_envs)
+    begun, iterations = time.perf_counter(), args.total_timesteps // (args.num_steps * args.num_envs)
     if iterations == 0:
         least = args.num_steps * args.num_envs
         raise ValueError(
@@ -184,7 +184,7 @@ def main(args: Args) -> Path:
             advantages = advantages_of(args, rewards, values, dones, agent.get_value(next_obs))
         update(args, agent, optimizer, tuple(x.flatten(0, 1) for x in (obs, acted, logprobs, advantages, values)))
         steps = (iteration + 1) * args.num_steps * args.num_envs
-        rate, mean = steps / (time.time() - begun), np.mean(episodes.return_queue)
+        rate, mean = steps / (time.perf_counter() - begun), np.mean(episodes.return_queue)
         print(f"{steps:9,} samples, {rate:,.0f}/s, return {mean:.2f}", flush=True)
 
     card = {

@@ -59,6 +59,12 @@ def modules_of_the_test(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
             del sys.modules[name]
 
 
+@pytest.fixture(autouse=True)
+def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether work takes longer than `estimator.progress.EVERY` is for the machine to say."""
+    monkeypatch.setattr("estimator.progress.EVERY", float("inf"))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with a folder whose first files share no kernel, so that two processes do not compile the same at once."""
     items.sort(key=lambda item: item.path.parent.name != "duffing_env")

@@ -13,9 +13,10 @@ from agents.evaluation.rollout import Evaluation, evaluate
 from agents.loading import spec_of
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import load_policy
-from agents.results import check_file, check_folder, spinner
+from agents.results import check_file, check_folder, say
 from duffing_env.silverbox import record_available
 from estimator.extras import how_to_get, is_missing, need
+from estimator.progress import progress
 
 #: What every input has to beat.
 SIGNALS = ("prbs", "uniform")
@@ -57,13 +58,9 @@ def compare(
         need("matplotlib")
     check_folder("report" if report else "output", folder)
     check_file("evaluation.json", folder / "evaluation.json")
-    with spinner("Evaluating") as say:
-        evaluations = evaluate(policies, env_id, systems, seed, options, lambda name: say(f"Evaluating {name}"))
+    with progress("Evaluating") as tell:
+        evaluations = evaluate(policies, env_id, systems, seed, options, tell=tell)
     title = f"{env_id}, {systems} systems"
-    print_table(evaluations, title)
-    print_estimators(evaluations)
-    if not record_available() and env_id != RIG_TRACK and "error_m" in evaluations[0].metrics:
-        print("What is measured by the Silverbox record is left out: the Silverbox record is not on this machine.")
     settings = {"env": env_id, "systems": systems, "seed": seed, "options": options}
     write_evaluations(folder / "evaluation.json", evaluations, settings)
     written = ["evaluation.json"]
@@ -72,14 +69,18 @@ def compare(
 
         write_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
         written += ["report.html"]
-    elif is_missing("matplotlib"):
-        print(f"Figures are left out: {how_to_get('matplotlib')}")
-    else:
+    elif not is_missing("matplotlib"):
         from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, save
 
         save(figure_of_contraction(evaluations, title), folder / "contraction.png")
         save(figure_of_inputs(evaluations), folder / "excitations.png")
         written += ["contraction.png", "excitations.png"]
+    print_table(evaluations, title)
+    print_estimators(evaluations)
+    if not record_available() and env_id != RIG_TRACK and "error_m" in evaluations[0].metrics:
+        say("What is measured by the Silverbox record is left out: the Silverbox record is not on this machine.")
+    if len(written) == 1:
+        say(f"Figures are left out: {how_to_get('matplotlib')}")
     for name in written:
-        print(folder / name)
+        say(str(folder / name))
     return evaluations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 
 from agents.evaluation.rollout import Evaluation
-from agents.results import show, table, write_json
+from agents.results import fitted, show, table, write_json
 from estimator.parameters import FloatArray
 from estimator.units import labelled
 
@@ -179,6 +179,9 @@ def write_evaluations(path: Path, evaluations: list[Evaluation], settings: dict[
 
 Table = tuple[list[str], list[list[str]]]
 
+#: Of a column [characters].
+_WIDEST = 36
+
 
 def leaderboard(evaluations: list[Evaluation]) -> Table:
     """Heads and rows: a column for each policy, the best log posterior gain first; `cell_of` each metric."""
@@ -208,16 +211,19 @@ def two_way_table(evaluations: list[Evaluation]) -> Table:
 
 def print_table(evaluations: list[Evaluation], title: str) -> None:
     """Print the leaderboard, with the intervals below."""
-    from rich.table import Table
+    from rich.table import Table as RichTable
 
     heads, rows = leaderboard(evaluations)
-    table = Table(title=title, caption=caption_of(evaluations))
-    table.add_column("", no_wrap=True)
-    for policy in heads[1:]:
-        table.add_column(policy, justify="right", overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    show(table, width=36 + 20 * len(evaluations))
+
+    def made(places: Sequence[int]) -> RichTable:
+        found = RichTable(title=title)
+        for place in places:
+            found.add_column(heads[place], justify="right" if place else "left", overflow="fold", max_width=_WIDEST)
+        for row in rows:
+            found.add_row(*(row[place] for place in places))
+        return found
+
+    show(fitted(made, len(heads)), caption_of(evaluations))
 
 
 def print_estimators(evaluations: list[Evaluation]) -> None:
@@ -225,7 +231,7 @@ def print_estimators(evaluations: list[Evaluation]) -> None:
     heads, rows = two_way_table(evaluations)
     if rows:
         title = "what other estimators make of the same inputs and outputs"
-        show(table(heads, rows, title=title), AUDITOR_IS, width=130)
+        show(table(heads, rows, title=title, labels=2), AUDITOR_IS)
 
 
 def in_order(evaluations: list[Evaluation]) -> list[Evaluation]:

@@ -99,9 +99,9 @@ def main(config: Config) -> None:
             plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in found.items()}
             results.append({"track": track, "case": title, **plain})
     heads = ("track", "options", "policy", "D-efficiency beside efe", "Fisher information / nat", "ended early")
-    show(table(heads, rows, markdown=True))
     if config.output is not None:
         write_json(config.output, results)
+    show(table(heads, rows, markdown=True, labels=3))
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from agents.cli import RIG_TRACK, followed, run_script
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.entries import check_policies
+from agents.loading import of_ones_own
 from agents.policies import TRAINED, make_policy
 from agents.policies.learned import CARD
 from agents.results import show, table, write_json
@@ -71,7 +72,8 @@ def play(member: Member, policy: str, seed: int) -> tuple[float, float, float]:
     state, start = None, np.ones(1, dtype=np.bool_)
     gained, terminated = 0.0, np.zeros(1, dtype=np.bool_)
     for _ in range(envs.horizon):
-        actions, state = chosen.predict(observations, state, start, deterministic=True)
+        with of_ones_own(policy, "policy"):
+            actions, state = chosen.predict(observations, state, start, deterministic=True)
         start = np.zeros(1, dtype=np.bool_)
         observations, _, terminated, truncated, infos = envs.step(actions)
         gained += float(infos["information_gain"][0])
@@ -123,12 +125,12 @@ def main(config: Config) -> None:
     rows.append(["ended early", "", *(f"{100 * e.mean():.1f} %" for e in ended)])
     rows.append(["90 % intervals that cover", "", *(f"{c.mean():.3f}" for c in covered)])
     rows.append(["information / nat", "", *(f"{g.mean():.2f}" for g in gains)])
-    heading = "D-efficiency beside efe: median / 10 % quantile"
-    show(heading, table(("oscillators", "number", *names), rows, markdown=True))
     if config.output is not None:
         config.output.mkdir(parents=True, exist_ok=True)
         told = {"gains": gains.tolist(), "ended": ended.tolist(), "covered": covered.tolist()}
         write_json(config.output / "universal.json", {"policies": names, **told})
+    heading = "D-efficiency beside efe: median / 10 % quantile"
+    show(heading, table(("oscillators", "number", *names), rows, markdown=True, labels=2))
     if config.ship:
         own = efficiency[1]
         first = {name: [float(np.median(own[mask])), float(np.quantile(own[mask], 0.1))] for name, mask in groups}

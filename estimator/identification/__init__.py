@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,8 @@ from estimator.identification.search import search
 from estimator.models.duffing import KINDS
 from estimator.online import OnlineEstimator
 from estimator.parameters import FloatArray
+from estimator.progress import progress as shown
+from estimator.progress import untold
 from estimator.rig import Rig
 from estimator.units import Scales
 
@@ -39,7 +41,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
             list. Before its first sample a record may have been in any motion; its first outputs, three, as many as the
             input is late, and one more of an accelerometer, are left out, because inputs before the record may still
             act. An output that is NaN is missing; a record is cut where an input is.
-        progress: tell on stderr what is being done.
+        progress: tell on stderr how far it is, where it takes more than 5 seconds.
 
     Returns:
         Parameters with intervals, warnings of the checks, forecasts, and the belief to go on with.
@@ -68,7 +70,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     """
     rig = Rig.of(rig)
     read = records_of(records, rig)
-    with _teller(progress) as tell:
+    with shown("Identifying") if progress else nullcontext(untold) as tell:
         scales = _scales(rig, read)
         u = tuple(one.u / scales.input for one in read)
         y = tuple(explicable(one.y, rig, LATEST) / scales.output for one in read)
@@ -76,7 +78,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         found = search(Problem(rig, scales, u, tuple(one - origin for one in y), origin), tell)
         problem = found.fitter.problem
         belief, noises = posterior(problem, found)
-        tell("checking the result")
+        tell(0.9, "checking the result")
         begun = found.motions + np.array([origin, 0.0])
         forecasts = tuple(_forecast(belief, rig, one, motion) for one, motion in zip(read, begun, strict=True))
         parameters = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
@@ -111,15 +113,3 @@ def _forecast(belief: Belief, rig: Rig, record: Record, motion: FloatArray) -> F
     numbers[: belief.model.n_states] = motion
     estimator = OnlineEstimator(belief.model, replace(belief, record=numbers), rig)
     return estimator.forecast(record.u, explicable(record.y, rig))
-
-
-@contextmanager
-def _teller(progress: bool) -> Iterator[Callable[[str], None]]:
-    """Tells what is being done, where that is wanted."""
-    if not progress:
-        yield lambda text: None
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status("Identifying") as status:
-        yield lambda text: status.update(text.capitalize())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +13,7 @@ from estimator.identification.problem import Problem
 from estimator.identification.start import starts
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
+from estimator.progress import Tell
 from estimator.rig_prior import rig_prior
 
 #: Without a guess a coefficient is believed to be about 0, within so many of its natural sizes.
@@ -107,24 +107,24 @@ def prior_of(problem: Problem) -> Prior:
     return Prior.of(*problem.inward(guess.coefficients_mean, guess.coefficients_cov))
 
 
-def search(problem: Problem, tell: Callable[[str], None]) -> Found:
+def search(problem: Problem, tell: Tell) -> Found:
     """Find the coefficients and the noises, for the rig's own interpolation and delay.
 
     Args:
         problem: the records.
-        tell: is told what is being done.
+        tell: is told the share that is done, by experience, and what is being done.
 
     Raises:
         ValueError: where no start leads anywhere.
     """
     coarse = next(n for n in _SUBSTEPS if problem.frequency / n < _ANGLE)
     fitter = Fitter(replace(problem, substeps=coarse), prior_of(problem))
-    tell("looking for a start")
+    tell(0.0, "looking for a start")
     looked = _look(fitter)
     start, level, hypothesis, reach = looked.mean[0], float(looked.level[0]), looked.hypotheses[0], 30.0
     substeps = enough_substeps(problem, start, looked.cov[0])
-    tell("fitting coefficients and noises")
-    for _ in range(_ROUNDS):
+    for k in range(_ROUNDS):
+        tell(0.9 - 0.6 * 0.5**k, "fitting coefficients and noises")
         problem = replace(problem, substeps=substeps)
         hypothesis = replace(hypothesis, motions=motions(problem, hypothesis, start[None], level)[0])
         found = settle(fitter.on(problem), hypothesis, start, level, reach)

@@ -268,6 +268,23 @@ def test_help_has_examples_on_lines_of_their_own_and_names_every_argument(run):
         assert all(argument in told for argument in arguments)
 
 
+@pytest.mark.parametrize("columns", ["80", "300"])
+@pytest.mark.parametrize("words", ["", "identify", "design", "run", "train", "evaluate", "export", "report", "rig",
+                                   "rig init", "rig list"])  # fmt: skip
+def test_no_line_of_a_help_is_wider_than_80_characters(run, monkeypatch, words, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    status, told, _ = run(*words.split(), "--help")
+    assert status == 0
+    assert max(map(len, told.splitlines())) <= 80
+
+
+def test_no_line_of_a_table_is_wider_than_80_characters(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for words in (["report"], ["rig", "list"]):
+        told = run(*words)[1]
+        assert max(map(len, told.splitlines())) <= 80
+
+
 def test_nothing_heavy_is_imported_for_the_help():
     code = (
         "import sys\nfrom agents.commands import main\n"

@@ -10,7 +10,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from agents.cli import progress_bar, told_in_one_line
+from agents.cli import told_in_one_line
 from agents.commands import main
 from agents.commands.identify import show as show_identified
 from agents.commands.rig_file import from_record
@@ -19,11 +19,12 @@ from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, s
 from agents.evaluation.leaderboard import print_table
 from agents.evaluation.report import write_report
 from agents.evaluation.rollout import evaluate
-from agents.results import show, spinner, table
+from agents.results import show, table
 from agents.running.experiment import design
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import write_settings
 from estimator import Rig, identify
+from estimator.progress import _bar, progress
 
 NAMES = [
     "<script>alert(1)</script>", "\"><img src=x onerror='alert(1)'>", "&lt;b&gt;", "=cmd|' /C calc'!A0", "+1+1", "-2",
@@ -123,13 +124,15 @@ def test_an_error_is_one_line(name, capsys):
 
 
 @names
-def test_what_is_being_done(name, capsys):
-    with spinner("Evaluating") as say:
-        say(f"Evaluating {name}")
-    with progress_bar() as bar:
-        bar.disable = False
-        bar.add_task(name, total=1)
-        bar.refresh()
+def test_what_is_being_done(name, capsys, monkeypatch):
+    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
+    with progress("Evaluating") as tell:
+        tell(0.5, name)
+    said = capsys.readouterr().err
+    assert is_tame(said)
+    assert len(said.splitlines()) == 1
+    with _bar() as show_bar:
+        show_bar(0.5, name)
 
 
 @sharp

@@ -178,12 +178,16 @@ def table_of(capsys, *evaluations):
     print_table(list(evaluations), "a title")
     lines = capsys.readouterr().out.splitlines()
     assert any("a title" in line for line in lines)
-    head = ["".join(parts) for parts in zip(*_rows(lines, "┃"), strict=True)][1:]  # long names are folded
-    body = _rows(lines, "│")
-    cells = {}
-    for centers, intervals in zip(body[::2], body[1::2], strict=True):
-        assert intervals[0] == ""
-        cells[centers[0]] = list(zip(centers[1:], intervals[1:], strict=True))
+    assert max(map(len, lines)) <= 80
+    head, cells = [], {}
+    begins = [k for k, line in enumerate(lines) if line.startswith("┏")]
+    for begin, end in zip(begins, [*begins[1:], None], strict=True):  # a wide table comes in parts
+        part = lines[begin:end]
+        head += ["".join(parts) for parts in zip(*_rows(part, "┃"), strict=True)][1:]  # long names are folded
+        body = _rows(part, "│")
+        for centers, intervals in zip(body[::2], body[1::2], strict=True):
+            assert intervals[0] == ""
+            cells.setdefault(centers[0], []).extend(zip(centers[1:], intervals[1:], strict=True))
     return head, cells
 
 

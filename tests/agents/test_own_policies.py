@@ -1,6 +1,7 @@
 """Policies of a user's own: made from instances, classes, functions and models, and evaluated as any other."""
 
 import os
+import re
 import sys
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNormalize
 
 from agents import make_policy, save_policy
+from agents.evaluation.protocol import fingerprint
 from agents.evaluation.rollout import evaluate
 from agents.policies.learned import load_policy
 from agents.studies import baselines
@@ -484,3 +486,38 @@ def test_a_normaliser_beside_an_algorithm_is_refused(tmp_path):
     model = PPO("MlpPolicy", DuffingVecEnv("duffing_env/Short-v0", 2, seed=0), device="cpu")
     with pytest.raises(ValueError, match="normalizer must be None for an algorithm"):
         save_policy(tmp_path, model, normalizer=(0.0, 1.0, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (
+            "os:system",
+            "policy must be an object or a function of your own, but os:system is <built-in function system>",
+        ),
+        ("os:path", "policy must be an object or a function of your own, but os:path is <module"),
+        ("os:makedirs", "policy must be one, but os:makedirs fails: TypeError"),
+        ("os:nothing", "os has no 'nothing'; name one it has"),
+        ("enum:Enum", "policy must be one, but enum:Enum fails: TypeError"),
+        ("decimal:Context", "policy must have predict, or be a function of observations"),
+        ("broken_of_tests:policy", "'broken_of_tests' cannot be imported: SyntaxError"),
+        ("leaving_of_tests:policy", "'leaving_of_tests' cannot be imported: SystemExit: 3"),
+        ("needing_of_tests:policy", "needing_of_tests needs another package: No module named 'no_such_package'"),
+        ("failing_of_tests:policy", "policy must be one, but failing_of_tests:policy fails: KeyError: 'gone' ("),
+        (".:policy", "cannot be imported"),
+    ],
+)
+def test_what_is_no_policy_is_refused_in_a_sentence(policy, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken_of_tests.py").write_text("policy = (\n")
+    (tmp_path / "leaving_of_tests.py").write_text("raise SystemExit(3)\n")
+    (tmp_path / "needing_of_tests.py").write_text("import no_such_package\n")
+    (tmp_path / "failing_of_tests.py").write_text("def policy(seen):\n    return {}['gone']\n")
+    with pytest.raises(ValueError, match=re.escape(message)):
+        evaluate([policy], **SHORT)
+
+
+def test_an_object_of_a_module_has_the_fingerprint_of_its_class(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "object_of_tests.py").write_text("class Still:\n    predict = None\npolicy = Still()\n")
+    assert fingerprint("object_of_tests:policy") == fingerprint("object_of_tests:Still") != ""

@@ -227,6 +227,28 @@ def test_a_training_goes_on_from_what_was_written_before_the_disk_was_full(tmp_p
     assert resume(tmp_path / "run").curve[-1][0] == 1024
 
 
+@pytest.mark.parametrize("room", [0, 1], ids=["log", "checkpoint"])
+def test_a_training_whose_disk_is_full_before_its_first_checkpoint_leaves_nothing(tmp_path, room):
+    """There is room for config.json: what does not fit is the log, or, after its rows, the policy."""
+    small = ALGORITHMS["ppo"](num_envs=8, batch_size=16, hidden=(64,), n_steps=16)
+    config = TrainConfig(
+        env=SHORT, steps=1024, eval_every=1024, output=tmp_path / "made" / "run", hyperparameters=small
+    )
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(steps, found):
+        size = 5000 if room else 20
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+
+    try:
+        with pytest.raises(OSError, match=r"File too large; make room.*'.*" + ("policy" if room else "progress.csv")):
+            train(config, fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
+    assert train(config).curve[-1][0] == 1024
+
+
 def test_a_run_ends_with_its_input_at_zero_and_whole_rows(bench, tmp_path):
     rig, told = Rig.from_file(bench / "bench.toml"), []
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -284,3 +284,15 @@ def test_a_million_samples_are_compared_at_once():
     u, y = rng.standard_normal((2, 1_000_000))
     assert shared([(u, y), (u, y[::-1])]) is None
     assert shared([(u[:600_000], y[:600_000]), (u[599_900:], y[599_900:])]) == (0, 599_900, 1, 0)
+
+
+def test_an_absurd_number_is_refused_by_record_and_sample(tmp_path):
+    u, y = simulated(SOFT, samples=400)
+    y[7] = 1e300
+    with pytest.raises(ValueError, match=r"y of record 0 must be within ±1e\+30, but at sample 7 is 1e\+300; leave it"):
+        records_of((u, y), rig_of(SOFT))
+    path = tmp_path / "absurd.csv"
+    path.write_text("u,y\n" + "".join(f"{a!r},{b!r}\n" for a, b in zip((-u).tolist(), u.tolist(), strict=True)))
+    path.write_text(path.read_text().replace(repr(-float(u[3])), "-1e299", 1))
+    with pytest.raises(ValueError, match=rf"u of {re.escape(str(path))} must be within ±1e\+30, but at sample \d+ is "):
+        records_of(path, rig_of(SOFT))

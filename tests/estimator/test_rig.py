@@ -237,3 +237,31 @@ def test_the_instrument_comes_from_the_file_that_the_rig_comes_from(tmp_path, mo
     Path("beam").write_text("step = 0.5\ninstrument = 3\n")
     with pytest.raises(ValueError, match="beam must be a rig file, but is not: instrument must be a table, but is 3"):
         Rig.with_instrument("./beam")
+
+
+@pytest.mark.parametrize(
+    ("where", "channel", "message"),
+    [
+        ("input", {"limit": -1}, "input.limit must be a number from 1e-30 to 1e+30, but is -1; leave it out"),
+        ("output", {"range": 1e300}, "output.range must be a number from 1e-30 to 1e+30, but is 1e+300"),
+        ("output", {"limit": -1}, "output must have no limit, but has -1; use range"),
+        ("input", {"range": "wide"}, "input must have no range, but has 'wide'; use limit"),
+        ("input", {"noise": 0.0}, "input.noise must be a number"),
+        ("output", {"noise": 0.0}, "output.noise must be a number"),
+        ("output", {"offset": "x"}, "output.offset must be a number"),
+        ("input", {"unit": ""}, "input.unit must be a short text"),
+        ("output", {"column": 3}, "output.column must be a name"),
+        ("output", {"kind": "speed"}, "output.kind must be one of"),
+        ("input", {"limits": 3}, "input must have keys of"),
+    ],
+)
+def test_an_error_says_of_which_channel(where, channel, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Rig.from_dict({"step": 1e-3, where: channel})
+
+
+def test_a_channel_alone_says_whose_limit_or_range_is_wrong():
+    with pytest.raises(ValueError, match="limit of an input must be a number"):
+        Channel(limit=-1)
+    with pytest.raises(ValueError, match="range of an output must be a number"):
+        Channel(range=np.inf)

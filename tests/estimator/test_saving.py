@@ -66,6 +66,9 @@ REFUSED = {
     "objects": lambda a: {**a, "records": np.array([{"a": 1}], dtype=object)},
     "inputs that are not finite": lambda a: {**a, "inputs": a["inputs"] * np.nan},
     "a belief that is not finite": lambda a: {**a, "records": a["records"] * np.nan},
+    "inputs that are absurd": lambda a: {**a, "inputs": np.full_like(a["inputs"], 1e300)},
+    "a waiting output that is absurd": lambda a: {**a, "outputs": np.full_like(a["outputs"], -1e300)},
+    "a walk that is absurd": lambda a: {**a, "walk": a["walk"] + 1e300},
     "a negative covariance": lambda a: {**a, "records": a["records"] * np.where(np.arange(len(a["first"])) > 8, -1, 1)},
     "a prior with a negative covariance": lambda a: {**a, "first": a["first"] * np.where(a["first"] > 0, -1, 1)},
     "a negative walk": lambda a: {**a, "walk": a["walk"] - 1.0},
@@ -81,6 +84,18 @@ def test_a_file_with_wrong_content_is_refused(what, written):
     with pytest.raises(
         ValueError, match=f"path must be a whole file of .* or a run, but {re.escape(str(path))} is not"
     ):
+        load_estimator(path)
+
+
+@pytest.mark.parametrize("array", ["records", "first"])
+@pytest.mark.parametrize("place", [2, 20, -1], ids=["mean", "covariance", "rate"])
+@pytest.mark.parametrize("value", [1e300, -1e200, 1e61])
+def test_an_absurd_number_of_a_belief_is_refused_by_its_name(array, place, value, written):
+    """It is finite, and would overflow at the first sample."""
+    path, arrays = written
+    arrays[array][..., place] = value
+    np.savez(path, **arrays)
+    with pytest.raises(ValueError, match=rf"{re.escape(str(path))} is not .*, but \w+ is {re.escape(f'{value:g}')}; "):
         load_estimator(path)
 
 
@@ -151,7 +166,7 @@ def test_members_that_are_no_belief_together_are_refused():
     estimator.run(*record(12))
     arrays = estimator.arrays()
     arrays["records"] *= 1e300
-    with pytest.raises(ValueError, match="records must be finite"):
+    with pytest.raises(ValueError, match=r"records must be within ±1e\+\d0, but \w+ is "):
         estimator.restore(arrays)
 
 
