@@ -98,7 +98,7 @@ class Config(TrainConfig):
     def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
         """Compare what was trained with the usual policies."""
         if config.env == FAMILY:
-            print(f"python -m agents.studies.universal --policies {policy}")
+            print(f"python -m agents.studies.family --policies {policy}")
         elif self.systems:
             from agents.evaluation.comparison import compare, usual_policies
 
