@@ -9,7 +9,7 @@ WORKERS ?= 2
 
 demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
 	rm -rf runs/demo
-	$(BIN)/python train.py --steps 200000 --output runs/demo
+	$(BIN)/python train.py --steps 100000 --output runs/demo
 
 test: $(READY)  ## all tests but the slow evidence, in WORKERS processes
 	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder

@@ -48,7 +48,7 @@ class Config(TrainConfig):
     """Trainings, of the seed and those after it, into OUTPUT/SEED each; the same command goes on with them."""
     ray: bool = False
     """Whether seeds, or trials of --tune, are spread over a Ray cluster: that of RAY_ADDRESS, or of this machine."""
-    systems: int = 256
+    systems: int = 32
     """Systems to compare on afterwards; 0 to skip the comparison."""
 
     def __post_init__(self) -> None:
@@ -87,7 +87,7 @@ class Config(TrainConfig):
         if self.resume is None:
             run = train(self)
         else:
-            if asdict(replace(self, resume=None, systems=256)) != asdict(Config()):
+            if asdict(replace(self, resume=None, systems=Config.systems)) != asdict(Config()):
                 raise ValueError("resume takes all settings but systems from the run; leave out the others")
             run = resume(self.resume)
         say(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
@@ -100,13 +100,13 @@ class Config(TrainConfig):
     def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
         """Compare what was trained with the usual policies."""
         if config.env == FAMILY:
-            say(f"python -m agents.studies.universal --policies {policy}")
+            say(f"python -m agents.studies.family --policies {policy}")
         elif self.systems:
             from agents.evaluation.comparison import compare, usual_policies
 
-            compare(
-                (policy, *usual_policies(config.env, config.options)), config.env, self.systems, config.options, folder
-            )
+            policies = (policy, *usual_policies(config.env, config.options))
+            compare(policies, config.env, self.systems, config.options, folder, briefly=True)
+            print("More, on more systems: duffing-env evaluate --help")
 
 
 def default_config(words: list[str] | None) -> Config:

@@ -79,6 +79,16 @@ METRICS = {
 }
 
 
+#: The chief ones, with titles for a table of 80 characters; and those whose spread it has.
+HEADLINE = {
+    "information_gain": "information / nat",
+    "efficiency": "D-efficiency / %",
+    "coverage": "intervals cover / %",
+    "ended_early": "ended early / %",
+}
+_WITH_SPREAD = ("information_gain", "efficiency")
+
+
 #: What the less known of them are, where they are in a table.
 TERMS = {
     "nees": "NEES: squared error in units of the believed covariance; 1 where beliefs are right",
@@ -224,6 +234,30 @@ def print_table(evaluations: list[Evaluation], title: str) -> None:
         return found
 
     show(fitted(made, len(heads)), caption_of(evaluations))
+
+
+def headline(evaluations: list[Evaluation]) -> Table:
+    """Heads and rows: a line for each policy, with the chief figures, which are in ``HEADLINE``."""
+    shown = {name: title for name, title in HEADLINE.items() if name in evaluations[0].metrics}
+    rows = []
+    for evaluation in evaluations:
+        cells = [evaluation.title]
+        for name in shown:
+            metric, values = METRICS[name], evaluation.metrics[name].reshape(evaluation.seeds, -1)
+            entry = center_and_interval(values, metric)
+            spread = f" ± {metric.text((entry['high'] - entry['low']) / 2)}" if name in _WITH_SPREAD else ""
+            cells.append(f"{metric.text(center_of(entry))}{spread}")
+        rows.append(cells)
+    return ["", *shown.values()], rows
+
+
+def print_headline(evaluations: list[Evaluation], title: str) -> None:
+    """Print the chief figures, in 80 columns."""
+    heads, rows = headline(evaluations)
+    caption = "means over systems ± half of the 95 % bootstrap interval; 90 % intervals that cover"
+    if "efficiency" in evaluations[0].metrics:
+        caption += f"\n{TERMS['efficiency']}"
+    show(table(heads, rows, title=title), caption)
 
 
 def print_estimators(evaluations: list[Evaluation]) -> None:

@@ -19,6 +19,7 @@ from agents.planner.block_policy import BlockPlanner
 from agents.planner.policy import Planner
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
+from agents.policies.lookahead import Lookahead
 from agents.policies.own import own_policy
 from agents.policies.signals import make_signal
 from estimator.checks import MOST_SEED, hint, shown, whole
@@ -54,6 +55,7 @@ POLICIES: dict[str, Callable[..., Policy]] = {
     **FEEDBACK,
     "efe": Planner,
     "efe-myopic": partial(Planner, horizon=1),
+    "lookahead": Lookahead,
     **{f"efe-block-{n}": partial(BlockPlanner, block=n) for n in (16, 64, 256)},
 }
 

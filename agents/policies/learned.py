@@ -157,7 +157,7 @@ class LearnedPolicy:
             if foresight.features != self._features:
                 raise ValueError(
                     f"env must have {self._features} features for this policy, but has {foresight.features}: it is of "
-                    "another model than the policy was trained on; play ppo/universal there"
+                    "another model than the policy was trained on; play lookahead there"
                 )
             self._foresight = foresight
         if not isinstance(self._foresight, Foresight):

@@ -32,7 +32,7 @@ class Subject:
     algo: Literal["ppo", "sac", "td3", "tqc", "recurrent_ppo"] = "ppo"
     """Algorithm."""
     env: str = "duffing_env/Amplitude-v0"
-    """Track, such as Short-v0; or family, the oscillators of all kinds that ppo/universal is trained on."""
+    """Track, such as Short-v0; or family, oscillators of all kinds."""
     rig: str | None = None
     """Rig file, or the name of a rig that ships; the track is then Rig-v0."""
     settings: Path | None = None
@@ -97,7 +97,7 @@ class TrainConfig(Subject):
         elif self.options or self.eval_every or self.algo != "ppo":
             raise ValueError(
                 f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare with "
-                "python -m agents.studies.universal"
+                "python -m agents.studies.family"
             )
         if self.hyperparameters is None:
             object.__setattr__(self, "hyperparameters", read_settings(self.algo, self.env, self.settings))

@@ -14,11 +14,11 @@ from agents.planner.motion import View
 from agents.policies import make_policy
 from agents.policies.foresight import CommonForesight
 from agents.policies.imagined import BOUND, FEATURES, imaginer
+from agents.policies.lookahead import rule
 from agents.policies.ways import CHANGES, ROUNDS, WORDS
-from agents.studies.universal import play, unseen
+from agents.studies.family import play, unseen
 from agents.training import PPOSettings, TrainConfig, train
 from agents.training.family import draw_member
-from agents.training.rule import rule
 from estimator.belief import covariance_places
 from estimator.models.difference import difference
 
@@ -276,27 +276,28 @@ def test_members_are_drawn_within_their_ranges_and_make_environments():
     assert make("duffing_env/Rig-v0", 1, member.options).horizon == member.options["horizon"]
 
 
-def test_a_policy_for_all_oscillators_needs_an_environment_to_look_at():
-    policy = make_policy("ppo/universal")
-    with pytest.raises(ValueError, match="env must be given"):
-        policy.predict(np.zeros(22, dtype=np.float32))
+def test_lookahead_needs_an_environment_whose_posterior_it_sees():
+    with pytest.raises(ValueError, match="env must be one of duffing_env"):
+        make_policy("lookahead")
+    with pytest.raises(ValueError, match="'posterior' for lookahead, but shows 'history'"):
+        make_policy("lookahead", make("duffing_env/Amplitude-v0", 2, {"observation": "history"}))
+    policy = make_policy("lookahead", make("duffing_env/Amplitude-v0", 2))
+    with pytest.raises(ValueError, match="observation must have 22 entries"):
+        policy.predict(np.zeros((2, 21), dtype=np.float32))
+    with pytest.raises(ValueError, match="observation must be finite"):
+        policy.predict(np.full((2, 22), np.nan, dtype=np.float32))
 
 
-def test_the_policy_that_ships_is_ahead_of_a_signal_on_unseen_members():
-    told = make_policy("ppo/universal").card["scores"]["efficiency"]
-    assert told["all"][0] > 0.85
-    assert told["all"][1] > 0.6
+def test_lookahead_is_ahead_of_a_signal_on_unseen_members():
     members = [member for member in unseen(24) if member.options["horizon"] < 200]
-    ours, signal = (
-        [play(member, name, i)[0] for i, member in enumerate(members)] for name in ("ppo/universal", "prbs")
-    )
+    ours, signal = ([play(member, name, i)[0] for i, member in enumerate(members)] for name in ("lookahead", "prbs"))
     assert np.median(np.subtract(ours, signal)) > 0.5
 
 
 @pytest.mark.parametrize("env_id", ["duffing_env/Amplitude-v0", "duffing_env/Power-v0"])
 def test_it_plays_tracks_that_it_was_not_trained_on(env_id):
     gains = {}
-    for name in ("ppo/universal", "prbs"):
+    for name in ("lookahead", "prbs"):
         envs = make(env_id, 16)
         policy = make_policy(name, envs)
         observations, _ = envs.reset(seed=3)
@@ -306,7 +307,7 @@ def test_it_plays_tracks_that_it_was_not_trained_on(env_id):
             observations, _, terminated, truncated, infos = envs.step(actions)
             gains[name] += np.where(running, infos["information_gain"], 0.0).mean()
             running &= ~(terminated | truncated)
-    assert gains["ppo/universal"] > gains["prbs"] + 1.0
+    assert gains["lookahead"] > gains["prbs"] + 1.0
 
 
 def test_beside_the_observation_it_is_turned_upright():
@@ -344,7 +345,7 @@ def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path, log
     policy = make_policy(str(run.folder), envs)
     seen = observations_of(envs, 30)
     view = CommonForesight(envs).look(seen)
-    expected = view.act(rule(view.features, 3) - 1)
+    expected = view.act(rule(view.features))
     # Of a few beliefs two ways are worth about the same.
     by = [FEATURES.index(f"best_{way}_whole") for way in ("up", "none")]
     clear = (np.abs(view.features[:, by]) > 0.1).all(axis=1)

@@ -16,6 +16,7 @@ from agents.evaluation.leaderboard import (
     METRICS,
     leaderboard,
     print_estimators,
+    print_headline,
     print_table,
     summarise,
     two_way_table,
@@ -274,6 +275,17 @@ def test_ten_columns_are_not_cut(capsys):
     head, cells = table_of(capsys, *(make_evaluation(policy, shift=-i) for i, policy in enumerate(policies)))
     assert head == policies
     assert all(text.strip("-0123456789.,[] ") == "" for row in cells.values() for cell in row for text in cell)
+
+
+def test_the_chief_figures_are_a_line_for_each_policy(capsys):
+    metrics = {name: np.full(3, value) for name, (value, _, _) in CONSTANTS.items()}
+    trained = "runs/ppo-amplitude-v0-12"
+    print_headline([make_evaluation(trained, **metrics), make_evaluation("prbs", **metrics)], "a title")
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = [line.split() for line in lines if line.startswith((trained, "prbs"))]
+    cells = ["12.35", "±", "0.00", "87.7", "±", "0.0", "75.0", "0.0"]
+    assert rows == [[trained, *cells], ["prbs", *cells]]
 
 
 def load_strictly(path):

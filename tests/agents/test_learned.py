@@ -461,7 +461,7 @@ def test_the_search_for_unpicklers_finds_them(source):
     assert len(list(unpickling(source))) >= 1
 
 
-@pytest.mark.parametrize("name", [name for name in trained_policies() if name != "ppo/universal"])
+@pytest.mark.parametrize("name", trained_policies())
 def test_a_policy_that_ships_does_what_its_card_says(name):
     card = make_policy(name).card
     (evaluation,) = evaluate([name], card["config"]["env"], systems=32)

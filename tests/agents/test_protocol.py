@@ -11,6 +11,7 @@ import pytest
 from agents.commands import main
 from agents.evaluation import board, protocol
 from agents.evaluation.oracle import Oracle, Systems
+from agents.policies import POLICIES
 
 SHORT = "duffing_env/Short-v0"
 PRBS = ("--protocol", "Short-v0", "--policies", "prbs")
@@ -238,8 +239,10 @@ def test_two_programs_may_add_at_once(tmp_path, entry):
 def test_the_board_that_ships_is_of_what_ships():
     entries = board.read(board.SHIPPED)
     shown = {entry["name"] for entry in entries if entry["track"] == SHORT}
-    assert {"ppo/short", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
+    assert {"ppo/short", "lookahead", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
     for entry in entries:
+        # What has a name without a training has learned nothing.
+        assert (entry["budget"] == "none") == (entry["name"] in POLICIES), entry["name"]
         for policy, found in entry["policies"].items():
             if policy in protocol.trained_policies():
                 assert found == protocol.fingerprint(policy), policy

@@ -300,7 +300,7 @@ def test_a_path_loads_the_trained_policy(tmp_path, monkeypatch):
     assert make_policy(str(tmp_path), seed=3) == ("loaded", tmp_path, 3)
 
 
-@pytest.mark.parametrize("name", ["prbs", "efe", "ppo/universal"])
+@pytest.mark.parametrize("name", ["prbs", "efe", "lookahead"])
 def test_the_name_of_an_environment_is_none(name):
     with pytest.raises(ValueError, match="env must be an environment, but is 'duffing_env/Short-v1'; pass what gym"):
         make_policy(name, "duffing_env/Short-v1")
