@@ -14,6 +14,7 @@ import pytest
 import tyro
 
 from agents.cli import JsonOptions, run_script, with_rig
+from agents.commands import main
 from agents.training import TrainConfig
 from agents.training.hyperparameters import track_of
 from estimator import Rig
@@ -31,7 +32,7 @@ DECLARED = {
 
 @pytest.fixture
 def script(tmp_path, monkeypatch, capsys):
-    """Runs a script as the shell would, in an empty folder, but within this process: returns status and messages."""
+    """Runs a script as the shell would, in an empty folder, but within this process: returns status, out and err."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "400")
 
@@ -42,18 +43,9 @@ def script(tmp_path, monkeypatch, capsys):
             runpy.run_path(str(ROOT / name), run_name="__main__")
         except SystemExit as stop:
             status = stop.code
-        return status, capsys.readouterr().err
+        return status, *capsys.readouterr()
 
     return run
-
-
-def command(script, *arguments, folder=ROOT):
-    """Run a script in a process of its own; lines of its output are not broken."""
-    return subprocess.run(
-        [sys.executable, ROOT / script, *map(str, arguments)],
-        env=os.environ | {"COLUMNS": "400", "OMP_NUM_THREADS": "1"},
-        capture_output=True, text=True, timeout=600, cwd=folder,
-    )  # fmt: skip
 
 
 def declared_options(file, name):
@@ -67,11 +59,10 @@ def declared_options(file, name):
 
 
 @pytest.mark.parametrize("name", DECLARED)
-def test_help_explains_every_option(name):
-    finished = command(name, "--help")
-    assert finished.returncode == 0, finished.stderr
-    assert finished.stderr == ""
-    columns = [re.split("[│╮╯]│", line) for line in finished.stdout.splitlines()]
+def test_help_explains_every_option(script, name):
+    status, told, messages = script(name, "--help")
+    assert (status, messages) == (0, "")
+    columns = [re.split("[│╮╯]│", line) for line in told.splitlines()]
     lines = [cells[k].strip("│ ") for k in (0, 1) for cells in columns if len(cells) > k]
     explained = 0
     for file, cls, prefix in DECLARED[name]:
@@ -87,54 +78,60 @@ def test_help_explains_every_option(name):
     assert explained == {"train.py": 33, "evaluate.py": 12}[name]
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "message"),
-    [
-        ("train.py", ["--steps", "0"], "steps must be a whole number from 1 to 1000000000000, but is 0"),
-        ("train.py", ["--steps", "many"], "many"),
-        ("train.py", ["--stepps", "5"], "--stepps"),
-        ("train.py", ["--reward", "free_energie"], "did you mean 'free_energy'"),
-        ("train.py", ["--systems", "1"], "systems must be 0 or at least 2, but is 1"),
-        ("train.py", ["--ppo.batch-size", "0"], "batch_size must be at least 1, but is 0"),
-        ("train.py", ["--options", '{"reward": "log_posterior"}'], "options must not hold reward"),
-        ("train.py", ["--options", '{"horizon": 0}'], "horizon must be a whole number from 1 to 1000000000, but is 0"),
-        ("train.py", ["--env", "duffing_env/Amplitud-v0"], "Amplitud"),
-        ("train.py", ["--env", "Shrt-v1"], "`Shrt` doesn't exist; did you mean 'duffing_env/Short-v1'?"),
-        ("train.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
-        ("train.py", ["--algo", "sacc"], "invalid choice 'sacc'"),
-        ("train.py", ["--algo", "sac", "--sac.tau", "2"], "tau must be in [0, 1], but is 2.0"),
-        ("train.py", ["--algo", "sac", "--ppo.gamma", "0.9"], "--ppo.gamma"),
-        ("train.py", ["--algo", "sac", "--steps", "5000"], "learning_starts must be below steps, but is 5000 of 5000"),
-        ("train.py", ["--settings", "none.toml"], "none.toml"),
-        ("train.py", ["--eval-every", "-1"], "eval_every must be a whole number from 0 to 1000000000000, but is -1"),
-        ("train.py", ["--tune", "-1"], "tune must be a whole number from 0 to 1000000, but is -1"),
-        ("train.py", ["--resume", "none"], "resume takes all settings but systems from the run"),
-        ("train.py", ["--rig", "silverbox", "--env", "Short-v0"], "env must be left out with rig"),
-        ("evaluate.py", ["--rig", "r.toml", "--env", "Short-v0"], "env must be left out with rig"),
-        ("evaluate.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
-        ("evaluate.py", ["--systems", "1"], "systems must be a whole number from 2 to 100000, but is 1"),
-        ("evaluate.py", ["--systems", "a few"], "a few"),
-        ("evaluate.py", ["--policies", "unifrom"], "did you mean 'uniform'"),
-        ("evaluate.py", ["--options", "[1]"], "options must be a JSON object, but are [1]"),
-        ("evaluate.py", ["--options", "[" * 100_000], "options must be a JSON object, but are nested too deeply"),
-        ("evaluate.py", ["--options", '{"num_envs": 3}'], "options must not hold num_envs"),
-        ("evaluate.py", ["--options", '{"autoreset_mode": "x"}'], "options must not hold autoreset_mode"),
-        ("train.py", ["--options", '{"max_episode_steps": "x"}'], "options must not hold max_episode_steps"),
-        ("train.py", ["--options", '{"seed": 3}'], "options must not hold seed, but seed is 3; leave it out"),
-        ("train.py", ["--options", '{"levels": 3}'], "options must not hold levels, but levels is 3; leave it out"),
-        ("train.py", ["--options", '{"id": "x"}'], "options must not hold id, but id is 'x'; leave it out"),
-        ("evaluate.py", ["--options", '{"id": "x"}'], "options must not hold id, but id is 'x'; leave it out"),
-        ("evaluate.py", ["--options", '{"vectorization_mode": "sync"}'], "options must not hold vectorization_mode"),
-        ("evaluate.py", ["--options", '{"horizon"'], "JSON"),
-        ("evaluate.py", ["--options", '{"horizn": 3}'], "did you mean 'horizon'"),
-        ("evaluate.py", ["--env", "duffing_env/Amplitude-v7"], "[ `v0`, `v1` ]"),
+#: What no script takes, and what it says.
+REFUSED = {
+    "train.py": [
+        (["--steps", "0"], "steps must be a whole number from 1 to 1000000000000, but is 0"),
+        (["--steps", "many"], "many"),
+        (["--stepps", "5"], "--stepps"),
+        (["--reward", "free_energie"], "did you mean 'free_energy'"),
+        (["--systems", "1"], "systems must be 0 or at least 2, but is 1"),
+        (["--ppo.batch-size", "0"], "batch_size must be at least 1, but is 0"),
+        (["--options", '{"reward": "log_posterior"}'], "options must not hold reward"),
+        (["--options", '{"horizon": 0}'], "horizon must be a whole number from 1 to 1000000000, but is 0"),
+        (["--env", "duffing_env/Amplitud-v0"], "Amplitud"),
+        (["--env", "Shrt-v1"], "`Shrt` doesn't exist; did you mean 'duffing_env/Short-v1'?"),
+        (["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
+        (["--algo", "sacc"], "invalid choice 'sacc'"),
+        (["--algo", "sac", "--sac.tau", "2"], "tau must be in [0, 1], but is 2.0"),
+        (["--algo", "sac", "--ppo.gamma", "0.9"], "--ppo.gamma"),
+        (["--algo", "sac", "--steps", "5000"], "learning_starts must be below steps, but is 5000 of 5000"),
+        (["--settings", "none.toml"], "none.toml"),
+        (["--eval-every", "-1"], "eval_every must be a whole number from 0 to 1000000000000, but is -1"),
+        (["--tune", "-1"], "tune must be a whole number from 0 to 1000000, but is -1"),
+        (["--resume", "none"], "resume takes all settings but systems from the run"),
+        (["--rig", "silverbox", "--env", "Short-v0"], "env must be left out with rig"),
+        (["--options", '{"max_episode_steps": "x"}'], "options must not hold max_episode_steps"),
+        (["--options", '{"seed": 3}'], "options must not hold seed, but seed is 3; leave it out"),
+        (["--options", '{"levels": 3}'], "options must not hold levels, but levels is 3; leave it out"),
+        (["--options", '{"id": "x"}'], "options must not hold id, but id is 'x'; leave it out"),
     ],
-)
-def test_a_bad_value_is_one_message_and_exit_status_2(script, name, arguments, message, tmp_path):
-    status, messages = script(name, *arguments, "--output", "out")
-    assert status == 2
-    assert message in messages
-    assert list(tmp_path.iterdir()) == []
+    "evaluate.py": [
+        (["--rig", "r.toml", "--env", "Short-v0"], "env must be left out with rig"),
+        (["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
+        (["--systems", "1"], "systems must be a whole number from 2 to 100000, but is 1"),
+        (["--systems", "a few"], "a few"),
+        (["--policies", "unifrom"], "did you mean 'uniform'"),
+        (["--options", "[1]"], "options must be a JSON object, but are [1]"),
+        (["--options", "[" * 100_000], "options must be a JSON object, but are nested too deeply"),
+        (["--options", '{"num_envs": 3}'], "options must not hold num_envs"),
+        (["--options", '{"autoreset_mode": "x"}'], "options must not hold autoreset_mode"),
+        (["--options", '{"id": "x"}'], "options must not hold id, but id is 'x'; leave it out"),
+        (["--options", '{"vectorization_mode": "sync"}'], "options must not hold vectorization_mode"),
+        (["--options", '{"horizon"'], "JSON"),
+        (["--options", '{"horizn": 3}'], "did you mean 'horizon'"),
+        (["--env", "duffing_env/Amplitude-v7"], "[ `v0`, `v1` ]"),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_bad_value_is_one_message_and_exit_status_2(script, name, tmp_path):
+    for arguments, message in REFUSED[name]:
+        status, _, messages = script(name, *arguments, "--output", "out")
+        assert status == 2, arguments
+        assert message in messages
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_a_rig_may_be_one_that_ships(tmp_path, monkeypatch):
@@ -142,34 +139,41 @@ def test_a_rig_may_be_one_that_ships(tmp_path, monkeypatch):
     assert with_rig({"horizon": 9}, "beam") == {"horizon": 9, "rig": Rig.shipped("beam").to_dict()}
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments"), [("train.py", ["--reward", "foo"]), ("evaluate.py", ["--policies", "foo"])]
-)
-def test_a_bad_value_shows_no_traceback(name, arguments, tmp_path):
-    finished = command(name, *arguments, folder=tmp_path)
-    assert finished.returncode == 2
-    assert [line for line in finished.stdout.splitlines() if not line.startswith("An update takes ")] == []
+def test_a_bad_value_shows_no_traceback(tmp_path):
+    """In a process of its own, with whatever is told before."""
+    finished = subprocess.run(
+        [sys.executable, ROOT / "evaluate.py", "--policies", "foo"],
+        env=os.environ | {"COLUMNS": "400"}, capture_output=True, text=True, timeout=600, cwd=tmp_path,
+    )  # fmt: skip
+    assert (finished.returncode, finished.stdout) == (2, "")
     (line,) = (line for line in finished.stderr.splitlines() if not line.startswith("duffing-env is compiling"))
-    assert line.startswith(f"{name}: ")
+    assert line.startswith("evaluate.py: ")
     assert "'foo'" in line
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "package", "extra"),
-    [
+def test_a_bad_reward_is_one_line(script, tmp_path):
+    status, told, messages = script("train.py", "--reward", "foo")
+    assert status == 2
+    assert [line for line in told.splitlines() if not line.startswith("An update takes ")] == []
+    (line,) = (line for line in messages.splitlines() if not line.startswith("duffing-env is compiling"))
+    assert line.startswith("train.py: ")
+    assert "'foo'" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_extra_is_one_line(script, monkeypatch, tmp_path):
+    for name, arguments, package, extra in (
         ("train.py", ["--output", "out"], "torch", "train"),
         ("train.py", ["--tune", "2", "--output", "out"], "optuna", "tune"),
         ("train.py", ["--algo", "tqc", "--output", "out"], "sb3_contrib", "train"),
         ("evaluate.py", ["--policies", "prbs", "--report", "out"], "matplotlib", "report"),
-    ],
-)
-def test_a_missing_extra_is_one_line(script, name, arguments, package, extra, monkeypatch, tmp_path):
-    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None if name == package else name)
-    status, messages = script(name, *arguments)
-    assert status == 2
-    assert messages == f"{name}: {package} is not installed; get it with: pip install 'duffing-env[{extra}]'\n"
-    assert list(tmp_path.iterdir()) == []
+    ):
+        monkeypatch.setattr("estimator.extras.find_spec", lambda name, gone=package: None if name == gone else name)
+        status, _, messages = script(name, *arguments)
+        assert status == 2
+        assert messages == f"{name}: {package} is not installed; get it with: pip install 'duffing-env[{extra}]'\n"
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_figures_are_left_out_without_matplotlib(script, monkeypatch, tmp_path):
@@ -180,39 +184,42 @@ def test_figures_are_left_out_without_matplotlib(script, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["train.py", "evaluate.py"])
-def test_examples_in_the_help_keep_lines_of_their_own(name, monkeypatch):
+def test_examples_in_the_help_keep_lines_of_their_own(script, name, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    told = subprocess.run([sys.executable, ROOT / name, "--help"], capture_output=True, text=True).stdout
+    _, told, _ = script(name, "--help")
     lines = [line.strip() for line in told.splitlines() if "duffing-env " in line]
     assert len(lines) >= 7
     assert all(line.startswith("$ duffing-env ") and line.count("$") == 1 and len(line) < 80 for line in lines)
 
 
-def test_the_list_of_commands_has_no_examples_that_would_be_broken(monkeypatch):
+def test_the_list_of_commands_has_no_examples_that_would_be_broken(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
-    code = "from agents.commands import main; main(['--help'])"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT).stdout
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    told = capsys.readouterr().out
     assert "$" not in told
     assert "• evaluate  Compare policies on common random numbers" in told
     assert "• rig       Describe your rig in a file" in told
 
 
 def test_help_of_the_command_is_quick():
-    """It imports nothing that computes."""
+    """It imports nothing that computes, neither for the list of commands nor for one of them."""
     code = (
         "import sys\nfrom agents.commands import main\n"
-        "try:\n    main(['--help'])\nexcept SystemExit:\n"
-        "    print(*{'numba', 'scipy', 'torch', 'gymnasium', 'numpy', 'sympy'} & sys.modules.keys(), file=sys.stderr)\n"
+        "for words in (['--help'], ['identify', '--help']):\n"
+        "    try:\n        main(words)\n    except SystemExit:\n        pass\n"
+        "    heavy = {'numba', 'scipy', 'torch', 'gymnasium', 'numpy', 'sympy', 'matplotlib'} & sys.modules.keys()\n"
+        "    print(words, *heavy - ({'numpy', 'sympy'} if len(words) > 1 else set()), file=sys.stderr)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert "train" in done.stdout
-    assert done.stderr == "\n"
+    assert done.stderr == "['--help']\n['identify', '--help']\n"
 
 
 def test_a_folder_that_is_a_file_is_one_message(script, tmp_path):
     (tmp_path / "out").write_text("precious")
     arguments = ["--policies", "uniform", "--systems", 2, "--options", '{"horizon": 4}', "--output", "out"]
-    status, messages = script("evaluate.py", *arguments)
+    status, _, messages = script("evaluate.py", *arguments)
     assert status == 2
     assert messages.startswith("evaluate.py: ")
     assert "out" in messages
@@ -227,39 +234,38 @@ def test_the_module_that_registers_a_track_may_stand_before_its_id(script, tmp_p
     )
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
     env = "own_of_tests:mine/OfTests-v0"
-    status, messages = script("evaluate.py", "--env", env, "--policies", "uniform", "--systems", 2)
+    status, _, messages = script("evaluate.py", "--env", env, "--policies", "uniform", "--systems", 2)
     assert status == 0, messages
     told = json.loads((tmp_path / "runs" / "evaluation" / "evaluation.json").read_text())
     assert told["settings"]["env"] == env
     config = TrainConfig(env=env)
     assert (config.env, track_of(config.env)) == (env, "OfTests-v0")
     assert TrainConfig(env="duffing_env:duffing_env/Short-v0") == TrainConfig(env="Short-v0")
-    status, messages = script("evaluate.py", "--env", "no_such_module:mine/OfTests-v0")
+    status, _, messages = script("evaluate.py", "--env", "no_such_module:mine/OfTests-v0")
     assert status == 2
     assert "env must be the id of a track such as duffing_env/Short-v0, but is no_such_module:mine/OfT" in messages
 
 
 def test_train_then_evaluate(script, tmp_path):
     """The way through both scripts: a policy that one wrote, the other compares."""
-    finished = command(
+    status, told, messages = script(
         "train.py", "--steps", 512, "--seed", 4, "--options", '{"horizon": 32}', "--output", "made", "--systems", 4,
         "--torch-threads", 1, "--ppo.num-envs", 16, "--ppo.n-steps", 16, "--ppo.batch-size", 128, "--ppo.hidden", 6, 5,
-        folder=tmp_path,
     )  # fmt: skip
-    assert finished.returncode == 0, finished.stderr
+    assert status == 0, messages
     # On a machine that has not compiled its kernels yet it says so.
-    said = [line for line in finished.stderr.splitlines() if not line.startswith("duffing-env is compiling ")]
+    said = [line for line in messages.splitlines() if not line.startswith("duffing-env is compiling ")]
     assert said == [
         "duffing-env: warning: a training of 2 updates may leave a policy worse than it began; take more steps than 512"
     ]
-    assert "The run is in made" in finished.stdout
+    assert "The run is in made" in told
     made = {path.name for path in (tmp_path / "made").iterdir()}
     pictures = {"contraction.png", "excitations.png", "learning_curve.png"}
     assert made == pictures | {
         "checkpoints", "config.json", "evaluation.json", "policy.json", "policy.safetensors", "progress.csv",
     }  # fmt: skip
     for name in (*pictures, "evaluation.json"):
-        assert str(Path("made") / name) in finished.stdout.splitlines()
+        assert str(Path("made") / name) in told.splitlines()
     description = json.loads((tmp_path / "made" / "config.json").read_text())
     assert description["config"]["options"] == {"horizon": 32}
     assert description["config"]["hyperparameters"]["hidden"] == [6, 5]
@@ -268,7 +274,7 @@ def test_train_then_evaluate(script, tmp_path):
     assert list(compared["policies"]) == ["made", "ppo/amplitude", "efe", "prbs", "uniform"]
 
     arguments = ["--policies", "made", "prbs", "--options", '{"horizon": 32}', "--systems", 4]
-    status, messages = script("evaluate.py", *arguments)
+    status, _, messages = script("evaluate.py", *arguments)
     assert status == 0, messages
     evaluated = json.loads((tmp_path / "runs" / "evaluation" / "evaluation.json").read_text())
     assert evaluated["settings"] == {
@@ -288,49 +294,43 @@ class Config:
     """Options."""
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
+def test_options_are_read_as_json():
+    for text, expected in (
         ("{}", {}),
         ('{"spread": 0.2, "horizon": 128}', {"spread": 0.2, "horizon": 128}),
         ('{"as_published": true, "data": null}', {"as_published": True, "data": None}),
         ('{"a": {"b": [1, 2]}}', {"a": {"b": [1, 2]}}),
-    ],
-)  # fmt: skip
-def test_options_are_read_as_json(text, expected):
-    options = tyro.cli(Config, args=["--options", text]).options
-    assert options == expected
-    assert [type(value) for value in options.values()] == [type(value) for value in expected.values()]
-
-
-def test_options_keep_their_default():
+    ):
+        options = tyro.cli(Config, args=["--options", text]).options
+        assert options == expected
+        assert [type(value) for value in options.values()] == [type(value) for value in expected.values()]
     assert tyro.cli(Config, args=[]).options == {"a": 1}
 
 
-@pytest.mark.parametrize("text", ["[1]", "3", '"spread"', "null", "spread=0.2", "{'spread': 0.2}", ""])
-def test_options_that_are_no_json_object_are_refused(text, capsys):
-    with pytest.raises(SystemExit) as caught:
-        tyro.cli(Config, args=["--options", text])
-    assert caught.value.code == 2
-    assert "options" in capsys.readouterr().err
+def test_options_that_are_no_json_object_are_refused(capsys):
+    for text in ("[1]", "3", '"spread"', "null", "spread=0.2", "{'spread': 0.2}", ""):
+        with pytest.raises(SystemExit) as caught:
+            tyro.cli(Config, args=["--options", text])
+        assert caught.value.code == 2
+        assert "options" in capsys.readouterr().err
 
 
 def test_errors_of_the_program_are_not_hidden(monkeypatch):
-    def main(config):
+    def fail(config):
         raise KeyError("a defect")
 
     monkeypatch.setattr(sys, "argv", ["script.py"])
     with pytest.raises(KeyError, match="a defect"):
-        run_script(main, Config, "A script.")
+        run_script(fail, Config, "A script.")
 
 
 @pytest.mark.parametrize("error", [ValueError("mend this"), FileNotFoundError("mend this")])
 def test_errors_of_the_user_are_one_line(monkeypatch, capsys, error):
-    def main(config):
+    def fail(config):
         raise error
 
     monkeypatch.setattr(sys, "argv", ["folder/script.py"])
     with pytest.raises(SystemExit) as caught:
-        run_script(main, Config, "A script.")
+        run_script(fail, Config, "A script.")
     assert caught.value.code == 2
     assert capsys.readouterr().err == "script.py: mend this\n"
