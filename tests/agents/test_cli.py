@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import tyro
+from tables import table
 
 from agents.cli import JsonOptions, run_script, with_rig
 from agents.commands import main
@@ -78,60 +79,54 @@ def test_help_explains_every_option(script, name):
     assert explained == {"train.py": 33, "evaluate.py": 12}[name]
 
 
-#: What no script takes, and what it says.
-REFUSED = {
-    "train.py": [
-        (["--steps", "0"], "steps must be a whole number from 1 to 1000000000000, but is 0"),
-        (["--steps", "many"], "many"),
-        (["--stepps", "5"], "--stepps"),
-        (["--reward", "free_energie"], "did you mean 'free_energy'"),
-        (["--systems", "1"], "systems must be 0 or at least 2, but is 1"),
-        (["--ppo.batch-size", "0"], "batch_size must be at least 1, but is 0"),
-        (["--options", '{"reward": "log_posterior"}'], "options must not hold reward"),
-        (["--options", '{"horizon": 0}'], "horizon must be a whole number from 1 to 1000000000, but is 0"),
-        (["--env", "duffing_env/Amplitud-v0"], "Amplitud"),
-        (["--env", "Shrt-v1"], "`Shrt` doesn't exist; did you mean 'duffing_env/Short-v1'?"),
-        (["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
-        (["--algo", "sacc"], "invalid choice 'sacc'"),
-        (["--algo", "sac", "--sac.tau", "2"], "tau must be in [0, 1], but is 2.0"),
-        (["--algo", "sac", "--ppo.gamma", "0.9"], "--ppo.gamma"),
-        (["--algo", "sac", "--steps", "5000"], "learning_starts must be below steps, but is 5000 of 5000"),
-        (["--settings", "none.toml"], "none.toml"),
-        (["--eval-every", "-1"], "eval_every must be a whole number from 0 to 1000000000000, but is -1"),
-        (["--tune", "-1"], "tune must be a whole number from 0 to 1000000, but is -1"),
-        (["--resume", "none"], "resume takes all settings but systems from the run"),
-        (["--rig", "silverbox", "--env", "Short-v0"], "env must be left out with rig"),
-        (["--options", '{"max_episode_steps": "x"}'], "options must not hold max_episode_steps"),
-        (["--options", '{"seed": 3}'], "options must not hold seed, but seed is 3; leave it out"),
-        (["--options", '{"levels": 3}'], "options must not hold levels, but levels is 3; leave it out"),
-        (["--options", '{"id": "x"}'], "options must not hold id, but id is 'x'; leave it out"),
+@table(
+    ("name", "arguments", "message"),
+    [
+        ("train.py", ["--steps", "0"], "steps must be a whole number from 1 to 1000000000000, but is 0"),
+        ("train.py", ["--steps", "many"], "many"),
+        ("train.py", ["--stepps", "5"], "--stepps"),
+        ("train.py", ["--reward", "free_energie"], "did you mean 'free_energy'"),
+        ("train.py", ["--systems", "1"], "systems must be 0 or at least 2, but is 1"),
+        ("train.py", ["--ppo.batch-size", "0"], "batch_size must be at least 1, but is 0"),
+        ("train.py", ["--options", '{"reward": "log_posterior"}'], "options must not hold reward"),
+        ("train.py", ["--options", '{"horizon": 0}'], "horizon must be a whole number from 1 to 1000000000, but is 0"),
+        ("train.py", ["--env", "duffing_env/Amplitud-v0"], "Amplitud"),
+        ("train.py", ["--env", "Shrt-v1"], "`Shrt` doesn't exist; did you mean 'duffing_env/Short-v1'?"),
+        ("train.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
+        ("train.py", ["--algo", "sacc"], "invalid choice 'sacc'"),
+        ("train.py", ["--algo", "sac", "--sac.tau", "2"], "tau must be in [0, 1], but is 2.0"),
+        ("train.py", ["--algo", "sac", "--ppo.gamma", "0.9"], "--ppo.gamma"),
+        ("train.py", ["--algo", "sac", "--steps", "5000"], "learning_starts must be below steps, but is 5000 of 5000"),
+        ("train.py", ["--settings", "none.toml"], "none.toml"),
+        ("train.py", ["--eval-every", "-1"], "eval_every must be a whole number from 0 to 1000000000000, but is -1"),
+        ("train.py", ["--tune", "-1"], "tune must be a whole number from 0 to 1000000, but is -1"),
+        ("train.py", ["--resume", "none"], "resume takes all settings but systems from the run"),
+        ("train.py", ["--rig", "silverbox", "--env", "Short-v0"], "env must be left out with rig"),
+        ("evaluate.py", ["--rig", "r.toml", "--env", "Short-v0"], "env must be left out with rig"),
+        ("evaluate.py", ["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
+        ("evaluate.py", ["--systems", "1"], "systems must be a whole number from 2 to 100000, but is 1"),
+        ("evaluate.py", ["--systems", "a few"], "a few"),
+        ("evaluate.py", ["--policies", "unifrom"], "did you mean 'uniform'"),
+        ("evaluate.py", ["--options", "[1]"], "options must be a JSON object, but are [1]"),
+        ("evaluate.py", ["--options", "[" * 100_000], "options must be a JSON object, but are nested too deeply"),
+        ("evaluate.py", ["--options", '{"num_envs": 3}'], "options must not hold num_envs"),
+        ("evaluate.py", ["--options", '{"autoreset_mode": "x"}'], "options must not hold autoreset_mode"),
+        ("train.py", ["--options", '{"max_episode_steps": "x"}'], "options must not hold max_episode_steps"),
+        ("train.py", ["--options", '{"seed": 3}'], "options must not hold seed, but seed is 3; leave it out"),
+        ("train.py", ["--options", '{"levels": 3}'], "options must not hold levels, but levels is 3; leave it out"),
+        ("train.py", ["--options", '{"id": "x"}'], "options must not hold id, but id is 'x'; leave it out"),
+        ("evaluate.py", ["--options", '{"id": "x"}'], "options must not hold id, but id is 'x'; leave it out"),
+        ("evaluate.py", ["--options", '{"vectorization_mode": "sync"}'], "options must not hold vectorization_mode"),
+        ("evaluate.py", ["--options", '{"horizon"'], "JSON"),
+        ("evaluate.py", ["--options", '{"horizn": 3}'], "did you mean 'horizon'"),
+        ("evaluate.py", ["--env", "duffing_env/Amplitude-v7"], "[ `v0`, `v1` ]"),
     ],
-    "evaluate.py": [
-        (["--rig", "r.toml", "--env", "Short-v0"], "env must be left out with rig"),
-        (["--env", "CartPole-v1"], "env must be a track, which has a vector environment of duffing_env"),
-        (["--systems", "1"], "systems must be a whole number from 2 to 100000, but is 1"),
-        (["--systems", "a few"], "a few"),
-        (["--policies", "unifrom"], "did you mean 'uniform'"),
-        (["--options", "[1]"], "options must be a JSON object, but are [1]"),
-        (["--options", "[" * 100_000], "options must be a JSON object, but are nested too deeply"),
-        (["--options", '{"num_envs": 3}'], "options must not hold num_envs"),
-        (["--options", '{"autoreset_mode": "x"}'], "options must not hold autoreset_mode"),
-        (["--options", '{"id": "x"}'], "options must not hold id, but id is 'x'; leave it out"),
-        (["--options", '{"vectorization_mode": "sync"}'], "options must not hold vectorization_mode"),
-        (["--options", '{"horizon"'], "JSON"),
-        (["--options", '{"horizn": 3}'], "did you mean 'horizon'"),
-        (["--env", "duffing_env/Amplitude-v7"], "[ `v0`, `v1` ]"),
-    ],
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_bad_value_is_one_message_and_exit_status_2(script, name, tmp_path):
-    for arguments, message in REFUSED[name]:
-        status, _, messages = script(name, *arguments, "--output", "out")
-        assert status == 2, arguments
-        assert message in messages
-        assert list(tmp_path.iterdir()) == []
+)
+def test_a_bad_value_is_one_message_and_exit_status_2(script, name, arguments, message):
+    status, _, messages = script(name, *arguments, "--output", "out")
+    assert status == 2
+    assert message in messages
+    assert list(Path().iterdir()) == []
 
 
 def test_a_rig_may_be_one_that_ships(tmp_path, monkeypatch):
@@ -162,18 +157,21 @@ def test_a_bad_reward_is_one_line(script, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_extra_is_one_line(script, monkeypatch, tmp_path):
-    for name, arguments, package, extra in (
+@table(
+    ("name", "arguments", "package", "extra"),
+    [
         ("train.py", ["--output", "out"], "torch", "train"),
         ("train.py", ["--tune", "2", "--output", "out"], "optuna", "tune"),
         ("train.py", ["--algo", "tqc", "--output", "out"], "sb3_contrib", "train"),
         ("evaluate.py", ["--policies", "prbs", "--report", "out"], "matplotlib", "report"),
-    ):
-        monkeypatch.setattr("estimator.extras.find_spec", lambda name, gone=package: None if name == gone else name)
-        status, _, messages = script(name, *arguments)
-        assert status == 2
-        assert messages == f"{name}: {package} is not installed; get it with: pip install 'duffing-env[{extra}]'\n"
-        assert list(tmp_path.iterdir()) == []
+    ],
+)
+def test_a_missing_extra_is_one_line(script, name, arguments, package, extra, monkeypatch):
+    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None if name == package else name)
+    status, _, messages = script(name, *arguments)
+    assert status == 2
+    assert messages == f"{name}: {package} is not installed; get it with: pip install 'duffing-env[{extra}]'\n"
+    assert list(Path().iterdir()) == []
 
 
 def test_figures_are_left_out_without_matplotlib(script, monkeypatch, tmp_path):
@@ -294,25 +292,31 @@ class Config:
     """Options."""
 
 
-def test_options_are_read_as_json():
-    for text, expected in (
+@table(
+    ("text", "expected"),
+    [
         ("{}", {}),
         ('{"spread": 0.2, "horizon": 128}', {"spread": 0.2, "horizon": 128}),
         ('{"as_published": true, "data": null}', {"as_published": True, "data": None}),
         ('{"a": {"b": [1, 2]}}', {"a": {"b": [1, 2]}}),
-    ):
-        options = tyro.cli(Config, args=["--options", text]).options
-        assert options == expected
-        assert [type(value) for value in options.values()] == [type(value) for value in expected.values()]
+    ],
+)  # fmt: skip
+def test_options_are_read_as_json(text, expected):
+    options = tyro.cli(Config, args=["--options", text]).options
+    assert options == expected
+    assert [type(value) for value in options.values()] == [type(value) for value in expected.values()]
+
+
+def test_options_keep_their_default():
     assert tyro.cli(Config, args=[]).options == {"a": 1}
 
 
-def test_options_that_are_no_json_object_are_refused(capsys):
-    for text in ("[1]", "3", '"spread"', "null", "spread=0.2", "{'spread': 0.2}", ""):
-        with pytest.raises(SystemExit) as caught:
-            tyro.cli(Config, args=["--options", text])
-        assert caught.value.code == 2
-        assert "options" in capsys.readouterr().err
+@table("text", ["[1]", "3", '"spread"', "null", "spread=0.2", "{'spread': 0.2}", ""])
+def test_options_that_are_no_json_object_are_refused(text, capsys):
+    with pytest.raises(SystemExit) as caught:
+        tyro.cli(Config, args=["--options", text])
+    assert caught.value.code == 2
+    assert "options" in capsys.readouterr().err
 
 
 def test_errors_of_the_program_are_not_hidden(monkeypatch):
@@ -324,7 +328,7 @@ def test_errors_of_the_program_are_not_hidden(monkeypatch):
         run_script(fail, Config, "A script.")
 
 
-@pytest.mark.parametrize("error", [ValueError("mend this"), FileNotFoundError("mend this")])
+@table("error", [ValueError("mend this"), FileNotFoundError("mend this")])
 def test_errors_of_the_user_are_one_line(monkeypatch, capsys, error):
     def fail(config):
         raise error

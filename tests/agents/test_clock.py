@@ -28,7 +28,8 @@ def set_back(monkeypatch):
     assert time.time() > time.time()
 
 
-def test_a_training_lasts_forward(set_back, tmp_path):
+def test_a_training_lasts_forward(set_back, tmp_path, monkeypatch):
+    monkeypatch.setattr("agents.training.heldout._SYSTEMS", 4)
     small = ALGORITHMS["ppo"](num_envs=8, batch_size=64, hidden=(4,), n_steps=16)
     found = train(
         TrainConfig(env="duffing_env/Short-v0", steps=512, output=tmp_path, eval_every=256, hyperparameters=small)

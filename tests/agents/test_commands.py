@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import table
 
 from agents.commands import main
 from estimator import Rig
@@ -119,35 +120,36 @@ def test_warnings_are_told(run, folder, monkeypatch):
     assert "No check speaks" not in told
 
 
-REFUSED = [
-    (
-        ["identify", "none.toml", "record.csv"],
-        "there is no none.toml; write it by hand, or by duffing-env rig init",
-    ),
-    (["identify", "rig.toml", "none.csv"], "there is no none.csv"),
-    (["identify", "rig.toml"], "data must name at least one CSV or MAT file"),
-    (["identify", "record.csv"], "is record.csv; write one: duffing-env rig init --from record.csv"),
-    (["identify", "bad.toml", "record.csv"], "did you mean 'step'?"),
-    (["rig", "init", "rig.toml"], "there is rig.toml; name another, or add --force"),
-    (["rig", "init", "new.toml", "--from", "bem"], "there is no bem"),
-    (["rig", "init", "new.toml", "--from", "plain.csv"], "add --step SECONDS"),
-    (["rig", "init", "new.toml", "--from", "uneven.csv"], "samples must be evenly spaced"),
-    (["rig", "init", "new.toml", "--from", "fortnights.csv"], "times must be in one of s, ms"),
-    (
-        ["rig", "init", "new.toml", "--from", "r.mat"],
-        "r.mat must be a CSV file to tell the step, but is a MAT file",
-    ),
-    (["rig", "init", "new.toml", "--from", "r.mat", "--step", "1"], "r.mat must be a sound MAT file"),
-    (
-        ["rig", "init", "new.toml", "--from", "kind.csv"],
-        "unit of 'displacement [m/s]' must be of a kind with the name, displacement, but tells velocity",
-    ),
-    (["rig", "init", "new.toml", "--step", "1"], "step goes with a record"),
-    (["rig", "init", "new.toml", "--from", "plain.csv", "--step", "-1"], "step must be a number from 1e-30"),
-]
-
-
-def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch):
+@table(
+    ("words", "message"),
+    [
+        (
+            ["identify", "none.toml", "record.csv"],
+            "there is no none.toml; write it by hand, or by duffing-env rig init",
+        ),
+        (["identify", "rig.toml", "none.csv"], "there is no none.csv"),
+        (["identify", "rig.toml"], "data must name at least one CSV or MAT file"),
+        (["identify", "record.csv"], "is record.csv; write one: duffing-env rig init --from record.csv"),
+        (["identify", "bad.toml", "record.csv"], "did you mean 'step'?"),
+        (["rig", "init", "rig.toml"], "there is rig.toml; name another, or add --force"),
+        (["rig", "init", "new.toml", "--from", "bem"], "there is no bem"),
+        (["rig", "init", "new.toml", "--from", "plain.csv"], "add --step SECONDS"),
+        (["rig", "init", "new.toml", "--from", "uneven.csv"], "samples must be evenly spaced"),
+        (["rig", "init", "new.toml", "--from", "fortnights.csv"], "times must be in one of s, ms"),
+        (
+            ["rig", "init", "new.toml", "--from", "r.mat"],
+            "r.mat must be a CSV file to tell the step, but is a MAT file",
+        ),
+        (["rig", "init", "new.toml", "--from", "r.mat", "--step", "1"], "r.mat must be a sound MAT file"),
+        (
+            ["rig", "init", "new.toml", "--from", "kind.csv"],
+            "unit of 'displacement [m/s]' must be of a kind with the name, displacement, but tells velocity",
+        ),
+        (["rig", "init", "new.toml", "--step", "1"], "step goes with a record"),
+        (["rig", "init", "new.toml", "--from", "plain.csv", "--step", "-1"], "step must be a number from 1e-30"),
+    ],
+)
+def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     Path("rig.toml").write_text("step = 1e-3")
     Path("bad.toml").write_text("stepp = 1e-3")
@@ -157,16 +159,15 @@ def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch
     Path("kind.csv").write_text("t,u,displacement [m/s]\n0,1,2\n1,1,2\n2,2,3\n")
     Path("r.mat").write_bytes(b"none")
     Path("fortnights.csv").write_text("t [fortnight],u,y\n0,1,2\n1,1,2\n2,2,3\n")
-    for words, message in REFUSED:
-        status, told, messages = run(*words)
-        assert (status, told) == (2, "")
-        (line,) = messages.splitlines()
-        assert line.startswith("duffing-env: ")
-        assert message in line
-        assert not Path("new.toml").exists()
+    status, told, messages = run(*words)
+    assert (status, told) == (2, "")
+    (line,) = messages.splitlines()
+    assert line.startswith("duffing-env: ")
+    assert message in line
+    assert not Path("new.toml").exists()
 
 
-@pytest.mark.parametrize(
+@table(
     ("head", "step", "units", "kind"),
     [
         ("time [ms],force [N],displacement [mm]", 1.6384e-3, ("N", "mm"), "displacement"),

@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 
 import pytest
+from tables import table
 
 from agents.training import ALGORITHMS, PPOSettings, SACSettings, TrainConfig
 from agents.training.hyperparameters import FILES, read_settings, settings_of, track_of, write_settings
@@ -23,10 +24,9 @@ def test_there_is_one_file_for_each_algorithm():
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_file_is_sound_for_every_track(algo):
-    assert len(TRACKS) > 10
-    for env_id in TRACKS:
-        assert type(read_settings(algo, env_id)) is ALGORITHMS[algo], env_id
+@table("env_id", TRACKS)
+def test_every_file_is_sound_for_every_track(algo, env_id):
+    assert type(read_settings(algo, env_id)) is ALGORITHMS[algo]
 
 
 def test_ppo_is_as_its_class_says_where_its_file_is_silent():
@@ -55,32 +55,31 @@ def test_hyperparameters_that_are_given_go_before_the_file(tmp_path):
         TrainConfig(algo="sac", hyperparameters=given)
 
 
-#: Text of a file, and what is said of it.
-MISTAKES = [
-    (
-        "[default]\ngama = 0.9",
-        r"gama is no hyperparameter of SACSettings; did you mean 'gamma'\?; mend \[default\]",
-    ),
-    ("[Power]\ntaau = 0.9", r"did you mean 'tau'\?; mend \[Power\] of .*settings.toml"),
-    ("[default]\nn_steps = 64", "n_steps is no hyperparameter of SACSettings"),
-    ('["Short-v1"]\ngamma = 0.9', r"has \[Short-v1\]; did you mean 'Short'\?"),
-    ("gamma = 0.9", r"must be in tables such as \[default\], but .* has gamma in none"),
-    ('[default]\ngamma = "high"', "gamma must be a number, but is 'high'"),
-    ("[default]\nnum_envs = 2.5", "num_envs must be a whole number, but is 2.5"),
-    ("[default]\nnum_envs = true", "num_envs must be a whole number, but is True"),
-    ("[default]\nhidden = 64", "hidden must be a list of whole numbers, but is 64"),
-    ("[default]\nhidden = [64, 0.5]", "hidden must be a list of whole numbers"),
-    ("[default]\ntau = 2", r"tau must be in \[0, 1\], but is 2.0"),
-    ("[default]\nentropy_weight = 0", "entropy_weight must be positive, but is 0.0"),
-    ("[default]\nlearning_starts = -1", "learning_starts must be at least 0, but is -1"),
-    ("[default]\nlearning_rate =", "settings must be a TOML file, but .*settings.toml is not"),
-]
-
-
-def test_a_mistake_is_refused_by_name(tmp_path):
-    for text, message in MISTAKES:
-        with pytest.raises(ValueError, match=message):
-            read_settings("sac", SHORT, written(tmp_path, text))
+@table(
+    ("text", "message"),
+    [
+        (
+            "[default]\ngama = 0.9",
+            r"gama is no hyperparameter of SACSettings; did you mean 'gamma'\?; mend \[default\]",
+        ),
+        ("[Power]\ntaau = 0.9", r"did you mean 'tau'\?; mend \[Power\] of .*settings.toml"),
+        ("[default]\nn_steps = 64", "n_steps is no hyperparameter of SACSettings"),
+        ('["Short-v1"]\ngamma = 0.9', r"has \[Short-v1\]; did you mean 'Short'\?"),
+        ("gamma = 0.9", r"must be in tables such as \[default\], but .* has gamma in none"),
+        ('[default]\ngamma = "high"', "gamma must be a number, but is 'high'"),
+        ("[default]\nnum_envs = 2.5", "num_envs must be a whole number, but is 2.5"),
+        ("[default]\nnum_envs = true", "num_envs must be a whole number, but is True"),
+        ("[default]\nhidden = 64", "hidden must be a list of whole numbers, but is 64"),
+        ("[default]\nhidden = [64, 0.5]", "hidden must be a list of whole numbers"),
+        ("[default]\ntau = 2", r"tau must be in \[0, 1\], but is 2.0"),
+        ("[default]\nentropy_weight = 0", "entropy_weight must be positive, but is 0.0"),
+        ("[default]\nlearning_starts = -1", "learning_starts must be at least 0, but is -1"),
+        ("[default]\nlearning_rate =", "settings must be a TOML file, but .*settings.toml is not"),
+    ],
+)
+def test_a_mistake_is_refused_by_name(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        read_settings("sac", SHORT, written(tmp_path, text))
 
 
 def test_an_unknown_algorithm_is_refused():

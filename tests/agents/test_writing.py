@@ -107,8 +107,9 @@ def bench(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def undrawn():
-    """Figures are made and written, but not drawn, which takes most of a second for a page."""
+def quick():
+    """Figures are made and written, but not drawn, which takes most of a second for a page; clocks jump."""
+    clock = JumpingClock()
 
     def savefig(figure, buffer, format, **options):
         buffer.write({"svg": "<svg></svg>", "png": bytes(1000)}[format])
@@ -116,6 +117,8 @@ def undrawn():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("matplotlib.figure.Figure.savefig", savefig)
         patch.setattr(protocol, "SYSTEMS", 8)
+        for module in ("run", "simulated"):
+            patch.setattr(f"agents.running.{module}.RealClock", lambda: clock)
         yield
 
 
