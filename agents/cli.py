@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -172,6 +174,8 @@ def told_in_one_line(name: str) -> Iterator[None]:
     Args:
         name: of the command, which stands before the message.
     """
+    # At the end of the process Python looks through all that Numba and torch have built, which takes 0.1 s and more.
+    atexit.register(gc.freeze)
     try:
         with stopped_by_sigterm():
             yield

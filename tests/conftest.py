@@ -38,6 +38,16 @@ def record() -> SilverboxRecord:
     return load_record()
 
 
+@pytest.fixture
+def jumping_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runs of this process, and their simulated plants, share a clock that jumps: none waits, and none is late."""
+    from agents.running.clock import JumpingClock
+
+    clock = JumpingClock()
+    for module in ("run", "simulated"):
+        monkeypatch.setattr(f"agents.running.{module}.RealClock", lambda: clock)
+
+
 @pytest.fixture(autouse=True)
 def modules_of_the_test(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Forget the modules that a test wrote and imported: another test may give its own the same name."""

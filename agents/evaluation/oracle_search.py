@@ -33,6 +33,7 @@ from agents.planner.polish import polish
 from agents.planner.pursuit import pursuit
 from estimator.belief import Belief
 from estimator.checks import MOST_SEED, whole
+from estimator.extras import need
 from estimator.parameters import FloatArray
 
 #: Starts of a search at least; it goes on to so many times as many, until so many that began anew agree within [nats].
@@ -185,6 +186,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Search, store, and say how far it is."""
+    need("highspy")
     systems = Systems.of(config.env, config.systems, config.options)
     began = time.perf_counter()
     if config.check:

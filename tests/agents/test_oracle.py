@@ -13,9 +13,11 @@ from agents.evaluation.oracle_search import Config, main, search
 from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
 from agents.planner.programme import Programme
+from estimator.extras import how_to_get, is_missing
 
 SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Amplitude-v1"
 STORED = [f"duffing_env/{name}-v{version}" for name in ("Amplitude", "Short", "Power", "Output") for version in (0, 1)]
+searches = pytest.mark.skipif(is_missing("highspy"), reason=how_to_get("highspy"))
 
 
 @pytest.fixture
@@ -63,6 +65,7 @@ def test_rows_do_not_depend_on_their_number():
 
 
 @pytest.mark.slow  # a search
+@searches
 def test_the_search_keeps_the_limits_and_beats_a_random_signal():
     systems = Systems.of(SHORT, 1)
     rng = np.random.default_rng(0)
@@ -90,6 +93,7 @@ def test_searches_of_nothing_are_refused(options, message):
 
 
 @pytest.mark.slow  # the search is seconds of compilation
+@searches
 @pytest.mark.parametrize(("same", "tried"), [(np.inf, 6), (-1.0, 48)])
 def test_the_search_goes_on_until_three_starts_agree(same, tried, monkeypatch):
     found = []
@@ -106,6 +110,7 @@ def test_the_search_goes_on_until_three_starts_agree(same, tried, monkeypatch):
 
 
 @pytest.mark.slow  # as above
+@searches
 def test_fewer_than_three_starts_do_not_agree(monkeypatch):
     monkeypatch.setattr(oracle_search, "_LONGER", 1)
     short = Systems.of(SHORT, 1, {"horizon": 32})
@@ -113,6 +118,7 @@ def test_fewer_than_three_starts_do_not_agree(monkeypatch):
 
 
 @pytest.mark.slow  # the search is seconds of compilation
+@searches
 def test_what_blows_up_is_not_polished():
     systems = Systems.of(SHORT, 1)
     limits = systems.limits._replace(output=50.0, aim=50.0, amplitude=5.0)
@@ -121,6 +127,7 @@ def test_what_blows_up_is_not_polished():
 
 
 @pytest.mark.slow  # the search is seconds of compilation
+@searches
 def test_under_a_budget_the_search_spends_it_in_a_burst():
     systems = Systems.of(POWER, 1)
     u, value, _ = search(systems, 0, np.empty((0, 256)), np.random.default_rng(0), 2)
@@ -132,6 +139,7 @@ def test_under_a_budget_the_search_spends_it_in_a_burst():
 
 
 @pytest.mark.slow  # the search is seconds of compilation
+@searches
 @pytest.mark.parametrize("options", [{}, {"horizon": 96, "max_rms": 0.03}])
 def test_the_search_serves_the_differential_equation_too(options, empty_folder):
     systems = Systems.of(CONTINUOUS, 1, {"horizon": 48, **options})
@@ -150,6 +158,7 @@ def test_the_search_serves_the_differential_equation_too(options, empty_folder):
 
 
 @pytest.mark.slow  # the search is seconds of compilation
+@searches
 def test_the_command_stores_what_is_better_and_nothing_else(empty_folder, capsys):
     systems = Systems.of(SHORT, 2)
     with pytest.raises(FileNotFoundError, match="no oracle is stored"):
@@ -180,6 +189,7 @@ def test_the_command_stores_what_is_better_and_nothing_else(empty_folder, capsys
 
 
 @pytest.mark.slow  # as above
+@searches
 def test_polishing_ends_at_a_summit_within_the_limits():
     systems = Systems.of(SHORT, 1)
     model, limits = systems.plant.model, systems.limits
@@ -199,6 +209,7 @@ def test_polishing_ends_at_a_summit_within_the_limits():
 
 
 @pytest.mark.slow  # as above
+@searches
 def test_what_does_not_come_near_its_goal_is_given_up(monkeypatch):
     systems = Systems.of(SHORT, 1)
     model, limits = systems.plant.model, systems.limits

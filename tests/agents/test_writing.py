@@ -33,7 +33,6 @@ from estimator.identification.tables import read_table
 
 resource = pytest.importorskip("resource", reason="this system has no limits of the size of files")
 
-#: Ten milliseconds a sample, so that a run is not late on a busy machine.
 RIG = """step = 1e-2
 [input]
 unit = "N"

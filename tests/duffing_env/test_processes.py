@@ -114,7 +114,7 @@ def test_three_processes_that_compile_at_once_agree(tmp_path):
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=variables)
         for _ in range(3)
     ]
-    said = [each.communicate(timeout=300) for each in running]
+    said = [each.communicate(timeout=1800) for each in running]
     assert [each.returncode for each in running] == [0, 0, 0], said
     assert {told.strip() for told, _ in said} == set(run("print(play(70, 3))"))
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]

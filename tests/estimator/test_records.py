@@ -223,8 +223,8 @@ def test_a_mat_file_is_read_by_nothing_that_lies_beside_it_and_not_for_ever(tmp_
     for name in ("numpy", "io", "scipy"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user was executed')")
     np.testing.assert_array_equal(read("r.mat", Rig(0.01))[1], y)
-    monkeypatch.setattr("estimator.identification.records._PATIENCE", 0.01)
-    with pytest.raises(ValueError, match=r"r\.mat must be a MAT file that can be read within 0\.01 s, but was not"):
+    monkeypatch.setattr("estimator.identification.records._PATIENCE", 0.0)  # which no machine is quick enough for
+    with pytest.raises(ValueError, match=r"r\.mat must be a MAT file that can be read within 0 s, but was not"):
         read("r.mat", Rig(0.01))
 
 

@@ -219,7 +219,7 @@ def test_what_identify_saves_outlives_a_pipe_that_closes_early(tmp_path, monkeyp
     assert abs(mean - TRUTH["m"]) < 5 * std
 
 
-def test_a_run_goes_on_from_a_posterior(tmp_path, monkeypatch):
+def test_a_run_goes_on_from_a_posterior(tmp_path, monkeypatch, jumping_clock):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.toml").write_text(RIG_FILE.partition("[guess]")[0])
     plant = SimulatedPlant(RIG, TRUTH, clock=JumpingClock())
