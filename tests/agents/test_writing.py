@@ -240,7 +240,11 @@ def test_a_signal_while_it_writes_is_one_line_and_leaves_everything_as_it_was(wo
 def test_a_training_goes_on_from_what_was_written_before_the_disk_was_full(tmp_path, monkeypatch, algo):
     monkeypatch.setattr("agents.training.heldout._SYSTEMS", 4)
     small = {"num_envs": 8, "batch_size": 16, "hidden": (4,)}
-    own = {"n_steps": 16} if algo == "ppo" else {"buffer_size": 400, "learning_starts": 32, "train_freq": 4}
+    own = (
+        {"n_steps": 16}
+        if algo == "ppo"
+        else {"buffer_size": 400, "learning_starts": 32, "train_freq": 4, "gradient_steps": 2}
+    )
     config = TrainConfig(
         algo=algo, env=SHORT, steps=1024, checkpoints=4, eval_every=128, output=tmp_path / "run",
         hyperparameters=ALGORITHMS[algo](**small, **own),
