@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from tables import table
 
 from estimator.extras import EXTRAS
 
@@ -54,17 +55,17 @@ def test_versions_agree():
     assert SETTINGS["tool"]["mypy"]["python_version"] == VERSIONS[0]
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/index.md"])
+@table("document", ["README.md", "docs/index.md"])
 def test_documents_say_which(document):
     assert f"Python {VERSIONS[0]} to {VERSIONS[-1]} and make" in (ROOT / document).read_text()
 
 
-@pytest.mark.parametrize("target", ["demo", "test", "docs", "lint", "clean"])
+@table("target", ["demo", "test", "docs", "lint", "clean"])
 def test_make_says_which_first(project, target):
     assert make(project, "-n", target, f"PYTHON={python(project, VERSIONS[0])}").stdout.startswith(f"{WORKS}.\n")
 
 
-@pytest.mark.parametrize("version", [f"3.{minor(VERSIONS[0]) - 1}", f"3.{minor(VERSIONS[-1]) + 1}", "2.7"])
+@table("version", [f"3.{minor(VERSIONS[0]) - 1}", f"3.{minor(VERSIONS[-1]) + 1}", "2.7"])
 def test_make_refuses_others(project, version):
     done = make(project, "test", f"PYTHON={python(project, version)}")
     assert done.returncode
@@ -79,7 +80,7 @@ def test_make_says_that_python_is_missing(project):
     assert f"{WORKS}; no-such-python is not to be found" in done.stderr
 
 
-@pytest.mark.parametrize("version", VERSIONS)
+@table("version", VERSIONS)
 def test_make_takes_each(project, version):
     done = make(project, "-n", "test", f"PYTHON={python(project, version)}")
     assert done.returncode == 0

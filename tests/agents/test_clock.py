@@ -31,7 +31,8 @@ def set_anew(monkeypatch, request):
 
 
 @pytest.mark.parametrize("algo", ["ppo", "sac"])
-def test_a_training_lasts_as_long_as_it_does(set_anew, tmp_path, algo):
+def test_a_training_lasts_as_long_as_it_does(set_anew, tmp_path, monkeypatch, algo):
+    monkeypatch.setattr("agents.training.heldout._SYSTEMS", 4)
     own = {"n_steps": 16} if algo == "ppo" else {"buffer_size": 400, "learning_starts": 32}
     small = ALGORITHMS[algo](num_envs=8, batch_size=64, hidden=(4,), **own)
     began = time.perf_counter()

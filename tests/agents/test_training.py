@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file
+from tables import table
 
 import agents.vec_env
 from agents import make_policy
@@ -41,7 +42,7 @@ def torch_threads():
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Runs of 20,000 samples: twice with seed 0, once with seed 1."""
+    """Runs of five updates: twice with seed 0, once with seed 1."""
     folder = tmp_path_factory.mktemp("runs")
     seeds = {"first": 0, "again": 0, "other": 1}
     return {
@@ -207,7 +208,7 @@ def test_hyperparameters_reach_the_algorithm(tmp_path):
     assert int(rows[1]["train/n_updates"]) == 3
 
 
-@pytest.mark.parametrize(("checkpoints", "expected"), [(1, [512]), (2, [256, 512]), (4, [128, 256, 384, 512])])
+@table(("checkpoints", "expected"), [(1, [512]), (2, [256, 512]), (4, [128, 256, 384, 512])])
 def test_checkpoints_are_evenly_spaced(tmp_path, checkpoints, expected):
     run = tiny(tmp_path / "run", steps=512, checkpoints=checkpoints)
     assert sorted(int(path.name) for path in (run.folder / "checkpoints").iterdir()) == expected
@@ -258,7 +259,7 @@ def test_another_observation_than_the_posterior_has_no_foresight(tmp_path, seen)
     assert (run.folder / "policy.json").exists()
 
 
-@pytest.mark.parametrize(
+@table(
     ("settings", "message"),
     [
         ({"algo": np.ones(2)}, r"algo must be one of \['ppo', .*\], but is array"),
@@ -278,7 +279,7 @@ def test_senseless_settings_are_refused_before_anything_is_written(tmp_path, set
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
+@table(
     ("settings", "message"),
     [
         ({"num_envs": 0}, "num_envs must be at least 1, but is 0"),

@@ -17,6 +17,14 @@ ENV = "duffing_env/Short-v0"
 TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=128, hidden=(4,))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_systems():
+    """Trials are scored on 8 systems instead of 128."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("agents.training.heldout._SYSTEMS", 8)
+        yield
+
+
 @pytest.fixture
 def optuna():
     return pytest.importorskip("optuna", reason="Optuna is not installed; it is the extra tune")

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from loopback import RIG, RIG_FILE, TABLE, TRUTH, Scpi
+from tables import table
 
 from agents.running import instrument
 from agents.running.run import Plan, run
@@ -238,7 +239,7 @@ def test_the_usual_timeout_is_back_after_a_block_that_failed(monkeypatch):
     assert link.timeout == 1000 * TABLE["timeout"], "what zeroes the input next would wait for a block's time"
 
 
-@pytest.mark.parametrize(
+@table(
     ("change", "message"),
     [
         ({"set": "SOUR?"}, r"instrument.set must have \['u'\] in braces"),
