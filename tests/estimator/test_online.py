@@ -272,16 +272,16 @@ def test_a_held_noise_is_a_force_over_a_sample():
 def test_look_ahead_waits_for_the_next_input(samples):
     u, y = samples
     rig = Rig.silverbox("look_ahead")
-    estimator, shorter, untouched = (OnlineEstimator(ODE, rig=rig) for _ in range(3))
+    estimator, shorter, untouched = (OnlineEstimator(ODE, rig=rig, iterations=2) for _ in range(3))
     estimator.update(u[0], y[0])
     assert np.isnan(estimator.free_energy)
     assert estimator.forecasts.shape == (0, 2)
     np.testing.assert_array_equal(estimator.belief.record, untouched.belief.record)
-    assert estimator.run(u[1:200], y[1:200]).shape == (199, 3)
+    assert estimator.run(u[1:200], y[1:200]).shape == (199, 2)
     shorter.run(u[:200], y[:200])
     assert_same(estimator, shorter)
     # The belief does not know the last output yet, and knows the last input: it acts on the sample before.
-    other_output, other_input = OnlineEstimator(ODE, rig=rig), OnlineEstimator(ODE, rig=rig)
+    other_output, other_input = (OnlineEstimator(ODE, rig=rig, iterations=2) for _ in range(2))
     other_output.run(u[:200], np.append(y[:199], 9.9))
     assert estimator.belief == other_output.belief
     other_input.run(np.append(u[:199], 0.9), y[:200])
@@ -290,10 +290,10 @@ def test_look_ahead_waits_for_the_next_input(samples):
 
 def test_spline_takes_records_and_no_samples(samples, monkeypatch):
     u, y = samples
-    estimator, shown = (OnlineEstimator(ODE, rig=Rig.silverbox("spline")) for _ in range(2))
+    estimator, shown = (OnlineEstimator(ODE, rig=Rig.silverbox("spline"), iterations=2) for _ in range(2))
     with pytest.raises(ValueError, match=re.escape("interpolation must not be 'spline' for single samples; use run()")):
         estimator.update(u[0], y[0])
-    assert estimator.run(u, y).shape == (300, 3)
+    assert estimator.run(u, y).shape == (300, 2)
     monkeypatch.setattr("estimator.online._SAMPLES_BETWEEN_REPORTS", 70)
     shown.run(u, y, progress=True)  # in one piece: a spline through a part of the record is another one
     assert_same(estimator, shown)
