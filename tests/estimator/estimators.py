@@ -29,7 +29,7 @@ KINDS = {
     "ode, sigma points": lambda: OnlineEstimator(ODE, expectations="sigma_points", drift=1e-3),
     "ensemble": lambda: OnlineEstimator(noise_hypotheses=3),
     "large ensemble": lambda: OnlineEstimator(difference("three-tap"), rig=OWN_TAPS, noise_hypotheses=13, drift=0.01),
-    "ode ensemble": lambda: OnlineEstimator(duffing(), rig=Rig.silverbox("look_ahead"), noise_hypotheses=3),
+    "ode ensemble": lambda: OnlineEstimator(duffing(offsets=True), rig=Rig.silverbox("look_ahead"), noise_hypotheses=3),
 }
 
 
