@@ -16,6 +16,9 @@ ODE = duffing(offsets=True, feedthrough=True, noise="held")
 #: Of a difference equation that nobody else has.
 TERMS = (Term(1), Term(3), Term(0, 1), Term(1, 1), Term(tap=0), Term(tap=1), Term(tap=2))
 
+#: As a rig with a guess is estimated, with an input that is known a sample later.
+AHEAD = {"model": duffing(offsets=True), "rig": Rig.silverbox("look_ahead"), "expectations": "sigma_points"}
+
 ONE_TAP, OWN_TAPS = Rig.silverbox("zero_order", 1), Rig.silverbox("zero_order", 0)
 
 KINDS = {
@@ -26,10 +29,10 @@ KINDS = {
     "ode": lambda: OnlineEstimator(ODE),
     "ode, held input": lambda: OnlineEstimator(duffing(offsets=True), rig=Rig.silverbox("zero_order")),
     "ode, look-ahead": lambda: OnlineEstimator(ODE, rig=Rig.silverbox("look_ahead"), iterations=2),
-    "ode, sigma points": lambda: OnlineEstimator(ODE, expectations="sigma_points", drift=1e-3),
+    "ode, sigma points": lambda: OnlineEstimator(**AHEAD, drift=1e-3),
     "ensemble": lambda: OnlineEstimator(noise_hypotheses=3),
     "large ensemble": lambda: OnlineEstimator(noise_hypotheses=13, drift=0.01),
-    "ode ensemble": lambda: OnlineEstimator(duffing(offsets=True), rig=Rig.silverbox("look_ahead"), noise_hypotheses=3),
+    "ode ensemble": lambda: OnlineEstimator(**AHEAD, noise_hypotheses=3),
 }
 
 

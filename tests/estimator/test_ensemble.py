@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimators import record
+from estimators import AHEAD, record
 from scipy.special import logsumexp
 from tables import table
 
-from estimator import Channel, OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
+from estimator import Channel, OnlineEstimator, Rig, difference, recorded_prior, silverbox_prior
 from estimator.belief import Belief
 from estimator.ensemble import FARTHEST, LEVELS, displaced, first_weights, matched_gamma, priors, side_by_side
 from estimator.inference.mixture import SWITCHING, foretell, leave_out, mixing, switch, weigh
@@ -17,8 +17,8 @@ from estimator.rig_prior import rig_prior
 
 RATIOS = 5
 MODELS = {
-    "paper": (difference(), Rig.silverbox("zero_order", 1), silverbox_prior()),
-    "look-ahead": (duffing(offsets=True), Rig.silverbox("look_ahead"), recorded_prior(duffing(offsets=True))),
+    "paper": {"model": difference(), "rig": Rig.silverbox("zero_order", 1), "prior": silverbox_prior()},
+    "look-ahead": AHEAD | {"prior": recorded_prior(AHEAD["model"])},
 }
 ANY_MODEL = pytest.mark.parametrize("model", MODELS)
 
@@ -28,19 +28,18 @@ def samples():
     return record(200)
 
 
-def ensemble(name, **options):
-    model, rig, prior = MODELS[name]
-    return OnlineEstimator(model, prior, rig, noise_hypotheses=RATIOS, **options)
+def ensemble(name):
+    return OnlineEstimator(**MODELS[name], noise_hypotheses=RATIOS)
 
 
 def members(name):
     """The same members as estimators of their own, with the priors that the documentation says."""
-    model, rig, prior = MODELS[name]
+    model, prior = MODELS[name]["model"], MODELS[name]["prior"]
     for level in (1 / 3, 1, 3):
         for factor in (1 / 30, 30**-0.5, 1, 30**0.5, 30):
             g_shape, g_rate, n_shape, n_rate = displaced(prior.noises, factor, level)
             moved = Belief.of(model, prior.mean, prior.cov, (g_shape, g_rate), (n_shape, n_rate))
-            yield OnlineEstimator(model, moved, rig)
+            yield OnlineEstimator(**MODELS[name] | {"prior": moved})
 
 
 # --- The mixture ---------------------------------------------------------------------------------------------------
@@ -233,7 +232,7 @@ def test_predictions_and_free_runs_are_those_of_the_mean(samples, model):
     u, y = samples
     estimator = ensemble(model)
     estimator.run(u, y)
-    alone = OnlineEstimator(estimator.model, estimator.belief, estimator.rig)
+    alone = OnlineEstimator(**MODELS[model] | {"prior": estimator.belief})
     if model == "paper":
         np.testing.assert_array_equal(estimator.predict(u, y), alone.predict(u, y))
         np.testing.assert_array_equal(estimator.simulate(u, y[:5]), alone.simulate(u, y[:5]))
