@@ -4,6 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
+from tables import table
 
 from agents.evaluation import oracle as module_of_oracle
 from agents.evaluation.oracle import Oracle, Systems, as_stored
@@ -74,7 +75,7 @@ def test_what_is_stored_is_never_larger_and_stays():
     np.testing.assert_array_equal(as_stored(0.15 * stored / 0.15), stored)
 
 
-@pytest.mark.parametrize("track", STORED)
+@table("track", STORED)
 def test_stored_oracles_keep_the_limits_of_their_tracks(track):
     oracle = Oracle.of(Systems.of(track, 256))
     assert len(oracle.values) >= 16

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import t
+from tables import table
 
 import duffing_env
 from agents.planner.motion import View, reach_of, swing_of
@@ -136,7 +137,7 @@ def test_single_environments_are_planned_for_as_rows_are():
         observation, *_ = env.step(action)
 
 
-@pytest.mark.parametrize(
+@table(
     ("options", "words"),
     [
         ({"horizon": 0}, "horizon must be a whole number"),
@@ -277,7 +278,7 @@ def test_under_a_budget_plans_follow_the_differential_equation_too():
     assert np.all(np.max(windows, axis=0) > 0.5 * (inputs**2).sum(axis=0))
 
 
-@pytest.mark.parametrize("track", ["Short-v0", "Short-v1"])
+@table("track", ["Short-v0", "Short-v1"])
 def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track):
     """As the module says: exceeded with probability ``risk`` by outputs that all are at the margin."""
     env, freedom = gym.make(f"duffing_env/{track}"), 4 + (2 + np.arange(48) / 16) ** 2
