@@ -54,7 +54,7 @@ class Row:
         return self._envs.records[self._row : self._row + 1]
 
 
-def observations_of(env_id, samples=40, count=24):
+def observations_of(env_id, samples=40, count=12):
     """What a batch shows after some random pushes, gentle enough that most episodes go on."""
     envs = make(env_id, count)
     rng = np.random.default_rng(1)
@@ -488,7 +488,13 @@ def test_entropy_counts_less_and_less(tmp_path):
 def test_a_run_that_was_stopped_goes_on_with_the_same_foresight(tmp_path):
     settings = PPOSettings(foresight=True, levels=3, num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
     config = TrainConfig(
-        env=DRIFT, steps=512, checkpoints=2, eval_every=128, output=tmp_path / "run", hyperparameters=settings
+        env=DRIFT,
+        steps=512,
+        checkpoints=2,
+        eval_every=128,
+        output=tmp_path / "run",
+        hyperparameters=settings,
+        options={"horizon": 48},
     )
 
     def stop(steps, found):

@@ -212,7 +212,9 @@ def test_features_are_those_of_the_matrices(track, pace, least, options):
     assert {*signs} == {-1.0, 1.0}
     assert (shares.min() < 1.0) == ((track == "Amplitude" and pace == 1) or least > 0.0)
     terms = terms._replace(margin=terms.margin[40])
-    for i in range(12):
+    # Those of either sign, of a push that is not allowed, and of a smaller one, say most.
+    rows = {np.argmin(signs), np.argmax(signs), np.argmax((~safe).any(axis=1)), np.argmin(shares.min(axis=1))}
+    for i in rows:
         told, allowed, sign, share = reference(envs.belief(i), seen[i], ahead, terms, least)
         np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
         np.testing.assert_array_equal(safe[i], allowed)
@@ -293,11 +295,10 @@ def test_the_policy_that_ships_is_ahead_of_a_signal_on_unseen_members():
     assert np.median(np.subtract(ours, signal)) > 0.5
 
 
-@pytest.mark.parametrize("env_id", ["duffing_env/Amplitude-v0", "duffing_env/Power-v0"])
-def test_it_plays_tracks_that_it_was_not_trained_on(env_id):
+def test_it_plays_a_track_that_it_was_not_trained_on():
     gains = {}
     for name in ("ppo/universal", "prbs"):
-        envs = make(env_id, 16)
+        envs = make("duffing_env/Amplitude-v0", 16)
         policy = make_policy(name, envs)
         observations, _ = envs.reset(seed=3)
         state, gains[name], running = None, 0.0, np.ones(16, dtype=np.bool_)

@@ -18,7 +18,7 @@ from tables import table
 import agents
 from agents import make_policy
 from agents.evaluation.rollout import evaluate
-from agents.policies import TRAINED, trained_policies
+from agents.policies import TRAINED
 from agents.policies.learned import CARD, WEIGHTS, load_policy
 from agents.policies.saving import save_policy
 from agents.training import ALGORITHMS
@@ -462,7 +462,7 @@ def test_the_search_for_unpicklers_finds_them(source):
     assert len(list(unpickling(source))) >= 1
 
 
-@pytest.mark.parametrize("name", [name for name in trained_policies() if name != "ppo/universal"])
+@pytest.mark.parametrize("name", ["ppo/drift", "ppo/short"])  # of the others: tests/research/test_ship.py
 def test_a_policy_that_ships_does_what_its_card_says(name):
     card = make_policy(name).card
     (evaluation,) = evaluate([name], card["config"]["env"], systems=32)

@@ -175,7 +175,7 @@ def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
 @pytest.mark.parametrize(
     ("track", "options", "systems", "most_early"),
     [
-        ("Amplitude-v1", {"horizon": 96}, 16, 0),
+        pytest.param("Amplitude-v1", {"horizon": 96}, 16, 0, marks=pytest.mark.slow),
         # Now and then an episode ends early: of strong process noise, or near where the difference equation blows up.
         pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, 16, 1, marks=pytest.mark.slow),
         pytest.param("WienerHammerstein", {"horizon": 48}, 16, 0, marks=pytest.mark.slow),  # seconds of compilation
@@ -287,24 +287,36 @@ def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track):
         np.testing.assert_allclose(margin, t(freedom).isf(risk / 48), rtol=1e-12)
 
 
-def test_moves_become_shorter_towards_the_end():
-    envs = make("Pendulum-v1", 3, horizon=60)
+#: Of about 27 samples in a period, and of Eq. (1), whose planner the tests of runs compile.
+SLOW_RIG = {
+    "step": 1e-3, "input": {"unit": "N", "limit": 20.0}, "output": {"unit": "m", "range": 0.01},
+    "guess": {"m": (0.38, 0.42), "c": (5.0, 8.0), "a": (2.1e4, 2.3e4), "b": (0.5e8, 2e8)},
+}  # fmt: skip
+
+
+def test_on_a_rig_moves_of_several_samples_become_shorter_towards_the_end():
+    options = {"rig": SLOW_RIG, "horizon": 60, "noise_hypotheses": 1}
+    envs = make("Rig", 3, **options)
     policy = make_policy("efe", envs, seed=0)
     observations, _ = envs.reset(seed=0)
-    state, moves, left = None, [], np.zeros(3)
+    state, moves, left, gains = None, [], np.zeros(3), np.zeros(3)
     for _ in range(envs.horizon):
         begun = left == 0
         actions, state = policy.predict(observations, state)
         if begun.all():
             moves.append(state.held + 1)
         left = state.held
-        observations, *_ = envs.step(actions)
+        observations, rewards, terminated, *_ = envs.step(actions)
+        assert not terminated.any()
+        gains += rewards
     lengths = np.array(moves)
     assert (lengths == lengths[:, :1]).all(), "all plan at the same samples"
     assert lengths[0, 0] == policy.terms.pace == 3
     assert (np.diff(lengths[:, 0]) <= 0).all()
     assert set(lengths[:, 0].tolist()) == {1, 3}
     assert lengths[:, 0].sum() == envs.horizon
+    *_, chance = roll_out("Rig", 3, options=options, name="prbs")
+    assert gains.mean() > chance.mean() + 0.5
 
 
 def precisions(belief, plan):

@@ -103,8 +103,8 @@ def test_no_matrix_is_below_the_information():
     assert np.linalg.slogdet(np.eye(4) + C - N.T @ W)[1] < np.linalg.slogdet(np.eye(4) + told)[1] + 1.0
 
 
-@pytest.mark.parametrize("horizon", [6, 8])
-def test_it_is_above_every_input_of_a_tiny_problem(horizon):
+def test_it_is_above_every_input_of_a_tiny_problem():
+    horizon = 6
     systems = Systems.of(SHORT, 1, {"horizon": horizon})
     inputs = 0.15 * np.array(list(product([-1.0, 0.0, 1.0], repeat=horizon)))
     rng = np.random.default_rng(0)
@@ -154,13 +154,13 @@ def test_stored_bounds_are_above_the_oracles(track, count, share):
 
 
 def test_it_is_above_every_input_of_a_tiny_problem_with_little_energy():
-    horizon = 16
+    horizon = 12
     systems = Systems.of("duffing_env/Power-v0", 1, {"horizon": horizon, "max_rms": 0.05})
-    inputs = np.random.default_rng(0).normal(size=(4096, horizon)) * np.random.default_rng(1).random((4096, 1))
+    inputs = np.random.default_rng(0).normal(size=(1024, horizon)) * np.random.default_rng(1).random((1024, 1))
     inputs *= np.sqrt(systems.limits.energy) / np.linalg.norm(inputs, axis=1, keepdims=True)
     inputs = inputs.clip(-0.15, 0.15)
     worths = np.array([systems.worth(u[None])[0][0] for u in inputs])
-    bound = Certificate(systems, 0).find(inputs[[worths.argmax()]], rounds=32)
+    bound = Certificate(systems, 0).find(inputs[[worths.argmax()]], rounds=16)
     assert worths.max() < bound < worths.max() + 2.5
 
 
