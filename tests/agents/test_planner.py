@@ -1,4 +1,7 @@
-"""The planner: what it imagines against the structured update's twin, its limits, its batches and its goals."""
+"""The planner, sample by sample and in blocks: its limits, its batches and its goals.
+
+All that compiles the search of a model is in this file: one process then compiles most of it only once.
+"""
 
 import itertools
 from types import SimpleNamespace
@@ -10,6 +13,8 @@ from scipy.stats import t
 from tables import table
 
 import duffing_env
+from agents.planner import block_policy, blocks
+from agents.planner.block_policy import BlockPlanner
 from agents.planner.motion import View, reach_of, swing_of
 from agents.planner.policy import Planner
 from agents.policies import make_policy
@@ -374,3 +379,42 @@ def test_what_moves_teach_counts_the_less_the_later():
         assert known(found) @ -np.diff(weights) > worths.max() - little
         others += worths[np.argmax(tried[:, -1])] < worths.max() - 2 * little
     assert others > 0  # the end alone would have chosen other plans
+
+
+def test_blocks_begin_with_the_episode_in_a_batch():
+    """Where a step only begins the next episode, no block goes into it."""
+    envs = gym.make_vec("duffing_env/Short-v0", 2, vectorization_mode="vector_entry_point", horizon=24)
+    policy = make_policy("efe-block-16", envs)
+    observations, _ = envs.reset(seed=0)
+    state, played = None, []
+    for _ in range(2 * 25):
+        actions, state = policy.predict(observations, state)
+        observations, _, terminated, _, _ = envs.step(actions)
+        assert not terminated.any()
+        played.append(actions[:, 0])
+    first, over, second = np.split(np.array(played), [24, 25])
+    np.testing.assert_array_equal(over, 0.0)
+    for episode in (first, second[:24]):
+        assert (np.abs(episode).max(axis=0) > 0.5).all()
+        assert (np.count_nonzero(episode[:16], axis=0) > 12).all()
+
+
+def test_a_safe_block_is_tried_nearer_to_the_limit(monkeypatch):
+    """It tells more then, and is as safe."""
+    env = gym.make("duffing_env/Short-v0", max_output=0.3).unwrapped
+    observation, _ = env.reset(seed=0)
+    told = {}
+
+    def best_block(view, systems, futures, candidates, amplitude, bound, played):
+        found = blocks.best_block(view, systems, futures, candidates, amplitude, bound, played)
+        told[blocks._HALVINGS] = blocks.expected(view, systems, futures.limit, found[0])[0]
+        assert found[1] == 1.0
+        assert found[2] < bound
+        return found
+
+    monkeypatch.setattr(block_policy, "best_block", best_block)
+    for halvings in (0, blocks._HALVINGS):
+        monkeypatch.setattr(blocks, "_HALVINGS", halvings)
+        BlockPlanner(env, block=24, risk=0.1).predict(observation)
+    never, often = told.values()
+    assert often > never + 0.05
