@@ -52,7 +52,7 @@ def test_noise_that_is_no_force_is_refused():
         make_policy("efe-block-16", env)
 
 
-def runge_kutta_of_the_pendulum(coefficients, start, u, steps=16):
+def runge_kutta_of_the_pendulum(coefficients, start, u, steps=PENDULUM.substeps):
     """Angles after each sample, the input held."""
     gravity, friction, torque = coefficients
     z, h, seen = np.array(start), 1.0 / steps, []
@@ -100,7 +100,7 @@ def test_a_block_is_planned_for_a_model_of_two_sensors(monkeypatch):
     shown = futures.shown(u, slice(0, 3))
     for i in range(3):
         expected = runge_kutta_of_the_pendulum(futures.coefficients[i], futures.states[i], u + process[i])
-        np.testing.assert_allclose(shown[i], expected + sensor[i], atol=1e-3)
+        np.testing.assert_allclose(shown[i], expected + sensor[i], atol=1e-9)
     leaving = futures.leaving(u, len(futures.states))
     is_out = (np.abs(futures.shown(u, slice(None))) > futures.limit).any(axis=1)
     np.testing.assert_array_equal(leaving, np.flatnonzero(is_out))
