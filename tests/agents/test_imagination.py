@@ -1,6 +1,5 @@
 """Imagination: against plain NumPy references for three models, its costs, and what lost numbers are worth."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from tables import table
 from agents.planner.design import Known, designer
 from agents.planner.imagination import Terms, mind
 from agents.planner.pursuit import pursuit
-from agents.planner.search import search
 from duffing_env.continuous import ContinuousExperiment
 from duffing_env.experiment import SimulatedExperiment
 from estimator.belief import Belief
@@ -317,31 +315,3 @@ def test_one_state_is_enough():
 def test_what_has_no_meaning_is_refused(model, degree, lag):
     with pytest.raises(ValueError, match="degree and lag must be 0 or 1"):
         imagination(model, degree, lag)
-
-
-@table("left", [4, 200])
-def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
-    case, horizon = "paper", 4
-    model = CASES[case][0]
-    # What is known after one move, two and four counts; a plan to the end is worth what is known there.
-    weights = np.array([1.0, 1.0, 0.0, 1.0]) if left > horizon else np.array([0.0, 0.0, 0.0, 1.0])
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        belief = random_belief(model, rng)
-        rate = 0.1 * np.linalg.inv(belief.coefficients_cov)
-        plans, others = np.zeros((2, 1, horizon))
-        rates, words = rate[None].copy(), rng.integers(1, 2**63, (1, 4), dtype=np.uint64)
-        episode = terms(model, margin=np.full(left, 2.0))
-        arguments = belief.record[None].copy(), np.array([left]), horizon, 60, episode, np.zeros((1, 2))
-        searched = plans, others, rates, words
-        search(model).plan(*arguments, *searched, np.empty(1), np.empty(1, dtype=np.int64))
-
-        def worth(inputs, belief=belief, rate=rate):
-            known = []
-            for t in range(horizon):
-                cov = expected(case, belief, inputs[: t + 1], 0.0, np.zeros(4))[1][2:, 2:]
-                known.append(0.5 * np.linalg.slogdet(np.linalg.inv(cov) + (left - t - 1) * rate)[1])
-            return weights @ known
-
-        best = max(worth(inputs) for inputs in itertools.product((-0.15, 0.0, 0.15), repeat=horizon))
-        assert worth(plans[0]) >= best - 1e-4

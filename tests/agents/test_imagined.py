@@ -339,9 +339,9 @@ def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path, log
     settings = PPOSettings(foresight=True, levels=3, num_envs=512, n_steps=2, batch_size=512)
     settings = replace(settings, learning_rate=1e-9, rule_logit=logit)
     run = train(
-        TrainConfig(env="duffing_env/Amplitude-v1", steps=1024, output=tmp_path / "r", hyperparameters=settings)
+        TrainConfig(env="duffing_env/Amplitude-v0", steps=1024, output=tmp_path / "r", hyperparameters=settings)
     )
-    envs = make("duffing_env/Amplitude-v1", 256)
+    envs = make("duffing_env/Amplitude-v0", 256)
     policy = make_policy(str(run.folder), envs)
     seen = observations_of(envs, 30)
     view = CommonForesight(envs).look(seen)

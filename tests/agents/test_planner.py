@@ -15,12 +15,14 @@ from tables import table
 import duffing_env
 from agents.planner import block_policy, blocks
 from agents.planner.block_policy import BlockPlanner
+from agents.planner.imagination import Terms
 from agents.planner.motion import View, reach_of, swing_of
 from agents.planner.policy import Planner
+from agents.planner.search import search
 from agents.policies import make_policy
 from duffing_env.experiment import SimulatedExperiment
 from estimator import Channel, Rig
-from estimator.belief import covariance_places
+from estimator.belief import Belief, covariance_places
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -339,6 +341,40 @@ def precisions(belief, plan):
         z = np.array([theta @ [z[0], z[0] ** 3, z[1], u], z[0]])
         known.append(np.linalg.inv(P[2:, 2:]))
     return np.array(known)
+
+
+def random_belief(rng):
+    """A belief about Eq. (2) near those of the tracks."""
+    coefficients = np.array([1.8, -0.4, -0.93, 0.38])
+    scale = np.concatenate([[0.02, 0.02], 0.03 * np.abs(coefficients)])
+    factor = np.eye(6) + 0.3 * np.tril(rng.normal(0, 1, (6, 6)), -1)
+    cov = np.outer(scale, scale) * (factor @ factor.T)
+    state = rng.uniform(0.1, 0.3, 2) * [1, 0.5]
+    noises = (2.0, 2.0 * 0.01**2), (3.0, 3.0 * 0.02**2)
+    return Belief.of(difference(), np.concatenate([state, coefficients]), cov, *noises)
+
+
+@table("left", [4, 200])
+def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
+    horizon = 4
+    # What is known after one move, two and four counts; a plan to the end is worth what is known there.
+    weights = np.array([1.0, 1.0, 0.0, 1.0]) if left > horizon else np.array([0.0, 0.0, 0.0, 1.0])
+    terms = Terms(0.15, np.inf, 10.0, np.full(left, 2.0), walk=np.zeros(4), scales=np.ones(2))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        belief = random_belief(rng)
+        rate = 0.1 * np.linalg.inv(belief.coefficients_cov)
+        plans, others = np.zeros((2, 1, horizon))
+        rates, words = rate[None].copy(), rng.integers(1, 2**63, (1, 4), dtype=np.uint64)
+        arguments = belief.record[None].copy(), np.array([left]), horizon, 60, terms, np.zeros((1, 2))
+        search(difference()).plan(*arguments, plans, others, rates, words, np.empty(1), np.empty(1, dtype=np.int64))
+
+        def worth(inputs, belief=belief, rate=rate):
+            to_come = (left - 1 - np.arange(horizon))[:, None, None] * rate
+            return 0.5 * np.linalg.slogdet(precisions(belief, inputs)[1:] + to_come)[1] @ weights
+
+        best = max(worth(inputs) for inputs in itertools.product((-0.15, 0.0, 0.15), repeat=horizon))
+        assert worth(plans[0]) >= best - 1e-4
 
 
 @pytest.mark.parametrize(("track", "moves"), [("Amplitude-v0", 44), ("Short-v0", 24)])
