@@ -212,7 +212,9 @@ def test_features_are_those_of_the_matrices(track, pace, least, options):
     assert {*signs} == {-1.0, 1.0}
     assert (shares.min() < 1.0) == ((track == "Amplitude" and pace == 1) or least > 0.0)
     terms = terms._replace(margin=terms.margin[40])
-    for i in range(12):
+    # Those of either sign, of a push that is not allowed, and of a smaller one, say most.
+    rows = {np.argmin(signs), np.argmax(signs), np.argmax((~safe).any(axis=1)), np.argmin(shares.min(axis=1))}
+    for i in rows:
         told, allowed, sign, share = reference(envs.belief(i), seen[i], ahead, terms, least)
         np.testing.assert_allclose(features[i], told, rtol=2e-3, atol=2e-3)
         np.testing.assert_array_equal(safe[i], allowed)
@@ -294,11 +296,10 @@ def test_lookahead_is_ahead_of_a_signal_on_unseen_members():
     assert np.median(np.subtract(ours, signal)) > 0.5
 
 
-@pytest.mark.parametrize("env_id", ["duffing_env/Amplitude-v0", "duffing_env/Power-v0"])
-def test_it_plays_tracks_that_it_was_not_trained_on(env_id):
+def test_it_plays_a_track_that_it_was_not_trained_on():
     gains = {}
     for name in ("lookahead", "prbs"):
-        envs = make(env_id, 16)
+        envs = make("duffing_env/Amplitude-v0", 16)
         policy = make_policy(name, envs)
         observations, _ = envs.reset(seed=3)
         state, gains[name], running = None, 0.0, np.ones(16, dtype=np.bool_)
@@ -339,9 +340,9 @@ def test_a_policy_begins_at_the_rule_and_plays_its_own_model_alone(tmp_path, log
     settings = PPOSettings(foresight=True, levels=3, num_envs=512, n_steps=2, batch_size=512)
     settings = replace(settings, learning_rate=1e-9, rule_logit=logit)
     run = train(
-        TrainConfig(env="duffing_env/Amplitude-v1", steps=1024, output=tmp_path / "r", hyperparameters=settings)
+        TrainConfig(env="duffing_env/Amplitude-v0", steps=1024, output=tmp_path / "r", hyperparameters=settings)
     )
-    envs = make("duffing_env/Amplitude-v1", 256)
+    envs = make("duffing_env/Amplitude-v0", 256)
     policy = make_policy(str(run.folder), envs)
     seen = observations_of(envs, 30)
     view = CommonForesight(envs).look(seen)

@@ -7,6 +7,7 @@ from unittest.mock import ANY
 import matplotlib.image
 import numpy as np
 import pytest
+from tables import table
 
 import agents.evaluation.figures
 import agents.evaluation.rollout
@@ -93,7 +94,7 @@ def test_centres_are_means_and_medians():
         assert entry["high"] <= values.max()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@table("seed", range(5))
 def test_intervals_contain_the_centre(seed):
     for name, entry in summarise(make_evaluation(seed=seed, systems=12)).items():
         center = entry.get("mean", entry.get("median"))
@@ -347,7 +348,7 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
     check_picture(folder / "excitations.png", 1440, 480, colours=2)
 
 
-@pytest.mark.parametrize("policies", [1, 10])
+@table("policies", [1, 10])
 def test_contraction_shows_the_quartiles_of_every_policy(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
     figure = figure_of_contraction(evaluations, "title")
@@ -372,7 +373,7 @@ def test_contraction_shows_losses_too():
     assert low <= losses.lines[0].get_ydata().min()
 
 
-@pytest.mark.parametrize("policies", [1, 10])
+@table("policies", [1, 10])
 def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
     panels = figure_of_inputs(evaluations).axes
@@ -392,7 +393,7 @@ def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(poli
         assert frequencies[-1] == pytest.approx(0.5 / SAMPLING_STEP)
 
 
-@pytest.mark.parametrize("updates", [1, 2, 30])
+@table("updates", [1, 2, 30])
 def test_learning_curve_shows_returns_over_samples(updates):
     curve = [(4096 * (i + 1), 0.5 * i + 0.1, np.nan if i == 0 else float(i)) for i in range(updates)]
     axes = figure_of_learning(curve, "information_gain").axes[0]

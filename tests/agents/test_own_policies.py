@@ -10,12 +10,12 @@ import pytest
 import torch
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNormalize
+from tables import table
 
 from agents import make_policy, save_policy
 from agents.evaluation.protocol import fingerprint
 from agents.evaluation.rollout import evaluate
 from agents.policies.learned import load_policy
-from agents.studies import baselines
 from agents.training import TrainConfig, train
 from agents.training.algorithms import PPOSettings
 from agents.vec_env import DuffingVecEnv
@@ -54,7 +54,7 @@ def test_a_class_is_called_with_what_it_takes():
         make_policy(Push, power=2)
 
 
-@pytest.mark.parametrize("function", [against_displacement, lambda x: against_displacement(x)[:, 0]])
+@table("function", [against_displacement, lambda x: against_displacement(x)[:, 0]])
 def test_a_function_of_observations_is_a_policy(function):
     policy, seen = make_policy(function), observations()
     actions, state = policy.predict(seen, "state")
@@ -64,7 +64,7 @@ def test_a_function_of_observations_is_a_policy(function):
     np.testing.assert_array_equal(single, actions[0])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@table("dtype", [torch.float32, torch.float64])
 def test_a_module_of_torch_is_a_policy(dtype):
     torch.manual_seed(0)
     network, seen = torch.nn.Linear(FEATURES, 1, dtype=dtype), observations()
@@ -75,13 +75,13 @@ def test_a_module_of_torch_is_a_policy(dtype):
     assert np.abs(actions).max() == 1
 
 
-@pytest.mark.parametrize("given", [np.zeros((3, 2)), np.zeros(2), np.array([0, np.nan, 0])])
+@table("given", [np.zeros((3, 2)), np.zeros(2), np.array([0, np.nan, 0])])
 def test_a_function_that_gives_something_else_is_refused(given):
     with pytest.raises(ValueError, match="policy must give a finite action for each of 3 observations"):
         make_policy(lambda seen: given).predict(observations(3))
 
 
-@pytest.mark.parametrize(
+@table(
     ("thing", "options", "message"),
     [(3, {}, "policy must have predict, or be a function"), (Push(0), {"strength": 1}, "options must be none")],
 )
@@ -133,13 +133,12 @@ def test_what_a_policy_refuses_is_told_with_its_name(monkeypatch):
         evaluate([Picky()], **SHORT)
 
 
-@pytest.mark.parametrize(
+@table(
     ("actions", "told"),
     [
         (np.full((4, 1), np.nan, dtype=np.float32), "must be finite, but row 0 is nan"),
         (np.zeros(4, dtype=np.float32), r"must have shape \(4, 1\), but have \(4,\)"),
     ],
-    ids=["nan", "shape"],
 )
 def test_whose_actions_are_none_is_told_with_its_name(actions, told):
     class Broken(Push):
@@ -156,7 +155,7 @@ def normalised_model(kind=PPO, **settings):
     return kind("MlpPolicy", envs, seed=0, device="cpu", **steps, **settings).learn(32), envs
 
 
-@pytest.mark.parametrize("kind", [PPO, A2C, SAC, TD3])
+@table("kind", [PPO, A2C, SAC, TD3])
 def test_the_normaliser_goes_with_the_policy(tmp_path, kind):
     model, envs = normalised_model(kind, **({"batch_size": 32} if kind is PPO else {}))
     save_policy(tmp_path / "mine", model)
@@ -179,7 +178,7 @@ def test_elu_is_played(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
+@table(
     ("settings", "message"),
     [
         ({"policy_kwargs": {"activation_fn": torch.nn.GELU}}, "but has the activation gelu"),
@@ -235,7 +234,7 @@ def normalised(env):
     return NormalizeObservation(env)
 
 
-@pytest.mark.parametrize(
+@table(
     ("wrap", "name"),
     [(normalised, "NormalizeObservation"), (Halved, "Halved"), (Three, "Three"), (Stacked, "Stacked")],
 )
@@ -279,21 +278,13 @@ def test_an_archive_says_how_it_is_converted(tmp_path):
         make_policy(str(tmp_path / "model.zip"))
 
 
-def test_an_algorithm_as_it_comes_is_trained_and_saved(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    baselines.main(baselines.Config("ppo", steps=100))
-    policy = make_policy("runs/sb3-ppo-short-v0-0")
-    assert policy.card["steps"] == 2048  # a roll-out of PPO as it comes
-    assert policy.predict(observations(), deterministic=True)[0].shape == (50, 1)
-
-
 def sequence(between=torch.nn.ReLU, *after):
     torch.manual_seed(0)
     return torch.nn.Sequential(torch.nn.Linear(FEATURES, 8), between(), torch.nn.Linear(8, 1), *after)
 
 
-@pytest.mark.parametrize("between", [torch.nn.Tanh, torch.nn.ReLU, torch.nn.ELU])
-@pytest.mark.parametrize("after", [(), (torch.nn.Tanh(),)])
+@table("between", [torch.nn.Tanh, torch.nn.ReLU, torch.nn.ELU])
+@table("after", [(), (torch.nn.Tanh(),)])
 def test_a_network_alone_is_saved_with_what_it_sees(tmp_path, between, after):
     model, seen = sequence(between, *after), observations()
     mean, std = np.full(FEATURES, 0.1), np.linspace(0.2, 1.0, FEATURES)
@@ -308,7 +299,7 @@ def test_a_network_alone_is_saved_with_what_it_sees(tmp_path, between, after):
     np.testing.assert_allclose(make_policy(str(tmp_path)).predict(seen)[0], plain, atol=1e-6)
 
 
-@pytest.mark.parametrize(
+@table(
     ("model", "message"),
     [
         (sequence(torch.nn.GELU), r"but is \['linear', 'gelu', 'linear'\]"),
@@ -326,7 +317,7 @@ def test_a_network_alone_that_could_not_be_played_is_refused(tmp_path, model, me
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize(
+@table(
     ("normalizer", "message"),
     [
         ((np.zeros(FEATURES), np.zeros(FEATURES), 10.0), "normalizer.std must be positive, but is 0.0 somewhere"),
@@ -358,7 +349,7 @@ def test_a_normaliser_that_cannot_be_played_is_refused(tmp_path, normalizer, mes
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("kind", ["network", "algorithm"])
+@table("kind", ["network", "algorithm"])
 def test_weights_that_are_not_finite_are_refused(tmp_path, kind):
     model = sequence() if kind == "network" else PPO("MlpPolicy", gym.make("duffing_env/Short-v0"), device="cpu")
     layer = model[2] if kind == "network" else model.policy.action_net
@@ -379,7 +370,7 @@ def test_a_network_for_other_observations_is_told_with_its_name():
 HISTORY = {"observation": "history", "history": 10}
 
 
-@pytest.mark.parametrize("how", ["saved", "trained", "card", "config"])
+@table("how", ["saved", "trained", "card", "config"])
 def test_a_policy_plays_the_observation_that_it_learned_from(tmp_path, how):
     """A history of ten samples has as many entries as the posterior."""
     mine = str(tmp_path / "mine")
@@ -432,7 +423,7 @@ def test_a_run_is_not_replaced_and_a_policy_is(tmp_path):
         assert make_policy(tmp_path / "mine").card["steps"] == steps
 
 
-@pytest.mark.parametrize(
+@table(
     ("card", "message"),
     [
         (
@@ -463,7 +454,7 @@ def test_the_card_of_another_policy_says_nothing_of_the_network(tmp_path):
     assert load_policy(tmp_path / "second").card["network"]["activation"] == "relu"
 
 
-@pytest.mark.parametrize("failing", [1, 2, 3, 4])
+@table("failing", [1, 2, 3, 4])
 def test_a_policy_that_is_half_written_is_no_policy(tmp_path, monkeypatch, failing):
     """Each file is renamed once beside the policy, and once into its place."""
     save_policy(tmp_path, sequence(), {"steps": 1})

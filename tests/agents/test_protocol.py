@@ -7,6 +7,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from tables import table
 
 from agents.commands import main
 from agents.evaluation import board, protocol
@@ -87,7 +88,7 @@ def test_what_is_measured_twice_is_the_same(entry, monkeypatch):
     assert again == entry
 
 
-@pytest.mark.parametrize("track", protocol.TRACKS)
+@table("track", protocol.TRACKS)
 def test_shifted_sets_are_other_sets(track):
     usual = gym.spec(track).kwargs
     for env_id, options in protocol.shifts_of(track).values():
@@ -95,7 +96,7 @@ def test_shifted_sets_are_other_sets(track):
         gym.make_vec(env_id, num_envs=2, vectorization_mode="vector_entry_point", branch="test", **options)
 
 
-@pytest.mark.parametrize(
+@table(
     ("samples", "budget"),
     [
         (0, "none"),
@@ -111,7 +112,7 @@ def test_budgets(samples, budget):
     assert protocol._budget(samples) == budget
 
 
-@pytest.mark.parametrize(
+@table(
     ("words", "message"),
     [
         (("--protocol", "Short-v0"), "policies must name one for the protocol"),
@@ -146,7 +147,7 @@ def test_blanks_around_a_name_do_not_make_it_another(tmp_path, monkeypatch, entr
             board.check(tmp_path / "board.jsonl", name)
 
 
-@pytest.mark.parametrize("steps", [-5, "many", 1.5, None])
+@table("steps", [-5, "many", 1.5, None])
 def test_steps_of_a_card_that_are_no_number_of_samples_are_refused(tmp_path, steps):
     (tmp_path / "policy.json").write_text(json.dumps({"steps": steps}))
     with pytest.raises(ValueError, match=r"steps of .*policy.json must be a whole number from 0 to .*, but is"):
@@ -163,7 +164,7 @@ def test_the_latest_entry_of_a_name_counts(monkeypatch, tmp_path, entry):
     assert found["seeds"] == 2
 
 
-@pytest.mark.parametrize("line", ["", "{", "[]", '{"name": "x"}', '{"name": "x", "track": "y", "score": 3}'])
+@table("line", ["", "{", "[]", '{"name": "x"}', '{"name": "x", "track": "y", "score": 3}'])
 def test_a_broken_board_is_told(tmp_path, entry, line):
     path = tmp_path / "board.jsonl"
     path.write_text(json.dumps(entry) + "\n" + line + "\n")
