@@ -15,7 +15,7 @@ from estimator.models.difference import difference
 from estimator.physical import coefficients_of
 
 sys.path.append(str(Path(__file__).parents[1] / "estimator"))
-from filtering import CASES
+from reference.plants import CASES
 
 Q, R, LIMIT, AMPLITUDE = 5e-4, 3e-4, 0.3, 0.1
 PAPER = difference()

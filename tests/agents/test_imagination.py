@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drag import DRAG
+from reference.plants import DRAG
 
 from agents.planner.design import Known, designer
 from agents.planner.imagination import Terms, mind

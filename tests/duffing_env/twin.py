@@ -7,10 +7,10 @@ priors and the twins of the circuit.
 from dataclasses import replace
 from functools import cache
 
-import mean_field_reference as reference
 import numpy as np
 import pytest
-from mean_field_reference import LOG_2PI, expected_log_normal, gamma_divergence
+import reference.mean_field as reference
+from reference.mean_field import LOG_2PI, expected_log_normal, gamma_divergence
 from rounding import U32
 
 from duffing_env.rewards import REWARDS

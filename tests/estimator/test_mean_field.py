@@ -5,7 +5,7 @@ import re
 import numba
 import numpy as np
 import pytest
-from mean_field_reference import (
+from reference.mean_field import (
     LAYOUT,
     Moments,
     assert_same_moments,

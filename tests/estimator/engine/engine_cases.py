@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import drag
 import numpy as np
 from engine_reference import EPS, Belief, Plant
+from reference.plants import DRAG as SIGNED_DRAG
 
 from estimator.engine.rows import input_rows
 from estimator.models.difference import difference
@@ -27,7 +27,7 @@ VAN_DER_POL = Model(
 )
 
 #: Drag, which is quadratic in the speed, and a sensor that shows no sign.
-DRAG = replace(drag.DRAG, outputs={"y": "abs(x)"})
+DRAG = replace(SIGNED_DRAG, outputs={"y": "abs(x)"})
 
 
 @dataclass(frozen=True)
