@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
+from tables import table
 
 from estimator.belief import Belief
 from estimator.models.model import Model
@@ -123,7 +124,7 @@ def test_rounding_leaves_a_covariance_symmetric():
         belief(cov=cov)
 
 
-@pytest.mark.parametrize(
+@table(
     ("changes", "message"),
     [
         (
@@ -152,7 +153,7 @@ def test_errors_name_the_field(changes, message):
         belief(**changes)
 
 
-@pytest.mark.parametrize(
+@table(
     ("point", "message"),
     [
         (1.0, "coefficients must have shape (..., 3), but has ()"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from estimators import OWN_TAPS, record
 from scipy.special import logsumexp
+from tables import table
 
 from estimator import Channel, OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
 from estimator.belief import Belief
@@ -77,7 +78,7 @@ def take(weights, energies, predictions, free_energies, forecasts):
     return shares[:, -1]
 
 
-@pytest.mark.parametrize("scale", [0.1, 10.0, 1000.0])
+@table("scale", [0.1, 10.0, 1000.0])
 def test_weigh_equals_its_twin(scale):
     rng = np.random.default_rng(0)
     energies = scale * rng.standard_normal((4, 50, 3))
@@ -161,8 +162,8 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
     )
 
 
-@pytest.mark.parametrize("n", [1, 8, 32])
-@pytest.mark.parametrize("members", [1, 21, 40])
+@table("n", [1, 8, 32])
+@table("members", [1, 21, 40])
 def test_mixtures_have_the_moments_of_their_finite_members(members, n):
     """Of one system or of several beside each other, also over many blocks; to the last bit the same."""
     names, rng = 3, np.random.default_rng(members)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import table
 
 from estimator import lanes
 from estimator.lanes import LANES, lanewise, of_lane, part, rows
@@ -69,7 +70,7 @@ def test_one_lane_is_touched_or_none():
     np.testing.assert_array_equal(np.argwhere(changed), [[2, 5], [3, 5]])
 
 
-@pytest.mark.parametrize("uniform", ["factor", "factor shift a"])
+@table("uniform", ["factor", "factor shift a"])
 def test_a_parameter_is_a_row_or_uniform(uniform):
     with pytest.raises(ValueError, match=r"(shift|a) of add_and_multiply must be a row or uniform, and not both"):
         lanewise(LAYOUT, "total product", uniform=uniform)(add_and_multiply)

@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 from estimators import KINDS, ODE, ONE_TAP, OWN_TAPS, TRUTH, assert_same, motion, pendulum_estimator, record
+from tables import table
 
 from estimator import (
     SILVERBOX_TWIN,
@@ -63,8 +64,8 @@ def test_run_is_repeated_update(kind, samples, monkeypatch, capsys):
     assert len(free_energies) == 120 - whole.waits
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("bad", [1e200, 1e154])  # after the second the belief may be finite, its free energy is not
+@table("kind", KINDS)
+@table("bad", [1e200, 1e154])  # after the second the belief may be finite, its free energy is not
 def test_unchanged_after_an_update_that_raised(kind, bad, samples):
     estimator, untouched = KINDS[kind](), KINDS[kind]()
     for each in (estimator, untouched):
@@ -83,7 +84,7 @@ def test_unchanged_after_an_update_that_raised(kind, bad, samples):
     assert_same(estimator, untouched)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@table("kind", KINDS)
 def test_copies_and_pickles_go_on_alike(kind, samples):
     u, y = samples
     estimator = KINDS[kind]()
@@ -95,7 +96,7 @@ def test_copies_and_pickles_go_on_alike(kind, samples):
         assert_same(estimator, other)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@table("kind", KINDS)
 def test_rewind_forgets_the_state_and_keeps_what_was_learned(kind, samples):
     u, y = samples
     estimator, first = KINDS[kind](), KINDS[kind]().belief
@@ -115,7 +116,7 @@ def test_rewind_forgets_the_state_and_keeps_what_was_learned(kind, samples):
     assert estimator.belief.entropy() < once or estimator.settings.drift
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in MISFITS])
+@table("kind", [kind for kind in KINDS if kind not in MISFITS])
 def test_nothing_is_learned_from_a_gap(kind, samples):
     u, y = samples
     estimator = KINDS[kind]()
@@ -135,7 +136,7 @@ def test_nothing_is_learned_from_a_gap(kind, samples):
     np.testing.assert_array_equal(np.isfinite(estimator.forecasts), True)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@table("kind", KINDS)
 def test_asking_changes_nothing(kind, samples):
     u, y = samples
     asked, untouched = KINDS[kind](), KINDS[kind]()
@@ -200,8 +201,8 @@ def test_defaults():
     assert OnlineEstimator(ODE).belief == recorded_prior(ODE)
 
 
-@pytest.mark.parametrize("delay", [0, 1])
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+@table("delay", [0, 1])
+@table("factorisation", FACTORISATIONS)
 def test_predict_and_simulate_equal_plain_loops(samples, factorisation, delay):
     u, y = samples
     estimator = OnlineEstimator(rig=Rig.silverbox("zero_order", delay), factorisation=factorisation)
@@ -328,8 +329,8 @@ def test_two_sensors():
 # --- What is refused -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
-@pytest.mark.parametrize(
+@table("factorisation", FACTORISATIONS)
+@table(
     ("u", "y", "message"),
     [
         (np.nan, 0.1, "u must be finite, but u[0] is nan; remove or interpolate"),
@@ -347,7 +348,7 @@ def test_what_is_no_sample_is_refused(samples, factorisation, u, y, message):
     assert_same(estimator, untouched)
 
 
-@pytest.mark.parametrize(
+@table(
     ("change", "message"),
     [
         (lambda u, y: (u, y[:-1]), "u and y must have one length, but have 300 and 299; cut the longer one"),
@@ -373,7 +374,7 @@ def test_unchanged_after_a_run_that_raised(samples, change, message):
     assert_same(estimator, untouched)
 
 
-@pytest.mark.parametrize(
+@table(
     ("call", "message"),
     [
         (lambda: Rig(1.0, "linear", 2000), "delay (for linear) must be a whole number from 0 to 1000, but is 2000"),

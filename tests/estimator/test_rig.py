@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import table
 
 from estimator import Channel, OnlineEstimator, Rig, load_estimator, save_estimator
 from estimator.electronic_duffing import electronic_duffing
@@ -46,7 +47,7 @@ def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
     assert Rig.of(tomllib.loads(TOML)) == rig == Rig.of(json.loads(json.dumps(rig.to_dict())))
 
 
-@pytest.mark.parametrize(
+@table(
     "rig",
     [
         Rig(0.1),
@@ -63,7 +64,7 @@ def test_a_saved_rig_is_the_same(rig, tmp_path):
         rig.save("a\0b")
 
 
-@pytest.mark.parametrize(
+@table(
     ("change", "message"),
     [
         ({"stepp": 1.0}, "rig must have keys of"),
@@ -134,7 +135,7 @@ def test_a_file_that_is_named_like_a_rig_that_ships_is_found(tmp_path, monkeypat
     assert Rig.of("./beam") == Rig(3)
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "settings"),
     [
         ("electronic-duffing", {}),
@@ -154,7 +155,7 @@ def test_the_board_s_files_are_those_of_its_potentiometers(name, settings):
         assert low < value < high
 
 
-@pytest.mark.parametrize(
+@table(
     ("change", "message"),
     [
         ({"p1": 0.0}, "to 1, but is 0.0; give the potentiometer's division ratio"),
@@ -170,7 +171,7 @@ def test_potentiometers_are_checked(change, message):
         electronic_duffing(**change)
 
 
-@pytest.mark.parametrize(
+@table(
     ("input_unit", "output_unit", "order", "units"),
     [
         ("N", "m", 0, ("kg", "N s/m", "N/m", "N/m³")),

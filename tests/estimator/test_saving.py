@@ -8,13 +8,14 @@ import re
 import numpy as np
 import pytest
 from estimators import KINDS, assert_same, record
+from tables import table
 
 from estimator import OnlineEstimator, load_estimator, save_estimator
 
 FEW = ("paper", "mean field", "own terms, drift", "ode, look-ahead", "ensemble")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@table("kind", KINDS)
 def test_a_saved_estimator_continues_bit_by_bit(kind, tmp_path):
     u, y = record()
     original = KINDS[kind]()
@@ -74,7 +75,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("what", REFUSED)
+@table("what", REFUSED)
 def test_a_file_with_wrong_content_is_refused(what, written):
     path, arrays = written
     np.savez(path, **REFUSED[what](arrays))
@@ -116,7 +117,7 @@ def test_what_is_no_file_is_refused(tmp_path):
 # --- Arrays --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", FEW)
+@table("kind", FEW)
 def test_restore_is_all_or_nothing(kind):
     estimator, other, untouched = (KINDS[kind]() for _ in range(3))
     other.run(*record())
@@ -136,7 +137,7 @@ def test_restore_is_all_or_nothing(kind):
     np.testing.assert_array_equal(estimator.belief.record, other.belief.record)
 
 
-@pytest.mark.parametrize("place", [3, ".", "a" * 300, "\0"])
+@table("place", [3, ".", "a" * 300, "\0"])
 def test_what_cannot_be_written_is_refused(place, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="path must be the name of a file"):

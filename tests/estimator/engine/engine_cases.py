@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from engine_reference import EPS, Belief, Plant
+from reference.filters import EPS, Plant
 from reference.plants import DRAG as SIGNED_DRAG
+from reference.structured import Belief
 
 from estimator.engine.rows import input_rows
 from estimator.models.difference import difference

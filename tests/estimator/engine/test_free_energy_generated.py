@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from engine_cases import CASES, get_belief, random_belief
-from engine_reference import EPS, update
+from reference.filters import EPS
+from reference.structured import update
 from scipy.stats import norm
 from test_structured_generated import LANES, some_samples, updated
 
