@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drag import DRAG
+from reference.plants import DRAG
 
 from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
