@@ -174,7 +174,7 @@ def test_structured_beliefs_are_calibrated_and_precise():
 
 
 def test_specifications_travel_as_json():
-    options = {"reward": "log_posterior", "factorisation": "mean_field", "iterations": 4, "horizon": 30, "spread": 0.2}
+    options = {"reward": "log_posterior", "horizon": 30, "spread": 0.2, "max_slew": 0.1, "branch": "test"}
     env = gym.make(TRACK, **options)
     text = env.spec.to_json()
     assert json.loads(text)["kwargs"].items() >= options.items()

@@ -15,15 +15,14 @@ from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.model_env import ModelEnv
 from duffing_env.replay import ReplayExperiment
-from duffing_env.rewards import REWARDS
 from duffing_env.tracks import TRACKS
-from duffing_env.vector_env import DuffingVectorEnv
+from duffing_env.vector_env import ContinuousVectorEnv
 from estimator import OnlineEstimator, Rig
 from estimator.lanes import LANES
 
 #: Nine members each: of four environments they share a block with others'. The reward's kernel tells the mixture's own
 #: free energy, and what a step tells of the information and the posterior are rewards, too.
-OPTIONS = {**GUESSED, "reward": "free_energy"}
+OPTIONS = {**GUESSED, "reward": "free_energy", "horizon": 256, "max_output": 0.6}
 
 
 def weighing(twin):
@@ -54,27 +53,22 @@ def weighing(twin):
 
 
 #: Kernels of their own, which are left to the evidence; three others only read the mixture.
-EVIDENCE = ("fisher", "expected_free_energy", "simulation_error")
+EVIDENCE = [pytest.param(r, marks=pytest.mark.slow) for r in ("fisher", "expected_free_energy")]
 
 
-@pytest.mark.parametrize("reward", ["free_energy", *(pytest.param(r, marks=pytest.mark.slow) for r in EVIDENCE)])
+@pytest.mark.parametrize("reward", ["free_energy", *EVIDENCE])
 def test_an_environment_that_weighs_hypotheses_follows_its_twin(reward):
-    options = GUESSED | {"horizon": 40, "jump": 0.3, "drift": 0.02}
+    options = GUESSED | {"horizon": 20, "jump": 0.3, "drift": 0.02}
+    twin = weighing(TwinContinuousEnv)(0, **options)
+    assert assert_env_follows_twin(ContinuousEnv(reward=reward, **options), twin, reward, 0, 1) == [(False, True)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reward", ["free_energy", "fisher", "expected_free_energy", "simulation_error"])
+def test_so_does_one_on_the_difference_equation(reward):
+    options = GUESSED | {"horizon": 60}
     twin = weighing(TwinEnv)(0, **options)
     assert assert_env_follows_twin(DuffingEnv(reward=reward, **options), twin, reward, 0) == [(False, True)] * 2
-
-
-@pytest.mark.parametrize(
-    "reward",
-    [
-        *(reward for reward in REWARDS if reward not in (*EVIDENCE, "free_energy")),
-        *(pytest.param(r, marks=pytest.mark.slow) for r in ("free_energy", *EVIDENCE[:2])),
-    ],
-)
-def test_so_does_one_on_the_differential_equation(reward):
-    options = {"noise_hypotheses": 3, "horizon": 20, "process_noise_guess": 1.5e-3}
-    env, twin = ContinuousEnv(reward=reward, **options), weighing(TwinContinuousEnv)(0, **options)
-    assert_env_follows_twin(env, twin, reward, 0, 1)
 
 
 def close(first, second):
@@ -87,11 +81,19 @@ def close(first, second):
     np.testing.assert_allclose(first.noises, second.noises, rtol=1e-9)
 
 
-def test_the_belief_is_that_of_the_online_estimator():
-    env = DuffingEnv(**OPTIONS)
+ESTIMATED = {
+    "continuous": (ContinuousEnv, Rig.silverbox("zero_order", -1)),  # an action acts before the sample that it brings
+    "difference": (DuffingEnv, Rig.silverbox("zero_order", 0)),
+}
+
+
+@pytest.mark.parametrize("case", ["continuous", pytest.param("difference", marks=pytest.mark.slow)])
+def test_the_belief_is_that_of_the_online_estimator(case):
+    make, rig = ESTIMATED[case]
+    env = make(**OPTIONS)
     env.reset(seed=0)
     prior = env.experiment.believed
-    estimator = OnlineEstimator(prior.model, prior, Rig.silverbox("zero_order", 0), noise_hypotheses=3)
+    estimator = OnlineEstimator(prior.model, prior, rig, noise_hypotheses=3)
     close(env.belief, estimator.belief)
     u, y, rewards = np.empty((3, 256))
     for t, action in enumerate(random_actions(256)[:, 0]):
@@ -106,10 +108,10 @@ def test_blocks_that_more_members_share_with_their_neighbours():
     # Fifteen members each, of 70 environments: what is told of one does not depend on those beside it.
     options = OPTIONS | {"noise_hypotheses": 5, "horizon": 25, "max_output": 0.2}
     actions = random_actions(30, 70)
-    envs = DuffingVectorEnv(70, **options)
+    envs = ContinuousVectorEnv(70, **options)
     envs.reset(seed=list(range(70)))
     together = [envs.step(action) for action in actions]
-    few = DuffingVectorEnv(5, **options)
+    few = ContinuousVectorEnv(5, **options)
     few.reset(seed=list(range(31, 36)))
     for step, action in zip(together, actions[:, 31:36], strict=True):
         for one, other in zip(step[:4], few.step(action)[:4], strict=True):
@@ -117,7 +119,7 @@ def test_blocks_that_more_members_share_with_their_neighbours():
 
 
 def test_a_member_that_overflowed_has_no_say():
-    envs, plain = (DuffingVectorEnv(6, **OPTIONS) for _ in range(2))
+    envs, plain = (ContinuousVectorEnv(6, **OPTIONS) for _ in range(2))
     actions = random_actions(40, 6)
     roll_out(envs, actions[:10])
     roll_out(plain, actions[:10])

@@ -1,5 +1,7 @@
 """Rewards and endings against plain linear algebra."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -23,6 +25,12 @@ TWIN = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
 HORIZON, MAX_OUTPUT = 10, 0.6
 ACTIVE = {True: [0, 1, 2, 3], False: [0, 2, 3]}
 WORKED = ("free_energy", "fisher", "expected_free_energy", "simulation_error")  # their hooks leave what they are worth
+
+
+@cache
+def payer(kind):
+    """`pay` in a block of a kind."""
+    return lanewise(layout_of(kind), "REWARD EARNED", uniform="terminal forfeits terminated_return")(pay)
 
 
 class Lanes:
@@ -70,8 +78,7 @@ class Lanes:
         self.code.settle(self.rows.reshape(-1), SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
         forfeits = terminated_return is not None
         if terminal or forfeits:
-            paid = lanewise(self.place, "REWARD EARNED", uniform="terminal forfeits terminated_return")(pay)
-            paid(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)
+            payer(self.kind)(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)
 
     @property
     def belief(self):

@@ -267,7 +267,7 @@ def test_several_plants_are_several_environments():
 
 def test_one_plant_is_not_driven_by_two_environments():
     plant = Difference()
-    options = {"prior": silverbox_prior(), "noise_hypotheses": 1, "max_input": 0.15}
+    options = {"prior": silverbox_prior(), "noise_hypotheses": 1, "max_input": 0.15, "reward": "free_energy"}
     envs = gym.make_vec("duffing_env/Rig-v0", num_envs=2, rig=VOLTS, plant=plant, vectorization_mode="sync", **options)
     envs.reset()
     with pytest.raises(ResetNeeded, match=r"plant must not be shared.*one plant is one environment; for several use"):
