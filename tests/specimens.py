@@ -201,9 +201,12 @@ COMPILED = [
         options=TIGHT | {"reward": "expected_free_energy", "noise_range": 10.0, "terminal": True},
     ),
     difference_env("simulation error", options=TIGHT | {"reward": "simulation_error", "jump": 0.3, "drift": 0.01}),
+    difference_env("hypotheses", options=TIGHT | GUESSED | {"reward": "free_energy"}),
     difference_env("mean field", options=TIGHT | {"reward": "free_energy", "factorisation": "mean_field"}),
     continuous_env("continuous", options=TIGHT | KNOWN | {"reward": "expected_free_energy"}),
-    continuous_env("hypotheses", options=TIGHT | GUESSED | {"reward": "free_energy", "max_slew": 0.1}),
+    continuous_env(
+        "continuous hypotheses", options=TIGHT | {"noise_hypotheses": 3, "reward": "parameter_error", "max_slew": 0.1},
+    ),
     continuous_env("nlarx", options=TIGHT | KNOWN | {"estimator": "nlarx", "iterations": 1, "reward": "log_posterior"}),
     replay_env("replay", options={"reward": "free_energy", "max_output": 0.6}),
     replay_env(

@@ -70,21 +70,21 @@ def test_the_plant_does_not_depend_on_the_estimator():
 
 
 def test_the_first_observation_says_that_nothing_is_known_yet():
-    env = gym.make(TRACK, reward="free_energy")
+    env = gym.make(TRACK)
     observation, _ = env.reset(seed=0)
     np.testing.assert_allclose(observation[[*range(8), *range(14, 20)]], 0.0, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(observation[20:], 1.0)
 
 
-def test_the_error_is_of_the_parameters():
-    env = ContinuousEnv(**ODE, horizon=60)
+def test_the_parameters_errors_sum_to_their_change():
+    env = ContinuousEnv(reward="parameter_error", horizon=60, noise_hypotheses=3)
+    prior = env.belief
     for seed in range(3):
         env.reset(seed=seed)
-        for action in random_actions(20, seed=seed)[:, 0]:
-            env.step(action)
-            true = np.array([env.truth[name] for name in ("m", "c", "a", "b")])
-            error = np.minimum(np.abs(env.belief.physical()[0] / true - 1), 1).mean()
-            assert env._batch.quantity("ERROR")[0] == pytest.approx(error, abs=1e-9)
+        total = sum(env.step(action)[1] for action in random_actions(60, seed=seed)[:, 0])
+        true = np.array([env.truth[name] for name in ("m", "c", "a", "b")])
+        error = [np.minimum(np.abs(belief.physical()[0] / true - 1), 1).mean() for belief in (prior, env.belief)]
+        assert total == pytest.approx(error[0] - error[1], abs=1e-9)
 
 
 def test_beliefs_are_calibrated_and_those_of_the_difference_equation_are_not():
@@ -127,7 +127,7 @@ def test_a_soft_spring_that_pushes_is_a_number_if_a_bad_one():
 def test_an_episode_is_drawn_with_the_maps_of_its_estimator():
     from duffing_env.rendering import _physical_moments
 
-    env = gym.make(TRACK, render_mode="rgb_array", horizon=5, reward="free_energy")
+    env = gym.make(TRACK, render_mode="rgb_array", horizon=5)
     env.reset(seed=0)
     env.step(np.float32([0.5]))
     assert env.render().shape[-1] == 3
