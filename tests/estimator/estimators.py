@@ -17,7 +17,7 @@ ONE_TAP, OWN_TAPS = Rig.silverbox("zero_order", 1), Rig.silverbox("zero_order", 
 
 KINDS = {
     "paper": lambda: OnlineEstimator(),
-    "mean field": lambda: OnlineEstimator(rig=OWN_TAPS, factorisation="mean_field", iterations=4),
+    "mean field": lambda: OnlineEstimator(rig=OWN_TAPS, factorisation="mean_field"),
     "published": lambda: OnlineEstimator(factorisation="mean_field", as_published=True),
     "three-tap": lambda: OnlineEstimator(difference("three-tap"), rig=OWN_TAPS),
     "own terms, drift": lambda: OnlineEstimator(
@@ -28,8 +28,8 @@ KINDS = {
     "ode, look-ahead": lambda: OnlineEstimator(ODE, rig=Rig.silverbox("look_ahead"), iterations=2),
     "ode, sigma points": lambda: OnlineEstimator(ODE, expectations="sigma_points", drift=1e-3),
     "ensemble": lambda: OnlineEstimator(noise_hypotheses=3),
-    "large ensemble": lambda: OnlineEstimator(difference("offset"), noise_hypotheses=13, drift=0.01),
-    "ode ensemble": lambda: OnlineEstimator(duffing(), rig=Rig.silverbox("look_ahead"), noise_hypotheses=3),
+    "large ensemble": lambda: OnlineEstimator(difference("three-tap"), rig=OWN_TAPS, noise_hypotheses=13, drift=0.01),
+    "ode ensemble": lambda: OnlineEstimator(duffing(offsets=True), rig=Rig.silverbox("look_ahead"), noise_hypotheses=3),
 }
 
 

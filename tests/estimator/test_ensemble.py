@@ -156,9 +156,9 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
     assert rate / shape == pytest.approx(variances.mean(), rel=0.003)
     assert 1 / shape == pytest.approx(variances.var() / variances.mean() ** 2, rel=0.01)
     # The same in compiled code, of two noises.
-    records = np.column_stack([np.zeros((2, 2)), shapes, rates, shapes, 2 * rates])
+    records = np.column_stack([np.zeros((2, 6 + 21)), shapes, rates, shapes, 2 * rates])
     np.testing.assert_allclose(
-        mixing(1).mixture(side_by_side(records, LANES), weights)[1][2:], [shape, rate, shape, 2 * rate]
+        mixing(6).mixture(side_by_side(records, LANES), weights)[1][6 + 21 :], [shape, rate, shape, 2 * rate]
     )
 
 
@@ -166,14 +166,14 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
 @table("members", [1, 21, 40])
 def test_mixtures_have_the_moments_of_their_finite_members(members, n):
     """Of one system or of several beside each other, also over many blocks; to the last bit the same."""
-    names, rng = 3, np.random.default_rng(members)
+    names, rng = 6, np.random.default_rng(members)
     means, roots = rng.standard_normal((members, n, names)), rng.standard_normal((members, n, names, names))
     covs, noises = roots @ roots.swapaxes(2, 3), rng.uniform(1.0, 5.0, (members, n, 4))
     upper = np.triu_indices(names)
     records = np.concatenate([means, covs[:, :, upper[0], upper[1]], noises], axis=2)
     weights = rng.dirichlet(np.ones(members), n).T.copy()
     if members > 1:
-        records[1, :, 4], records[2, : n // 2 + 1, 0], weights[3] = np.nan, np.inf, 0.0
+        records[1, :, 8], records[2, : n // 2 + 1, 0], weights[3] = np.nan, np.inf, 0.0
     found, size = mixing(names), records.shape[2]
     before = np.full((LANES, size), np.nan)
     blocks = side_by_side(np.concatenate([before, records.reshape(-1, size)]), LANES)
@@ -196,8 +196,8 @@ def test_mixtures_have_the_moments_of_their_finite_members(members, n):
 
 
 def test_a_mixture_of_no_finite_member_is_nothing():
-    records = np.full((2, 3 + 6 + 4), np.nan)
-    assert np.isnan(mixing(3).mixture(side_by_side(records, LANES), np.full(2, 0.5))[1]).all()
+    records = np.full((2, 6 + 21 + 4), np.nan)
+    assert np.isnan(mixing(6).mixture(side_by_side(records, LANES), np.full(2, 0.5))[1]).all()
 
 
 # --- The estimator -------------------------------------------------------------------------------------------------

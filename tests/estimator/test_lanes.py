@@ -151,10 +151,15 @@ def test_functions_within_functions_are_named_apart():
     """Those of two kinds would have one name, and the linker would take one for the other (`estimator.lanes.part`)."""
     root = Path(__file__).parents[2]
     unnamed = []
+
+    def look(node, within, name):
+        for child in ast.iter_child_nodes(node):
+            is_function = isinstance(child, ast.FunctionDef)
+            if is_function and within:
+                names = [ast.unparse(decorator) for decorator in child.decorator_list]
+                unnamed.extend(f"{name}: {child.name}" for decorator in names if decorator in ("jit", "kernel"))
+            look(child, within or is_function, name)
+
     for path in [p for package in ("estimator", "duffing_env", "agents") for p in (root / package).rglob("*.py")]:
-        for outer in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            for inner in ast.walk(outer) if isinstance(outer, ast.FunctionDef) else ():
-                if isinstance(inner, ast.FunctionDef) and inner is not outer:
-                    names = [ast.unparse(decorator) for decorator in inner.decorator_list]
-                    unnamed += [f"{path.name}: {inner.name}" for name in names if name in ("jit", "kernel")]
+        look(ast.parse(path.read_text(encoding="utf-8")), False, path.name)
     assert unnamed == []

@@ -71,14 +71,21 @@ def test_terms_are_products_of_whole_powers(term, words):
         difference((Term(1), term))
 
 
-@table("power", ["0.5", "1.5", "(-1/2)", "2.0", "9", "(-3)", "0.3", "loss", "(loss - 1)"])
-def test_any_power_is_what_it_says(power):
-    x, loss = 1.7, 0.4
-    model = Model(**{**TANK, "rates": (), "next_state": (f"u + loss*x**{power}",)})
-    expected = loss * x ** eval(power, {"loss": loss})
-    assert free_run(model, [loss], [0.25], [x])[0] == pytest.approx(0.25 + expected, rel=1e-14)
-    slope = calculus(model).by[0][0].subs({symbol("x"): x, symbol("loss"): loss})
-    assert float(slope) == pytest.approx(expected * eval(power, {"loss": loss}) / x, rel=1e-12)
+def test_any_power_is_what_it_says():
+    powers = ["0.5", "1.5", "(-1/2)", "2.0", "9", "(-3)", "0.3", "loss", "(loss - 1)"]
+    x, loss, names = 1.7, 0.4, [f"c{i}" for i in range(len(powers))]
+    terms = " + ".join(f"{name}*x**{power}" for name, power in zip(names, powers, strict=True))
+    coefficients = {"loss": "1", **dict.fromkeys(names, "1")}
+    model = Model(**{**TANK, "coefficients": coefficients, "rates": (), "next_state": (f"u + {terms}",)})
+    (slopes,) = calculus(model).by[0][:1]
+    for name, power in zip(names, powers, strict=True):
+        given = dict(zip(coefficients, [loss, *(1.3 * (name == other) for other in names)], strict=True))
+        exponent = eval(power, {"loss": loss})
+        assert free_run(model, list(given.values()), [0.25], [x])[0] == pytest.approx(
+            0.25 + 1.3 * x**exponent, rel=1e-14
+        )
+        slope = slopes.subs({symbol("x"): x, **{symbol(c): value for c, value in given.items()}})
+        assert float(slope) == pytest.approx(1.3 * exponent * x ** (exponent - 1), rel=1e-12)
 
 
 @table("name", ["coefficients", "u", "state"])

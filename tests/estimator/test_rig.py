@@ -20,6 +20,8 @@ from estimator.units import Scales
 
 GUESS = {"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (-1e8, 1e8)}
 BENCH = Rig(1e-3, input=Channel("N", limit=20.0), output=Channel("m", range=0.03), guess=GUESS)
+#: Whose estimator other tests compile.
+AHEAD = replace(BENCH, interpolation="look_ahead")
 TOML = """
 step = 1e-3
 interpolation = "linear"
@@ -201,13 +203,14 @@ def test_numbers_do_not_depend_on_the_units():
     """The same bench in newtons and metres, and in millinewtons and micrometres."""
     small = Rig(
         1e-3,
+        "look_ahead",
         input=Channel("mN", limit=20e3),
         output=Channel("um", range=0.03e6),
         guess={name: tuple(v * (1e-3 if name != "b" else 1e-15) for v in GUESS[name]) for name in GUESS},
     )
     rng = np.random.default_rng(0)
     u, y = rng.choice([-6.0, 6.0], 300), 0.01 * rng.standard_normal(300).cumsum() / 10
-    one, other = OnlineEstimator(rig=BENCH), OnlineEstimator(rig=small)
+    one, other = OnlineEstimator(rig=AHEAD), OnlineEstimator(rig=small)
     assert one.settings.noise_hypotheses == (7, 7)
     one.run(u, y)
     other.run(1e3 * u, 1e6 * y)
@@ -218,13 +221,13 @@ def test_numbers_do_not_depend_on_the_units():
 
 
 def test_an_estimator_of_a_rig_is_saved_whole(tmp_path):
-    estimator = OnlineEstimator(rig=BENCH)
+    estimator = OnlineEstimator(rig=AHEAD)
     rng = np.random.default_rng(1)
     u, y = rng.choice([-6.0, 6.0], 40), 1e-3 * rng.standard_normal(40)
     estimator.run(u[:20], y[:20])
     save_estimator(estimator, tmp_path / "e.npz")
     other = load_estimator(tmp_path / "e.npz")
-    assert (other.rig, other.scales) == (BENCH, BENCH.scales)
+    assert (other.rig, other.scales) == (AHEAD, AHEAD.scales)
     for one in (estimator, other):
         one.run(u[20:], y[20:])
     assert other.belief == estimator.belief

@@ -16,7 +16,7 @@ from estimator.engine.points import ROUNDING
 from estimator.engine.rows import input_rows
 from estimator.models.model import Model
 
-NAMES = ["duffing", "duffing, all terms", "cubic", "pendulum", "wiener-hammerstein", "van der pol"]
+NAMES = ["duffing, all terms", "cubic", "pendulum", "wiener-hammerstein", "van der pol"]
 
 
 def generated(case):
