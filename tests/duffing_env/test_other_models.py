@@ -60,10 +60,9 @@ def test_it_is_played_and_believed():
         z = moved(plant, z, truth, (u,))
         expected.append(z)
     assert (np.ptp(expected, axis=0) > 0.5).all()
-    deviations = np.abs(np.array(shown) - expected)
-    assert (
-        abs(np.corrcoef((np.array(shown) - expected).T)[0, 1]) < 0.5
-    )  # four standard errors: each has a noise of its own
+    noises = np.array(shown) - expected
+    assert abs(np.corrcoef(noises.T)[0, 1]) < 0.5  # within four standard errors: each sensor has a noise of its own
+    deviations = np.abs(noises)
     assert (deviations < 6 * np.array([1e-4, 3e-4])).all()  # standard deviations of the sensors
     assert (deviations.max(axis=0) > [1e-4, 3e-4]).all()
     for name, (mean, std) in env.belief.coefficients().items():
