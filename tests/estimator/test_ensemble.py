@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimators import OWN_TAPS, record
+from estimators import record
 from scipy.special import logsumexp
 from tables import table
 
@@ -18,12 +18,9 @@ from estimator.rig_prior import rig_prior
 RATIOS = 5
 MODELS = {
     "paper": (difference(), Rig.silverbox("zero_order", 1), silverbox_prior()),
-    "three-tap": (difference("three-tap"), OWN_TAPS, recorded_prior(difference("three-tap"))),
-    "look-ahead": (duffing(), Rig.silverbox("look_ahead"), recorded_prior(duffing())),
+    "look-ahead": (duffing(offsets=True), Rig.silverbox("look_ahead"), recorded_prior(duffing(offsets=True))),
 }
-ANY_MODEL = pytest.mark.parametrize(
-    "model", [pytest.param(name, marks=[pytest.mark.slow] * (name == "look-ahead")) for name in MODELS]
-)
+ANY_MODEL = pytest.mark.parametrize("model", MODELS)
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +244,7 @@ def test_predictions_and_free_runs_are_those_of_the_mean(samples, model):
 
 
 def test_a_member_that_overflowed_has_no_say(samples):
-    estimator = ensemble("three-tap")
+    estimator = ensemble("look-ahead")
     estimator.run(*samples)
     arrays = estimator.arrays()
     arrays["records"][0], arrays["weights"][0] = np.nan, 0.0

@@ -26,10 +26,10 @@ from estimator.models.pendulum import PENDULUM
 FACTORISATIONS = ("structured", "mean_field")
 
 #: Kinds that fit the record.
-FITS = ("paper", "published", "three-tap", "ode", "ode, look-ahead", "ensemble")
+FITS = ("paper", "published", "own terms, drift", "ode", "ode, look-ahead", "ensemble")
 
 #: Kinds that take no missing outputs, or that fit the record so badly that they run away in a gap.
-MISFITS = ("mean field", "published", "own terms, drift")
+MISFITS = ("mean field", "published")
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_nothing_is_learned_from_a_gap(kind, samples):
     if estimator.settings.drift:
         assert (variances > 1).all()
     else:
-        np.testing.assert_allclose(variances, 1.0, rtol=1e-3)
+        np.testing.assert_allclose(variances, 1.0, rtol=1e-3 if estimator.settings.noise_hypotheses == 1 else 1e-2)
     np.testing.assert_array_equal(np.isfinite(estimator.forecasts), True)
 
 
@@ -237,7 +237,7 @@ def test_a_free_run_may_diverge(model):
 
 @pytest.mark.parametrize("interpolation", ["linear", "zero_order"])
 def test_a_known_oscillator_is_found(interpolation):
-    models = {"linear": ODE, "zero_order": duffing()}  # ODE's offsets and feedthrough are 0
+    models = {"linear": ODE, "zero_order": duffing(offsets=True)}  # ODE's offsets and feedthrough are 0
     truth = recorded_prior(duffing()).coefficients_mean * [0.8, 0.85, 1.2, 1.25]
     rng = np.random.default_rng(0)
     u = np.convolve(rng.uniform(-0.3, 0.3, 403), np.full(4, 0.5), mode="valid")
