@@ -3,7 +3,10 @@
 $ python examples/cleanrl_ppo.py --seed 0
 $ duffing-env evaluate --protocol Short-v0 --policies "mine=runs/cleanrl-ppo-short-v0-*" --submit mine
 
-Ours are the environment, by its id, and the policy folder at the end. Needs the extra ``train``.
+Ours are the environment, by its id, and the policy folder at the end. Needs the extra ``train``, and Gymnasium 1.4. In
+earlier versions the wrappers `RecordEpisodeStatistics` and `NormalizeReward` leave out the first step after every end
+where environments are reset in the same step, as here (Gymnasium #1017, #1451): printed returns and the scale of
+rewards are then a little off.
 """
 
 import sys

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import json
 import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -24,7 +23,7 @@ from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.rollout import Evaluation, roll_out
 from agents.loading import load_object
 from agents.policies import TRAINED, trained_policies
-from agents.policies.learned import CARD, MOST_STEPS, WEIGHTS
+from agents.policies.learned import CARD, MOST_STEPS, WEIGHTS, steps_of
 from agents.results import versions
 from estimator.checks import whole
 from estimator.parameters import FloatArray
@@ -176,9 +175,7 @@ def _samples_of(policy: str) -> int | None:
     folder = _folder_of(policy)
     if folder is None:
         return None
-    steps = json.loads((folder / CARD).read_text()).get("steps", 0)
-    whole(f"steps of {folder / CARD}", steps, MOST_STEPS, 0)
-    return int(steps)
+    return steps_of(folder)
 
 
 def fingerprint(policy: str) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.policies.learned import CARD, CONFIG
+from agents.policies.learned import CARD, CONFIG, steps_of
 from agents.policies.saving import write_policy
 from agents.results import check_folder, write_json
 from agents.stopping import Stopper, telling
@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 
 #: Picture of the returns in a run folder.
 LEARNING = "learning_curve.png"
+
+#: Samples that the network had learned from that a run began with (``begin``): all of them count.
+BEFORE = "steps_before"
 
 #: After a signal, the update that is on its way may take so many seconds, before nothing more is saved.
 _PATIENCE = 60.0
@@ -111,7 +114,11 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
     if not (folder / CONFIG).is_file():
         raise ValueError(f"resume must be a run folder, which holds {CONFIG}, but {folder} is not one; name a run's")
     if (folder / CARD).exists():
-        raise ValueError(f"resume must be a run that was stopped, but {folder} is finished; it holds its policy")
+        command = shlex.join(["duffing-env", "train", "--begin", str(folder)])
+        raise ValueError(
+            f"resume must be a run that was stopped, but {folder} is finished; for more samples begin another run with "
+            f"its network: {command}"
+        )
     check_folder("resume", folder)
     with telling(lambda said: said or _left(folder)):
         return _Training(read_config(folder), folder, on_evaluation).run()
@@ -164,6 +171,8 @@ class _Training:
         self._board: Any = None
         begun_as = folder / CONFIG
         self._description = json.loads(begun_as.read_text()) if begun_as.exists() else describe(config)
+        if not begun_as.exists() and config.begin is not None:
+            self._description[BEFORE] = steps_of(config.begin)
 
     def run(self) -> Run:
         from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
@@ -259,7 +268,8 @@ class _Training:
         return done * self._config.checkpoints // self._config.steps
 
     def _card(self) -> dict[str, Any]:
-        return {"algorithm": self._config.algo, "steps": self._model.num_timesteps, **self._description}
+        learned_from = self._model.num_timesteps + self._description.get(BEFORE, 0)
+        return {"algorithm": self._config.algo, "steps": learned_from, **self._description}
 
     def _seconds(self) -> float:
         return time.perf_counter() - self._clock

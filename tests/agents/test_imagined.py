@@ -37,9 +37,9 @@ def observations_of(envs, samples, seed=0):
 DIRECTIONS = (1.0, 0.0, -1.0)
 
 
-def beside(envs, records):
-    """The same environments with other beliefs."""
-    return SimpleNamespace(experiment=envs.experiment, records=records)
+def beside(envs, records, seen):
+    """The same environments with other beliefs, whatever they showed."""
+    return SimpleNamespace(experiment=envs.experiment, records=records, shown=seen)
 
 
 def reference(belief, seen, ahead, terms, least=0.0):
@@ -225,11 +225,11 @@ def test_a_belief_looks_the_same_alone_and_any_is_finite():
     foresight, rng = CommonForesight(envs), np.random.default_rng(1)
     seen = observations_of(envs, 40)
     records = envs.records * rng.choice([-1e3, 0.0, 1e-3, 1.0, 1e6], envs.records.shape)
-    view = CommonForesight(beside(envs, records)).look(seen)
+    view = CommonForesight(beside(envs, records, seen)).look(seen)
     assert np.isfinite(view.features).all()
     assert (np.abs(view.features) <= BOUND).all()
     assert view.safe.any(axis=1).all()
-    alone = CommonForesight(beside(envs, envs.records[7:8])).look(seen[7][None])
+    alone = CommonForesight(beside(envs, envs.records[7:8], seen[7:8])).look(seen[7:8])
     np.testing.assert_array_equal(alone.features[0], foresight.look(seen).features[7])
 
 
@@ -242,7 +242,7 @@ def test_turning_the_task_over_turns_the_action_over():
     records[:, :2] *= -1
     crossed = covariance_places(envs.experiment.model)[states[:, None] & ~states]
     records[:, crossed] *= -1
-    foresight, reverse = CommonForesight(envs), CommonForesight(beside(envs, records))
+    foresight, reverse = CommonForesight(envs), CommonForesight(beside(envs, records, turned))
     one, other = foresight.look(seen), reverse.look(turned)
     np.testing.assert_allclose(one.features, other.features, atol=1e-5)
     choices = np.linspace(-1, 1, 12)
@@ -255,7 +255,7 @@ def test_it_refuses_what_it_cannot_look_at():
     with pytest.raises(ValueError, match="hold must be 1"):
         CommonForesight(make("duffing_env/Amplitude-v0", 1, {"hold": 2}))
     envs = make("duffing_env/Amplitude-v0", 2)
-    with pytest.raises(ValueError, match="policy's own 2 environments, but is of 1"):
+    with pytest.raises(ValueError, match=r"showed last, but has shape \(1, 22\) in place of \(2, 22\)"):
         CommonForesight(envs).look(observations_of(envs, 1)[:1])
 
 

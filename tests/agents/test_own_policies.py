@@ -480,6 +480,31 @@ def test_a_policy_that_is_half_written_is_no_policy(tmp_path, monkeypatch, faili
     assert all(path.is_file() for path in tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["efe", "ppo/short", "velocity-sign", "prbs"])
+def test_an_environment_of_stable_baselines3_is_taken_as_it_is(name):
+    envs = DuffingVecEnv("duffing_env/Short-v0", 2, seed=0, max_input=0.1)
+    expected, _ = make_policy(name, envs.envs).predict(envs.reset(), deterministic=True)
+    for held in (envs, VecCheckNan(envs), VecNormalize(envs, norm_obs=False)):
+        actions, _ = make_policy(name, held).predict(envs.envs.shown, deterministic=True)
+        np.testing.assert_array_equal(actions, expected)
+    normalised = VecNormalize(envs)
+    if name == "prbs":
+        np.testing.assert_array_equal(make_policy(name, normalised).predict(normalised.reset())[0], expected)
+    else:
+        with pytest.raises(ValueError, match=r"VecNormalize changes them, .* without it, or choose a signal"):
+            make_policy(name, VecCheckNan(normalised))
+    with pytest.raises(ValueError, match=r"env must take inputs as actions, but .* Discrete\(5\); make it without"):
+        make_policy(name, DuffingVecEnv("duffing_env/Short-v0", 2, seed=0, levels=5))
+
+
+def test_a_model_does_not_normalise_twice():
+    envs = VecNormalize(DuffingVecEnv("duffing_env/Short-v0", 2, seed=0))
+    model = PPO("MlpPolicy", envs, n_steps=4, batch_size=8, device="cpu")
+    make_policy(model, envs.venv)
+    with pytest.raises(ValueError, match=r"env must show its observations as they are, .* VecNormalize, too"):
+        make_policy(model, envs)
+
+
 def test_a_normaliser_beside_an_algorithm_is_refused(tmp_path):
     model = PPO("MlpPolicy", DuffingVecEnv("duffing_env/Short-v0", 2, seed=0), device="cpu")
     with pytest.raises(ValueError, match="normalizer must be None for an algorithm"):

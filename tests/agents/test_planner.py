@@ -1,5 +1,6 @@
 """The planner: what it imagines against the structured update's twin, its limits, its batches and its goals."""
 
+import copy
 import itertools
 from types import SimpleNamespace
 
@@ -7,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import t
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import duffing_env
 from agents.planner.motion import View, reach_of, swing_of
@@ -47,6 +50,90 @@ def roll_out(track, n, seed=0, steps=None, options=None, name="efe", **planner):
         early += int((running & terminated).sum())
         running &= ~start
     return np.array(inputs), np.array(outputs), early, gains
+
+
+BELIEVING = pytest.mark.parametrize("name", ["efe", "ppo/short"])
+NOT_SHOWN = "observation must be what the environment of this policy showed last, but "
+
+
+def played(policy, observations, step, steps=3):
+    """Observations of some steps under a policy."""
+    state = None
+    for _ in range(steps):
+        action, state = policy.predict(observations, state)
+        observations = step(action)
+    return observations
+
+
+@BELIEVING
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_it_plays_its_own_environments_through_their_ends(name, mode):
+    envs = make("Short", 3, horizon=5, autoreset_mode=mode)
+    policy, (observations, _) = make_policy(name, envs), envs.reset(seed=0)
+    for k in range(14):
+        actions, _ = policy.predict(observations.astype(np.float64 if k % 2 else np.float32))
+        observations, _, terminated, truncated, _ = envs.step(actions)
+        if mode == "Disabled" and (terminated | truncated).any():
+            policy.predict(observations)
+            observations, _ = envs.reset(options={"reset_mask": np.array([k > 6, True, True])})
+            if k < 6:
+                observations, _ = envs.reset(options={"reset_mask": np.array([True, False, False])})
+
+
+@BELIEVING
+@pytest.mark.parametrize("wrap", [
+    lambda env: env, gym.wrappers.RecordEpisodeStatistics, lambda env: gym.wrappers.TimeLimit(env, 40),
+    gym.wrappers.FlattenObservation,
+])  # fmt: skip
+def test_wrappers_that_leave_observations_alone_are_played(name, wrap):
+    env = wrap(gym.make("duffing_env/Short-v0"))
+    policy = make_policy(name, env)
+    played(policy, env.reset(seed=0)[0], lambda action: env.step(action)[0])
+    # The pair of them goes on from a copy.
+    copied, its = copy.deepcopy((env, policy))
+    one, other = (
+        played(p, e.unwrapped.shown[0], lambda a, e=e: e.step(a)[0]) for e, p in ((env, policy), (copied, its))
+    )
+    np.testing.assert_array_equal(one, other)
+    # A batch of one, as Stable-Baselines3 has it.
+    envs = DummyVecEnv([lambda: Monitor(env)])
+    for its in (policy, make_policy(name, envs)):
+        played(its, envs.reset(), lambda actions: envs.step(actions)[0], steps=50)
+
+
+@BELIEVING
+@pytest.mark.parametrize("wrap", [
+    lambda env: gym.wrappers.TransformObservation(env, lambda seen: 0.0 * seen, env.observation_space),
+    lambda env: gym.wrappers.TransformObservation(env, lambda seen: seen + np.float32(1e-6), env.observation_space),
+    lambda env: gym.wrappers.DelayObservation(env, 3), gym.wrappers.NormalizeObservation,
+    lambda env: gym.wrappers.RescaleObservation(env, np.float32(-1), np.float32(1)),
+    gym.wrappers.TimeAwareObservation,
+])  # fmt: skip
+def test_wrappers_that_change_observations_are_refused(name, wrap):
+    env = wrap(gym.make("duffing_env/Short-v0"))
+    policy = make_policy(name, env)
+    with pytest.raises(ValueError, match=NOT_SHOWN if name == "efe" else f"{NOT_SHOWN}|observation must have 22"):
+        played(policy, env.reset(seed=0)[0], lambda action: env.step(action)[0])
+
+
+@BELIEVING
+@pytest.mark.parametrize("rows", [3, 4])
+def test_another_environment_than_its_own_is_refused(name, rows):
+    envs, other = make("Short", 3), make("Short", rows)
+    envs.reset(seed=0)
+    policy, (observations, _) = make_policy(name, envs), other.reset(seed=0)
+    message = f"{NOT_SHOWN}entry . of environment 0 is .* in place of 0; .* make it for the environment that is played"
+    with pytest.raises(ValueError, match=message if rows == 3 else r"3 environments|has shape \(4, 22\) in place of"):
+        played(policy, observations, lambda actions: other.step(actions)[0])
+    left_behind, _ = envs.reset(seed=0)
+    envs.step(np.ones((3, 1), np.float32))
+    with pytest.raises(ValueError, match=NOT_SHOWN):
+        policy.predict(left_behind)
+
+
+def test_the_planner_needs_the_posterior_to_be_shown():
+    with pytest.raises(ValueError, match=r"env must show the posterior, .* but its observation is 'history'"):
+        make_policy("efe", make("Short", 2, observation="history", history=20))
 
 
 @pytest.mark.parametrize("track", ["Amplitude", "Power"])

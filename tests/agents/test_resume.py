@@ -229,7 +229,9 @@ def test_the_script_resumes(tmp_path, monkeypatch, capsys):
 
 def test_a_finished_run_is_not_resumed(tmp_path):
     train(replace(config("ppo", tmp_path / "run"), steps=128))
-    with pytest.raises(ValueError, match=r"resume must be a run that was stopped, but .*run is finished"):
+    with pytest.raises(
+        ValueError, match=r"must be a run that was stopped, but .*run is finished; .* train --begin .*run"
+    ):
         resume(tmp_path / "run")
     with pytest.raises(ValueError, match=r"resume must be a run folder, .* but .*none is not one; name a"):
         resume(tmp_path / "none")

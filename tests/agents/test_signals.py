@@ -1,17 +1,25 @@
 """Excitation policies: batches, episodes, seeds, limits, and what each signal looks like."""
 
+import copy
+import pickle
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from agents.policies import POLICIES, make_policy
 from agents.policies.excitations import EXCITATIONS, draw_prbs, draw_recorded, draw_regime, draw_uniform
+from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_SAMPLES, SignalPolicy
 from duffing_env import silverbox
+from estimator import Channel, Rig
+
+GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
+RIG = Rig(1e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03, noise=5e-6), guess=GUESS)
 
 
 def stand_in(**attributes):
@@ -39,6 +47,30 @@ def play(policy, rows, steps, episode_starts=None):
         actions, state = policy.predict(np.zeros((rows, 3)), state, start)
         volts.append(actions[:, 0].astype(np.float64) * policy.max_input)
     return np.array(volts)
+
+
+@pytest.mark.parametrize("name", [*EXCITATIONS, *FEEDBACK])
+@pytest.mark.parametrize("track", ["Short-v0", "Rig-v0"])
+def test_a_policy_goes_on_from_a_copy(name, track):
+    """Also within another process, which has the bytes alone."""
+    rig = {"rig": RIG} if track == "Rig-v0" else {}
+    policy = make_policy(name, gym.make(f"duffing_env/{track}", horizon=20, **rig), seed=4)
+    seen = np.zeros((2, 35 if rig else 22))
+    _, state = policy.predict(seen)
+    copies = [copy.deepcopy((policy, state)), pickle.loads(pickle.dumps((policy, state)))]
+    copies.append(pickle.loads(cloudpickle.dumps((policy, state))))
+    starts = [[k % 7 == 0, k == 20] for k in range(1, 30)]
+
+    def goes_on(policy, state):
+        played = []
+        for start in starts:
+            actions, state = policy.predict(seen, state, start)
+            played.append(actions)
+        return np.array(played)
+
+    expected = goes_on(policy, state)
+    for copied in copies:
+        np.testing.assert_array_equal(goes_on(*copied), expected)
 
 
 @pytest.fixture

@@ -175,6 +175,14 @@ def test_a_training_can_begin_with_the_network_of_a_policy(runs, tmp_path):
     before, after = (load_file(folder / "policy.safetensors") for folder in (runs["first"].folder, begun.folder))
     for name, tensor in before.items():
         np.testing.assert_allclose(after[name], tensor, atol=1e-6)
+    # All samples count that it ever learned from, and again where it is gone on with.
+    steps = [make_policy(str(place)).card["steps"] for place in (runs["first"].folder, *begun.folder.glob("**/0*"))]
+    assert steps[0] == 20480
+    assert make_policy(str(begun.folder)).card["steps"] == max(steps[1:]) == 20480 + 4096
+    again = replace(SMALL, learning_rate=1e-12)
+    settings |= {"output": tmp_path / "further", "begin": begun.folder}
+    further = train(TrainConfig(**settings, hyperparameters=again))
+    assert make_policy(str(further.folder)).card["steps"] == 20480 + 2 * 4096
     with pytest.raises(ValueError, match="begin must be a policy with the network of the training"):
         tiny(tmp_path / "other", begin=runs["first"].folder)
     with pytest.raises(ValueError, match=r"begin must be the folder of a policy, but .*nowhere has no policy"):

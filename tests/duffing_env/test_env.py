@@ -1,5 +1,7 @@
 """The single environment: Gymnasium's contract, and what the class docstring promises."""
 
+import copy
+import dataclasses
 import json
 import re
 import threading
@@ -14,6 +16,7 @@ from rounding import U32
 from twin import to_coefficients
 
 from duffing_env.env import DuffingEnv
+from duffing_env.experiment import SimulatedExperiment
 from duffing_env.vector_env import DuffingVectorEnv
 
 TRACK = "duffing_env/Amplitude-v0"
@@ -76,8 +79,9 @@ def test_steps_outside_an_episode_are_refused():
 
 
 NO_NUMBERS = [
-    "a", [None], {}, 1j, [10**400], np.array([None]), np.array(["x"]), np.array([1j]), np.array([{}]),
-    np.ma.masked, np.ma.masked_array([0.5], [True]), lambda: 0.5,
+    "a", "0.5", ["0.5"], b"0.5", np.array(["0.5"]), np.array("0.5", object), [None], {}, 1j, [10**400],
+    np.array([None]), np.array(["x"]), np.array([1j]), np.array([{}]), np.ma.masked,
+    np.ma.masked_array([0.5], [True]), lambda: 0.5,
 ]  # fmt: skip
 
 
@@ -182,6 +186,56 @@ def test_specifications_travel_as_json():
     assert again.unwrapped.experiment == env.unwrapped.experiment
     assert same(play(env, random_actions(0), seed=0), play(again, random_actions(0), seed=0))
     assert gym.make(env.spec).unwrapped.experiment == env.unwrapped.experiment
+
+
+@pytest.mark.parametrize("travels", [False, True])
+def test_a_specification_takes_other_options(travels):
+    """What follows from the old ones is no limit of what is made with new ones."""
+    spec = gym.make("duffing_env/Short-v0", max_input=1e-3, max_output=0.5).spec
+    assert spec.max_episode_steps == copy.deepcopy(spec).max_episode_steps == 48
+    spec = EnvSpec.from_json(spec.to_json()) if travels else dataclasses.replace(spec)
+    env = gym.make(spec, horizon=60, max_output=0.4)
+    assert (env.spec.max_episode_steps, env.spec.kwargs["max_output"]) == (60, 0.4)
+    assert gym.wrappers.TimeAwareObservation(env).max_timesteps == 60
+    assert len(play(env, np.zeros((80, 1)), seed=0)) == 61
+    for mode in ("vector_entry_point", "sync"):
+        envs = gym.make_vec(spec, num_envs=2, vectorization_mode=mode, horizon=60)
+        envs.reset(seed=0)
+        assert mode == "sync" or envs.spec.max_episode_steps == 60
+        ends = [envs.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(60)]
+        assert ends == [False] * 59 + [True]
+    limited = gym.make(spec, max_episode_steps=9).spec
+    assert limited.max_episode_steps == gym.make(limited, horizon=60).spec.max_episode_steps == 9
+    assert gym.make_vec(spec, num_envs=2, max_episode_steps=9).spec.max_episode_steps == 9
+
+
+def test_options_are_read_and_not_set():
+    env = gym.make("duffing_env/Short-v0")
+    envs = gym.vector.SyncVectorEnv([lambda: env])
+    for name in (field.name for field in dataclasses.fields(SimulatedExperiment)):
+        before = env.get_wrapper_attr(name)
+        assert before == getattr(env.unwrapped.experiment, name)
+        sets = (
+            lambda name=name: setattr(env.unwrapped, name, 0.3),
+            lambda name=name: env.set_wrapper_attr(name, 0.3),
+            lambda name=name: env.set_wrapper_attr(name, 0.3, force=False),
+            lambda name=name: envs.set_attr(name, 0.3),
+        )
+        for call in sets:
+            with pytest.raises(AttributeError, match=f"^{name} cannot be set to 0.3 in .* make a new one with {name}="):
+                call()
+        assert env.get_wrapper_attr(name) is before
+    assert not env.set_wrapper_attr("stage", 2, force=False)
+    env.set_wrapper_attr("stage", 2)
+    assert env.get_wrapper_attr("stage") == 2
+
+
+def test_a_tensor_that_requires_a_gradient_is_refused_with_what_to_do():
+    torch = pytest.importorskip("torch")
+    env = DuffingEnv(**SHORT)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^action must be .*; pass action.detach\(\)"):
+        env.step(torch.zeros(1, requires_grad=True))
 
 
 def test_closing_twice_is_fine():

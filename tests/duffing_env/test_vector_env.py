@@ -221,8 +221,6 @@ def test_bad_options_are_refused():
 def test_gymnasium_makes_it_without_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # It says so of every v0 that has a v1, and means the newest; here they are other equations.
-        warnings.filterwarnings("ignore", r".*duffing_env/\w+-v0 is out of date", DeprecationWarning)
         envs = gym.make_vec(TRACK, num_envs=3, vectorization_mode="vector_entry_point", reward="log_posterior")
         assert type(gym.make_vec(TRACK, num_envs=3)) is DuffingVectorEnv
     assert type(envs) is DuffingVectorEnv
@@ -256,6 +254,36 @@ def test_the_specification_tells_the_limit_and_cuts_no_longer_horizon():
         steps = [aware.step([0.0]) for _ in range(horizon)]
         assert [step[3] for step in steps] == [False] * (horizon - 1) + [True]
         assert gym.make(env.spec).unwrapped.experiment == env.unwrapped.experiment
+
+
+def test_what_a_batch_was_made_with_is_not_set():
+    envs = DuffingVectorEnv(3, **BOTH_ENDS)
+    names = ["num_envs", "threads", "copy", "autoreset_mode", "max_episode_steps", "render_mode", "horizon", "reward"]
+    for name in names:
+        before = getattr(envs, name)
+        with pytest.raises(AttributeError, match=f"^{name} cannot be set to 5 in .* make a new one with {name}="):
+            setattr(envs, name, 5)
+        assert getattr(envs, name) is before
+
+
+def test_systems_of_choice_for_some_rows():
+    envs, drawn = (DuffingVectorEnv(4, noise_range=10.0, horizon=20) for _ in range(2))
+    drawn.reset(seed=3)
+    truth = {"m": 7e-6, "c": 2e-4, "a": 1.0, "b": 0.5}
+    envs.reset(
+        seed=3, options={"truth": [None, truth, None, truth | {"process_noise": 1e-3, "measurement_noise": 2e-3}]}
+    )
+    for name in drawn.truth:
+        found, expected = envs.truth[name].copy(), drawn.truth[name].copy()
+        np.testing.assert_array_equal(found[[0, 2]], expected[[0, 2]])
+        if name in truth:
+            np.testing.assert_allclose(found[[1, 3]], truth[name], rtol=1e-12)
+    np.testing.assert_allclose(envs.truth["process_noise"][[1, 3]], [drawn.truth["process_noise"][1], 1e-3], rtol=1e-12)
+    for wrong, message in ([truth] * 3, "truth must be one for all environments, or 4 of them, but is 3"), (
+        [None, {"m": 1.0}, None, None], r"truth\[1\] must give the parameters"
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            envs.reset(options={"truth": wrong})
 
 
 @pytest.mark.parametrize("options", [{}, {"noise_range": 10.0}, {"jump": 0.3, "horizon": 40}], ids=str)
