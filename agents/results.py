@@ -103,7 +103,7 @@ def fitted(made: Callable[[Sequence[int]], Any], columns: int, labels: int = 1) 
     from rich.console import Console
     from rich.measure import Measurement
 
-    wide, room = Console(width=_WIDEST), console().width
+    wide, room = Console(width=_WIDEST, markup=False, emoji=False), console().width
     first, groups = list(range(labels)), [list[int]()]
     for place in range(labels, columns):
         tried = made([*first, *groups[-1], place])

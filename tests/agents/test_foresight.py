@@ -53,6 +53,10 @@ class Row:
     def records(self):
         return self._envs.records[self._row : self._row + 1]
 
+    @property
+    def shown(self):
+        return self._envs.shown[self._row : self._row + 1]
+
 
 def observations_of(env_id, samples=40, count=12):
     """What a batch shows after some random pushes, gentle enough that most episodes go on."""

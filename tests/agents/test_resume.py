@@ -237,7 +237,7 @@ def test_the_script_resumes(run_of_400, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "400")
     monkeypatch.setattr(sys, "argv", ["train.py", "--resume", str(run_of_400), "--systems", "0"])
     runpy.run_path(str(Path(agents.__file__).parents[1] / "train.py"), run_name="__main__")
-    assert f"The run is in {run_of_400}" in capsys.readouterr().out.replace("\n", "")
+    assert f"The run is in {run_of_400}" in " ".join(capsys.readouterr().out.split())
     assert make_policy(str(run_of_400)).card["steps"] == STEPS
 
 
