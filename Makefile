@@ -5,14 +5,19 @@ READY := .venv/.ready
 # Processes that run the tests. A file's tests stay together, so that few kernels are compiled twice.
 WORKERS ?= 2
 
-.PHONY: demo test docs lint format bench evidence portability compat lock clean
+.PHONY: demo test test-research docs lint format bench evidence portability compat lock clean
 
 demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
 	rm -rf runs/demo
-	$(BIN)/python train.py --steps 200000 --output runs/demo
+	$(BIN)/python train.py --steps 100000 --output runs/demo
 
-test: $(READY)  ## all tests but the slow evidence, in WORKERS processes
-	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+PYTEST = $(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+
+test: $(READY)  ## the tests of the packages but the slow evidence, in WORKERS processes
+	$(PYTEST) --ignore=tests/research
+
+test-research: $(READY)  ## the tests of studies, the oracles' search, certificates and benchmarks
+	$(PYTEST) tests/research
 
 docs: $(READY)  ## the manual, into build/manual; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file docs/manual/mkdocs.yml

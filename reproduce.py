@@ -1,8 +1,8 @@
 """Repeats the experiment of Kouw (2020) on the Silverbox record, or runs the Silverbox benchmark's official protocol.
 
-$ python reproduce.py                     the paper's experiment, against its published numbers
-$ python reproduce.py silverbox           the official protocol, for every estimator
-$ python reproduce.py silverbox --select  other settings, compared without test data
+$ python reproduce.py                     the paper's experiment
+$ python reproduce.py silverbox           the official protocol
+$ python reproduce.py silverbox --select  other settings, without test data
 """
 
 import sys

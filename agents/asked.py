@@ -20,6 +20,32 @@ def check_state(state: Any, arrays: int) -> None:
         raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
 
 
+def check_shown(env: Any, observed: npt.NDArray[Any]) -> None:
+    """Refuse observations (n, entries) that an environment did not show last: its beliefs are not theirs.
+
+    Args:
+        env: whose beliefs a policy reads; its ``shown`` is what it showed last.
+        observed: what the policy is asked about.
+
+    Raises:
+        ValueError: naming the first entry that differs.
+    """
+    last = env.shown
+    if observed.shape == last.shape:
+        same = observed == last
+        if same.all():
+            return
+        row, entry = np.argwhere(~same)[0].tolist()
+        given = f"entry {entry} of environment {row} is {observed[row, entry]:.9g} in place of {last[row, entry]:.9g}"
+    else:
+        given = f"has shape {observed.shape} in place of {last.shape}"
+    raise ValueError(
+        f"observation must be what the environment of this policy showed last, but {given}; the policy reads that "
+        "environment's belief and is no function of the observation, so make it for the environment that is played, "
+        "as make_policy(name, env), without wrappers that change or delay observations, and call predict between steps"
+    )
+
+
 def check_rows(name: str, given: int, expected: int) -> None:
     """Refuse what is for another number of environments than the observation."""
     if given != expected:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import atexit
+import codecs
+import gc
+import io
 import json
+import os
+import shutil
 import sys
+import textwrap
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from signal import SIGINT
 from typing import Annotated, Any, TypeVar
 
 import tyro
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from tyro.constructors import PrimitiveConstructorSpec
 
 from agents.loading import spec_of
@@ -66,22 +72,15 @@ def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
     return {**options, "rig": Rig.of(rig).to_dict()}
 
 
-def progress_bar() -> Progress:
-    """A bar on stderr that names what is being done; none where that is a file, which has room for messages only."""
-    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
-    console = Console(stderr=True)
-    return Progress(*columns, console=console, disable=not console.is_terminal)
-
-
 def followed(tasks: Iterable[tuple[str, Task]]) -> Iterator[Task]:
-    """Tasks, one after the other, behind a `progress_bar` that names the one at hand."""
+    """Tasks, one after the other; `estimator.progress.progress` names the one at hand."""
+    from estimator.progress import progress
+
     tasks = list(tasks)
-    with progress_bar() as bar:
-        shown = bar.add_task("", total=len(tasks))
-        for name, task in tasks:
-            bar.update(shown, description=name)
+    with progress() as tell:
+        for done, (name, task) in enumerate(tasks):
+            tell(done / len(tasks), name)
             yield task
-            bar.advance(shown)
 
 
 def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[str | Path]) -> None:
@@ -146,7 +145,7 @@ def check_track(env_id: str) -> None:
     try:
         entry: Any = spec_of(env_id).vector_entry_point
         entry = load_env_creator(entry) if isinstance(entry, str) else entry
-    except ImportError as error:
+    except (ImportError, AttributeError) as error:
         raise ValueError(
             f"env must be the id of a track such as duffing_env/Short-v0, but is {env_id}: {error}"
         ) from error
@@ -162,6 +161,61 @@ def check_track(env_id: str) -> None:
         )
 
 
+#: What letters become that an encoding has not; others lose their accents, or become question marks.
+_LEGIBLE = {
+    "²": "^2", "³": "^3", "⁴": "^4", "⁻": "^-", "·": "*", "×": "x", "±": "+/-", "−": "-", "–": "-", "—": "-",
+    "…": "...",
+    "→": "->", "≤": "<=", "≥": ">=", "µ": "u", "μ": "u", "γ": "gamma", "ξ": "xi", "η": "eta", "θ": "theta",
+    "σ": "sigma", "ω": "omega", "ρ": "rho", "Λ": "Lambda", "½": "1/2", "°": "deg", "•": "*", "─": "-", "━": "-",
+    "│": "|", "┃": "|",
+}  # fmt: skip
+
+
+def _legible(error: UnicodeError) -> tuple[str, int]:
+    """What stands for letters that a stream cannot write."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    letters = error.object[error.start : error.end]
+    return "".join(_spelled(letter) for letter in letters), error.end
+
+
+def _spelled(letter: str) -> str:
+    if letter in _LEGIBLE or "\u2500" <= letter <= "\u257f":  # lines of boxes
+        return _LEGIBLE.get(letter, "+")
+    plain = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
+    return plain or "?"
+
+
+codecs.register_error("legible", _legible)
+
+
+@contextmanager
+def _as_terminals_have_it() -> Iterator[None]:
+    """Print lines of 80 characters at most, and letters in any encoding."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="legible")
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(min(80, shutil.get_terminal_size().columns))
+    try:
+        yield
+    finally:
+        del os.environ["COLUMNS"]
+        if before is not None:
+            os.environ["COLUMNS"] = before
+
+
+def parsed(kind: Any, **options: Any) -> Any:
+    """What `tyro.cli` makes of the words; its help in lines of 80 characters, which it breaks only within boxes."""
+    said = io.StringIO()
+    try:
+        with redirect_stdout(said):
+            return tyro.cli(kind, **options)
+    finally:
+        for line in said.getvalue().splitlines():
+            print("\n".join(textwrap.wrap(line, 80, break_long_words=False, break_on_hyphens=False)) or line.strip())
+
+
 @contextmanager
 def told_in_one_line(name: str) -> Iterator[None]:
     """End the process where the user can mend what went wrong, with one message and no traceback.
@@ -172,8 +226,10 @@ def told_in_one_line(name: str) -> Iterator[None]:
     Args:
         name: of the command, which stands before the message.
     """
+    # At the end of the process Python looks through all that Numba and torch have built, which takes 0.1 s and more.
+    atexit.register(gc.freeze)
     try:
-        with stopped_by_sigterm():
+        with stopped_by_sigterm(), _as_terminals_have_it():
             yield
     except (KeyboardInterrupt, Stopped) as stopped:
         left = ""
@@ -208,4 +264,4 @@ def run_script(main: Callable[[Config], object], config: type[Config], descripti
             ``config`` where it is None.
     """
     with told_in_one_line(Path(sys.argv[0]).name):
-        main(tyro.cli(config, description=description))
+        main(parsed(config, description=description))

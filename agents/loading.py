@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from types import BuiltinFunctionType, ModuleType
 from typing import TYPE_CHECKING, Any
+
+from estimator.extras import EXTRAS
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -20,19 +25,58 @@ def load_object(place: str, what: str) -> Any:
         what: is looked for, in the messages.
 
     Raises:
-        ValueError: naming what is wrong: no such module, or no such name in it.
+        ValueError: naming what is wrong: no such module, one that cannot be imported, no such name in it, or a name
+            that is a module, or as a policy a function of the system.
+        ModuleNotFoundError: for a package of an extra that the module needs, and that is not there.
     """
     module, _, name = place.partition(":")
     if not module or not name:
         raise ValueError(f"{what} must be module:name, but is {place!r}; such as lab:{what}, for {what} in lab.py")
     try:
-        return getattr(_imported(module), name)
+        found = getattr(_imported(module), name)
     except ModuleNotFoundError as error:
-        if error.name is None or not module.startswith(error.name):
+        if error.name is not None and module.startswith(error.name):
+            raise ValueError(f"{what} must be module:name, but there is no module {module!r}: {error}") from error
+        if _needs_extra(error):
             raise
-        raise ValueError(f"{what} must be module:name, but there is no module {module!r}: {error}") from error
+        raise ValueError(f"{what} must be module:name, but {module} needs another package: {error}") from error
+    except ImportError as error:
+        raise ValueError(f"{what} must be module:name, but {module!r} cannot be imported: {error}") from error
     except AttributeError as error:
         raise ValueError(f"{what} must be module:name, but {module} has no {name!r}; name one it has") from error
+    # A function of the system takes no observations, and may do anything with them.
+    if isinstance(found, ModuleType) or (what == "policy" and isinstance(found, BuiltinFunctionType)):
+        raise ValueError(f"{what} must be an object or a function of your own, but {place} is {found!r:.60}; name one")
+    return found
+
+
+@contextmanager
+def of_ones_own(place: Any, what: str) -> Iterator[None]:
+    """Let what a thing of a user's own raises say whose it is, and where: it may be no policy at all.
+
+    Args:
+        place: ``module:name``; of what has another name, faults are the program's.
+        what: it is to be.
+
+    Raises:
+        ValueError: in place of any other exception.
+    """
+    try:
+        yield
+    except ValueError:
+        raise
+    except (Exception, SystemExit) as error:
+        if not isinstance(place, str) or ":" not in place or _needs_extra(error):
+            raise
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        raise ValueError(
+            f"{what} must be one, but {place} fails: {type(error).__name__}: {error} ({last.filename}, line "
+            f"{last.lineno}); mend it, or name another"
+        ) from error
+
+
+def _needs_extra(error: BaseException) -> bool:
+    return isinstance(error, ModuleNotFoundError) and str(error.name).split(".")[0] in EXTRAS
 
 
 #: What the commands pass on themselves where they make a track, beside the options.
@@ -68,7 +112,13 @@ def spec_of(env_id: str) -> EnvSpec:
 
 
 def _imported(module: str) -> Any:
+    """A module; whatever ends its import is an ImportError."""
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)
-    return importlib.import_module(module)
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ImportError(f"{type(error).__name__}: {error}") from error

@@ -4,76 +4,122 @@ from __future__ import annotations
 
 import json
 import platform
+import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
 from estimator.checks import printable
 from estimator.files import check_place, write_atomically
-
-#: Of a table for the manual [characters].
-_WIDEST = 10_000
+from estimator.progress import WIDTH
 
 
-def show(*parts: Any, width: int = 100) -> None:
-    """Print texts and tables, as wide as the terminal but at least so many characters.
-
-    A table for the manual is as wide as its cells.
-    """
-    from rich.box import MARKDOWN
+def console() -> Any:
+    """Of rich, as wide as the terminal, but at most `WIDTH`."""
     from rich.console import Console
-    from rich.measure import Measurement
 
-    console = Console(highlight=False, markup=False, emoji=False)
-    width = max(console.width, width)
+    made = Console(highlight=False, markup=False, emoji=False)
+    made.width = min(WIDTH, made.width)
+    return made
+
+
+def say(text: str, file: TextIO | None = None) -> None:
+    """Print a text in lines of at most `WIDTH` characters; a word that is longer, such as a path, stays whole."""
+    for line in printable(text, "\n").split("\n"):
+        whole = textwrap.wrap(line, WIDTH, break_long_words=False, break_on_hyphens=False)
+        print("\n".join(whole), file=file)
+
+
+def warn(text: str) -> None:
+    """Print a warning on stderr."""
+    say(f"duffing-env: warning: {text}", sys.stderr)
+
+
+def show(*parts: Any) -> None:
+    """Print texts, as `say` does, and tables (`table`)."""
     for part in parts:
-        is_whole = getattr(part, "box", None) is MARKDOWN
-        options = console.options.update(max_width=_WIDEST)
-        console.width = max(width, Measurement.get(console, options, part).maximum) if is_whole else width
-        console.print(printable(part, "\n") if isinstance(part, str) else part)
+        if isinstance(part, str):
+            say(part)
+        else:
+            for k, piece in enumerate(part):
+                if k:
+                    print()
+                console().print(piece)
 
 
-@contextmanager
-def spinner(what: str) -> Iterator[Callable[[str], None]]:
-    """A spinner on stderr, and what tells it a new text."""
-    from rich.console import Console
-    from rich.text import Text
-
-    with Console(stderr=True).status(what) as status:
-        yield lambda text: status.update(Text(printable(text)))
-
-
-def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: bool = False, title: str = "") -> Any:
+def table(
+    titles: Sequence[str], rows: Iterable[Sequence[str]], *, markdown: bool = False, title: str = "", labels: int = 1
+) -> list[Any]:
     """A table of texts for `show`: the first column to the left, the others to the right, titles broken before cells.
+
+    Where it is wider than `WIDTH`, there are several, which begin with the same columns.
 
     Args:
         titles: of the columns.
         rows: their cells.
         markdown: whether the manual is to take the table as it is.
         title: above the table.
+        labels: columns that say what a row is, and stand in each of several tables.
     """
     from rich.box import MARKDOWN, SIMPLE_HEAD
     from rich.table import Table
 
-    made = Table(
-        box=MARKDOWN if markdown else SIMPLE_HEAD, show_edge=markdown, padding=(0, 1) if markdown else (0, 1, 0, 0),
-        title=title or None,
-    )  # fmt: skip
     cells = [[printable(cell, "\n") for cell in row] for row in rows]
-    for place, text in enumerate(titles):
-        below = "\n".join(cell for row in cells for cell in row[place : place + 1]).splitlines()
-        width = max([10, *map(len, below)])
-        broken = (textwrap.fill(line, width, break_long_words=False) for line in text.splitlines())
-        heading = text if markdown else "\n".join(broken)
-        made.add_column(heading, justify="left" if markdown or place == 0 else "right", no_wrap=markdown)
-    for row in cells:
-        made.add_row(*row)
-    return made
+
+    def made(places: Sequence[int]) -> Any:
+        found = Table(
+            box=MARKDOWN if markdown else SIMPLE_HEAD, show_edge=markdown, padding=(0, 1) if markdown else (0, 1, 0, 0),
+            title=title or None,
+        )  # fmt: skip
+        for place in places:
+            below = "\n".join(cell for row in cells for cell in row[place : place + 1]).splitlines()
+            width = max([10, *map(len, below)])
+            broken = (textwrap.fill(line, width, break_long_words=False) for line in titles[place].splitlines())
+            heading = titles[place] if markdown else "\n".join(broken)
+            is_label = place < labels
+            found.add_column(
+                heading, justify="left" if markdown or place == 0 else "right", overflow="fold",
+                max_width=_LABEL if is_label else None,
+            )  # fmt: skip
+        for row in cells:
+            found.add_row(*(row[place] for place in places))
+        return found
+
+    return fitted(made, len(titles), labels)
+
+
+def fitted(made: Callable[[Sequence[int]], Any], columns: int, labels: int = 1) -> list[Any]:
+    """Tables of rich, each at most `WIDTH` wide, in place of one.
+
+    Args:
+        made: the table of some columns.
+        columns: of the whole table.
+        labels: the first columns, which each table has.
+    """
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    wide, room = Console(width=_WIDEST, markup=False, emoji=False), console().width
+    first, groups = list(range(labels)), [list[int]()]
+    for place in range(labels, columns):
+        tried = made([*first, *groups[-1], place])
+        if groups[-1] and Measurement.get(wide, wide.options, tried).maximum > room:
+            groups.append([])
+        groups[-1].append(place)
+    found = [made([*first, *group]) for group in groups]
+    for later in found[1:]:
+        later.title = None
+    for earlier in found[:-1]:
+        earlier.caption = None
+    return found
+
+
+#: Of what is measured, and of a label [characters].
+_WIDEST, _LABEL = 10_000, 32
 
 
 def write_json(path: Path, content: Any) -> None:

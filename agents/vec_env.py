@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from duffing_env.contract import Fixed, checked_options
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.extras import need
 from estimator.parameters import Parameters
@@ -23,9 +24,16 @@ from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402
     VecEnvStepReturn,
 )
 
+_TRUNCATED = "TimeLimit.truncated"
+
 
 class BatchVecEnv(VecEnv):
-    """A `VecEnv` that is one batch: what an attribute or a method of the batch gives stands for every row."""
+    """A `VecEnv` that is one batch: what a method of the batch gives stands for every row."""
+
+    def __init__(self, *given: Any) -> None:
+        #: Attributes of a caller's own, by name and row.
+        self._given: dict[str, dict[int, Any]] = {}
+        super().__init__(*given)
 
     @property
     def _batch(self) -> Any:
@@ -33,12 +41,26 @@ class BatchVecEnv(VecEnv):
         return self
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute, once for every row asked for."""
-        return [getattr(self._batch, attr_name)] * len(self._rows(indices))
+        """An attribute of every row asked for: what `set_attr` gave it, or what all have alike."""
+        rows, given = self._rows(indices), self._given.get(attr_name, {})
+        if rows and all(row in given for row in rows):
+            return [given[row] for row in rows]
+        return self._attributes(attr_name, rows)
+
+    def _attributes(self, name: str, rows: list[int]) -> list[Any]:
+        return [getattr(self._batch, name)] * len(rows)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute; it is one for all rows."""
-        setattr(self._batch, attr_name, value)
+        """Give rows an attribute of a caller's own, or set one that all have alike.
+
+        Raises:
+            AttributeError: for an option of the environments, or what else cannot be set.
+        """
+        for owner in (self._batch, self):
+            if hasattr(owner, attr_name):
+                setattr(owner, attr_name, value)
+                return
+        self._given.setdefault(attr_name, {}).update(dict.fromkeys(self._rows(indices), value))
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         """Call a method once; its result stands for every row asked for."""
@@ -57,10 +79,13 @@ class BatchVecEnv(VecEnv):
 class DuffingVecEnv(BatchVecEnv):
     """Stable-Baselines3's view of a `DuffingVectorEnv` in mode ``SAME_STEP``.
 
-    A finished row's info holds what the environment tells of its last step, the ``belief`` and the ``truth`` it ended
-    with, ``terminal_observation``, ``TimeLimit.truncated`` (so that a time limit is not taken for a terminal state) and
-    ``episode`` (return, length, time), which is what Stable-Baselines3 otherwise needs a `VecMonitor` for. All buffers
-    that are handed out are copies.
+    A row's info holds what the environment says of the step, such as ``information_gain``, and
+    ``TimeLimit.truncated`` (so that a time limit is not taken for a terminal state), as with `DummyVecEnv`; so do
+    ``reset_infos`` of a reset. That of a finished row also has the ``belief`` and the ``truth`` it ended with,
+    ``terminal_observation`` and ``episode`` (return, length, time), which is what Stable-Baselines3 otherwise needs a
+    `VecMonitor` for. All buffers that are handed out are copies.
+
+    ``set_options({"truth": truth})``, or a list of such for each row, chooses the systems of the next reset alone.
 
     Args:
         env: the id of a registered track; or a vector environment that was made with
@@ -73,6 +98,8 @@ class DuffingVecEnv(BatchVecEnv):
     Raises:
         ValueError: for an environment that was made otherwise.
     """
+
+    levels = Fixed("levels", "_n_levels")
 
     def __init__(
         self,
@@ -102,6 +129,7 @@ class DuffingVecEnv(BatchVecEnv):
         num_envs = int(made.num_envs)
         self.envs = made
         self.render_mode = None
+        self._n_levels = levels
         self._levels = np.linspace(-1.0, 1.0, levels, dtype=np.float32) if levels else None
         action_space = gym.spaces.Discrete(levels) if levels else made.single_action_space
         super().__init__(num_envs, made.single_observation_space, action_space)
@@ -117,12 +145,23 @@ class DuffingVecEnv(BatchVecEnv):
         return [seed] * self.num_envs
 
     def reset(self) -> VecEnvObs:
-        """Start an episode in every row."""
-        observations, _ = self.envs.reset(seed=self._seed_of_batch)
+        """Start an episode in every row.
+
+        Raises:
+            ValueError: for options of `set_options` that a reset does not take; nothing has changed then.
+        """
+        if len(self._options) != self.num_envs:
+            raise ValueError(
+                f"options must be a dict, or {self.num_envs} of them, one for each row, but are {len(self._options)}"
+            )
+        chosen = [checked_options(options, "truth").get("truth") for options in self._options]
+        options = None if all(truth is None for truth in chosen) else {"truth": chosen}
+        observations, infos = self.envs.reset(seed=self._seed_of_batch, options=options)
         self._seed_of_batch = None
+        self._reset_options()
         self._returns[:] = 0.0
         self._lengths[:] = 0
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self.reset_infos = rows_of(infos, self._told, self.num_envs)
         return observations
 
     @property
@@ -147,13 +186,15 @@ class DuffingVecEnv(BatchVecEnv):
         self._returns += rewards
         self._lengths += 1
         dones = terminated | truncated
-        rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        rows = rows_of(infos, self._told, self.num_envs, **{_TRUNCATED: False})
         if dones.any():
             elapsed = round(time.perf_counter() - self._started, 6)
             for row in np.flatnonzero(dones).tolist():
+                del rows[row][_TRUNCATED]
+                self.reset_infos[row] = rows[row]
                 rows[row] = told_of(infos["final_info"], row) | {
                     "terminal_observation": infos["final_obs"][row],
-                    "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
+                    _TRUNCATED: bool(truncated[row] and not terminated[row]),
                     "episode": {"r": float(self._returns[row]), "l": int(self._lengths[row]), "t": elapsed},
                 }
             self._returns[dones] = 0.0
@@ -164,21 +205,36 @@ class DuffingVecEnv(BatchVecEnv):
         """Close the environments."""
         self.envs.close()
 
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of every row asked for: its part of what the batch has for each row, or what all have alike."""
-        rows = self._rows(indices)
-        if attr_name == "belief":
+    def _attributes(self, name: str, rows: list[int]) -> list[Any]:
+        """Of what the batch has for each row, their parts."""
+        if name == "belief":
             return [self._batch.belief(row) for row in rows]
-        value = getattr(self.envs if hasattr(self.envs, attr_name) else self._batch, attr_name)
+        value = getattr(self.envs if hasattr(self.envs, name) else self._batch, name)
         if isinstance(value, Parameters):
             return [Parameters({name: numbers[row].item() for name, numbers in value.items()}) for row in rows]
         each = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
         return [value[row] if each else value for row in rows]
 
     @property
+    def _told(self) -> tuple[str, ...]:
+        """What is told of every step."""
+        return (*self._batch.single._reported, *self._batch.single._flags)
+
+    @property
     def _batch(self) -> DuffingVectorEnv:
         batch: DuffingVectorEnv = self.envs.unwrapped
         return batch
+
+
+def rows_of(infos: dict[str, Any], names: Sequence[str], rows: int, **others: Any) -> list[dict[str, Any]]:
+    """What a vector environment's infos tell of each row, as infos of single environments, and what all have alike."""
+    template = dict.fromkeys(names, 0.0) | {name: False for name in names if infos[name].dtype == np.bool_} | others
+    told = [template.copy() for _ in range(rows)]
+    for name in names:
+        if infos[name].any():  # flags seldom are
+            for row, value in zip(told, infos[name].tolist(), strict=True):
+                row[name] = value
+    return told
 
 
 def told_of(infos: dict[str, Any], row: int) -> dict[str, Any]:

@@ -33,9 +33,9 @@ COMPILED = (
     "tests/duffing_env/test_simulation.py",
     "tests/agents/test_design.py",
     "tests/agents/test_planner.py",
-    "tests/benchmarks/test_coverage.py",
-    "tests/benchmarks/test_roofline.py",
-    "tests/benchmarks/test_pieces.py",
+    "tests/research/benchmarks/test_coverage.py",
+    "tests/research/benchmarks/test_roofline.py",
+    "tests/research/benchmarks/test_pieces.py",
 )
 #: Networks, beside torch's.
 NETWORKS = (

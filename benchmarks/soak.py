@@ -22,7 +22,7 @@ import gymnasium as gym
 import numpy as np
 
 import duffing_env  # noqa: F401  registers the tracks
-from agents.cli import progress_bar, run_script
+from agents.cli import followed, run_script
 from duffing_env.silverbox import record_available
 from duffing_env.tracks import TRACKS
 from estimator import Channel, OnlineEstimator, Rig
@@ -73,9 +73,8 @@ def main(config: Config) -> None:
     if unknown:
         raise ValueError(f"runs must be of {names}, but are {sorted(unknown)}")
     found = {}
-    with progress_bar() as bar:
-        for name in bar.track(config.runs or names, description="runs"):
-            found[name] = filtered(name, config.steps) if name in FILTERS else soak(name, config.steps)
+    for name in followed((name, name) for name in config.runs or names):
+        found[name] = filtered(name, config.steps) if name in FILTERS else soak(name, config.steps)
     rows = [[name, *(f"{value:,}" for value in counts.values())] for name, counts in found.items()]
     heads = ("run", "samples", "episodes", "not finite", "out of bounds", "not a covariance", "growth / kB")
     show(table(heads, rows, markdown=True))

@@ -100,42 +100,54 @@ class Batch:
         self._call(RESET_NOW)
 
     def checked_truth(self, truth: Any) -> FloatArray:
-        """(size, quantities) what ``reset(options={"truth": ...})`` asks for, inside, for `choose`.
+        """(size, quantities) what ``reset(options={"truth": ...})`` asks for, inside, for `choose`: NaN what is drawn.
 
         Raises:
             ValueError: for what is no such truth, naming the parameter.
         """
+        if not isinstance(truth, list | tuple):
+            return self._checked(truth, "truth", self.size)
+        if len(truth) != self.size:
+            raise ValueError(f"truth must be one for all environments, or {self.size} of them, but is {len(truth)}")
+        chosen = np.full((self.size, len(self._truth)), np.nan)
+        for row, each in enumerate(truth):
+            if each is not None:
+                chosen[row] = self._checked(each, f"truth[{row}]", 1)[0]
+        return chosen
+
+    def _checked(self, truth: Any, called: str, size: int) -> FloatArray:
+        """(size, quantities) of one truth for so many environments."""
         experiment = self.experiment
         names, needed = list(self._truth), list(parameter_names(experiment.truth_model))
         if experiment.plant is None:
-            raise ValueError("truth cannot be chosen here: no plant is simulated; leave it out")
+            raise ValueError(f"{called} cannot be chosen here: no plant is simulated; leave it out")
         if not isinstance(truth, Mapping) or set(truth) not in (set(names), set(needed)):
             noises = f", or these and {names[len(needed) :]}" if len(names) > len(needed) else ""
-            raise ValueError(f"truth must give the parameters {needed}{noises}, but is {truth!r:.300}")
-        chosen = np.full((self.size, len(names)), np.nan)
+            raise ValueError(f"{called} must give the parameters {needed}{noises}, but is {truth!r:.300}")
+        chosen = np.full((size, len(names)), np.nan)
         for k, name in enumerate(names[: len(truth)]):
             value = truth[name]
             try:
                 chosen[:, k] = value
             except (TypeError, ValueError):
                 raise ValueError(
-                    f"truth[{name!r}] must be a number, or {self.size} of them, but is {value!r:.200}"
+                    f"{called}[{name!r}] must be a number, or {size} of them, but is {value!r:.200}"
                 ) from None
             if not np.isfinite(chosen[:, k]).all():
-                raise ValueError(f"truth[{name!r}] must be finite, but is {value!r:.200}")
+                raise ValueError(f"{called}[{name!r}] must be finite, but is {value!r:.200}")
             if (name == "m" or k >= len(needed)) and not (chosen[:, k] > 0).all():
-                raise ValueError(f"truth[{name!r}] must be positive, but is {value!r:.200}")
+                raise ValueError(f"{called}[{name!r}] must be positive, but is {value!r:.200}")
         return chosen / self._worth
 
     def choose(self, mask: npt.NDArray[np.bool_], truth: FloatArray) -> None:
         """Begin the episodes of ``mask``, which were just reset, once more: with these systems, and the same noise.
 
-        Standard deviations that ``truth`` has as NaN stay as they were drawn.
+        What ``truth`` has as NaN stays as it was drawn: all of a row, or its standard deviations.
         """
         setup, n = self._setup, len(parameter_names(self.experiment.truth_model))
         kept = [place for name, place in self._place.items() if name.startswith(("STREAM_", "JUMP_"))]
         noises = [self._place[row] for row in noise_rows(self.experiment.truth_model).values()]
-        for row in np.flatnonzero(mask).tolist():
+        for row in np.flatnonzero(mask & np.isfinite(truth[:, 0])).tolist():
             b, lane = divmod(row, LANES)
             drawn, stds = self._blocks[b, kept, lane], self._blocks[b, noises, lane]
             if np.isfinite(truth[row]).all() and truth.shape[1] > n:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import copy
+import sys
 from collections.abc import Callable
 from dataclasses import fields
 from functools import wraps
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
 
 from duffing_env.batch import Batch
 from duffing_env.experiment import Experiment
 from duffing_env.own import Own, bounds_of
-from estimator.checks import hint
+from estimator.checks import hint, shown
 from estimator.parameters import FloatArray
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -42,17 +45,89 @@ def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, An
     return options or {}
 
 
+class _Steps(int):
+    """Steps of an episode by the environment's own horizon, and not by a limit that somebody asked for."""
+
+
+class TrackSpec(EnvSpec):
+    """A specification that says after how many steps an episode ends, which wrappers ask for.
+
+    That number follows from the options, and an environment made from the specification may be given others. So it is
+    no limit: `gymnasium.make` and `make_vec`, which would cut a longer ``horizon`` short by it, find None, and JSON has
+    None. A limit that was asked for (``max_episode_steps=9``) stays one.
+    """
+
+    @property
+    def max_episode_steps(self) -> int | None:
+        """Steps of an episode at most."""
+        steps: int | None = self.__dict__["max_episode_steps"]
+        asking = sys._getframe(1)
+        makes = asking.f_globals.get("__name__") == EnvSpec.__module__ and asking.f_code.co_name in ("make", "make_vec")
+        return None if makes and isinstance(steps, _Steps) else steps
+
+    @max_episode_steps.setter
+    def max_episode_steps(self, steps: int | None) -> None:
+        self.__dict__["max_episode_steps"] = steps
+
+    def to_json(self) -> str:
+        """As `gymnasium.envs.registration.EnvSpec`, which reads it again."""
+        told = {field.name: getattr(self, field.name) for field in fields(EnvSpec) if field.init}
+        if isinstance(told["max_episode_steps"], _Steps):
+            told["max_episode_steps"] = None
+        return EnvSpec(**told).to_json()
+
+
+class Fixed:
+    """An attribute of an environment that can be read, but not set, because nothing would follow from it.
+
+    Args:
+        name: of the attribute, and of the argument that it was made with.
+        place: where it is read, from the environment on.
+    """
+
+    def __init__(self, name: str, place: str) -> None:
+        self._name, self._read = name, attrgetter(place)
+
+    def __get__(self, env: Any, kind: type | None = None) -> Any:
+        if env is None:
+            return self
+        return env.__dict__[self._name] if self._name in env.__dict__ else self._read(env)
+
+    def __set__(self, env: Any, value: Any) -> None:
+        if not hasattr(env, self._name):  # an option of other environments, which this one has not
+            env.__dict__[self._name] = value
+            return
+        raise AttributeError(
+            f"{self._name} cannot be set to {shown(value)} in an environment that is made already; make a new one with "
+            f"{self._name}=..., or choose the system of an episode with reset(options={{'truth': ...}})"
+        )
+
+
 class Specified:
     """What an environment, single or vector, tells of its experiment and beliefs, and its specification.
 
-    The specification tells Gymnasium's wrappers after how many steps an episode ends. That is no part of what is
-    registered, because Gymnasium would then cut a longer ``horizon`` short.
+    Its options are attributes that can be read. Whoever sets one, by `setattr`, ``set_wrapper_attr`` or ``set_attr``,
+    gets an AttributeError: an experiment is what it was made as.
+
+    The specification tells Gymnasium's wrappers after how many steps an episode ends (`TrackSpec`). That is no part of
+    what is registered, because Gymnasium would then cut a longer ``horizon`` short.
     """
 
     experiment: Experiment
     _batch: Batch
     _own: Own | None
     _spec: EnvSpec | None = None
+
+    def __init_subclass__(cls, **named: Any) -> None:
+        super().__init_subclass__(**named)
+        for name in (field.name for field in fields(cls._kind())):
+            if not hasattr(cls, name):
+                setattr(cls, name, Fixed(name, f"experiment.{name}"))
+
+    @classmethod
+    def _kind(cls) -> type[Experiment]:
+        """The experiments whose options are those of the environment."""
+        raise NotImplementedError
 
     @property
     def records(self) -> FloatArray:
@@ -69,14 +144,15 @@ class Specified:
         return self._batch if self._own is None else self._own
 
     @property
-    def max_input(self) -> float:
-        """Input of the action 1 [V]."""
-        return self.experiment.max_input
+    def shown(self) -> npt.NDArray[np.float32]:
+        """(environments, entries) the observations of the last reset or step; not a copy."""
+        return self._seen.observations
 
-    @property
-    def horizon(self) -> int:
-        """Samples of an episode that no limit ends."""
-        return self.experiment.samples
+    #: Input of the action 1 [V].
+    max_input: Any = Fixed("max_input", "experiment.max_input")
+
+    #: Samples of an episode that no limit ends.
+    horizon: Any = Fixed("horizon", "experiment.samples")
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -85,9 +161,16 @@ class Specified:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        if spec is not None and spec.max_episode_steps is None:
-            spec = copy.copy(spec)
-            spec.max_episode_steps = -(-self.experiment.samples // self.experiment.hold)
+        if spec is not None:
+            told = {field.name: getattr(spec, field.name) for field in fields(EnvSpec) if field.init}
+            # As JSON can hold it.
+            modes = {name: mode.value for name, mode in spec.kwargs.items() if isinstance(mode, AutoresetMode)}
+            told["kwargs"] = {**spec.kwargs, **modes}
+            if told["max_episode_steps"] is None or isinstance(told["max_episode_steps"], _Steps):
+                steps, limit = -(-self.experiment.samples // self.experiment.hold), spec.kwargs.get("max_episode_steps")
+                # A vector environment has the limit that was asked for among its options.
+                told["max_episode_steps"] = _Steps(min(steps, limit) if limit and limit > 0 else steps)
+            spec = TrackSpec(**told)
         self._spec = spec
 
 

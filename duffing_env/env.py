@@ -183,6 +183,10 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}  # noqa: RUF012
     experiment_kind: ClassVar[type[Experiment]] = SimulatedExperiment
 
+    @classmethod
+    def _kind(cls) -> type[Experiment]:
+        return cls.experiment_kind
+
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
         if render_mode is not None:
             one_of("render_mode", render_mode, self.metadata["render_modes"])
@@ -335,9 +339,11 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
 def _one_number(action: npt.ArrayLike) -> float:
     try:
         given = action if type(action) is np.ndarray else numbers("action", action)
-        value = float(given.item()) if given.size == 1 else math.nan
+        item = given.item() if given.size == 1 else math.nan
+        value = math.nan if isinstance(item, str | bytes) else float(item)  # float() reads text, too
     except (TypeError, ValueError, OverflowError):
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"action must be one finite number in [-1, 1], but is {shown(action)}")
+        remedy = "; pass action.detach()" if getattr(action, "requires_grad", False) else ""
+        raise ValueError(f"action must be one finite number in [-1, 1], but is {shown(action)}{remedy}")
     return min(max(value, -1.0), 1.0)

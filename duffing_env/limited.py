@@ -91,6 +91,16 @@ class DriftEnv(DuffingEnv):
     only what is known at the end is left over an episode; with ``terminated_return=0`` nothing is gained by ending it
     before the jump.
 
+    ## Policies
+
+    What they gain, on 128 systems of the branch ``test``. Training has the command, and more.
+
+    | policy | ``information_gain`` / nat |
+    |---|---|
+    | a script: wait for 390 samples, then `efe` | 14.37 |
+    | `ppo/drift` | 13.78 |
+    | `efe` from the start | 12.69 |
+
     ## Version history
 
     * v0: initial version

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from duffing_env.contract import Fixed
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import Experiment, SimulatedExperiment
 from duffing_env.rig_plant import ONE_PLANT, AnyRig, Plant, RigNumbers, RigPlantEnv, checked_rig
@@ -195,6 +196,9 @@ class RigEnv(DuffingEnv):
     """
 
     experiment_kind: ClassVar[type[Experiment]] = RigExperiment
+
+    plant = Fixed("plant", "_plant")
+    _plant: ClassVar[None] = None
 
     def __new__(cls, plant: Plant | None = None, **options: Any) -> Any:
         """Itself; or, around a plant, a `RigPlantEnv`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 from estimator.models.pendulum import STEP
@@ -83,9 +82,9 @@ def register_tracks() -> None:
     """Register every track with Gymnasium; what is registered already is left as it is."""
     from gymnasium.envs.registration import register, registry
 
-    # To Gymnasium a higher version is a newer one. Here v0 is the paper's equation, and v1 the differential equation.
-    warnings.filterwarnings("ignore", r".*duffing_env/\w+-v0 is out of date", DeprecationWarning)
-
     for track_id, spec in TRACKS.items():
         if track_id not in registry:
             register(track_id, **spec)
+            # To Gymnasium a higher version of a name is a newer one, and it calls the others out of date. Here v0 is
+            # the paper's equation and v1 the differential equation, so the version is a part of the name.
+            registry[track_id].name = track_id.removeprefix("duffing_env/")

@@ -16,7 +16,15 @@ from gymnasium.vector.utils import batch_space
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.continuous import ContinuousEnv
-from duffing_env.contract import Specified, action_space, checked_options, in_turn, make_experiment, observation_space
+from duffing_env.contract import (
+    Fixed,
+    Specified,
+    action_space,
+    checked_options,
+    in_turn,
+    make_experiment,
+    observation_space,
+)
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import MOST_SAMPLES, Experiment
 from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
@@ -82,6 +90,18 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
     single: ClassVar[type[DuffingEnv]] = DuffingEnv
 
+    num_envs = Fixed("num_envs", "_num_envs")
+    max_episode_steps = Fixed("max_episode_steps", "_max_episode_steps")
+    autoreset_mode = Fixed("autoreset_mode", "_autoreset_mode")
+    copy = Fixed("copy", "_copy")
+    threads = Fixed("threads", "_threads")
+    render_mode = Fixed("render_mode", "_render_mode")
+    _render_mode: ClassVar[None] = None
+
+    @classmethod
+    def _kind(cls) -> type[Experiment]:
+        return cls.single.experiment_kind
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -105,9 +125,8 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         except ValueError:
             modes = [mode.value for mode in AutoresetMode]
             raise ValueError(f"autoreset_mode must be one of {modes}, but is {autoreset_mode!r}") from None
-        self.num_envs = int(num_envs)
+        self._num_envs, self._threads, self._max_episode_steps = int(num_envs), int(threads), limit
         self.metadata = {**type(self).metadata, "autoreset_mode": self._autoreset_mode}
-        self.render_mode = None
         self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
         self.single_observation_space = observation_space(self.experiment)
         each, seen = len(self.experiment.setup.hypotheses), int(np.prod(self.single_observation_space.shape))
@@ -122,7 +141,7 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         reset_mode = _RESET_MODES[self._autoreset_mode]
         hold = self.experiment.hold
         cut = math.inf if limit is None else float(limit * hold)
-        self._batch = Batch(self.experiment, self.num_envs, reset_mode, int(threads), hold, cut)
+        self._batch = Batch(self.experiment, self.num_envs, reset_mode, self._threads, hold, cut)
         self._own = Own.of(self._batch)
         self._copy = copy
         self._turn = [None]
@@ -130,11 +149,6 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         self._finished: Flags = np.ones(self.num_envs, dtype=np.bool_)
         self._everywhere: Flags = np.ones(self.num_envs, dtype=np.bool_)
         self._any_due = True
-
-    @property
-    def autoreset_mode(self) -> AutoresetMode:
-        """When a finished row starts its next episode."""
-        return self._autoreset_mode
 
     @property
     def truth(self) -> Parameters:
@@ -161,7 +175,8 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
             seed: of the batch, from which `spawn_seeds` makes the rows'; or one seed for each row. The random numbers
                 of rows that get none go on; at first they come from the operating system.
             options: may hold ``reset_mask``, and ``truth``, systems of choice for this episode of the rows: as of the
-                single environment, each entry a number or (num_envs,) numbers.
+                single environment, each entry a number or (num_envs,) numbers; or a list of num_envs of them, one for
+                each row, with None for a row whose system is drawn.
 
         Raises:
             ValueError: for another option, a mask or a truth that is not one, or another number of seeds.

@@ -16,7 +16,7 @@ from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
-from estimator.units import VOLTS, Scales
+from estimator.units import SIZES, VOLTS, Scales
 
 
 @cache
@@ -45,12 +45,21 @@ def check_record(what: str, model: Model, record: FloatArray, rounding: float) -
         rounding: what may be left below zero of a covariance's eigenvalues, in units of its standard deviations.
 
     Raises:
-        ValueError: for numbers that are not finite, a shape or rate that is not positive, or a covariance that is not
-            positive semi-definite.
+        ValueError: for numbers that are not finite, or beyond 1e30 (of the covariance, shapes and rates: 1e60), whose
+            products overflow; a shape or rate that is not positive; or a covariance that is not positive
+            semi-definite.
     """
     if not np.isfinite(record).all():
         bad = belief_names(model)[int(np.argmin(np.isfinite(record)))]
         raise ValueError(f"{what} must be finite, but {bad} is not; replace it")
+    d = len(model.names)
+    most = np.where(np.arange(len(record)) < d, SIZES[1], SIZES[1] ** 2)
+    if (beyond := np.abs(record) > most).any():
+        place = int(np.argmax(beyond))
+        raise ValueError(
+            f"{what} must be within ±{most[place]:g}, but {belief_names(model)[place]} is {record[place]:g}; give "
+            "numbers near 1, by scales that fit"
+        )
     noises = record[-2 - 2 * model.n_outputs :]
     if (noises <= 0).any():
         raise ValueError(f"{what} must have positive shapes and rates of the noises, but has {noises.tolist()}")

@@ -109,9 +109,18 @@ def numbers(name: str, values: npt.ArrayLike) -> FloatArray:
     try:
         if np.iscomplexobj(values):
             raise TypeError("they are complex")
+        if _has_text(values):  # which NumPy reads as numbers
+            raise TypeError("text is no number; convert it")
         return np.array(values, dtype=np.float64, order="C")
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # torch's, of a tensor with a gradient
         raise ValueError(f"{name} must be numbers, but is {shown(values)}; {error}") from error
+
+
+def _has_text(values: object) -> bool:
+    """Whether there is text among values, nested or not."""
+    if isinstance(values, np.ndarray):
+        return values.dtype.kind in "US" or (values.dtype.kind == "O" and any(map(_has_text, values.flat)))
+    return isinstance(values, str | bytes) or (isinstance(values, list | tuple) and any(map(_has_text, values)))
 
 
 def printable(text: str, kept: str = "") -> str:

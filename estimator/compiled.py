@@ -23,19 +23,9 @@ from typing import Any
 
 import numba
 from llvmlite import binding
-from numba.core import event
-from numba.core.caching import _Cache
-from numba.core.compiler import CompileResult
-from numba.core.runtime import rtsys
-from numba.core.serialize import dumps
 
 from estimator.files import write_atomically
-
-# Numba's objects live as long as the process, and are so many that Python's garbage collector takes longer to look
-# through them, several times where the process ends, than many a script to run. Where there is little else yet, as
-# where a script begins, they are taken out of its sight. Elsewhere that would keep alive what others have done with.
-if len(gc.get_objects()) < 80_000:
-    gc.freeze()
+from estimator.numba_internals import CompileResult, _Cache, dumps, event, rtsys
 
 
 @cache
@@ -85,16 +75,24 @@ class Compilation(event.Listener):
 
     What takes longer than `PATIENCE` says on stderr that it compiles, once in a process. Python's garbage collector
     rests meanwhile: it looks through all that Numba builds, again and again, and finds nothing.
+
+    Args:
+        now: the time [s].
+        timer: makes what calls a function after so many seconds.
     """
 
     #: Seconds that the process may spend compiling before it says so.
     PATIENCE = 2.0
 
-    def __init__(self) -> None:
+    def __init__(
+        self, now: Callable[[], float] = time.perf_counter, timer: Callable[..., Any] = threading.Timer
+    ) -> None:
+        self._now, self._make_timer = now, timer
         self._depth = 0  # a function that others call is compiled while they are
         self._spent = 0.0
-        self._began = 0.0
-        self._timer: threading.Timer | None = None
+        self._began: float | None = None
+        self._said = False
+        self._timer: Any = None
         self._collects = False
 
     def on_start(self, event: Any) -> None:
@@ -107,31 +105,30 @@ class Compilation(event.Listener):
             return
         self._collects = gc.isenabled()
         gc.disable()
-        self._began = time.perf_counter()
-        if self._spent < self.PATIENCE:
-            self._timer = threading.Timer(self.PATIENCE - self._spent, self._say, [dispatcher.py_func])
+        self._began = self._now()
+        if not self._said:
+            rest = max(0.0, self.PATIENCE - self._spent)
+            self._timer = self._make_timer(rest, self._say, [dispatcher.py_func])
             self._timer.daemon = True
             self._timer.start()
 
     def on_end(self, event: Any) -> None:
         """A function is compiled, or cannot be."""
         self._depth = max(0, self._depth - 1)
-        if self._depth > 0 or self._began == 0.0:
+        if self._depth > 0 or self._began is None:
             return
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._spent += time.perf_counter() - self._began
-        self._began = 0.0
+        self._spent += self._now() - self._began
+        self._began = None
         if self._collects:
             gc.enable()
 
     def _say(self, function: Callable[..., Any]) -> None:
-        self._spent = self.PATIENCE
-        place = folder()
-        kept = "again in every process, because no folder can be written" if place is None else f"once, into {place}"
-        what = f"{function.__module__}.{function.__name__}"
-        said = f"duffing-env is compiling {what} and what else it needs, which takes seconds to minutes ({kept})"
+        self._said = True
+        kept = "in every process" if folder() is None else "once"
+        said = f"duffing-env is compiling {function.__name__:.17}: seconds to minutes, {kept}"
         print(said, file=sys.stderr, flush=True)
 
 

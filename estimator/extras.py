@@ -7,6 +7,7 @@ from importlib.util import find_spec
 #: Name that a package is imported by, to the extra that brings it.
 EXTRAS = {
     "h5py": "datasets",
+    "highspy": "oracle",
     "matplotlib": "report",
     "minari": "datasets",
     "optuna": "tune",

@@ -7,7 +7,7 @@ import os
 import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from estimator.checks import shown
@@ -116,6 +116,54 @@ def append_atomically(path: Path, text: str) -> None:
             raise
         finally:
             os.close(place)
+
+
+def hold(name: str, folder: Path) -> int | None:
+    """Hold a folder against every other that asks for it so, until the descriptor that is returned is closed.
+
+    The kernel lets go of it where the process is killed. None where the system or the disk has no such locks.
+
+    Args:
+        name: of the argument that the folder is, in the message.
+        folder: must be there.
+
+    Raises:
+        ValueError: where it is held already.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    is_free = True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Whoever had it before may have removed it.
+        is_free = os.path.samestat(os.fstat(descriptor), os.stat(folder))
+    except (BlockingIOError, FileNotFoundError):
+        is_free = False
+    except OSError:  # such as of a network's disk
+        os.close(descriptor)
+        return None
+    if not is_free:
+        os.close(descriptor)
+        raise ValueError(
+            f"{name} must be a folder that nobody else writes to, but another process does to {folder}; wait for its "
+            "end, or name another"
+        )
+    return descriptor
+
+
+@contextmanager
+def held(name: str, folder: Path) -> Iterator[None]:
+    """`hold` a folder meanwhile."""
+    descriptor = hold(name, folder)
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            with suppress(OSError):
+                os.close(descriptor)
 
 
 def file_name(name: str, value: object) -> Path:

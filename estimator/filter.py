@@ -20,6 +20,7 @@ from estimator.parameters import FloatArray
 from estimator.rig import Rig
 from estimator.rig_prior import balance
 from estimator.settings import Settings
+from estimator.units import SIZES
 
 #: Shape of a Gamma belief that further samples do not move.
 _CERTAIN = 1e15
@@ -285,4 +286,8 @@ def _checked(name: str, value: npt.ArrayLike, own: FloatArray) -> FloatArray:
         raise ValueError(f"{name} must be finite, but is {array.tolist()}; use arrays() of an estimator")
     if name == "outputs" and np.isinf(array).any():
         raise ValueError(f"outputs must be finite or missing, but are {array.tolist()}; use arrays() of an estimator")
+    # Of beliefs `check_record` says what is too large.
+    if name not in ("records", "first") and (np.abs(array) > (most := SIZES[1] ** (1 + (name == "walk")))).any():
+        worst = array.flat[np.nanargmax(np.abs(array))]
+        raise ValueError(f"{name} must be within ±{most:g}, but has {worst:g}; use arrays() of an estimator")
     return array

@@ -17,6 +17,7 @@ from estimator.models.difference import difference
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.priors import recorded_prior, silverbox_prior
+from estimator.progress import progress as shown
 from estimator.rig import Channel, Rig
 from estimator.rig_prior import rig_prior
 from estimator.settings import Settings, settled
@@ -195,7 +196,7 @@ class OnlineEstimator:
         Args:
             u: (T,) inputs.
             y: (T,) outputs, paired with u by index; (T, sensors) where there are several.
-            progress: show a progress bar.
+            progress: tell on stderr how far it is, where it takes more than 5 seconds.
             missing: outputs that are NaN are missing: the state moves on, nothing is learned from them.
 
         Returns:
@@ -315,14 +316,14 @@ class OnlineEstimator:
         return (told[:, 0] if self.model.n_outputs == 1 else told) * np.array(scales)
 
     def _chunks(self, samples: int, progress: bool) -> Iterator[tuple[int, int]]:
-        """Ranges that cover all samples; one range without progress, else many with a bar that counts them."""
+        """Ranges that cover all samples; one range without progress, else many, which are told."""
         if not progress or self._filter.feed.at_once:
             yield 0, samples
             return
-        from rich.progress import track
-
-        for start in track(range(0, samples, _SAMPLES_BETWEEN_REPORTS), description="Identifying"):
-            yield start, min(start + _SAMPLES_BETWEEN_REPORTS, samples)
+        with shown("Identifying") as tell:
+            for start in range(0, samples, _SAMPLES_BETWEEN_REPORTS):
+                tell(start / samples)
+                yield start, min(start + _SAMPLES_BETWEEN_REPORTS, samples)
 
 
 def _overflowed(place: int, u: float, y: object) -> str:

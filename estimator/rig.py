@@ -75,7 +75,8 @@ class Channel:
         for name in ("limit", "range", "noise", "lag"):
             value = getattr(self, name)
             if value is not None:
-                number(name, value, *SIZES, "leave it out where it is not known")
+                of = {"limit": " of an input", "range": " of an output"}.get(name, "")
+                number(f"{name}{of}", value, *SIZES, "leave it out where it is not known")
         one_of("kind", self.kind, KINDS)
         number("offset", self.offset, -SIZES[1], SIZES[1], "0 where nothing is known")
         if self.column is not None:
@@ -126,21 +127,22 @@ class Rig:
         number("step", self.step, *SIZES, "give the seconds between samples")
         one_of("interpolation", self.interpolation, INTERPOLATIONS)
         least = -1 if self.interpolation == "zero_order" else 0
-        if isinstance(self.delay, float) and self.delay != int(min(max(self.delay, -9), 9e9)):
+        if isinstance(self.delay, float) and not self.delay.is_integer():
             number(f"delay (for {self.interpolation})", self.delay, -0.999, LONGEST_DELAY)
             one_of("interpolation (for a delay in parts of a sample)", self.interpolation, PARTS)
         else:
             whole(f"delay (for {self.interpolation})", self.delay, LONGEST_DELAY, least)
         for name, other in (("input", "range"), ("output", "limit")):
             channel = getattr(self, name)
+            right = "limit" if other == "range" else "range"
+            given = channel.get(other) if isinstance(channel, Mapping) else getattr(channel, other, None)
+            if given is not None:
+                raise ValueError(f"{name} must have no {other}, but has {shown(given)}; use {right}")
             if isinstance(channel, Mapping):
                 channel = _built(Channel, channel, name)
                 object.__setattr__(self, name, channel)
             if not isinstance(channel, Channel):
                 raise ValueError(f"{name} must be a Channel, but is {channel!r:.60}; use Channel('N', limit=20)")
-            if getattr(channel, other) is not None:
-                right = "limit" if other == "range" else "range"
-                raise ValueError(f"{name} must have no {other}, but has {getattr(channel, other)}; use {right}")
         if self.output.lag is not None:
             raise ValueError(f"output must have no lag, but has {self.output.lag}; a lag is of the input")
         if self.input.lag is not None:
@@ -323,4 +325,10 @@ def _built(kind: Any, described: object, where: str) -> Any:
             raise ValueError(f"{where} must have keys of {known}, but has {key!r:.60}{hint(key, known)}")
     if kind is Rig and "step" not in described:
         raise ValueError("rig must have a step, but has none; give the seconds between samples")
-    return kind(**described)
+    if kind is Rig:
+        return kind(**described)
+    try:
+        return kind(**described)
+    except ValueError as error:  # which begins with the name of a key
+        key, _, rest = str(error).partition(" ")
+        raise ValueError(f"{where}.{key} {rest.removeprefix(f'of an {where} ')}") from error

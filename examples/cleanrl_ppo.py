@@ -3,7 +3,10 @@
 $ python examples/cleanrl_ppo.py --seed 0
 $ duffing-env evaluate --protocol Short-v0 --policies "mine=runs/cleanrl-ppo-short-v0-*" --submit mine
 
-Ours are the environment, by its id, and the policy folder at the end. Needs the extra ``train``.
+Ours are the environment, by its id, and the policy folder at the end. Needs the extra ``train``, and Gymnasium 1.4. In
+earlier versions the wrappers `RecordEpisodeStatistics` and `NormalizeReward` leave out the first step after every end
+where environments are reset in the same step, as here (Gymnasium #1017, #1451): printed returns and the scale of
+rewards are then a little off.
 """
 
 import sys
@@ -163,7 +166,7 @@ def main(args: Args) -> Path:
     shape = (args.num_steps, args.num_envs)
     obs, acted = torch.zeros((*shape, features)), torch.zeros((*shape, actions))
     logprobs, rewards, dones, values = (torch.zeros(shape) for _ in range(4))
-    begun, iterations = time.time(), args.total_timesteps // (args.num_steps * args.num_envs)
+    begun, iterations = time.perf_counter(), args.total_timesteps // (args.num_steps * args.num_envs)
     if iterations == 0:
         least = args.num_steps * args.num_envs
         raise ValueError(
@@ -184,7 +187,7 @@ def main(args: Args) -> Path:
             advantages = advantages_of(args, rewards, values, dones, agent.get_value(next_obs))
         update(args, agent, optimizer, tuple(x.flatten(0, 1) for x in (obs, acted, logprobs, advantages, values)))
         steps = (iteration + 1) * args.num_steps * args.num_envs
-        rate, mean = steps / (time.time() - begun), np.mean(episodes.return_queue)
+        rate, mean = steps / (time.perf_counter() - begun), np.mean(episodes.return_queue)
         print(f"{steps:9,} samples, {rate:,.0f}/s, return {mean:.2f}", flush=True)
 
     card = {

@@ -38,6 +38,16 @@ def record() -> SilverboxRecord:
     return load_record()
 
 
+@pytest.fixture
+def jumping_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runs of this process, and their simulated plants, share a clock that jumps: none waits, and none is late."""
+    from agents.running.clock import JumpingClock
+
+    clock = JumpingClock()
+    for module in ("run", "simulated"):
+        monkeypatch.setattr(f"agents.running.{module}.RealClock", lambda: clock)
+
+
 @pytest.fixture(autouse=True)
 def modules_of_the_test(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Forget the modules that a test wrote and imported: another test may give its own the same name."""
@@ -49,6 +59,19 @@ def modules_of_the_test(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
             del sys.modules[name]
 
 
+@pytest.fixture(autouse=True)
+def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether work takes longer than `estimator.progress.EVERY` is for the machine to say."""
+    monkeypatch.setattr("estimator.progress.EVERY", float("inf"))
+
+
+#: Files whose kernels others compile, which begin when these are done.
+_LATE = ("test_rig_plant.py", "test_cli.py", "test_saving.py", "test_identification.py")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with a folder whose first files share no kernel, so that two processes do not compile the same at once."""
-    items.sort(key=lambda item: item.path.parent.name != "duffing_env")
+    """Let two processes that run at once not compile the same kernels.
+
+    The first folder is one whose first files share none.
+    """
+    items.sort(key=lambda item: (item.path.name in _LATE, item.path.parent.name != "duffing_env"))

@@ -7,17 +7,21 @@ import sys
 from pathlib import Path
 
 import pytest
+from tables import table
 
 ROOT = Path(__file__).parents[1]
 WITH_EXAMPLES = ["README.md"]
 WITH_EXAMPLES += [f"docs/{name}.md" for name in ("estimators", "own_data", "own_model", "quickstart", "running")]
 WITH_EXAMPLES += ["docs/extending.md", "docs/rig_electronic_duffing.md", "docs/rig_beam.md"]
-MODULES = [
-    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+#: Package to its modules with examples.
+MODULES = {
+    package: [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for path in sorted((ROOT / package).rglob("*.py"))
+        if re.search(r"^ +>>> ", path.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
     for package in ("agents", "benchmarks", "duffing_env", "estimator")
-    for path in sorted((ROOT / package).rglob("*.py"))
-    if re.search(r"^ +>>> ", path.read_text(encoding="utf-8"), re.MULTILINE)
-]
+}
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -87,7 +91,7 @@ def test_commands_answer_as_shown(document, desk, monkeypatch, capsys):
         assert NearEnough().check_output(answer, told, 0), f"{command}: {told}"
 
 
-@pytest.mark.parametrize(("want", "got", "near"), [
+@table(("want", "got", "near"), [
     ("m = 0.40001 kg, 90 % in [0.39, 0.41]", "m = 0.40012 kg, 90 % in [0.39, 0.41]", True),
     ("  m    0.4   0.39 to 0.41    kg", "m 0.4   0.39 to 0.41 kg  ", True),
     ("m = 0.4 kg", "m = 0.42 kg", False),
@@ -111,15 +115,17 @@ def test_every_check_is_explained():
     assert set(explained) == names
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_examples_of_the_docstrings_run(module, tmp_path, monkeypatch):
+@pytest.mark.parametrize("package", MODULES)
+def test_examples_of_the_docstrings_run(package, subtests, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    failures, examples = doctest.testmod(importlib.import_module(module))
-    assert examples > 0
-    assert failures == 0
+    for module in MODULES[package]:
+        with subtests.test(module):
+            failures, examples = doctest.testmod(importlib.import_module(module))
+            assert examples > 0
+            assert failures == 0
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@table("document", DOCUMENTS)
 def test_links_lead_somewhere(document):
     for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
         if "://" not in target:

@@ -14,7 +14,7 @@ SCRIPTS = ("train", "evaluate", "reproduce")
 
 def modules():
     """Name of every module to its file."""
-    paths = [path for floor in FLOORS for path in (ROOT / floor).rglob("*.py")]
+    paths = [path for floor in FLOORS for path in (ROOT / floor).rglob("*.py") if path.parent.name != "__pycache__"]
     paths += [ROOT / f"{name}.py" for name in SCRIPTS]
     names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
     return {name.removesuffix(".__init__"): path for name, path in zip(names, paths, strict=True)}

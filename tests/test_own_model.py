@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from reference.plants import VAN_DER_POL
 from scipy import stats
 from stable_baselines3.common.env_checker import check_env as check_sb3
 
@@ -11,20 +12,10 @@ import duffing_env  # noqa: F401 - registers the tracks
 from agents.policies import make_policy
 from duffing_env.batch import spawn_seeds
 from duffing_env.model_env import ModelEnv, ModelVectorEnv
-from estimator.models.model import Model
 
-VAN_DER_POL = Model(
-    name="van_der_pol",
-    states={"x": "V", "v": "V"},
-    coefficients={"stiffness": "1", "friction": "1", "gain": "1"},
-    rates=("v", "gain*u - stiffness*x + friction*(1 - x**2)*v"),
-    noise=("0", "sqrt(3)"),
-    outputs={"y": "x"},
-    substeps=4,
-)
 OPTIONS = {
     "system": VAN_DER_POL,
-    "mean": {"stiffness": 0.4, "friction": 0.2, "gain": 0.3},
+    "mean": {"excitation": 0.2, "stiffness": 0.4, "gain": 0.3},
     "spread": 0.2,
     "process_noise": 2e-3,
     "measurement_noise": 2e-3,

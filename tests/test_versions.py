@@ -5,10 +5,16 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from tables import table
+
+from estimator.extras import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -49,17 +55,17 @@ def test_versions_agree():
     assert SETTINGS["tool"]["mypy"]["python_version"] == VERSIONS[0]
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/index.md"])
+@table("document", ["README.md", "docs/index.md"])
 def test_documents_say_which(document):
     assert f"Python {VERSIONS[0]} to {VERSIONS[-1]} and make" in (ROOT / document).read_text()
 
 
-@pytest.mark.parametrize("target", ["demo", "test", "docs", "lint", "clean"])
+@table("target", ["demo", "test", "docs", "lint", "clean"])
 def test_make_says_which_first(project, target):
     assert make(project, "-n", target, f"PYTHON={python(project, VERSIONS[0])}").stdout.startswith(f"{WORKS}.\n")
 
 
-@pytest.mark.parametrize("version", [f"3.{minor(VERSIONS[0]) - 1}", f"3.{minor(VERSIONS[-1]) + 1}", "2.7"])
+@table("version", [f"3.{minor(VERSIONS[0]) - 1}", f"3.{minor(VERSIONS[-1]) + 1}", "2.7"])
 def test_make_refuses_others(project, version):
     done = make(project, "test", f"PYTHON={python(project, version)}")
     assert done.returncode
@@ -74,7 +80,7 @@ def test_make_says_that_python_is_missing(project):
     assert f"{WORKS}; no-such-python is not to be found" in done.stderr
 
 
-@pytest.mark.parametrize("version", VERSIONS)
+@table("version", VERSIONS)
 def test_make_takes_each(project, version):
     done = make(project, "-n", "test", f"PYTHON={python(project, version)}")
     assert done.returncode == 0
@@ -115,3 +121,38 @@ def test_lock_check_finds_what_is_missing():
 def test_the_citation_has_the_version_of_the_package():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+# --- Packages
+
+
+NUMBA = next(Requirement(line) for line in SETTINGS["project"]["dependencies"] if line.startswith("numba"))
+
+
+def test_numba_is_one_whose_insides_are_known():
+    installed = version("numba")
+    assert NUMBA.specifier.contains(installed, prereleases=True), (
+        f"Numba {installed} is installed, and its insides are known with {NUMBA.specifier} only: see whether all tests "
+        "pass with it, then raise the bound in pyproject.toml and in estimator/numba_internals.py"
+    )
+
+
+@pytest.mark.parametrize("package", ["estimator.online", "estimator.straight", "duffing_env.kernel"])
+def test_another_numba_is_refused_by_name(package):
+    (newest,) = (bound.version for bound in NUMBA.specifier if bound.operator == "<")
+    (oldest,) = (bound.version for bound in NUMBA.specifier if bound.operator == ">=")
+
+    def said(number):
+        code = f"import numba; numba.__version__ = {number!r}; import {package}"
+        return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT).stderr
+
+    message = said(f"{newest}.0rc1").splitlines()[-1]
+    assert message.startswith(f"ImportError: numba must be at least {oldest} and below {newest}, ")
+    assert message.endswith(f"but is {newest}.0rc1; get one with: pip install 'numba>={oldest},<{newest}'")
+    assert said(f"{oldest}.0") == said(f"0.{minor(newest) - 1}.9") == ""
+
+
+def test_extras_are_those_that_are_named_where_a_package_is_missing():
+    for package, extra in EXTRAS.items():
+        lines = SETTINGS["project"]["optional-dependencies"][extra]
+        assert any(line.startswith(package.replace("_", "-")) for line in lines), package

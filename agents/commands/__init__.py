@@ -12,7 +12,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from agents.cli import told_in_one_line
+from agents.cli import parsed, told_in_one_line
 from agents.commands.design import Design
 from agents.commands.evaluate import Evaluate
 from agents.commands.export import Export
@@ -71,7 +71,7 @@ def main(words: list[str] | None = None) -> None:
         config = (tyro.conf.FlagCreatePairsOff,)
         if name in COMMANDS:
             about = _RIG if name == "rig" else None
-            tyro.cli(COMMANDS[name], prog=f"{NAME} {name}", description=about, args=rest, config=config).run()
+            parsed(COMMANDS[name], prog=f"{NAME} {name}", description=about, args=rest, config=config).run()
         else:
             about = "Identify an oscillator; choose the input that tells most. Each command has its own --help."
-            tyro.cli(_listed(), prog=NAME, description=about, args=words, config=config)
+            parsed(_listed(), prog=NAME, description=about, args=words, config=config)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +14,7 @@ class Design:
     """Design the next experiment: a signal within the rig's limits, and the intervals to be expected after it.
 
     $ duffing-env design rig.toml
-    $ duffing-env design rig.toml posterior.npz --policy efe --samples 256 -o next.csv --figure next.png
+    $ duffing-env design rig.toml posterior.npz -o next.csv --figure next.png
     $ duffing-env design rig.toml posterior.npz --policy prbs -o next.csv
     """
 
@@ -24,7 +23,7 @@ class Design:
     posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[POSTERIOR]")] = None
     """What is known: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
     policy: str = "efe"
-    """The planner, a signal, or a policy that ships, such as ppo/universal."""
+    """The planner, a signal, lookahead, or a policy that ships."""
     samples: int = 256
     """Of the experiment."""
     bound: float = 0.05
@@ -41,9 +40,10 @@ class Design:
     def run(self) -> None:
         """Design, print what is to be expected, and write the signal."""
         from agents.cli import check_new, check_outputs
-        from agents.results import spinner
+        from agents.results import say
         from agents.running.experiment import design
         from estimator.extras import need
+        from estimator.progress import progress
         from estimator.saving import load_estimator
 
         check_outputs({"output": self.output, "figure": self.figure}, [self.rig, *filter(None, [self.posterior])])
@@ -54,28 +54,28 @@ class Design:
             if self.figure.suffix.lower() != ".png":
                 raise ValueError(f"figure must be a PNG file, but is {self.figure}; let its name end in .png")
         prior = None if self.posterior is None else load_estimator(self.posterior).belief
-        with spinner(f"Designing {self.samples} samples by {self.policy}"):
-            found = design(self.rig, prior, self.policy, self.samples, self.bound, self.seed)
-        # What is printed needs no file, and is told first; a pipe that closes early must not cost the files.
+        with progress("Designing") as tell:
+            found = design(self.rig, prior, self.policy, self.samples, self.bound, self.seed, tell)
+        # What is printed needs no file, and comes also where none can be written.
         try:
-            show(found)
-        finally:
             if self.output is not None:
                 found.write(self.output)
             if self.figure is not None:
                 from agents.evaluation.figures import figure_of_experiment, save
 
                 save(figure_of_experiment(found), self.figure)
+        finally:
+            show(found)
         if self.output is not None:
-            print(f"The signal is {self.output}")
+            say(f"The signal is {self.output}")
         if self.figure is not None:
-            print(f"The picture is {self.figure}")
+            say(f"The picture is {self.figure}")
 
 
 def show(found: Any) -> None:
     """Print the intervals before and after, and how safe the signal is."""
     from agents.results import show as print_all
-    from agents.results import table
+    from agents.results import table, warn
     from agents.running.experiment import too_slow
     from estimator.identification.checks import SLOWEST
     from estimator.units import digits_of
@@ -101,6 +101,6 @@ def show(found: Any) -> None:
     )
     if len(set(found.u.tolist())) == 1 and found.share > 0:
         said = f"every input is the same: {found.policy} holds its values for longer than {len(found.u)} samples here"
-        print(f"duffing-env: warning: {said}; choose another signal, or more samples", file=sys.stderr)
+        warn(f"{said}; choose another signal, or more samples")
     if found.samples_in_period < SLOWEST:
-        print(f"duffing-env: warning: {too_slow(found.rig.step, found.samples_in_period)}", file=sys.stderr)
+        warn(too_slow(found.rig.step, found.samples_in_period))

@@ -88,18 +88,23 @@ class Evaluate:
     def _measure(self, protocol: str) -> None:
         from agents.evaluation.board import CAPTION, TITLES, append, cells, check
         from agents.evaluation.protocol import measure
-        from agents.results import show, spinner, table
+        from agents.results import say, show, table
+        from estimator.progress import progress
 
         (policy,) = self.policies
         track = full_id(protocol)
         self._check_protocol(track)
         before = set() if self.submit is None else check(self.board, self.submit)
-        with spinner("Measuring") as say:
+        with progress("Measuring") as tell:
             name = policy.partition("=")[0] if self.submit is None else self.submit
-            entry = measure(policy, track, name, self.samples, say)
-        show(track, table(TITLES, [cells(entry)]), CAPTION, width=136)
+            entry = measure(policy, track, name, self.samples, tell)
+        # What is printed needs no file, and comes also where none can be written.
+        try:
+            if self.submit is not None:
+                append(self.board, entry)
+        finally:
+            show(track, table(TITLES, [cells(entry)]), CAPTION)
         if self.submit is not None:
-            append(self.board, entry)
-            print(f"{self.submit} is on the board {self.board}: duffing-env report")
+            say(f"{self.submit} is on the board {self.board}: duffing-env report")
             if track in before:
-                print(f"The board had {self.submit} on {track} before; the report shows the latest entry of a name.")
+                say(f"The board had {self.submit} on {track} before; the report shows the latest entry of a name.")

@@ -40,6 +40,7 @@ class Export:
 
         from agents.cli import check_new
         from agents.policies.export import export_signal
+        from agents.results import say
         from estimator.parameters import SAMPLING_STEP
 
         check_new("output", self.output, self.force)
@@ -47,4 +48,4 @@ class Export:
         volts = export_signal(self.name, self.output, **limits)
         peak, rms = np.abs(volts).max(), np.sqrt(np.mean(volts**2))
         seconds = volts.size * SAMPLING_STEP
-        print(f"{self.output}: {volts.size} samples, {seconds:.4g} s, peak {peak:.4g} V, RMS {rms:.4g} V")
+        say(f"{self.output}: {volts.size} samples, {seconds:.4g} s, peak {peak:.4g} V, RMS {rms:.4g} V")

@@ -41,6 +41,7 @@ class Identify:
     def run(self) -> None:
         """Identify, print, and write the page."""
         from agents.cli import check_outputs
+        from agents.results import say
         from estimator import identify
 
         if Path(self.rig).suffix.lower() in (".csv", ".mat"):
@@ -50,22 +51,22 @@ class Identify:
         if not self.data:
             raise ValueError("data must name at least one CSV or MAT file; add it after the rig file")
         check_outputs({"save": self.save, "report": self.report}, [self.rig, *self.data])
-        result = identify(self.rig, list(self.data), progress=sys.stderr.isatty())
-        # What is printed needs no file, and is told first; a pipe that closes early must not cost the files.
+        result = identify(self.rig, list(self.data), progress=True)
+        # What is printed needs no file, and comes also where none can be written.
         try:
-            if self.json:
-                print(json.dumps(described(result), indent=1))
-            else:
-                show(result)
-        finally:
             if self.save is not None:
                 from estimator.saving import save_estimator
 
                 save_estimator(result.estimator, self.save)
             if self.report is not None:
                 result.report(self.report, [shlex.join(["duffing-env", *sys.argv[1:]])])
+        finally:
+            if self.json:
+                print(json.dumps(described(result), indent=1))
+            else:
+                show(result)
         if self.report is not None and not self.json:
-            print(f"The page is {self.report}")
+            say(f"The page is {self.report}")
 
 
 def described(result: Result) -> dict[str, Any]:
@@ -88,29 +89,24 @@ def described(result: Result) -> dict[str, Any]:
 
 def show(result: Result) -> None:
     """Print a table, and the warnings under it."""
-    from rich import box
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
+    from rich.text import Text
 
+    from agents.results import console, table
+    from agents.results import show as print_all
     from estimator.checks import printable
     from estimator.units import digits_of
 
-    console = Console()
-    units, intervals = result.units, result.interval(0.9)
-    table = Table("", "mean", "90 % interval", "unit", box=box.SIMPLE_HEAD)
+    units, intervals, rows = result.units, result.interval(0.9), []
     for name, (mean, _) in result.parameters.items():
         low, high = intervals[name]
         digits = digits_of(low, high, 5)
-        table.add_row(
-            name,
-            "open" if name in result.open else f"{mean:.{digits}g}",
-            f"{low:.{digits}g} to {high:.{digits}g}",
-            escape(units[name]),
-        )
-    console.print("m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0", highlight=False)
-    console.print(table)
+        value = "open" if name in result.open else f"{mean:.{digits}g}"
+        rows.append([name, value, f"{low:.{digits}g} to {high:.{digits}g}", units[name]])
+    print_all(
+        "m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0",
+        table(("", "mean", "90 % interval", "unit"), rows),
+    )
     for warning in result.warnings:
-        console.print(f"[bold red]{warning.name}[/]: {escape(printable(warning.message))}", highlight=False)
+        console().print(Text.assemble((warning.name, "bold red"), f": {printable(warning.message)}"))
     if not result.warnings:
-        console.print("[green]No check speaks against this result.[/]")
+        console().print("No check speaks against this result.", style="green")

@@ -28,9 +28,13 @@ class Report:
         check_outputs({"output": self.output}, [self.board or board.OWN])
         own = self.board if self.board is not None else board.OWN if board.OWN.is_file() else None
         entries = {(e["track"], e["name"]): e for path in (board.SHIPPED, own) if path for e in board.read(path)}
-        for track, rows in board.tables(list(entries.values())).items():
-            show(f"\n{track}", table(board.TITLES, rows), width=136)
-        show(board.CAPTION)
+        # What is printed needs no file, and comes also where none can be written.
+        try:
+            if self.output is not None:
+                board.write_page(self.output, list(entries.values()))
+        finally:
+            for track, rows in board.tables(list(entries.values())).items():
+                show(f"\n{track}", table(board.TITLES, rows))
+            show(board.CAPTION)
         if self.output is not None:
-            board.write_page(self.output, list(entries.values()))
-            print(f"The page is {self.output}")
+            show(f"The page is {self.output}")

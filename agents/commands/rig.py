@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -38,7 +39,7 @@ class Init:
         """Write it."""
         from agents.cli import check_new
         from agents.commands.rig_file import ask, from_record, text_of
-        from estimator.checks import printable
+        from agents.results import say
         from estimator.files import write_atomically
         from estimator.rig import SHIPPED
 
@@ -53,9 +54,9 @@ class Init:
         else:
             text = from_record(Path(self.source), self.step, self.input, self.output)
         write_atomically(self.path, text)
-        print(f"Wrote {self.path}: read it, and correct what is not so.")
+        say(f"Wrote {self.path}: read it, and correct what is not so.")
         data = "data.csv" if self.source is None or self.source in SHIPPED else self.source
-        print(printable(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}"))
+        say(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}")
 
 
 @dataclass(frozen=True)
@@ -72,4 +73,5 @@ class List:
         width = max(map(len, SHIPPED))
         for name, path in SHIPPED.items():
             first = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
-            print(f"{name:<{width}}  {first.split('. See')[0].rstrip('.')}")
+            said = first.split(". See")[0].rstrip(".")
+            print(textwrap.fill(said, 80, initial_indent=f"{name:<{width}}  ", subsequent_indent=" " * (width + 2)))

@@ -19,7 +19,7 @@ class Run:
     The input is zero before and after, whatever happens. docs/running.md says what a plant is, and what can go wrong.
 
     $ duffing-env run rig.toml --plant agents.running.simulated:plant --out run
-    $ duffing-env run rig.toml --plant agents.running.instrument:plant --policy prbs --out run
+    $ duffing-env run rig.toml --plant agents.running.instrument:plant --out run
     $ duffing-env run rig.toml --plant lab:plant --block 64 --out run
     $ duffing-env run rig.toml run/estimator.npz --plant lab:plant --out next
     $ duffing-env identify rig.toml run/samples.csv
@@ -38,31 +38,30 @@ class Run:
 
     def run(self) -> None:
         """Run, and print the parameters; the exit status is 1 after a trip, or where the input could not be zeroed."""
-        from agents.cli import progress_bar
+        from agents.results import say, warn
         from agents.running.plant import load_plant
         from agents.running.run import run
         from estimator import Rig
-        from estimator.checks import printable
+        from estimator.progress import progress
         from estimator.saving import load_estimator
 
         rig, instrument = Rig.with_instrument(self.rig)
         prior = None if self.posterior is None else load_estimator(self.posterior).belief
         plant = load_plant(self.plant, rig, instrument)
         try:
-            with progress_bar() as bar:
-                task = bar.add_task(printable(self.plan.policy), total=self.plan.samples)
-                shown = lambda done: bar.update(task, completed=done)  # noqa: E731
+            with progress("Running") as tell:
+                shown = lambda done: tell(done / self.plan.samples, self.plan.policy)  # noqa: E731
                 result = run(rig, plant, self.out, self.plan, prior=prior, told=shown)
         finally:
             if hasattr(plant, "close"):
                 plant.close()
         show(result)
         if result.ended == "zero":
-            print(f"duffing-env: complete, but {result.message}", file=sys.stderr)
+            say(f"duffing-env: complete, but {result.message}", sys.stderr)
         elif result.exit_status:
-            print(f"duffing-env: ended early ({result.ended}): {result.message}", file=sys.stderr)
+            say(f"duffing-env: ended early ({result.ended}): {result.message}", sys.stderr)
         elif result.message:
-            print(f"duffing-env: warning: {result.message}", file=sys.stderr)
+            warn(result.message)
         sys.exit(result.exit_status)
 
 

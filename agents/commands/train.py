@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from agents.cli import told_in_one_line
+from agents.cli import parsed, told_in_one_line
+from agents.results import say, warn
 from agents.stopping import telling
 from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, train_seeds, tune
 from agents.training.family import FAMILY
@@ -47,7 +48,7 @@ class Config(TrainConfig):
     """Trainings, of the seed and those after it, into OUTPUT/SEED each; the same command goes on with them."""
     ray: bool = False
     """Whether seeds, or trials of --tune, are spread over a Ray cluster: that of RAY_ADDRESS, or of this machine."""
-    systems: int = 256
+    systems: int = 32
     """Systems to compare on afterwards; 0 to skip the comparison."""
 
     def __post_init__(self) -> None:
@@ -65,46 +66,47 @@ class Config(TrainConfig):
         """Train, compare, and say where everything is."""
         each = self.hyperparameters.samples_per_update
         if self.resume is None and self.samples > self.steps:
-            print(f"An update takes {each:,} samples, so {self.samples:,} will be learned from, not {self.steps:,}.")
+            say(f"An update takes {each:,} samples, so {self.samples:,} will be learned from, not {self.steps:,}.")
         if self.resume is None and (updates := self.samples // each) < _FEW:
             said = f"a training of {updates} update{'s' * (updates > 1)} may leave a policy worse than it began"
-            print(f"duffing-env: warning: {said}; take more steps than {self.steps:,}", file=sys.stderr)
+            warn(f"{said}; take more steps than {self.steps:,}")
         if self.tune:
             with telling(lambda said: _THE_SAME):
                 best = tune(self, self.tune, on_ray=self.ray)
-            print(f"The best hyperparameters are in {best}")
+            say(f"The best hyperparameters are in {best}")
             given = shlex.quote(str(best))
-            print(f"To train with them: the same command, with --settings {given} in place of --tune and --output")
+            say(f"To train with them: the same command, with --settings {given} in place of --tune and --output")
             return
         if self.seeds > 1:
             with telling(lambda said: _THE_SAME):
                 for folder in train_seeds(self, self.seeds, on_ray=self.ray):
-                    print(f"The run is in {folder}", flush=True)
+                    say(f"The run is in {folder}")
+                    sys.stdout.flush()
             self._compare(f"{self.algo}={folder.parent}/[0-9]*", self, folder.parent)
             return
         if self.resume is None:
             run = train(self)
         else:
-            if asdict(replace(self, resume=None, systems=256)) != asdict(Config()):
+            if asdict(replace(self, resume=None, systems=Config.systems)) != asdict(Config()):
                 raise ValueError("resume takes all settings but systems from the run; leave out the others")
             run = resume(self.resume)
-        print(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
+        say(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
         self._compare(str(run.folder), run.config, run.folder)
         if (picture := run.folder / LEARNING).exists():
-            print(picture)
+            say(str(picture))
         else:
-            print("No episode ended, so there is no learning curve; take more steps.")
+            say("No episode ended, so there is no learning curve; take more steps.")
 
     def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
         """Compare what was trained with the usual policies."""
         if config.env == FAMILY:
-            print(f"python -m agents.studies.universal --policies {policy}")
+            say(f"python -m agents.studies.family --policies {policy}")
         elif self.systems:
             from agents.evaluation.comparison import compare, usual_policies
 
-            compare(
-                (policy, *usual_policies(config.env, config.options)), config.env, self.systems, config.options, folder
-            )
+            policies = (policy, *usual_policies(config.env, config.options))
+            compare(policies, config.env, self.systems, config.options, folder, briefly=True)
+            print("More, on more systems: duffing-env evaluate --help")
 
 
 def default_config(words: list[str] | None) -> Config:
@@ -134,4 +136,4 @@ def main(name: str, words: list[str] | None = None) -> None:
     """
     with told_in_one_line(name):
         start = default_config(words)
-        tyro.cli(type(start), prog=name, description=DESCRIPTION, args=words, default=start).run()
+        parsed(type(start), prog=name, description=DESCRIPTION, args=words, default=start).run()

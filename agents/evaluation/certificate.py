@@ -42,6 +42,7 @@ from agents.cli import JsonOptions, followed, run_script
 from agents.evaluation.mixture import Moments, Multipliers, mix
 from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.state_grid import StateGrid
+from agents.results import show
 from estimator.free_run import free_run
 from estimator.models.difference import difference
 from estimator.parameters import FloatArray
@@ -258,7 +259,7 @@ def main(config: Config) -> None:
         oracle.save()
     share = np.exp((oracle.values - oracle.bounds)[:count] / 2.0)
     seconds = time.perf_counter() - began
-    print(f"{count} systems in {seconds:.0f} s: certified share {share.mean():.3f}, least {share.min():.3f}")
+    show(f"{count} systems in {seconds:.0f} s: certified share {share.mean():.3f}, least {share.min():.3f}")
 
 
 if __name__ == "__main__":

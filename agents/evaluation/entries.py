@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.batch import make
+from agents.loading import of_ones_own
 from agents.policies import make_policy
 from agents.policies.learned import CARD
 
@@ -43,7 +44,9 @@ def check_policies(policies: Sequence[Any], env_id: str, options: dict[str, Any]
     for policy in policies:
         if isinstance(policy, str):
             try:
-                make_policy(policy, envs, seed=seed)
+                with of_ones_own(policy, "policy"):
+                    made = make_policy(policy, envs, seed=seed)
+                check_predict(made, policy)
             except ValueError as error:
                 raise ValueError(f"{policy}: {error}") from error
     envs.close()

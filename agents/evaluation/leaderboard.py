@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 
 from agents.evaluation.rollout import Evaluation
-from agents.results import show, table, write_json
+from agents.results import fitted, show, table, write_json
 from estimator.parameters import FloatArray
 from estimator.units import labelled
 
@@ -77,6 +77,16 @@ METRICS = {
     "simulation_rmse": Metric("RMSE on the twin's arrow / mV", 3, 1e3, MEDIAN),
     "arrow_rmse": Metric("RMSE on the real arrow / mV", 2, 1e3, MEDIAN),
 }
+
+
+#: The chief ones, with titles for a table of 80 characters; and those whose spread it has.
+HEADLINE = {
+    "information_gain": "information / nat",
+    "efficiency": "D-efficiency / %",
+    "coverage": "intervals cover / %",
+    "ended_early": "ended early / %",
+}
+_WITH_SPREAD = ("information_gain", "efficiency")
 
 
 #: What the less known of them are, where they are in a table.
@@ -179,6 +189,9 @@ def write_evaluations(path: Path, evaluations: list[Evaluation], settings: dict[
 
 Table = tuple[list[str], list[list[str]]]
 
+#: Of a column [characters].
+_WIDEST = 36
+
 
 def leaderboard(evaluations: list[Evaluation]) -> Table:
     """Heads and rows: a column for each policy, the best log posterior gain first; `cell_of` each metric."""
@@ -208,16 +221,43 @@ def two_way_table(evaluations: list[Evaluation]) -> Table:
 
 def print_table(evaluations: list[Evaluation], title: str) -> None:
     """Print the leaderboard, with the intervals below."""
-    from rich.table import Table
+    from rich.table import Table as RichTable
 
     heads, rows = leaderboard(evaluations)
-    table = Table(title=title, caption=caption_of(evaluations))
-    table.add_column("", no_wrap=True)
-    for policy in heads[1:]:
-        table.add_column(policy, justify="right", overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    show(table, width=36 + 20 * len(evaluations))
+
+    def made(places: Sequence[int]) -> RichTable:
+        found = RichTable(title=title)
+        for place in places:
+            found.add_column(heads[place], justify="right" if place else "left", overflow="fold", max_width=_WIDEST)
+        for row in rows:
+            found.add_row(*(row[place] for place in places))
+        return found
+
+    show(fitted(made, len(heads)), caption_of(evaluations))
+
+
+def headline(evaluations: list[Evaluation]) -> Table:
+    """Heads and rows: a line for each policy, with the chief figures, which are in ``HEADLINE``."""
+    shown = {name: title for name, title in HEADLINE.items() if name in evaluations[0].metrics}
+    rows = []
+    for evaluation in evaluations:
+        cells = [evaluation.title]
+        for name in shown:
+            metric, values = METRICS[name], evaluation.metrics[name].reshape(evaluation.seeds, -1)
+            entry = center_and_interval(values, metric)
+            spread = f" ± {metric.text((entry['high'] - entry['low']) / 2)}" if name in _WITH_SPREAD else ""
+            cells.append(f"{metric.text(center_of(entry))}{spread}")
+        rows.append(cells)
+    return ["", *shown.values()], rows
+
+
+def print_headline(evaluations: list[Evaluation], title: str) -> None:
+    """Print the chief figures, in 80 columns."""
+    heads, rows = headline(evaluations)
+    caption = "means over systems ± half of the 95 % bootstrap interval; 90 % intervals that cover"
+    if "efficiency" in evaluations[0].metrics:
+        caption += f"\n{TERMS['efficiency']}"
+    show(table(heads, rows, title=title), caption)
 
 
 def print_estimators(evaluations: list[Evaluation]) -> None:
@@ -225,7 +265,7 @@ def print_estimators(evaluations: list[Evaluation]) -> None:
     heads, rows = two_way_table(evaluations)
     if rows:
         title = "what other estimators make of the same inputs and outputs"
-        show(table(heads, rows, title=title), AUDITOR_IS, width=130)
+        show(table(heads, rows, title=title, labels=2), AUDITOR_IS)
 
 
 def in_order(evaluations: list[Evaluation]) -> list[Evaluation]:

@@ -17,6 +17,7 @@ does it by default; it does not depend on the number of systems.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -31,8 +32,10 @@ from agents.planner.imagination import Terms
 from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
 from agents.planner.pursuit import pursuit
+from agents.results import show
 from estimator.belief import Belief
 from estimator.checks import MOST_SEED, whole
+from estimator.extras import need
 from estimator.parameters import FloatArray
 
 #: Starts of a search at least; it goes on to so many times as many, until so many that began anew agree within [nats].
@@ -185,12 +188,14 @@ class Config:
 
 def main(config: Config) -> None:
     """Search, store, and say how far it is."""
+    need("highspy")
     systems = Systems.of(config.env, config.systems, config.options)
     began = time.perf_counter()
     if config.check:
         for line in check(Oracle.of(systems), config.first, config.tries, config.seed):
-            print(line, flush=True)  # at once: a check that is cut short leaves what it found
-        print(f"{time.perf_counter() - began:.0f} s")
+            show(line)
+            sys.stdout.flush()  # at once: a check that is cut short leaves what it found
+        show(f"{time.perf_counter() - began:.0f} s")
         return
     count = max(config.systems, Oracle.stored(systems))
     oracle = begun(Systems.of(config.env, count, config.options))
@@ -204,8 +209,8 @@ def main(config: Config) -> None:
             path = oracle.first(int(np.isfinite(oracle.values).sum())).save()
     gained = oracle.values - 0.5 * np.linalg.slogdet(oracle.systems.precision)[1]
     seconds = time.perf_counter() - began
-    print(f"{config.systems - config.first} systems in {seconds:.0f} s; mean gain of {count}: {gained.mean():.3f} nats")
-    print(f"stored in {path}")
+    show(f"{config.systems - config.first} systems in {seconds:.0f} s; mean gain of {count}: {gained.mean():.3f} nats")
+    show(f"stored in {path}")
 
 
 if __name__ == "__main__":

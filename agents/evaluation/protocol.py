@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import json
 import sys
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,10 +22,11 @@ from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.rollout import Evaluation, roll_out
 from agents.loading import load_object
 from agents.policies import TRAINED, trained_policies
-from agents.policies.learned import CARD, MOST_STEPS, WEIGHTS
+from agents.policies.learned import CARD, MOST_STEPS, WEIGHTS, steps_of
 from agents.results import versions
 from estimator.checks import whole
 from estimator.parameters import FloatArray
+from estimator.progress import Tell, untold
 
 #: Of the protocol: entries of another version do not compare.
 VERSION = 1
@@ -80,7 +79,7 @@ def measure(
     track: str,
     name: str,
     samples: int | None = None,
-    on_step: Callable[[str], None] = lambda what: None,
+    tell: Tell = untold,
 ) -> dict[str, Any]:
     """What a policy is worth by the protocol, as an entry of a board.
 
@@ -89,7 +88,7 @@ def measure(
         track: one of `TRACKS`.
         name: that it has on the board.
         samples: that it learned from; a run folder says it itself.
-        on_step: told what is measured next.
+        tell: is told the share that is done, and what is measured next (`estimator.progress.progress`).
 
     Raises:
         ValueError: for another track, a missing name, samples that are no number of them, or something that is not a
@@ -103,15 +102,22 @@ def measure(
     _, members = members_of(policy)
     samples = max((_samples_of(member) or samples or 0 for member in members), default=0)
     budget = _budget(samples)
-    on_step(f"{name} on {track}")
-    evaluations = [_evaluation(member, track, TESTED) for member in members]
+    shifts = shifts_of(track)
+    total = (1 + len(shifts)) * len(members)
+
+    def played(env_id: str, options: dict[str, Any], done: int, at: str) -> list[Evaluation]:
+        return [
+            _evaluation(member, env_id, options, lambda share, k=k: tell((done + k + share) / total, at))
+            for k, member in enumerate(members)
+        ]
+
+    evaluations = played(track, TESTED, 0, f"{name} on {track}")
     oracle = Oracle.of(Systems.of(track, SYSTEMS))
     score = np.array([_score(evaluation, oracle) for evaluation in evaluations])
     shifted: dict[str, Any] = {}
-    for shift, (env_id, options) in shifts_of(track).items():
-        on_step(f"{name} on {track}, shifted: {shift}")
+    for k, (shift, (env_id, options)) in enumerate(shifts.items(), start=1):
         try:
-            there = [_evaluation(member, env_id, TESTED | options) for member in members]
+            there = played(env_id, TESTED | options, k * len(members), f"{name}, shifted: {shift}")
         except ValueError as error:
             shifted[shift] = {"refused": str(error)}
             continue
@@ -138,8 +144,8 @@ def measure(
     }
 
 
-def _evaluation(policy: str, env_id: str, options: dict[str, Any]) -> Evaluation:
-    evaluation, _, truth, experiment = roll_out(policy, env_id, SYSTEMS, SEED, options)
+def _evaluation(policy: str, env_id: str, options: dict[str, Any], tell: Tell) -> Evaluation:
+    evaluation, _, truth, experiment = roll_out(policy, env_id, SYSTEMS, SEED, options, tell)
     evaluation.metrics["fisher_gain"] = information(evaluation.inputs, truth, experiment, evaluation.outputs)
     return evaluation
 
@@ -176,9 +182,7 @@ def _samples_of(policy: str) -> int | None:
     folder = _folder_of(policy)
     if folder is None:
         return None
-    steps = json.loads((folder / CARD).read_text()).get("steps", 0)
-    whole(f"steps of {folder / CARD}", steps, MOST_STEPS, 0)
-    return int(steps)
+    return steps_of(folder)
 
 
 def fingerprint(policy: str) -> str:
@@ -187,7 +191,11 @@ def fingerprint(policy: str) -> str:
     if folder is not None:
         return digest(folder / WEIGHTS)
     if ":" in policy:
-        source = inspect.getsourcefile(load_object(policy, "policy"))
+        found = load_object(policy, "policy")
+        try:
+            source = inspect.getsourcefile(found)
+        except TypeError:  # an object, whose class it is that has a source
+            source = inspect.getsourcefile(type(found))
         return "" if source is None else digest(Path(source))
     return ""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from agents.evaluation import metrics
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.entries import check_policies, check_predict, members_of, title_of
+from agents.loading import of_ones_own
 from agents.planner.plants import plant_of
 from agents.policies import make_policy
 from duffing_env.experiment import Experiment, SimulatedExperiment
@@ -25,6 +27,7 @@ from estimator.models.duffing import duffing
 from estimator.parameters import FloatArray, Parameters
 from estimator.physical import coefficients_of
 from estimator.posteriors import posteriors
+from estimator.progress import Tell, untold
 from estimator.rig import Rig
 from estimator.units import Scales
 
@@ -32,6 +35,9 @@ from estimator.units import Scales
 AUDITOR = "auditor"
 #: Systems that one evaluation keeps in memory, with all that they did.
 _MOST_SYSTEMS = 100_000
+
+#: Of the time that a policy takes, about so much is playing.
+_PLAYING = 0.7
 
 FACTORISATIONS = ("structured", "mean_field")
 
@@ -80,6 +86,7 @@ def evaluate(
     seed: int = 0,
     options: dict[str, Any] | None = None,
     on_policy: Callable[[str], None] | None = None,
+    tell: Tell = untold,
 ) -> list[Evaluation]:
     """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
 
@@ -105,6 +112,7 @@ def evaluate(
         seed: of systems and noise; and of the policies' own randomness.
         options: of the environment.
         on_policy: called with each policy's name before its turn.
+        tell: is told the share that is done, and each policy's name (`estimator.progress.progress`).
 
     Raises:
         ValueError: for no policies, an unknown one, a pattern that less than two policies match, fewer than two
@@ -124,14 +132,22 @@ def evaluate(
     check_policies([member for _, members in groups for member in members], env_id, options, seed)
     evaluations = []
     told: dict[str, FloatArray] = {}
+    done, total = 0, sum(len(members) for _, members in groups)
     for title, members in groups:
         each = []
         for member in members:
             if on_policy is not None:
                 on_policy(title_of(member))
-            each.append(_evaluate(member, env_id, systems, seed, options, told))
+            part = partial(_tell_part, tell, done, total, title_of(member))
+            each.append(_evaluate(member, env_id, systems, seed, options, told, part))
+            done += 1
         evaluations.append(each[0] if title is None else pooled(title, each))
     return evaluations
+
+
+def _tell_part(tell: Tell, done: int, total: int, name: str, share: float) -> None:
+    """Tell the share that is done of all policies."""
+    tell((done + share) / total, name)
 
 
 def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
@@ -154,10 +170,12 @@ def pooled(title: str, evaluations: Sequence[Evaluation]) -> Evaluation:
 
 
 def _evaluate(
-    name: Any, env_id: str, systems: int, seed: int, options: dict[str, Any], told: dict[str, FloatArray]
+    name: Any, env_id: str, systems: int, seed: int, options: dict[str, Any], told: dict[str, FloatArray], tell: Tell
 ) -> Evaluation:
     """One policy; ``told`` keeps what the Silverbox regime tells of the systems, which are those of all policies."""
-    evaluation, beliefs, truth, experiment = roll_out(name, env_id, systems, seed, options)
+    evaluation, beliefs, truth, experiment = roll_out(
+        name, env_id, systems, seed, options, lambda share: tell(_PLAYING * share)
+    )
     if not isinstance(experiment, SimulatedExperiment):
         return evaluation
     found, stays = evaluation.metrics, experiment.jump == 0
@@ -183,9 +201,12 @@ def _evaluate(
 
 
 def roll_out(
-    name: Any, env_id: str, systems: int, seed: int, options: dict[str, Any]
+    name: Any, env_id: str, systems: int, seed: int, options: dict[str, Any], tell: Tell = untold
 ) -> tuple[Evaluation, list[Belief], Any, Experiment]:
-    """One episode of every system; the beliefs it ended with, the truth and the experiment."""
+    """One episode of every system; the beliefs it ended with, the truth and the experiment.
+
+    ``tell`` is told the share of the samples that were played.
+    """
     envs = make(env_id, systems, options)
     policy = make_policy(name, envs, seed=seed)
     check_predict(policy, name)
@@ -206,10 +227,12 @@ def roll_out(
     state, episode_start = None, np.ones(systems, dtype=np.bool_)
     deciding: list[float] = []
     for t in range(horizon):
+        tell(t / horizon)
         try:
             if t % hold == 0:
                 started = time.process_time()
-                actions, state = policy.predict(observations, state, episode_start, deterministic=True)
+                with of_ones_own(name, "policy"):
+                    actions, state = policy.predict(observations, state, episode_start, deterministic=True)
                 deciding.append(time.process_time() - started)
                 episode_start = np.zeros(systems, dtype=np.bool_)
             observations, _, terminated, truncated, infos = envs.step(actions)

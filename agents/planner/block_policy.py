@@ -1,4 +1,7 @@
-"""The planner in blocks: it decides on a whole block of inputs at once, and sees their outputs when all were played."""
+"""The planner in blocks reads its environment's belief and model, and is no function of the observation.
+
+It decides on a whole block of inputs at once, and sees their outputs when all were played.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,9 @@ class BlockState(NamedTuple):
 
 
 class BlockPlanner:
-    """Expected free energy planning, a block at a time, on the beliefs of an environment (`agents.planner.blocks`).
+    """Planning a block at a time on an environment's belief and model; it is no function of the observation.
+
+    It minimises expected free energy (`agents.planner.blocks`), in the environment that it was made for, as `Planner`.
 
     Args:
         env: as of `agents.planner.policy.Planner`.

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import cache
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from estimator.engine.motion import coarsened
 from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
+from estimator.progress import Tell, untold
 
 #: Systems that a block is planned for.
 SYSTEMS = 32
@@ -50,6 +52,9 @@ _RATE, _KEPT, _LAST = 0.05, 0.8, 0.05
 #: last number. Each time so many systems that leave the limit are added to those that are planned for.
 _AIM, _AIMS, _ADDED = 0.998, 16, 8
 _FALL, _FASTER, _FASTEST = 0.005, 1.5, 0.05
+
+#: Of a candidate's time, about so much is left after it was climbed first, and of that after every change of the aim.
+_LEFT = 0.6
 
 #: How often the last fall is halved, once a block is safe: it was too far by half of it on average.
 _HALVINGS = 2
@@ -132,7 +137,7 @@ def _climber(model: Model, degree: int) -> Any:
 
 def best_block(
     view: View, systems: Systems, futures: Futures, candidates: FloatArray, amplitude: float, bound: float,
-    played: int | None = None,
+    played: int | None = None, tell: Tell = untold,
 ) -> tuple[FloatArray, float, float]:  # fmt: skip
     """The best input that is safe enough: what tells most on average, of the summits that candidates lead to.
 
@@ -144,22 +149,35 @@ def best_block(
         amplitude: limit of the input.
         bound: of the probability.
         played: samples that are asked to be safe; all where None.
+        tell: is told the share that is done.
 
     Returns:
         Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and
         `Futures.chance` of leaving the limit.
     """
     futures.disturbances(candidates.shape[1])  # drawn before the threads share them
-    climb = partial(_summit, view, systems, futures, amplitude, bound, played)
+    parts, lock = np.zeros(len(candidates)), Lock()
+
+    def climb(k: int) -> tuple[FloatArray, float, float]:
+        def advance(part: float) -> None:
+            with lock:
+                parts[k] = part
+                tell(float(parts.mean()))
+
+        found = _summit(view, systems, futures, amplitude, bound, played, candidates[k], advance)
+        advance(1.0)
+        return found
+
     with ThreadPoolExecutor() as pool:
-        found = list(pool.map(climb, candidates))
+        found = list(pool.map(climb, range(len(candidates))))
     told = [expected(view, systems, futures.limit, u)[0] for u, *_ in found]
     return found[int(np.argmax(told))]
 
 
 def _summit(
-    view: View, systems: Systems, futures: Futures, amplitude: float, bound: float, played: int | None, u: FloatArray
-) -> tuple[FloatArray, float, float]:
+    view: View, systems: Systems, futures: Futures, amplitude: float, bound: float, played: int | None, u: FloatArray,
+    tell: Tell,
+) -> tuple[FloatArray, float, float]:  # fmt: skip
     """As `best_block`, from one candidate (T,)."""
     ascend = _climber(coarsened(view.model), view.degree)  # how safe a block is, is judged with all steps
     planned = set(range(SYSTEMS))
@@ -177,6 +195,7 @@ def _summit(
     too_high = aim = _AIM * futures.limit
     u = climbed(u, aim, min(_MOST_STEPS, _STEPS + len(u)))
     for k in range(_AIMS):
+        tell(1 - _LEFT ** (k + 1))
         leaving, probability = judged(u)
         if probability < bound:
             for _ in range(_HALVINGS if k else 0):

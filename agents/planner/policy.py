@@ -1,6 +1,7 @@
-"""The expected free energy planner: it imagines what candidate inputs would teach, and applies the best one's first.
+"""The expected free energy planner reads its environment's belief and model, and is no function of the observation.
 
-Of a sequence of inputs u over the next H samples the expected free energy is, in nats,
+It imagines what candidate inputs would teach, and applies the best one's first. Of a sequence of inputs u over the next
+H samples the expected free energy is, in nats,
 
     G(u) = -[½ log det C_0 - ½ log det (C_H(u)⁻¹ + J)⁻¹]              what it teaches (epistemic)
            + Σ_h E[(x_h - goal)²] / (2 goal_std²)                       how far it is from a goal (pragmatic, optional)
@@ -45,7 +46,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from agents.asked import check_rows, starts
+from agents.asked import check_rows, check_shown, starts
 from agents.planner.fading import faded_of
 from agents.planner.imagination import RISK, Terms, margin
 from agents.planner.motion import View, is_of_rig, limit_of, places, reach_of, shaken_of, swing_of
@@ -98,14 +99,16 @@ _CELLS, _FEWEST_CELLS, _MOST_CELLS = 13.5, 22, 38
 
 
 class Planner:
-    """Expected free energy planning on the beliefs of an environment.
+    """Expected free energy planning on an environment's belief and model; it is no function of the observation.
+
+    So it plays the environment that it was made for, and no other. `predict` must be called between that one's steps,
+    with what it showed last, which is checked; a wrapper that changes or delays observations is refused by that.
 
     Environment i searches with a stream of random numbers of its own, the i-th child of the seed, so that its inputs
     do not depend on the size of the batch.
 
     Args:
-        env: the unwrapped environment, single or vector, whose beliefs it reads: `predict` must be called between
-            its steps, with its observations.
+        env: the unwrapped environment, single or vector, whose beliefs it reads.
         seed: of the search.
         horizon: moves to plan for, each held for at most ``terms.pace`` samples, but no longer than the episode needs;
             by default 44, and the whole episode sample by sample where the energy is limited. No more than 24 of the
@@ -153,6 +156,11 @@ class Planner:
             raise ValueError(
                 f"env must take an action for every sample, as plans do, but its hold is {experiment.hold}; "
                 "make it with hold=1, or choose a signal or a feedback law"
+            )
+        if experiment.observation not in ("posterior", "privileged"):
+            raise ValueError(
+                f"env must show the posterior, in which the planner looks up the time left, but its observation is "
+                f"{shown(experiment.observation)}; make it with observation='posterior'"
             )
         setup, self.view = experiment.setup, View.of(experiment)
         number("goal", goal, -float(setup.max_output), float(setup.max_output), "a goal lies within the limit")
@@ -255,8 +263,8 @@ class Planner:
         """The observations (n, features) of all environments, and which of them begin an episode (n,).
 
         Raises:
-            ValueError: for an observation that is not finite, or not one of as many environments as ``env`` has; or a
-                state or ``episode_start`` that does not go with it.
+            ValueError: for an observation that is not finite, or not what ``env`` showed last; or a state or
+                ``episode_start`` that does not go with it.
         """
         observed, n = numbers("observation", observation), len(self._env.records)
         least = places(self.view.model).size
@@ -271,4 +279,6 @@ class Planner:
             if not isinstance(state, kind):
                 raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
             check_rows("state", len(state[0]), n)
-        return observed.reshape(n, -1), starts(episode_start, n)
+        observed = observed.reshape(n, -1)
+        check_shown(self._env, observed)
+        return observed, starts(episode_start, n)

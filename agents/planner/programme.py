@@ -12,6 +12,7 @@ import numpy as np
 from scipy import sparse
 
 from agents.planner.ascent import Limits
+from estimator.extras import need
 from estimator.parameters import FloatArray
 
 
@@ -23,10 +24,14 @@ class Programme:
         n: states.
         shown: the state that the first sensor shows, or n where it shows another output.
         limits: to be kept; ``aim`` is the limit of the signal.
+
+    Raises:
+        ModuleNotFoundError: without highspy, which the extra ``oracle`` brings.
     """
 
     def __init__(self, samples: int, n: int, shown: int, limits: Limits) -> None:
-        import highspy  # here, as only the search of oracles needs it
+        need("highspy")
+        import highspy
 
         self._highspy = highspy
         self._solver = highspy.Highs()

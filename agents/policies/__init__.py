@@ -19,7 +19,8 @@ from agents.planner.block_policy import BlockPlanner
 from agents.planner.policy import Planner
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
-from agents.policies.own import own_policy
+from agents.policies.lookahead import Lookahead
+from agents.policies.own import own_policy, within
 from agents.policies.signals import make_signal
 from estimator.checks import MOST_SEED, hint, shown, whole
 
@@ -54,6 +55,7 @@ POLICIES: dict[str, Callable[..., Policy]] = {
     **FEEDBACK,
     "efe": Planner,
     "efe-myopic": partial(Planner, horizon=1),
+    "lookahead": Lookahead,
     **{f"efe-block-{n}": partial(BlockPlanner, block=n) for n in (16, 64, 256)},
 }
 
@@ -84,10 +86,10 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             an object that has `predict`, such as a model of Stable-Baselines3, whose `VecNormalize` is not
             forgotten; a class, which is called with those of `env`, `seed` and the options that it takes by
             name; or a function of observations (n, features) that gives actions (n, 1), such as a module of torch.
-        env: The environment it is for, single or vector, wrapped or not: it gives the amplitude
-            limit, the episode's length and, where it replays a record, the recorded input; to a
-            trained policy with foresight what it imagines, without which most of them do not play.
-            None: the limit is 0.15 V.
+        env: The environment it is for, single or vector, wrapped or not, or a `VecEnv` of Stable-Baselines3 around
+            it: it gives the amplitude limit, the episode's length and, where it replays a record, the recorded
+            input. The planner and most trained policies read its belief and model, do not play without it, and
+            refuse observations that it did not show last. None: a Duffing track with a limit of 0.15 V.
         seed: The seed of the policy's own randomness; of a trained policy, that of the actions it samples.
         options: Further options of a policy that has some, such as `horizon=8` of `"efe"`; a
             trained policy has none.
@@ -97,14 +99,15 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
 
     Raises:
         ValueError: There is neither a policy nor a file of this name, it has no such option, it is no
-            policy, or `env` is not one of duffing_env.
+            policy, or `env` is not one of duffing_env; or is a `VecNormalize` that changes observations, under
+            which only signals play.
     """
     whole("seed", seed, MOST_SEED, 0)
     name = str(name) if isinstance(name, Path) else name
     if not isinstance(name, str):
         return own_policy(name, env, seed, options)
-    if env is not None and not hasattr(env, "unwrapped"):
-        raise ValueError(f"env must be an environment, but is {shown(env)}; pass what gym.make or gym.make_vec returns")
+    own = ":" in name and name not in POLICIES and not exists(name)
+    env = env if own else within(env, name in EXCITATIONS)
     if name in POLICIES:
         make = POLICIES[name]
         known = [o for o in inspect.signature(make).parameters if o not in ("regime", "env", "seed")]
@@ -112,7 +115,7 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             if option not in known:
                 raise ValueError(f"{option}={value!r} is no option of policy {name!r}, which has {known}")
         return make(env if env is None else env.unwrapped, seed, **options)
-    if ":" in name and not exists(name):
+    if own:
         return own_policy(load_object(name, "policy"), env, seed, options)
     if options:
         raise ValueError(f"options must be none for a trained policy, but are {options}; leave them out")

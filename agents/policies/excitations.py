@@ -1,9 +1,9 @@
 """Excitations by name: classical test signals, drawn by a generator, in volts.
 
-`EXCITATIONS` makes a `Draw` from an amplitude limit. Every draw is new: what is not random about a signal (its band,
-its levels) is fixed, and its phase, order or start is drawn. The sampling rate is 610.35 Hz (δ = 1.6384 ms); an input
-is held for a sample. `agents.policies.signals.SignalPolicy` plays them, within a track's limits. docs/policies.md has a
-table of them, with their frequency content.
+`EXCITATIONS` makes a `Draw` from an amplitude limit, which can be copied and pickled. Every draw is new: what is not
+random about a signal (its band, its levels) is fixed, and its phase, order or start is drawn. The sampling rate is
+610.35 Hz (δ = 1.6384 ms); an input is held for a sample. `agents.policies.signals.SignalPolicy` plays them, within a
+track's limits. docs/policies.md has a table of them, with their frequency content.
 """
 
 from __future__ import annotations
@@ -39,28 +39,40 @@ def draw_regime(name: str) -> Draw:
     The stretch is contiguous and starts anywhere it fits, gaps and quiet beginning included. One
     longer than the regime starts at its first sample and repeats it. See `duffing_env.silverbox.regime_input`.
     """
+    return partial(_regime, name=name)
 
-    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        regime = regime_input(name, rng)
-        start = rng.integers(max(regime.size - samples, 0), endpoint=True)
-        return np.resize(regime[start : start + samples], samples)
 
-    return draw
+def _regime(rng: np.random.Generator, samples: int, name: str) -> NDArray[np.float64]:
+    regime = regime_input(name, rng)
+    start = rng.integers(max(regime.size - samples, 0), endpoint=True)
+    return np.resize(regime[start : start + samples], samples)
 
 
 def draw_recorded(u: NDArray[np.float64]) -> Draw:
     """A given input in volts, shape `(samples,)`, from its first sample; repeated if too short."""
-    return lambda rng, samples: np.resize(u, samples)
+    return partial(_recorded, u=u)
+
+
+def _recorded(rng: np.random.Generator, samples: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.resize(u, samples)
 
 
 def draw_uniform(max_input: float) -> Draw:
     """Independent samples, uniform in ±`max_input` volts."""
-    return lambda rng, samples: rng.uniform(-max_input, max_input, samples)
+    return partial(_uniform, max_input=max_input)
+
+
+def _uniform(rng: np.random.Generator, samples: int, max_input: float) -> NDArray[np.float64]:
+    return rng.uniform(-max_input, max_input, samples)
 
 
 def draw_gaussian(max_input: float) -> Draw:
     """Independent normal samples of standard deviation `max_input` / 3, clipped at ±`max_input` (1 in 370 is)."""
-    return lambda rng, samples: np.clip(rng.normal(0.0, max_input / 3.0, samples), -max_input, max_input)
+    return partial(_gaussian, max_input=max_input)
+
+
+def _gaussian(rng: np.random.Generator, samples: int, max_input: float) -> NDArray[np.float64]:
+    return np.clip(rng.normal(0.0, max_input / 3.0, samples), -max_input, max_input)
 
 
 def draw_prbs(max_input: float, hold: int = 1) -> Draw:
@@ -78,12 +90,14 @@ def draw_levels(max_input: float, hold: int, levels: tuple[float, ...] = LEVELS)
         ValueError: `hold` is no whole number of at least 1.
     """
     whole("hold", hold, 10**9)
+    return partial(_levels, max_input=max_input, hold=hold, levels=levels)
 
-    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        values = rng.choice(levels, size=-(-samples // hold))
-        return max_input * np.repeat(values, hold)[:samples]
 
-    return draw
+def _levels(
+    rng: np.random.Generator, samples: int, max_input: float, hold: int, levels: tuple[float, ...]
+) -> NDArray[np.float64]:
+    values = rng.choice(levels, size=-(-samples // hold))
+    return max_input * np.repeat(values, hold)[:samples]
 
 
 def draw_multisine(max_input: float) -> Draw:
@@ -91,12 +105,12 @@ def draw_multisine(max_input: float) -> Draw:
 
     A draw is one period, so that its power lies on the lines exactly. Its crest factor is about 3.
     """
+    return partial(_multisine, max_input=max_input)
 
-    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        lines = band_lines(samples)
-        return _tones(lines, rng.uniform(0.0, 2.0 * np.pi, lines.size), samples, max_input)
 
-    return draw
+def _multisine(rng: np.random.Generator, samples: int, max_input: float) -> NDArray[np.float64]:
+    lines = band_lines(samples)
+    return _tones(lines, rng.uniform(0.0, 2.0 * np.pi, lines.size), samples, max_input)
 
 
 def draw_schroeder(max_input: float) -> Draw:
@@ -105,14 +119,14 @@ def draw_schroeder(max_input: float) -> Draw:
     The n-th of N lines of equal power has φ_n = -π n (n - 1) / N, which makes the sum a sweep through the band, with
     a crest factor of about 1.8: at the same peak it has nearly three times the power of random phases.
     """
+    return partial(_schroeder, max_input=max_input)
 
-    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        lines = band_lines(samples)
-        n = np.arange(1, lines.size + 1)
-        period = _tones(lines, -np.pi * n * (n - 1) / lines.size, samples, max_input)
-        return np.roll(period, rng.integers(samples))
 
-    return draw
+def _schroeder(rng: np.random.Generator, samples: int, max_input: float) -> NDArray[np.float64]:
+    lines = band_lines(samples)
+    n = np.arange(1, lines.size + 1)
+    period = _tones(lines, -np.pi * n * (n - 1) / lines.size, samples, max_input)
+    return np.roll(period, rng.integers(samples))
 
 
 def band_lines(samples: int) -> NDArray[np.int64]:
@@ -145,16 +159,16 @@ def draw_chirp(max_input: float, method: str) -> Draw:
     It rises because a hardening oscillator follows a rising frequency to larger displacements than a falling one.
     `method` is `"linear"` or `"logarithmic"` in time; see `scipy.signal.chirp`.
     """
+    return partial(_chirp, max_input=max_input, method=method)
 
-    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        from scipy.signal import chirp
 
-        time = SAMPLING_STEP * np.arange(samples)
-        low, high = BAND
-        phase = rng.uniform(0.0, 360.0)
-        return max_input * chirp(time, low, samples * SAMPLING_STEP, high, method=method, phi=phase)
+def _chirp(rng: np.random.Generator, samples: int, max_input: float, method: str) -> NDArray[np.float64]:
+    from scipy.signal import chirp
 
-    return draw
+    time = SAMPLING_STEP * np.arange(samples)
+    low, high = BAND
+    phase = rng.uniform(0.0, 360.0)
+    return max_input * chirp(time, low, samples * SAMPLING_STEP, high, method=method, phi=phase)
 
 
 def draw_square(max_input: float) -> Draw:
@@ -165,14 +179,14 @@ def draw_square(max_input: float) -> Draw:
     oscillator does: see ``square-believed`` and ``velocity-sign`` in `agents.policies.feedback`.
     """
     theta1, _, theta3, _ = coefficients_of(difference(), SILVERBOX_TWIN)
-    step = 2.0 * np.pi * SAMPLING_STEP * resonance(theta1, theta3)
+    step = float(2.0 * np.pi * SAMPLING_STEP * resonance(theta1, theta3))
+    return partial(_square, max_input=max_input, step=step)
 
-    def draw(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        from scipy.signal import square
 
-        return max_input * square(rng.uniform(0.0, 2.0 * np.pi) + step * np.arange(samples))
+def _square(rng: np.random.Generator, samples: int, max_input: float, step: float) -> NDArray[np.float64]:
+    from scipy.signal import square
 
-    return draw
+    return max_input * square(rng.uniform(0.0, 2.0 * np.pi) + step * np.arange(samples))
 
 
 def resonance(theta1: FloatArray | np.float64, theta3: FloatArray | np.float64) -> FloatArray:

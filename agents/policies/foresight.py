@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from agents.asked import check_shown
 from agents.planner.fading import faded_of
 from agents.planner.imagination import RISK, Terms, margin
 from agents.planner.motion import View, is_of_rig, limit_of, places, reach_of, shaken_of, survey, swing_of
@@ -145,8 +146,9 @@ class Foresight:
 
 
 class CommonForesight:
-    """What a policy for all oscillators looks with in an environment, single or vector, of whatever model.
+    """A policy's look at the belief and model of its environment, single or vector; no function of the observation.
 
+    So such a policy plays the environment that it was made for, and no other, and sees its observations as they are.
     What it sees is `agents.policies.imagined`, of the environment's beliefs as the planner reads them; nothing of it is
     of the systems that a policy was trained on. So with that alone a policy plays any environment. Beside the
     observation itself it tells more of one model, and a policy plays environments of that. Outputs keep a margin
@@ -230,14 +232,11 @@ class CommonForesight:
         """What the environment's beliefs look like, which it has just shown in observations (n, entries).
 
         Raises:
-            ValueError: for observations that are not of as many environments.
+            ValueError: for observations that it did not show last.
         """
-        seen, records = np.ascontiguousarray(observations, dtype=np.float32), self._env.records
-        if len(seen) != len(records):
-            raise ValueError(
-                f"observation must be of the policy's own {len(records)} environments, but is of {len(seen)}"
-            )
-        return self._seen(seen, records)
+        seen = np.ascontiguousarray(observations, dtype=np.float32)
+        check_shown(self._env, seen)
+        return self._seen(seen, self._env.records)
 
     def _seen(self, seen: npt.NDArray[np.float32], records: FloatArray) -> Sight:
         """What beliefs look like."""

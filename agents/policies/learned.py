@@ -19,7 +19,7 @@ import numpy.typing as npt
 from agents.asked import check_state, starts
 from agents.policies.foresight import CommonForesight, Foresight
 from agents.policies.imagined import FEATURES
-from estimator.checks import number, numbers
+from estimator.checks import number, numbers, whole
 from estimator.files import whole_file
 
 WEIGHTS = "policy.safetensors"
@@ -74,7 +74,10 @@ class Network:
 
 
 class LearnedPolicy:
-    """A trained actor: a network of the observation, with a memory where it was trained with one.
+    """A trained actor: a network of the observation or, with foresight, of its environment's belief and model.
+
+    One that looks out in its environment (`agents.policies.foresight.CommonForesight`) plays that environment alone.
+    One with a memory was trained with it.
 
     Args:
         network: which tensors make it up, and how.
@@ -157,7 +160,7 @@ class LearnedPolicy:
             if foresight.features != self._features:
                 raise ValueError(
                     f"env must have {self._features} features for this policy, but has {foresight.features}: it is of "
-                    "another model than the policy was trained on; play ppo/universal there"
+                    "another model than the policy was trained on; play lookahead there"
                 )
             self._foresight = foresight
         if not isinstance(self._foresight, Foresight):
@@ -180,6 +183,10 @@ class LearnedPolicy:
 
         The state is Stable-Baselines3's: hidden and cell values, each (1, n, units), of a policy with a memory, which
         forgets them where ``episode_start``; None is a memory of nothing. Without a memory it is handed on unused.
+
+        Raises:
+            ValueError: for an observation of another size, that is not finite, or, where the policy looks out in its
+                environment, that this did not show last.
         """
         if self._is_common and self._foresight is None:
             raise ValueError("env must be given to a policy that imagines there, but is None; pass it to make_policy")
@@ -232,6 +239,23 @@ def observation_of(env: Any) -> str | None:
     """What an unwrapped environment shows, by its name; "own" for a function, and None for an environment of others."""
     shown = getattr(getattr(env, "experiment", None), "observation", None)
     return shown if shown is None or isinstance(shown, str) else "own"
+
+
+def steps_of(folder: Path) -> int:
+    """Samples that the policy of a folder learned from, by its card.
+
+    Raises:
+        ValueError: where there is no sound card.
+    """
+    try:
+        card = json.loads(
+            whole_file(folder / CARD, f"policy folder must hold {CARD}", _LARGEST).read_text(encoding="utf-8")
+        )
+        steps = card.get("steps", 0)
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
+        raise ValueError(f"policy folder must hold a sound {CARD}, but {folder} does not: {error}") from error
+    whole(f"steps of {folder / CARD}", steps, MOST_STEPS, 0)
+    return int(steps)
 
 
 def _learned_from(card: dict[str, Any]) -> Any:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium import ActionWrapper, ObservationWrapper, Wrapper
 from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
 
-from estimator.checks import numbers
+from estimator.checks import numbers, shown
 
 #: Gymnasium's wrappers that change observations or actions.
 _CHANGING = (ObservationWrapper, ActionWrapper, VectorObservationWrapper, VectorActionWrapper)
@@ -36,10 +36,60 @@ def own_policy(made: Any, env: Any, seed: int, options: dict[str, Any]) -> Any:
     if hasattr(made, "predict"):
         check_wrappers(made)
         seen = made.get_vec_normalize_env() if hasattr(made, "get_vec_normalize_env") else None
-        return made if seen is None else _Normalised(made, seen)
+        if seen is None:
+            return made
+        if getattr(env, "norm_obs", False):
+            raise ValueError(
+                "env must show its observations as they are, which the model's own VecNormalize normalises, but is a "
+                "VecNormalize, too; pass the environment within, env.venv"
+            )
+        return _Normalised(made, seen)
     if not callable(made):
         raise ValueError(f"policy must have predict, or be a function of observations, but is {made!r:.60}")
     return _Function(made)
+
+
+def within(env: Any, is_signal: bool) -> Any:
+    """An environment of Gymnasium (or None) as it is, or that within a `VecEnv` of Stable-Baselines3.
+
+    Args:
+        env: as `agents.policies.make_policy` takes it.
+        is_signal: whether the policy looks at no observation.
+
+    Raises:
+        ValueError: for what is no environment, or a `VecEnv` that shows or takes something else than its environment.
+    """
+    if env is not None and not hasattr(env, "unwrapped"):
+        raise ValueError(f"env must be an environment, but is {shown(env)}; pass what gym.make or gym.make_vec returns")
+    if not hasattr(env, "env_is_wrapped"):  # which a VecEnv has
+        return env
+    held = env
+    while hasattr(held, "venv"):
+        if not is_signal and changes_observations(held):
+            raise ValueError(
+                f"env must show its observations as they are, but {type(held).__name__} changes them, which this "
+                "policy was not made for; play the environment without it, or choose a signal such as prbs"
+            )
+        held = held.venv
+    inner = getattr(held, "envs", None)
+    inner = inner[0] if isinstance(inner, list) else inner
+    if inner is None:
+        raise ValueError(
+            f"env must have its environments in this process, but {type(held).__name__} has not; "
+            "make it as agents.vec_env.DuffingVecEnv(id, n)"
+        )
+    if hasattr(env, "foresight") or env.action_space != getattr(inner, "single_action_space", inner.action_space):
+        raise ValueError(
+            f"env must take inputs as actions, but {type(env).__name__} takes something else, {env.action_space}; make "
+            "it without levels or foresight"
+        )
+    return inner
+
+
+def changes_observations(wrapper: Any) -> bool:
+    """Whether a wrapper of Stable-Baselines3 around a `VecEnv` shows something else than that."""
+    # A wrapper also has the attributes of what it wraps.
+    return bool(vars(wrapper).get("norm_obs", wrapper.observation_space != wrapper.venv.observation_space))
 
 
 def environments_of(model: Any) -> list[Any]:
@@ -95,7 +145,7 @@ class _Function:
     def __init__(self, function: Any) -> None:
         self._function = function
         torch = sys.modules.get("torch")
-        self._torch = torch if torch is not None and isinstance(function, torch.nn.Module) else None
+        self._is_module = torch is not None and isinstance(function, torch.nn.Module)
 
     def predict(
         self, observation: npt.ArrayLike, state: Any = None, episode_start: Any = None, deterministic: bool = False
@@ -103,13 +153,15 @@ class _Function:
         """As `agents.policies.Policy`; actions beyond the limits are cut."""
         seen = numbers("observation", observation).astype(np.float32)
         rows = np.atleast_2d(seen)
-        if self._torch is None:
+        if not self._is_module:
             chosen = self._function(rows)
         else:
-            like = next(self._function.parameters(), self._torch.zeros(()))
-            with self._torch.no_grad():
+            import torch
+
+            like = next(self._function.parameters(), torch.zeros(()))
+            with torch.no_grad():
                 try:
-                    chosen = self._function(self._torch.as_tensor(rows, dtype=like.dtype, device=like.device))
+                    chosen = self._function(torch.as_tensor(rows, dtype=like.dtype, device=like.device))
                 except RuntimeError as error:
                     raise ValueError(f"it must take observations of shape {rows.shape}, but says: {error}") from error
         if hasattr(chosen, "detach"):

@@ -58,8 +58,10 @@ def save_policy(
             Or, of whatever was trained elsewhere, the ``torch.nn.Sequential`` that gives the mean of the action: linear
             layers with tanh, ReLU or ELU between them, and perhaps a tanh at the end.
         card: what it was trained on: algorithm, track, options, seed, steps, versions; its algorithm and steps where
-            it is None. JSON must be able to hold it. Its ``observation`` ("posterior", "history", "privileged", or
-            "own") is that of the model's environment where it has none; an environment that shows another is refused.
+            it is None. Its steps are all samples that it ever learned from, which the algorithm counts anew in every
+            ``learn`` but with ``reset_num_timesteps=False``. JSON must be able to hold it. Its ``observation``
+            ("posterior", "history", "privileged", or "own") is that of the model's environment where it has none; an
+            environment that shows another is refused.
         normalizer: mean and standard deviation (features,) of the observations, and how many standard deviations a
             network of torch sees at most, all positive but the mean; None where it sees them as they are.
 

@@ -6,6 +6,7 @@ of its episodes, and to its input budget where it has one. `agents.policies.make
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -192,7 +193,8 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     experiment: Any = getattr(env, "experiment", None)
     if getattr(experiment, "rig", None) is not None:
         hold = holds(experiment.believed, samples)
-        draw = _held(EXCITATIONS[name](DEFAULT_MAX_INPUT), hold, limits.max_input / DEFAULT_MAX_INPUT)
+        usual = EXCITATIONS[name](DEFAULT_MAX_INPUT)
+        draw = partial(_slower, draw=usual, hold=hold, worth=limits.max_input / DEFAULT_MAX_INPUT)
     recorded = getattr(env, "recorded_input", None)
     if recorded is not None and name.startswith("silverbox-"):
         draw, samples = draw_recorded(recorded), len(recorded)
@@ -206,15 +208,11 @@ def holds(prior: Belief, samples: int) -> int:
     return int(np.clip(round(_RESONANCE / frequency(prior)), 1, max(1, samples // 8)))
 
 
-def _held(draw: Draw, hold: int, worth: float) -> Draw:
+def _slower(rng: np.random.Generator, samples: int, draw: Draw, hold: int, worth: float) -> NDArray[np.float64]:
     """A draw that is slower, and in another unit."""
-
-    def slower(rng: np.random.Generator, samples: int) -> NDArray[np.float64]:
-        # Below 5 samples a multisine has no line in its band.
-        values: NDArray[np.float64] = np.repeat(worth * draw(rng, max(5, -(-samples // hold))), hold)[:samples]
-        return values
-
-    return slower
+    # Below 5 samples a multisine has no line in its band.
+    values: NDArray[np.float64] = np.repeat(worth * draw(rng, max(5, -(-samples // hold))), hold)[:samples]
+    return values
 
 
 def limits_of(env: Any) -> tuple[Limits, int]:
@@ -227,8 +225,8 @@ def limits_of(env: Any) -> tuple[Limits, int]:
         return Limits(), DEFAULT_SAMPLES
     if not hasattr(env, "max_input"):
         raise ValueError(
-            f"env must be an environment of duffing_env, which has max_input, but its unwrapped "
-            f"type is {type(env).__name__}; pass env=None for a limit of {DEFAULT_MAX_INPUT} V"
+            f"env must be an environment of duffing_env, which has max_input, but its unwrapped type is "
+            f"{type(env).__name__}; pass what gym.make, gym.make_vec or DuffingVecEnv made of its id"
         )
     experiment = getattr(env, "experiment", None)
     limits = Limits(env.max_input, getattr(experiment, "max_rms", None), getattr(experiment, "hold", 1))

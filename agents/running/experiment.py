@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from agents.loading import of_ones_own
 from agents.planner.blocks import MOST_PLANNED, best_block, drafts, expected, systems_of
 from agents.planner.futures import Futures, drawn_at_rest, draws_for, rests
 from agents.planner.mean_design import Systems
@@ -27,6 +28,7 @@ from estimator.identification.checks import ENOUGH, SLOWEST
 from estimator.identification.columns import unit_of
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
+from estimator.progress import Tell, untold
 from estimator.rig import Rig
 from estimator.rig_prior import rig_prior
 
@@ -99,6 +101,7 @@ def design(
     samples: int = 256,
     bound: float = 0.05,
     seed: int = 0,
+    tell: Tell = untold,
 ) -> Designed:
     """Design the next experiment: a signal for an oscillator at rest.
 
@@ -113,6 +116,7 @@ def design(
         samples: of the experiment.
         bound: of the probability that the output leaves its range, under the whole belief.
         seed: of the policy, and of the systems that are drawn.
+        tell: is told the share that is done (`estimator.progress.progress`).
 
     Raises:
         ValueError: for a rig without limit or range, or without guess where there is no prior; a prior in other
@@ -140,15 +144,19 @@ def design(
     drawn = drawn_at_rest(belief, rng, draws_for(bound, MOST_PLANNED))
     futures = Futures(view.model, drawn, limit, rng, max(0, rig.whole_delay), view.degree)
     systems = systems_of(view, belief, futures, int(samples))
-    chooser = make_policy(policy, observed, seed=seed)  # type: ignore[arg-type]
+    with of_ones_own(policy, "policy"):
+        chooser = make_policy(policy, observed, seed=seed)  # type: ignore[arg-type]
     if isinstance(chooser, Planner):
         noises = min(max(_NOISE_SAMPLES // int(samples), _FEWEST_NOISES), _MOST_NOISES)
         begun = drafts(chooser, _at_rest(belief), int(samples), seed, noises)
-        u, share, probability = best_block(view, systems, futures, begun, observed.max_input, bound)
+        u, share, probability = best_block(view, systems, futures, begun, observed.max_input, bound, tell=tell)
     elif isinstance(chooser, SignalPolicy):
         u, share, probability = SignalDesign(chooser, observed).block(int(samples), futures, bound)
     else:
-        found = [_played(policy, observed, futures, k, bound, seed) for k in range(_PLAYED)]
+        found = [
+            _played(policy, observed, futures, k, bound, seed, lambda part, k=k: tell((k + part) / _PLAYED))
+            for k in range(_PLAYED)
+        ]
         told = [expected(view, systems, limit, u)[0] for u, *_ in found]
         u, share, probability = found[int(np.argmax(told))]
     in_period = 1 / frequency(belief)
@@ -222,7 +230,7 @@ class _Imagined:
         return float(self._scales.output * (y + self._noises[1][t - 1]))
 
 
-def _played(name: str, observed: Observed, futures: Futures, k: int, bound: float, seed: int) -> Block:
+def _played(name: str, observed: Observed, futures: Futures, k: int, bound: float, seed: int, tell: Tell) -> Block:
     """What a policy answers to a drawn system, as large as it is safe on all."""
     import gymnasium as gym
 
@@ -237,7 +245,9 @@ def _played(name: str, observed: Observed, futures: Futures, k: int, bound: floa
     observation, _ = env.reset()
     u, state, begins = np.zeros(observed.horizon), None, np.ones(1, dtype=bool)
     for t in range(observed.horizon):
-        action, state = policy.predict(observation, state, begins, deterministic=True)
+        tell(t / observed.horizon)
+        with of_ones_own(name, "policy"):
+            action, state = policy.predict(observation, state, begins, deterministic=True)
         begins = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, _ = env.step(action)
         u[t] = observed.max_input * float(action[0])

@@ -27,6 +27,7 @@ class Observed:
     Attributes:
         experiment: that of ``Rig-v0`` around a plant.
         belief: the belief now; to be set.
+        shown: (1, entries) what `observation` gave last.
     """
 
     def __init__(self, rig: Rig, prior: Belief, samples: int) -> None:
@@ -34,6 +35,7 @@ class Observed:
         self.experiment = RigPlantExperiment(rig=replace(rig, delay=0), prior=prior, horizon=samples)
         self.max_input, self.horizon = float(self.experiment.max_input), samples
         self.belief = prior
+        self.shown = self.observation(0.0, 0.0, 0)[None]
 
     @property
     def unwrapped(self) -> Observed:
@@ -71,4 +73,5 @@ class Observed:
         ])  # fmt: skip
         low, high = np.array(list(observation_bounds(belief.model).values())).T
         shown: npt.NDArray[np.float32] = np.clip(values, low, high).astype(np.float32)
+        self.shown = shown[None]
         return shown

@@ -72,7 +72,7 @@ def load_plant(place: str, rig: Rig, settings: Mapping[str, Any] | None = None) 
         plant = factory(rig, **(settings or {}))
     except ModuleNotFoundError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(
             f"plant must be made by {place}(rig, **instrument), with the table [instrument] of the rig file, but that "
             f"failed: {type(error).__name__}: {error}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.results import check_folder, finite, versions
-from estimator.files import append_atomically, write_atomically
+from estimator.files import append_atomically, hold, write_atomically, writing
 from estimator.rig import Rig
 
 #: Columns of samples.csv. `identify` takes ``time``, ``u`` and ``y``, which are called as the rig calls its columns.
@@ -34,16 +35,25 @@ class Recording:
         rig: whose names of columns the samples have.
 
     Raises:
-        ValueError: for a folder that holds something.
+        ValueError: for a folder that holds something, or that another process writes to.
         NotADirectoryError: for a file, or a place in one.
     """
 
     def __init__(self, folder: str | Path, manifest: dict[str, Any], rig: Rig) -> None:
         self.folder = Path(folder)
         check_folder("out", self.folder)
-        if self.folder.exists() and any(self.folder.iterdir()):
+        with writing(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        self._held = hold("out", self.folder)
+        try:
+            self._begin(manifest, rig)
+        except BaseException:
+            self._let_go()
+            raise
+
+    def _begin(self, manifest: dict[str, Any], rig: Rig) -> None:
+        if any(self.folder.iterdir()):
             raise ValueError(f"out must be a new or empty folder, but {self.folder} holds something; name another one")
-        self.folder.mkdir(parents=True, exist_ok=True)
         self._manifest = {**manifest, "versions": versions(), "commit": _commit(), "started": _time(), "ended": None}
         self._write_manifest()
         names = {"u": rig.input.column or "u", "y": rig.output.column or "y"}
@@ -68,10 +78,18 @@ class Recording:
 
     def close(self, **outcome: Any) -> None:
         """Tell events and manifest how it ended; the samples become read-only."""
-        self.note("ended", **outcome)
-        self._manifest |= {**outcome, "ended": _time()}
-        self._write_manifest()
-        self.samples.chmod(0o444)
+        try:
+            self.note("ended", **outcome)
+            self._manifest |= {**outcome, "ended": _time()}
+            self._write_manifest()
+            self.samples.chmod(0o444)
+        finally:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
 
     def _write_manifest(self) -> None:
         write_atomically(self.folder / "manifest.json", json.dumps(finite(self._manifest), indent=1) + "\n")

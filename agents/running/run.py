@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from agents.loading import of_ones_own
 from agents.planner.futures import Futures
 from agents.policies import make_policy
 from agents.policies.signals import SignalPolicy
@@ -129,10 +130,11 @@ def run(
     follower, silence = Follower(rig, prior), plan.silence(rig.step)
     check_session(rig, plant, silence)
     observed = Observed(rig, follower.belief, plan.samples)
-    policy = make_policy(plan.policy, observed, seed=plan.seed)  # type: ignore[arg-type]
-    design = design_of(policy, observed) if plan.block or isinstance(policy, SignalPolicy) else None
-    choose: Chooser | None = None if design else asking(policy, observed, follower)
-    _warm_up(follower, observed, design, policy, plan)
+    with of_ones_own(plan.policy, "policy"):
+        policy = make_policy(plan.policy, observed, seed=plan.seed)  # type: ignore[arg-type]
+        design = design_of(policy, observed) if plan.block or isinstance(policy, SignalPolicy) else None
+        choose: Chooser | None = None if design else asking(policy, observed, follower)
+        _warm_up(follower, observed, design, policy, plan)
     described = {"command": sys.argv, "rig": rig.to_dict(), "plan": asdict(plan), "watchdog": silence}
     recording = Recording(out, {**described, "plant": repr(plant)[:200]}, rig)
     session = Session(plant, rig, recording.note, silence, plan.stale)

@@ -19,7 +19,9 @@ import numpy as np
 from agents.cli import check_track, followed, full_id, run_script
 from agents.evaluation.batch import make
 from agents.evaluation.comparison import usual_policies
+from agents.loading import of_ones_own
 from agents.policies import make_policy, trained_policies
+from agents.results import show
 from estimator.checks import one_of, whole
 from estimator.extras import need
 
@@ -72,12 +74,14 @@ def collect(config: Config) -> list[dict[str, Any]]:
     """Episodes as Minari's buffers hold them: an observation more than actions, rewards and ends."""
     name = config.policy
     envs = make(config.env, min(_ROWS, config.episodes))
-    policy = make_policy(name, envs, seed=config.seed)
+    with of_ones_own(name, "policy"):
+        policy = make_policy(name, envs, seed=config.seed)
     episodes: list[dict[str, Any]] = []
     seeds = np.random.SeedSequence(config.seed).generate_state(-(-config.episodes // envs.num_envs))
     batches = [(f"batch {number} of {len(seeds)}", int(seed)) for number, seed in enumerate(seeds, start=1)]
     for seed in followed(batches):
-        episodes += _play(envs, policy, seed)
+        with of_ones_own(name, "policy"):
+            episodes += _play(envs, policy, seed)
     envs.close()
     return episodes[: config.episodes]
 
@@ -139,7 +143,7 @@ def main(config: Config) -> None:
         )
     gained = [float(np.sum(buffer.rewards)) for buffer in buffers]
     counts = f"{dataset.total_episodes} episodes, {dataset.total_steps} samples"
-    print(f"{config.name}: {counts}, return {np.mean(gained):.2f}")
+    show(f"{config.name}: {counts}, return {np.mean(gained):.2f}")
 
 
 if __name__ == "__main__":

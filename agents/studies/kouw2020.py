@@ -19,7 +19,7 @@ import numpy as np
 from agents.cli import followed
 from agents.evaluation.figures import new_figure, save
 from agents.policies import make_policy
-from agents.results import check_file, show, spinner, table, versions, write_json
+from agents.results import check_file, show, table, versions, write_json
 from duffing_env.silverbox import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
@@ -135,8 +135,7 @@ def reproduce(
 
 def run_all(record: SilverboxRecord, data: Path | None) -> dict[str, dict[str, Run]]:
     """Trains and validates each model of each setting, behind a progress bar on stderr."""
-    with spinner("compiling"):
-        compile_kernels(record, data)
+    compile_kernels(record, data)
     runs: dict[str, dict[str, Run]] = {name: {} for name in SETTINGS}
     tasks = [(f"{name}, {model}", (name, model)) for name, setting in SETTINGS.items() for model in setting.models]
     for name, model in followed(tasks):
@@ -290,7 +289,7 @@ def report(results: dict[str, Any]) -> None:
                 cells += [f"{mse:.4e}", f"{ratio:.4f}", f"{1e3 * np.sqrt(mse):.3f}"]
             rows.append(cells)
     show(
-        table(titles, rows),
+        table(titles, rows, labels=2),
         "\nratio: to the published error of the same model",
         *(f"{name + ':':20} {setting.summary}" for name, setting in SETTINGS.items()),
         *(

@@ -24,6 +24,7 @@ import numpy as np
 from agents.cli import run_script
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.leaderboard import METRICS, in_line
+from agents.loading import of_ones_own
 from agents.policies import make_policy
 from agents.results import show, table
 from estimator.parameters import FloatArray
@@ -52,12 +53,14 @@ class Config:
 def gains(policy: str, systems: int, seed: int = 0) -> tuple[FloatArray, int]:
     """(50, systems) information gained after every sample [nats], and the number of episodes that a limit ended."""
     envs = make(TRACK, systems, TESTED)
-    chosen = make_policy(policy, envs, seed=seed)
+    with of_ones_own(policy, "policy"):
+        chosen = make_policy(policy, envs, seed=seed)
     observations, _ = envs.reset(seed=seed)
     found, running = np.zeros((envs.horizon, systems)), np.ones(systems, dtype=np.bool_)
     state, start, early = None, np.ones(systems, dtype=np.bool_), 0
     for t in range(envs.horizon):
-        actions, state = chosen.predict(observations, state, start, deterministic=True)
+        with of_ones_own(policy, "policy"):
+            actions, state = chosen.predict(observations, state, start, deterministic=True)
         start = np.zeros(systems, dtype=np.bool_)
         observations, _, terminated, truncated, infos = envs.step(actions)
         found[t, running] = infos["information_gain"][running]

@@ -24,7 +24,7 @@ from agents.cli import run_script
 from agents.evaluation.leaderboard import print_table, summarise
 from agents.evaluation.rollout import evaluate, pooled
 from agents.policies.learned import CARD, WEIGHTS
-from agents.results import write_json
+from agents.results import show, write_json
 from estimator.files import write_atomically
 
 
@@ -76,7 +76,7 @@ def ship(config: Config) -> Path:
     }
     put(folder, config.runs[chosen], card)
     print_table([together], f"{env}, {config.systems} systems")
-    print(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
+    show(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
     return folder
 
 
@@ -84,7 +84,7 @@ def _check_name(name: str, algorithm: str | None, env: str, card: Path) -> None:
     """Refuse a name that is of other runs."""
     if name.partition("/")[0] != algorithm:
         raise ValueError(f"name must begin with the runs' algorithm, {algorithm}, but is {name!r}")
-    if card.is_file() and (of := json.loads(card.read_text())["track"]) != env:
+    if card.is_file() and (of := json.loads(card.read_text(encoding="utf-8"))["track"]) != env:
         raise ValueError(f"name must be one for {env}, but {name!r} is of {of}; ship the runs under another")
 
 
@@ -101,7 +101,7 @@ def card_of(run: Path) -> dict[str, Any]:
     """
     if not (run / WEIGHTS).is_file() or not (run / CARD).is_file():
         raise ValueError(f"runs must hold {WEIGHTS} and {CARD}, but {run} does not; pass finished run folders")
-    card: dict[str, Any] = json.loads((run / CARD).read_text())
+    card: dict[str, Any] = json.loads((run / CARD).read_text(encoding="utf-8"))
     card["command"] = [_name(word) for word in card.get("command", [])]
     if card["config"].get("output"):
         card["config"]["output"] = _name(card["config"]["output"])

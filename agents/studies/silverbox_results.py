@@ -78,11 +78,13 @@ def run_protocol(
     results = summarise(outcomes)
     for name, figure in figures_of(outcomes).items():
         save(figure, figures / f"silverbox_{name}.png")
+    if json is not None:
+        write_json(json, results)
     report(outcomes)
     if compare is not None:
         results["comparison"] = compare(sections, outcomes)
-    if json is not None:
-        write_json(json, results)
+        if json is not None:
+            write_json(json, results)
     return results
 
 
@@ -130,7 +132,7 @@ def report(outcomes: Mapping[str, Outcome]) -> None:
 
 
 def as_table(outcomes: Mapping[str, Outcome]) -> Any:
-    """A row for each setting, in 100 characters."""
+    """A row for each setting."""
     columns = ("multisine\n[mV]", "arrow\n[mV]", "n.e.\n[mV]", "1-step\n[mV]", "90 %\ncovers", "<1 mV\nafter")
     return table(
         ("", *columns, "µs per\nsample", "free energy\n[nats]"),

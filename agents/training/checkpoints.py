@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from agents.policies.learned import WEIGHTS
 from agents.policies.saving import write_policy
-from estimator.files import whole_file, write_atomically
+from estimator.files import whole_file, write_atomically, writing
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -68,8 +68,9 @@ def save_checkpoint(run: Path, model: BaseAlgorithm, card: dict[str, Any], progr
             alone.
     """
     target = run / FOLDER / f"{model.num_timesteps:09d}"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    half_written = Path(tempfile.mkdtemp(dir=run, prefix=_HALF_WRITTEN))
+    with writing(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        half_written = Path(tempfile.mkdtemp(dir=run, prefix=_HALF_WRITTEN))
     try:
         half_written.chmod(0o755)
         write_policy(half_written, model, card)
@@ -97,7 +98,9 @@ def load_progress(checkpoint: Path) -> Progress:
         ValueError: where the file is damaged.
     """
     try:
-        found = json.loads(whole_file(checkpoint / STATE, "checkpoint must be whole", 2**28).read_text())
+        found = json.loads(
+            whole_file(checkpoint / STATE, "checkpoint must be whole", 2**28).read_text(encoding="utf-8")
+        )
         return Progress(**{**found, "curve": [tuple(point) for point in found["curve"]]})
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"checkpoint must hold a sound {STATE}, but {checkpoint} does not: {error!r}") from error

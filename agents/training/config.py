@@ -32,7 +32,7 @@ class Subject:
     algo: Literal["ppo", "sac", "td3", "tqc", "recurrent_ppo"] = "ppo"
     """Algorithm."""
     env: str = "duffing_env/Amplitude-v0"
-    """Track, such as Short-v0; or family, the oscillators of all kinds that ppo/universal is trained on."""
+    """Track, such as Short-v0; or family, oscillators of all kinds."""
     rig: str | None = None
     """Rig file, or the name of a rig that ships; the track is then Rig-v0."""
     settings: Path | None = None
@@ -97,7 +97,7 @@ class TrainConfig(Subject):
         elif self.options or self.eval_every or self.algo != "ppo":
             raise ValueError(
                 f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare with "
-                "python -m agents.studies.universal"
+                "python -m agents.studies.family"
             )
         if self.hyperparameters is None:
             object.__setattr__(self, "hyperparameters", read_settings(self.algo, self.env, self.settings))
@@ -177,7 +177,7 @@ def claim(file: Path, config: TrainConfig) -> None:
         ValueError: for a file that says something else, naming the first setting that differs.
     """
     described = json.loads(json.dumps(describe(config)))
-    before = json.loads(file.read_text()) if file.exists() else described
+    before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else described
     was, now = _compared(before["config"]), _compared(described["config"])
     for name, value in now.items():
         if was.get(name) != value:
@@ -207,7 +207,7 @@ def read_config(folder: Path) -> TrainConfig:
     """The configuration that a run folder was made from; what only a script had in it is left out."""
     try:
         place = whole_file(folder / CONFIG, "resume must be a run folder, with a config.json", 2**20)
-        found = json.loads(place.read_text())["config"]
+        found = json.loads(place.read_text(encoding="utf-8"))["config"]
         known = {f.name: found[f.name] for f in fields(TrainConfig)}
         known |= {name: None if known[name] is None else Path(known[name]) for name in ("output", "settings", "begin")}
         known["hyperparameters"] = settings_of(ALGORITHMS[known["algo"]], known["hyperparameters"])

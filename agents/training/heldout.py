@@ -32,7 +32,7 @@ _SEED = 0
 
 def score_of(folder: Path) -> float:
     """The score of a finished run, which was evaluated at its end."""
-    *_, last = csv.DictReader((folder / FILE).read_text().splitlines())
+    *_, last = csv.DictReader((folder / FILE).read_text(encoding="utf-8").splitlines())
     return float(last[SCORE])
 
 
@@ -49,12 +49,12 @@ class HeldOut:
         self._folder, self._config = folder, config
         self._rows: list[dict[str, float]] = []
         if (folder / FILE).exists():
-            for row in csv.DictReader((folder / FILE).read_text().splitlines()):
+            for row in csv.DictReader((folder / FILE).read_text(encoding="utf-8").splitlines()):
                 if int(row["steps"]) <= steps:
                     self._rows.append({name: int(v) if name == "steps" else float(v) for name, v in row.items()})
         self._best = float("-inf")
         if (folder / BEST / CARD).exists():
-            self._best = json.loads((folder / BEST / CARD).read_text())["evaluation"][SCORE]
+            self._best = json.loads((folder / BEST / CARD).read_text(encoding="utf-8"))["evaluation"][SCORE]
 
     @property
     def has_begun(self) -> bool:

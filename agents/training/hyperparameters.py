@@ -51,7 +51,7 @@ def read_settings(algo: str, env_id: str, path: Path | None = None) -> Algorithm
     one_of("algo", algo, ALGORITHMS)
     file = FILES / f"{algo}.toml" if path is None else path
     try:
-        tables = tomllib.loads(whole_file(file, "settings must be a TOML file", 2**20).read_text())
+        tables = tomllib.loads(whole_file(file, "settings must be a TOML file", 2**20).read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"settings must be a TOML file, but {file} is not: {error}") from error
     for table, entries in tables.items():

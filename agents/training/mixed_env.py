@@ -10,14 +10,15 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from agents.evaluation.batch import make
 from agents.policies.foresight import CommonForesight
 from agents.policies.imagined import BOUND, FEATURES
 from agents.policies.sight import Sight
-from agents.vec_env import BatchVecEnv
+from agents.vec_env import BatchVecEnv, rows_of, told_of
 from duffing_env.vector_env import DuffingVectorEnv
+from estimator.checks import shown
 from estimator.lanes import LANES
 
 #: Draws what a group plays next: the id of a track, and the options of its environments.
@@ -52,9 +53,14 @@ class _Group:
         env_id, drawn = draw(rng)
         self.envs: DuffingVectorEnv = make(env_id, LANES, drawn | options)
         self.foresight = CommonForesight(self.envs, **seen)
-        observations, _ = self.envs.reset(seed=int(rng.integers(2**31)))
+        observations, self.infos = self.envs.reset(seed=int(rng.integers(2**31)))
         self.view: Sight = self.foresight.look(observations)
         self.left = self.envs.horizon
+
+    def told(self, **others: Any) -> list[dict[str, Any]]:
+        """The infos of its rows at the last reset or step."""
+        single = self.envs.single
+        return rows_of(self.infos, (*single._reported, *single._flags), LANES, **others)
 
 
 class MixedVecEnv(BatchVecEnv):
@@ -109,8 +115,16 @@ class MixedVecEnv(BatchVecEnv):
         return _Group(rng, self._draw, self._fixed, self._seen)
 
     def reset(self) -> VecEnvObs:
-        """Show what every row sees; the episodes have begun."""
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        """Show what every row sees; the episodes have begun.
+
+        Raises:
+            ValueError: for options of `set_options`: they are drawn here.
+        """
+        if any(self._options):
+            raise ValueError(
+                f"options must be none where they are drawn, but are {shown(self._options)}; leave them out"
+            )
+        self.reset_infos = [info for group in self._groups for info in group.told()]
         return np.concatenate([group.view.features for group in self._groups])
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
@@ -121,13 +135,14 @@ class MixedVecEnv(BatchVecEnv):
         """Step all groups."""
         features = np.empty((self.num_envs, self.foresight.features), dtype=np.float32)
         rewards, dones = np.empty(self.num_envs, dtype=np.float32), np.empty(self.num_envs, dtype=np.bool_)
-        rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        rows: list[dict[str, Any]] = []
         for g, group in enumerate(self._groups):
             mine = slice(g * LANES, (g + 1) * LANES)
             before = group.view.features[:, _TO_COME]
             actions = group.view.act(self._choices[mine])
-            observations, gained, terminated, truncated, _ = group.envs.step(actions)
+            observations, gained, terminated, truncated, group.infos = group.envs.step(actions)
             ended = terminated | truncated
+            rows += group.told(**{"TimeLimit.truncated": False})
             group.view = group.foresight.look(observations)
             group.left -= 1
             after = np.where(ended, np.float32(0), group.view.features[:, _TO_COME])
@@ -135,9 +150,9 @@ class MixedVecEnv(BatchVecEnv):
             self._returns[mine] += gained
             self._lengths[mine] += 1
             dones[mine] = ended | (group.left == 0)
-            for row in np.flatnonzero(dones[mine]):
+            for row in np.flatnonzero(dones[mine]).tolist():
                 at = g * LANES + row
-                rows[at] = {
+                rows[at] |= (told_of(group.infos["final_info"], row) if ended[row] else {}) | {
                     "terminal_observation": group.view.features[row].copy(),
                     "TimeLimit.truncated": bool(not ended[row]),
                     "episode": {"r": self._returns[at], "l": self._lengths[at], "t": perf_counter() - self._started},
@@ -148,6 +163,12 @@ class MixedVecEnv(BatchVecEnv):
                 group = self._groups[g] = self._drawn(self._rngs[g])
             features[mine] = group.view.features
         return features, rewards, dones, rows
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """As of `BatchVecEnv`; options of the environments are refused."""
+        if hasattr(self._groups[0].envs, attr_name):
+            setattr(self._groups[0].envs, attr_name, value)
+        super().set_attr(attr_name, value, indices)
 
     def close(self) -> None:
         """Close the environments."""

@@ -1,41 +1,23 @@
-"""Where a network with the features of all oscillators begins: at the rule that these tell, not at chance."""
+"""Where a network with the features of all oscillators begins: at the rule of `lookahead`, not at chance."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
-import numpy.typing as npt
 
 from agents.policies.foresight import CommonForesight
-from agents.policies.imagined import FEATURES
+from agents.policies.lookahead import NONE, UP
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
-
-_UP, _NONE = (FEATURES.index(f"best_{way}_whole") for way in ("up", "none"))
 
 #: How sharply a layer tells the sign of what it is given.
 _SHARP = 3.0
 
 
-def rule(features: npt.NDArray[np.float32], levels: int) -> npt.NDArray[np.int64]:
-    """The choices (n,) of what brings most, by features (n, len(FEATURES)): up, none, or down.
-
-    Example:
-        >>> import numpy as np
-        >>> seen = np.zeros((3, len(FEATURES)), dtype=np.float32)
-        >>> seen[:, _UP], seen[:, _NONE] = [1.0, -1.0, 1.0], [-1.0, -1.0, 0.5]
-        >>> rule(seen, 5)
-        array([4, 0, 2])
-    """
-    push = np.where(features[:, _UP] >= 0.0, levels - 1, 0)
-    return np.where(features[:, _NONE] > 0.0, levels // 2, push) if levels % 2 else push
-
-
 def begin_with_rule(model: BaseAlgorithm, envs: Any, logit: float) -> None:
-    """Let a new model's actor choose as `rule` does: two units of every layer carry what it depends on.
+    """Let a new model's actor choose as `lookahead` does: two units of every layer carry what that depends on.
 
     A model that does not choose from levels, or does not see the features of all oscillators, is left as it is.
 
@@ -53,7 +35,7 @@ def begin_with_rule(model: BaseAlgorithm, envs: Any, logit: float) -> None:
     policy: Any = model.policy
     layers = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, torch.nn.Linear)]
     with torch.no_grad():
-        inputs = _UP, _NONE
+        inputs = UP, NONE
         for layer in layers:
             layer.weight[:2], layer.bias[:2] = 0.0, 0.0
             for unit in range(2):

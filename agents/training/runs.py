@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import shlex
+import shutil
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.policies.learned import CARD, CONFIG
+from agents.policies.learned import CARD, CONFIG, steps_of
 from agents.policies.saving import write_policy
 from agents.results import check_folder, write_json
 from agents.stopping import Stopper, telling
@@ -34,12 +35,17 @@ from agents.training.config import IN_NATS, TrainConfig, contrib, describe, read
 from agents.training.heldout import METRICS, HeldOut
 from agents.training.hyperparameters import track_of
 from estimator.extras import need
+from estimator.files import held, writing
+from estimator.progress import progress
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 #: Picture of the returns in a run folder.
 LEARNING = "learning_curve.png"
+
+#: Samples that the network had learned from that a run began with (``begin``): all of them count.
+BEFORE = "steps_before"
 
 #: After a signal, the update that is on its way may take so many seconds, before nothing more is saved.
 _PATIENCE = 60.0
@@ -85,11 +91,12 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     Raises:
         Stopped: after a signal; its ``left`` says whether anything was kept, and how to go on.
         ModuleNotFoundError: without the packages of the extra ``train``.
-        ValueError: for settings that make no sense, before anything is written.
+        ValueError: for settings that make no sense, or a folder that another process trains in, before anything is
+            written.
+        OSError: naming the file that cannot be written; where there is no checkpoint to go on from, nothing is left.
     """
     need("torch", "stable_baselines3", "matplotlib", *contrib(config))
-    folder = _run_folder(config)
-    with telling(lambda said: said or _left(folder)):
+    with _new_folder(config) as folder, telling(lambda said: said or _left(folder)):
         return _Training(config, folder, on_evaluation).run()
 
 
@@ -105,15 +112,19 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
         on_evaluation: as of `train`.
 
     Raises:
-        ValueError: where it is no run folder, or the run is finished.
+        ValueError: where it is no run folder, the run is finished, or another process trains in it.
         OSError: where nothing can be written there.
     """
     if not (folder / CONFIG).is_file():
         raise ValueError(f"resume must be a run folder, which holds {CONFIG}, but {folder} is not one; name a run's")
-    if (folder / CARD).exists():
-        raise ValueError(f"resume must be a run that was stopped, but {folder} is finished; it holds its policy")
-    check_folder("resume", folder)
-    with telling(lambda said: said or _left(folder)):
+    with held("resume", folder), telling(lambda said: said or _left(folder)):
+        if (folder / CARD).exists():
+            command = shlex.join(["duffing-env", "train", "--begin", str(folder)])
+            raise ValueError(
+                f"resume must be a run that was stopped, but {folder} is finished; for more samples begin another run "
+                f"with its network: {command}"
+            )
+        check_folder("resume", folder)
         return _Training(read_config(folder), folder, on_evaluation).run()
 
 
@@ -163,21 +174,23 @@ class _Training:
         self._evaluated = on_evaluation
         self._board: Any = None
         begun_as = folder / CONFIG
-        self._description = json.loads(begun_as.read_text()) if begun_as.exists() else describe(config)
+        self._description = json.loads(begun_as.read_text(encoding="utf-8")) if begun_as.exists() else describe(config)
+        if not begun_as.exists() and config.begin is not None:
+            self._description[BEFORE] = steps_of(config.begin)
 
     def run(self) -> Run:
-        from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+        from stable_baselines3.common.logger import KVWriter
 
         from agents.evaluation.figures import figure_of_learning, save
-        from agents.training.callbacks import ContinuedCSV
+        from agents.training.callbacks import Board, ContinuedCSV, Log
 
         if not (self._folder / CONFIG).exists():
             write_json(self._folder / CONFIG, self._description)
         logs: list[KVWriter] = [ContinuedCSV(self._folder / "progress.csv", self._progress.steps)]
         if self._config.tensorboard:
-            self._board = TensorBoardOutputFormat(str(self._folder))
+            self._board = Board(self._folder)
             logs.append(self._board)
-        with closing(Logger(str(self._folder), logs)) as logger:
+        with closing(Log(self._folder, logs, self._progress.steps)) as logger:
             self._model.set_logger(logger)
             if self._config.eval_every > 0 and not self._held_out.has_begun:
                 self._evaluate()
@@ -191,24 +204,23 @@ class _Training:
         return Run(self._config, self._folder, curve, self._seconds())
 
     def _learn(self) -> None:
-        """Learn with a progress bar."""
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
+        """Learn, and show how far it is."""
         from agents.training.callbacks import Watch
 
-        columns = (TextColumn("Training"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn())
         total, begun = self._config.steps, self._progress.steps
         with ExitStack() as stack:
-            bar = stack.enter_context(Progress(*columns))
-            task = bar.add_task("", total=total, completed=begun, status="compiling")
-            started = time.perf_counter()
+            tell = stack.enter_context(progress("Training"))
+            tell(begun / total)
+            ended = ""
+
+            def on_step(steps: int) -> None:
+                tell(min(steps / total, 1.0), ended)
 
             def on_rollout(steps: int, mean_return: float) -> None:
+                nonlocal ended
                 self._progress.curve.append((steps, self._seconds(), None if math.isnan(mean_return) else mean_return))
-                rate = (steps - begun) / (time.perf_counter() - started)
                 ended = "no episode has ended" if math.isnan(mean_return) else f"return {mean_return:.2f}"
-                status = f"{steps:,} samples, {rate:,.0f}/s, {ended}"
-                bar.update(task, completed=min(steps, total), status=status)
+                on_step(steps)
 
             def on_update() -> None:
                 self._on_update()
@@ -219,7 +231,9 @@ class _Training:
             stopper = stack.enter_context(Stopper(_PATIENCE))
             self._model.learn(
                 total - begun,
-                callback=Watch(on_rollout, on_update, getattr(self._config.hyperparameters, "entropy_bonus", 0.0)),
+                callback=Watch(
+                    on_rollout, on_update, on_step, getattr(self._config.hyperparameters, "entropy_bonus", 0.0)
+                ),
                 log_interval=self._config.hyperparameters.log_interval,
                 reset_num_timesteps=begun == 0,
             )
@@ -259,7 +273,8 @@ class _Training:
         return done * self._config.checkpoints // self._config.steps
 
     def _card(self) -> dict[str, Any]:
-        return {"algorithm": self._config.algo, "steps": self._model.num_timesteps, **self._description}
+        learned_from = self._model.num_timesteps + self._description.get(BEFORE, 0)
+        return {"algorithm": self._config.algo, "steps": learned_from, **self._description}
 
     def _seconds(self) -> float:
         return time.perf_counter() - self._clock
@@ -294,8 +309,39 @@ def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
     return ForesightVecEnv(envs, foresight, levels, in_nats=config.reward in IN_NATS)
 
 
-def _run_folder(config: TrainConfig) -> Path:
-    """The folder to write to; one that is named must be new or empty."""
+@contextmanager
+def _new_folder(config: TrainConfig) -> Iterator[Path]:
+    """The folder to write to, held meanwhile; an error of the disk leaves nothing there without a checkpoint."""
+    _check_output(config)
+    base = Path("runs") / f"{config.algo}-{track_of(config.env).lower()}-{config.seed}"
+    folder, number, is_made = config.output or base, 1, False
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    while not is_made:
+        with writing(folder):
+            try:
+                folder.mkdir(parents=True, exist_ok=config.output is not None)
+                is_made = True
+            except FileExistsError:
+                number += 1
+                folder = base.with_name(f"{base.name}-{number}")
+                missing = [folder, *missing[1:]]
+    with held("output", folder):
+        _check_output(config)  # nobody else had it before
+        try:
+            yield folder
+        except OSError:
+            if latest_checkpoint(folder) is None:
+                for path in folder.iterdir():
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+            raise
+        finally:
+            with suppress(OSError):  # one that holds something stays
+                for place in missing:
+                    place.rmdir()
+
+
+def _check_output(config: TrainConfig) -> None:
+    """Refuse a named folder that is neither new nor empty."""
     if config.output is not None:
         for kept, name in (("run", CONFIG), ("policy", CARD)):
             if (config.output / name).exists():
@@ -307,10 +353,3 @@ def _run_folder(config: TrainConfig) -> Path:
                 f"output must be a new or empty folder, but {config.output} holds {other}, which is no training's; "
                 "name another"
             )
-        return config.output
-    base = Path("runs") / f"{config.algo}-{track_of(config.env).lower()}-{config.seed}"
-    folder, number = base, 1
-    while folder.exists():
-        number += 1
-        folder = base.with_name(f"{base.name}-{number}")
-    return folder

@@ -20,6 +20,7 @@ from agents.training.heldout import SCORE, score_of
 from agents.training.hyperparameters import track_of, write_settings
 from agents.training.runs import carry_on
 from estimator.extras import need
+from estimator.files import held
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -49,17 +50,23 @@ def tune(config: TrainConfig, trials: int, *, on_ray: bool = False) -> Path:
 
     Raises:
         ModuleNotFoundError: without Optuna, or Ray where that is asked for.
-        ValueError: where the folder holds another search.
+        ValueError: where the folder holds another search, or another process searches in it.
     """
     need("optuna")
-    import optuna
-    import optuna.storages.journal
-
     if on_ray:
         need("ray")
     folder = config.output or Path("runs") / f"tune-{config.algo}-{track_of(config.env).lower()}-{config.seed}"
     folder = folder.resolve()
     claim(folder / "search.json", config)
+    with held("output", folder):
+        return _search(config, folder, trials, on_ray)
+
+
+def _search(config: TrainConfig, folder: Path, trials: int, on_ray: bool) -> Path:
+    """Search, or go on with it."""
+    import optuna
+    import optuna.storages.journal
+
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # it warns of a trial that a signal ended, with a traceback
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
     # A folder that was renamed holds the study of its first name.

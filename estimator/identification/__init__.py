@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,8 @@ from estimator.identification.result import Result, deviations_of
 from estimator.identification.search import search, spread
 from estimator.models.duffing import KINDS
 from estimator.parameters import FloatArray
+from estimator.progress import progress as shown
+from estimator.progress import untold
 from estimator.rig import Rig
 from estimator.units import Scales
 
@@ -38,7 +40,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
             list. Before its first sample a record may have been in any motion; its first outputs, three, as many as the
             input is late, and one more of an accelerometer, are left out, because inputs before the record may still
             act. An output that is NaN is missing; a record is cut where an input is.
-        progress: tell on stderr what is being done.
+        progress: tell on stderr how far it is, where it takes more than 5 seconds.
 
     Returns:
         Parameters with intervals, warnings of the checks, forecasts, and the belief to go on with.
@@ -67,7 +69,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     """
     rig = Rig.of(rig)
     read = records_of(records, rig)
-    with _teller(progress) as tell:
+    with shown("Identifying") if progress else nullcontext(untold) as tell:
         scales = _scales(rig, read)
         u = tuple(one.u / scales.input for one in read)
         y = tuple(explicable(one.y, rig, LATEST) / scales.output for one in read)
@@ -78,7 +80,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         # Forecasts, and checks that compare the equation with others, are of the most probable place of a ridge.
         along = spread(found, JUDGED)
         belief, noises = posterior(problem, along)
-        tell("checking the result")
+        tell(0.9, "checking the result")
         forecasts = foreseen(found, belief)
         parameters = deviations_of(belief, along.ridges)
         warnings = examine(problem, found, along.ridges, belief, parameters, noises["input"], read, forecasts)
@@ -101,15 +103,3 @@ def _origin(rig: Rig, outputs: Sequence[FloatArray]) -> float:
     seen = np.concatenate(outputs)
     mean = float(np.nanmean(seen))
     return mean if KINDS[rig.output.kind] == 0 and abs(mean) > np.nanstd(seen) else 0.0
-
-
-@contextmanager
-def _teller(progress: bool) -> Iterator[Callable[[str], None]]:
-    """Tells what is being done, where that is wanted."""
-    if not progress:
-        yield lambda text: None
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status("Identifying") as status:
-        yield lambda text: status.update(text.capitalize())

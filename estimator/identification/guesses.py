@@ -120,7 +120,7 @@ def without_guess(problem: Problem, found: Found) -> tuple[Parameters, float]:
     Both fits are judged as if nothing were guessed, so that it does not count how improbable the guess holds them.
     """
     try:
-        alone = search(replace(problem, rig=replace(problem.rig, guess=None)), lambda text: None)
+        alone = search(replace(problem, rig=replace(problem.rig, guess=None)), lambda share, at="": None)
     except ValueError:  # the records tell too little without a guess
         return {}, 0.0
     judge = Fitter(found.fitter.problem, alone.fitter.prior)

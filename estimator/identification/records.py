@@ -21,6 +21,7 @@ from estimator.identification.shared import shared
 from estimator.identification.tables import read_table
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
+from estimator.units import SIZES
 
 #: No file of a record is larger [bytes].
 _LARGEST_FILE = 2**30
@@ -136,6 +137,12 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
                 raise ValueError(
                     f"u and y of {name} must have one length, but have {len(u)} and {len(y)}; cut the longer"
                 )
+            for part, values in (("u", u), ("y", y)):
+                for k in np.flatnonzero(np.abs(values) > SIZES[1])[:1]:
+                    raise ValueError(
+                        f"{part} of {name} must be within ±{SIZES[1]:g}, but at sample {k} is {values[k]:g}; leave it "
+                        "empty (NaN) where it is missing, or choose another unit"
+                    )
             whole.append(record)
             if first := next((earlier.name for earlier in whole[:-1] if _are_same(earlier, record)), None):
                 raise ValueError(f"{name} must be a record of its own, but has the samples of {first}; leave one out")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -16,6 +16,7 @@ from estimator.identification.ridges import Ridges, profiled
 from estimator.identification.start import effect, scattered, starts
 from estimator.parameters import FloatArray
 from estimator.physical import coefficients_of
+from estimator.progress import Tell
 from estimator.rig_prior import rig_prior
 
 #: Without a guess a coefficient is believed to be about 0, within so many of its natural sizes.
@@ -140,29 +141,29 @@ def prior_of(problem: Problem) -> Prior:
     return Prior.of(*problem.inward(guess.coefficients_mean, guess.coefficients_cov))
 
 
-def search(problem: Problem, tell: Callable[[str], None]) -> Found:
+def search(problem: Problem, tell: Tell) -> Found:
     """Find the coefficients and the noises, for the rig's own interpolation and delay.
 
     Args:
         problem: the records.
-        tell: is told what is being done.
+        tell: is told the share that is done, by experience, and what is being done.
 
     Raises:
         ValueError: where no start leads anywhere.
     """
     coarse = next(n for n in _SUBSTEPS if problem.frequency / n < _ANGLE)
     fitter = Fitter(replace(problem, substeps=coarse), prior_of(problem))
-    tell("looking for a start")
+    tell(0.0, "looking for a start")
     looked = _look(fitter)
     if not len(looked.mean):
         raise ValueError(
             "records must be of an oscillator that Eq. (1) can follow, and show what the input does for a few periods, "
             "but every start ran away; check units, columns and the sampling step, or add a guess to the rig"
         )
-    tell("fitting coefficients and noises")
+    tell(0.3, "fitting coefficients and noises")
     found = _settled(fitter, looked)
     if problem.rig.guess is None and found.disturbance > _POOR:
-        tell("looking for another start")
+        tell(0.6, "looking for another start")
         found = _settled_again(fitter, found)
     return found
 

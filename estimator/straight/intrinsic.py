@@ -8,9 +8,9 @@ from typing import Any
 
 import numba
 from llvmlite import binding, ir
-from numba.core import cgutils, types
-from numba.core.extending import _Intrinsic
+from numba import types
 
+from estimator.numba_internals import _Intrinsic, cgutils
 from estimator.straight.translation import EXTERNAL, Kinds, Source, Translated, Translation, leaves, vectorised
 
 _TYPES = {"double": types.float64, "i1": types.boolean, "i64": types.int64, "word": types.uint64}

@@ -1,11 +1,13 @@
-"""A clock that is set back: durations are of the clock that cannot be."""
+"""A clock that is set back, or forward: durations are of the clock that cannot be."""
 
+import csv
 import itertools
 import time
 
 import numpy as np
 import pytest
 
+from agents.running.clock import JumpingClock, RealClock
 from agents.running.run import Plan, run
 from agents.running.simulated import SimulatedPlant
 from agents.training import ALGORITHMS, TrainConfig, train
@@ -18,27 +20,38 @@ RIG = Rig(
 )  # fmt: skip
 
 
-@pytest.fixture
-def set_back(monkeypatch):
-    """Every look at the clock finds it an hour earlier than the last one."""
-    hours = itertools.count(0, -3600)
+@pytest.fixture(params=[-3600, 864_000], ids=["back", "forward"])
+def set_anew(monkeypatch, request):
+    """Every look at the clock finds it an hour earlier than the last one, or ten days later."""
+    seconds = itertools.count(0, request.param)
     now = time.time()
-    monkeypatch.setattr(time, "time", lambda: now + next(hours))
-    monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * (now + next(hours))))
-    assert time.time() > time.time()
+    monkeypatch.setattr(time, "time", lambda: now + next(seconds))
+    monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * (now + next(seconds))))
+    assert time.time() != time.time()
 
 
-def test_a_training_lasts_forward(set_back, tmp_path):
-    small = ALGORITHMS["ppo"](num_envs=8, batch_size=64, hidden=(4,), n_steps=16)
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+def test_a_training_lasts_as_long_as_it_does(set_anew, tmp_path, monkeypatch, algo):
+    monkeypatch.setattr("agents.training.heldout._SYSTEMS", 4)
+    own = {"n_steps": 16} if algo == "ppo" else {"buffer_size": 400, "learning_starts": 32}
+    small = ALGORITHMS[algo](num_envs=8, batch_size=64, hidden=(4,), **own)
+    began = time.perf_counter()
     found = train(
-        TrainConfig(env="duffing_env/Short-v0", steps=512, output=tmp_path, eval_every=256, hyperparameters=small)
+        TrainConfig(
+            env="duffing_env/Short-v0", algo=algo, steps=512, output=tmp_path, eval_every=256, hyperparameters=small
+        )
     )
+    longest = time.perf_counter() - began
     seconds = np.array(found.curve)[:, 1]
     assert (np.diff(seconds) > 0).all()
-    assert 0 < seconds[0] < found.seconds < 600
+    assert 0 < seconds[0] < found.seconds < longest
+    rows = list(csv.DictReader((tmp_path / "progress.csv").read_text().splitlines()))
+    assert rows
+    assert all(0 <= float(row["time/time_elapsed"]) <= longest for row in rows)
+    assert all(float(row["time/fps"]) * longest >= 8 for row in rows)
 
 
-def test_episodes_last_forward(set_back):
+def test_episodes_last_forward(set_anew):
     envs = DuffingVecEnv("duffing_env/Short-v0", 2, horizon=4)
     envs.reset()
     times = [info["episode"]["t"] for _ in range(12) for info in envs.step(np.zeros((2, 1)))[3] if "episode" in info]
@@ -47,9 +60,16 @@ def test_episodes_last_forward(set_back):
     assert (np.diff(times) >= 0).all()
 
 
-def test_a_run_meets_its_ticks(set_back, tmp_path):
-    found = run(RIG, SimulatedPlant(RIG), tmp_path / "run", Plan("prbs", 40))
-    assert (found.ended, found.exit_status) == ("complete", 0)
-    tick, clock = np.loadtxt(tmp_path / "run/samples.csv", delimiter=",", skiprows=1, usecols=(1, 7), unpack=True)
-    assert (np.diff(tick) > 0).all()
-    assert (np.diff(clock) >= 0).all()
+def test_the_clock_of_a_run_goes_forward(set_anew):
+    clock = RealClock()
+    begun = clock.now()
+    clock.wait(begun + 0.01)
+    assert clock.now() >= begun + 0.01
+
+
+def test_a_run_meets_its_ticks(set_anew, tmp_path):
+    clock = JumpingClock()
+    found = run(RIG, SimulatedPlant(RIG, clock=clock), tmp_path / "run", Plan("prbs", 40), clock=clock)
+    assert (found.ended, found.exit_status, found.late) == ("complete", 0, 0)
+    due, seen = np.loadtxt(tmp_path / "run/samples.csv", delimiter=",", skiprows=1, usecols=(1, 7), unpack=True)
+    np.testing.assert_allclose(seen, due, rtol=0, atol=1e-9)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import table
 
 from agents.planner.ascent import Limits, climber
 from agents.planner.design import Known, designer, half_log_det, invert
@@ -15,7 +16,7 @@ from estimator.models.difference import difference
 from estimator.physical import coefficients_of
 
 sys.path.append(str(Path(__file__).parents[1] / "estimator"))
-from filtering import CASES
+from reference.plants import CASES
 
 Q, R, LIMIT, AMPLITUDE = 5e-4, 3e-4, 0.3, 0.1
 PAPER = difference()
@@ -57,7 +58,7 @@ def test_the_worth_is_half_the_log_determinant_of_the_precision(name):
     assert value == pytest.approx(0.5 * np.linalg.slogdet(known.precision + told)[1], rel=1e-12)
 
 
-@pytest.mark.parametrize("size", [1, 4, 7])
+@table("size", [1, 4, 7])
 def test_factor_and_inverse(size):
     rng = np.random.default_rng(1)
     A = rng.standard_normal((size, size + 2))
@@ -70,7 +71,7 @@ def test_factor_and_inverse(size):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("moving", [False, True])
+@table("moving", [False, True])
 def test_the_gradient_is_that_of_differences(name, moving):
     model, interpolation, size, known = case_of(name)
     found = designer(model, int(interpolation == "linear"))

@@ -9,6 +9,7 @@ import pytest
 import rounding
 from safetensors.numpy import load_file
 from stable_baselines3 import PPO
+from tables import table
 
 import agents.evaluation.comparison
 import agents.evaluation.metrics
@@ -298,7 +299,7 @@ BY_THE_RECORD = {"silverbox_equivalent", "full_peak_equivalent", "simulation_rms
 def test_what_the_record_measures_is_left_out_without_it_and_it_is_said(without_record, tmp_path, capsys):
     (evaluation,) = compare(["uniform"], TRACK, 2, {"horizon": 5}, tmp_path)
     assert not BY_THE_RECORD & set(evaluation.metrics)
-    assert "the Silverbox record is not on this machine" in capsys.readouterr().out
+    assert "the Silverbox record is not on this machine" in " ".join(capsys.readouterr().out.split())
 
 
 def test_errors_of_free_runs_are_those_over_the_arrow_s_input(record):
@@ -336,7 +337,7 @@ def test_the_arrow_error_is_that_of_free_runs_over_the_record(record):
         assert 1e-3 < error < 0.05  # the signal itself has 54 mV
 
 
-@pytest.mark.parametrize(("scale", "diverges"), [(0.1, False), (1e3, True)])
+@table(("scale", "diverges"), [(0.1, False), (1e3, True)])
 def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverges):
     rng = np.random.default_rng(0)
     arrow = Regime("arrow", scale * rng.uniform(-1, 1, 80), 0.01 * rng.normal(size=80))
@@ -472,7 +473,12 @@ def test_the_auditor_is_not_led_astray_by_a_wide_guess(without_record):
 
 @pytest.mark.parametrize("track", ["Pendulum", "WienerHammerstein"])
 def test_tracks_of_other_models_are_evaluated_and_shown(track, tmp_path):
-    (evaluation,) = compare(["uniform"], f"duffing_env/{track}-v0", 6, {}, tmp_path, seed=SEED, report=True)
+    env_id, options = f"duffing_env/{track}-v0", {"horizon": 128}
+    if track == "Pendulum":
+        (evaluation,) = compare(["uniform"], env_id, 6, options, tmp_path, seed=SEED, report=True)
+        assert (tmp_path / "report.html").is_file()
+    else:
+        (evaluation,) = evaluate(["uniform"], env_id, 6, SEED, options)
     assert list(evaluation.estimators) == ["ode", "auditor"]
     for name in [name for name in evaluation.metrics if name.startswith("error_")]:
         # The environment's own estimator, but for the float32 of its inputs and outputs, which some errors amplify.
@@ -481,7 +487,6 @@ def test_tracks_of_other_models_are_evaluated_and_shown(track, tmp_path):
     assert evaluation.metrics["fisher_gain"].mean() == pytest.approx(
         evaluation.metrics["information_gain"].mean(), abs=1.0
     )
-    assert (tmp_path / "report.html").is_file()
 
 
 def test_policies_of_several_seeds_are_one_entry(tmp_path, without_record):
@@ -508,7 +513,7 @@ def test_policies_of_several_seeds_are_one_entry(tmp_path, without_record):
         evaluate([f"ppo={tmp_path}/run-1"], systems=2)
 
 
-@pytest.mark.parametrize("systems", [1, 0, -3])
+@table("systems", [1, 0, -3])
 def test_one_system_is_too_few(systems):
     with pytest.raises(ValueError, match=f"systems must be a whole number from 2 to 100000, but is {systems}"):
         evaluate(["uniform"], systems=systems)
@@ -558,7 +563,7 @@ def test_a_place_that_cannot_be_written_is_found_before_the_work(tmp_path, monke
         board.check(tmp_path / "new.jsonl", "mine")
 
 
-@pytest.mark.parametrize("shown", [{"observation": "history"}, {"observation": "history", "history": 1}])
+@table("shown", [{"observation": "history"}, {"observation": "history", "history": 1}])
 def test_what_is_shown_changes_nothing_of_what_is_measured(shown):
     usual, other = (evaluate(["uniform"], TRACK, 3, SEED, {"horizon": 12} | options)[0] for options in ({}, shown))
     np.testing.assert_array_equal(other.inputs, usual.inputs)
@@ -568,7 +573,8 @@ def test_what_is_shown_changes_nothing_of_what_is_measured(shown):
 
 def test_what_is_compared_where_the_posterior_is_not_seen_are_signals():
     assert usual_policies(TRACK, {"observation": "history"}) == ("prbs", "uniform")
-    assert {"efe", "ppo/amplitude"} < set(usual_policies(TRACK, {"observation": "posterior"}))
+    assert usual_policies(TRACK, {"hold": 4}) == ("ppo/amplitude", "prbs", "uniform")
+    assert {"efe", "lookahead", "ppo/amplitude"} < set(usual_policies(TRACK, {"observation": "posterior"}))
 
 
 def test_a_function_as_an_observation_is_not_compared_on():

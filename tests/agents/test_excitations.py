@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from tables import table
 
 from agents import make_policy
 from agents.commands import main
@@ -38,14 +39,14 @@ def power(name, low, high, samples=256):
     return density[(frequency >= low) & (frequency <= high)].sum() / density.sum()
 
 
-@pytest.mark.parametrize("name", DRAWN)
+@table("name", DRAWN)
 def test_draws_reach_the_limit_and_keep_it(name):
     u = np.abs(draws(name, max_input=0.2))
     assert 0.19 < u.max() <= 0.2 * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("name", ["multisine", "schroeder"])
-@pytest.mark.parametrize("samples", [48, 255, 256])
+@table("name", ["multisine", "schroeder"])
+@table("samples", [48, 255, 256])
 def test_multisines_have_equal_power_on_the_lines_of_the_band_and_none_elsewhere(name, samples):
     density = np.abs(np.fft.rfft(draws(name, 5, samples))) ** 2
     frequency = np.fft.rfftfreq(samples, SAMPLING_STEP)
@@ -67,7 +68,7 @@ def test_multisines_peak_at_the_limit_and_schroeder_phases_have_the_smaller_cres
     assert 2.5 < crest["multisine"] < 3.5
 
 
-@pytest.mark.parametrize(("name", "slope"), [("chirp-linear", 0.0), ("chirp-log", -1.0)])
+@table(("name", "slope"), [("chirp-linear", 0.0), ("chirp-log", -1.0)])
 def test_chirps_fill_the_band(name, slope):
     assert power(name, 8, 155) > 0.97
     low, high = power(name, 25, 50), power(name, 50, 100)
@@ -78,7 +79,7 @@ def test_chirps_fill_the_band(name, slope):
     assert np.diff(crossings)[:2].min() > 2 * np.diff(crossings)[-5:].max()
 
 
-@pytest.mark.parametrize("hold", [2, 4, 8])
+@table("hold", [2, 4, 8])
 def test_held_prbs_has_the_spectrum_of_its_hold(hold):
     density = (np.abs(np.fft.rfft(draws(f"prbs-{hold}", 4000))) ** 2).mean(axis=0)
     # The holds begin at the first sample, so that the nulls are exact where 256 is a multiple of the hold.
@@ -132,7 +133,7 @@ def test_resonance_is_where_a_free_oscillation_crosses_zero():
     assert resonance(np.float64(1.0), np.float64(0.1)) == 10.0  # describes no oscillator
 
 
-@pytest.mark.parametrize("name", EXCITATIONS)
+@table("name", EXCITATIONS)
 def test_a_budget_scales_the_whole_signal_down_to_it(name):
     free, fitted = (draw_signal(name, samples=256, max_rms=rms, seed=4) for rms in (None, MAX_RMS))
     rms = np.sqrt(np.mean(free**2))
@@ -172,15 +173,15 @@ def roll_out(name, track, systems, seed=21, **options):
     return np.array(asked), np.array(seen), ended
 
 
-@pytest.mark.parametrize("name", [*DRAWN, *FEEDBACK])
+@table("name", [*DRAWN, *FEEDBACK])
 def test_the_environment_cuts_nothing_of_what_a_budget_was_fitted_to(name):
     asked, seen, _ = roll_out(name, POWER, 8)
     np.testing.assert_allclose(seen[1:, :, 18], asked, atol=1e-6)
     assert seen[-1, :, 21].max() < 1e-4  # nor is any of it left
 
 
-@pytest.mark.parametrize("name", FEEDBACK)
-@pytest.mark.parametrize("options", [{}, {"max_output": 0.3}])
+@table("name", FEEDBACK)
+@table("options", [{}, {"max_output": 0.3}])
 def test_feedback_ends_no_episode_and_uses_the_room(name, options):
     asked, seen, ended = roll_out(name, AMPLITUDE, 64, **options)
     assert ended == 0
@@ -213,7 +214,7 @@ def test_amplitude_is_that_of_a_sampled_sine():
         assert policy.amplitude(row) == pytest.approx(0.3, rel=1e-4)
 
 
-@pytest.mark.parametrize("spread", [0.3, 0.1])
+@table("spread", [0.3, 0.1])
 def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
     env = SimpleNamespace(unwrapped=SimpleNamespace(max_input=0.15, experiment=SimulatedExperiment(spread=spread)))
     policy = make_policy("square-believed", env)
@@ -235,7 +236,7 @@ def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
     assert measured == pytest.approx(natural, rel=0.01)
 
 
-@pytest.mark.parametrize("name", FEEDBACK)
+@table("name", FEEDBACK)
 def test_feedback_pumps_equation_1_too(name):
     asked, seen, ended = roll_out(name, "duffing_env/Amplitude-v1", 16, horizon=128)
     assert ended == 0
@@ -258,7 +259,7 @@ def test_resonance_and_amplitude_are_read_off_equation_1():
         assert policy.amplitude(row)[0] == pytest.approx(0.3, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", FEEDBACK)
+@table("name", FEEDBACK)
 def test_feedback_on_a_batch_is_that_on_each_row(name):
     _, seen, _ = roll_out(name, AMPLITUDE, 3)
     policy = make_policy(name)
@@ -277,7 +278,7 @@ def test_feedback_on_a_batch_is_that_on_each_row(name):
     np.testing.assert_array_equal(fresh, began)
 
 
-@pytest.mark.parametrize("name", FEEDBACK)
+@table("name", FEEDBACK)
 def test_feedback_refuses_what_is_no_observation(name):
     policy = make_policy(name)
     with pytest.raises(ValueError, match=r"observation must have the shape \(22,\)"):
@@ -290,7 +291,7 @@ def test_square_believed_refuses_another_batch():
         policy.predict(np.zeros((4, 22)), np.zeros(3))
 
 
-@pytest.mark.parametrize("name", EXCITATIONS)
+@table("name", EXCITATIONS)
 def test_exported_signal_is_what_the_policy_plays_first(name):
     env = SimpleNamespace(unwrapped=SimpleNamespace(max_input=0.1, horizon=64))
     policy, state, played = make_policy(name, env, seed=5), None, []
@@ -314,7 +315,7 @@ def test_export_round_trip(tmp_path):
     assert [entry.name for entry in path.parent.iterdir()] == ["signal.csv"]
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "options", "message"),
     [
         ("multisin", {}, r"name must be one of .*did you mean 'multisine'"),

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rounding import U32, play
 from safetensors.numpy import load_file, save_file
+from tables import table
 
 from agents import make_policy
 from agents.evaluation.batch import make
@@ -52,8 +53,12 @@ class Row:
     def records(self):
         return self._envs.records[self._row : self._row + 1]
 
+    @property
+    def shown(self):
+        return self._envs.shown[self._row : self._row + 1]
 
-def observations_of(env_id, samples=40, count=24):
+
+def observations_of(env_id, samples=40, count=12):
     """What a batch shows after some random pushes, gentle enough that most episodes go on."""
     envs = make(env_id, count)
     rng = np.random.default_rng(1)
@@ -159,7 +164,7 @@ def test_features_are_those_of_the_twin(env_id):
     assert 0 < turned < len(observations)
 
 
-@pytest.mark.parametrize("name", ["Amplitude", "Power"])
+@table("name", ["Amplitude", "Power"])
 def test_features_are_those_that_the_shipped_policies_were_trained_with(name):
     """The numbers of the code that they were trained with, within float32's rounding, where noises are the prior's."""
     stored = json.loads((Path(__file__).parent / "data" / "foresight-eq2.json").read_text())[name]
@@ -310,7 +315,7 @@ def test_where_it_makes_no_sense_it_says_so():
         Foresight.of(make(AMPLITUDE, 1, {"hold": 2}), RATE)
 
 
-@pytest.mark.parametrize("env_id", [AMPLITUDE, POWER, "duffing_env/Drift-v0"])
+@table("env_id", [AMPLITUDE, POWER, "duffing_env/Drift-v0"])
 def test_in_its_own_environment_it_stays_as_it_is(env_id):
     foresight = Foresight.of(make(env_id, 3), RATE)
     for env in (make(env_id, 2), gym.make(env_id).unwrapped):
@@ -352,7 +357,7 @@ def test_on_a_plant_of_ones_own_it_takes_the_prior_and_the_limits():
     assert (moved.process, moved.sensor) == pytest.approx((1e-4**2, 2e-4**2))
 
 
-@pytest.mark.parametrize(
+@table(
     ("trained_in", "env_id"),
     [(AMPLITUDE, "duffing_env/Amplitude-v1"), (AMPLITUDE, POWER), (POWER, AMPLITUDE)],
 )
@@ -487,7 +492,13 @@ def test_entropy_counts_less_and_less(tmp_path):
 def test_a_run_that_was_stopped_goes_on_with_the_same_foresight(tmp_path):
     settings = PPOSettings(foresight=True, levels=3, num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
     config = TrainConfig(
-        env=DRIFT, steps=512, checkpoints=2, eval_every=128, output=tmp_path / "run", hyperparameters=settings
+        env=DRIFT,
+        steps=512,
+        checkpoints=2,
+        eval_every=128,
+        output=tmp_path / "run",
+        hyperparameters=settings,
+        options={"horizon": 48},
     )
 
     def stop(steps, found):

@@ -52,17 +52,58 @@ def test_noise_that_is_no_force_is_refused():
         make_policy("efe-block-16", env)
 
 
-def test_blocks_play_a_model_of_two_sensors():
-    env = gym.make("duffing_env/Pendulum-v0", horizon=32)
-    policy = make_policy("efe-block-16", env)
+def runge_kutta_of_the_pendulum(coefficients, start, u, steps=PENDULUM.substeps):
+    """Angles after each sample, the input held."""
+    gravity, friction, torque = coefficients
+    z, h, seen = np.array(start), 1.0 / steps, []
+    for value in u:
+
+        def rates(z, value=value):
+            return np.array([z[1], torque * value - friction * z[1] - gravity * np.sin(z[0])])
+
+        for _ in range(steps):
+            k1 = rates(z)
+            k2 = rates(z + h / 2 * k1)
+            k3 = rates(z + h / 2 * k2)
+            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(z + h * k3))
+        seen.append(z[0])
+    return np.array(seen)
+
+
+def test_a_block_is_planned_for_a_model_of_two_sensors(monkeypatch):
+    """Its systems have a noise for each sensor, and what must keep the limit is what the first one shows."""
+    env = gym.make("duffing_env/Pendulum-v0", horizon=32).unwrapped
     observation, _ = env.reset(seed=0)
-    state, done, total = None, False, 0.0
-    while not done:
+    asked = []
+
+    def best_block(view, systems, futures, candidates, amplitude, bound, played):
+        asked.append((systems, futures, candidates, amplitude, bound, played))
+        return candidates[0], 1.0, 0.0
+
+    monkeypatch.setattr(block_policy, "drafts", lambda planner, record, samples, seed: np.full((1, samples), 0.3))
+    monkeypatch.setattr(block_policy, "best_block", best_block)
+    policy, plan, state = BlockPlanner(env, block=8), [], None
+    for _ in range(9):
         action, state = policy.predict(observation, state)
-        observation, reward, terminated, done, _ = env.step(action)
-        total += reward
-        assert not terminated
-    assert total > 2.0
+        plan.append(action[0])
+        observation, *_ = env.step(action)
+    assert len(asked) == 2  # the second block begins with its ninth input
+    np.testing.assert_allclose(plan, 0.3 / env.max_input, rtol=1e-6)
+    systems, futures, candidates, amplitude, bound, played = asked[0]
+    assert (systems.noises.shape, systems.starts.shape[0]) == ((blocks.SYSTEMS, 3), blocks.SYSTEMS)
+    np.testing.assert_array_equal(systems.noises, futures.noises[: blocks.SYSTEMS] ** 2)
+    assert amplitude == env.max_input
+    assert 8 < played < candidates.shape[1]
+    assert bound >= 5e-4
+    u = candidates[0]
+    process, sensor = futures.disturbances(len(u))
+    shown = futures.shown(u, slice(0, 3))
+    for i in range(3):
+        expected = runge_kutta_of_the_pendulum(futures.coefficients[i], futures.states[i], u + process[i])
+        np.testing.assert_allclose(shown[i], expected + sensor[i], atol=1e-9)
+    leaving = futures.leaving(u, len(futures.states))
+    is_out = (np.abs(futures.shown(u, slice(None))) > futures.limit).any(axis=1)
+    np.testing.assert_array_equal(leaving, np.flatnonzero(is_out))
 
 
 @pytest.mark.parametrize(
@@ -81,42 +122,3 @@ def test_rare_events_are_counted_with_larger_deviations():
         bound, spread = counted(probability)
         assert bound == max(probability, 5e-4)
         assert norm.sf(spread * norm.isf(bound)) == pytest.approx(probability)
-
-
-def test_a_safe_block_is_tried_nearer_to_the_limit(monkeypatch):
-    """It tells more then, and is as safe."""
-    env = gym.make("duffing_env/Amplitude-v1").unwrapped
-    observation, _ = env.reset(seed=0)
-    told = {}
-
-    def best_block(view, systems, futures, candidates, amplitude, bound, played):
-        found = blocks.best_block(view, systems, futures, candidates, amplitude, bound, played)
-        told[blocks._HALVINGS] = blocks.expected(view, systems, futures.limit, found[0])[0]
-        assert found[1] == 1.0
-        assert found[2] < bound
-        return found
-
-    monkeypatch.setattr(block_policy, "best_block", best_block)
-    for halvings in (0, blocks._HALVINGS):
-        monkeypatch.setattr(blocks, "_HALVINGS", halvings)
-        BlockPlanner(env, block=64).predict(observation)
-    never, often = told.values()
-    assert often > never + 0.05
-
-
-def test_blocks_begin_with_the_episode_in_a_batch():
-    """Where a step only begins the next episode, no block goes into it."""
-    envs = gym.make_vec("duffing_env/Short-v0", 2, vectorization_mode="vector_entry_point", horizon=24)
-    policy = make_policy("efe-block-16", envs)
-    observations, _ = envs.reset(seed=0)
-    state, played = None, []
-    for _ in range(2 * 25):
-        actions, state = policy.predict(observations, state)
-        observations, _, terminated, _, _ = envs.step(actions)
-        assert not terminated.any()
-        played.append(actions[:, 0])
-    first, over, second = np.split(np.array(played), [24, 25])
-    np.testing.assert_array_equal(over, 0.0)
-    for episode in (first, second[:24]):
-        assert (np.abs(episode).max(axis=0) > 0.5).all()
-        assert (np.count_nonzero(episode[:16], axis=0) > 12).all()

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from tables import table
 
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.rollout import evaluate
@@ -30,7 +31,7 @@ def play(policy, rows, steps):
     return np.array(told)
 
 
-@pytest.mark.parametrize("name", ["uniform", "chirp-linear", "prbs-2", "schroeder"])
+@table("name", ["uniform", "chirp-linear", "prbs-2", "schroeder"])
 def test_a_signal_is_played_by_the_first_of_every_held_sample(name):
     sampled = play(make_policy(name, stand_in(1), seed=3), 2, 100)
     held = play(make_policy(name, stand_in(HOLD), seed=3), 2, 26)

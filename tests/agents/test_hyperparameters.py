@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 
 import pytest
+from tables import table
 
 from agents.training import ALGORITHMS, PPOSettings, SACSettings, TrainConfig
 from agents.training.hyperparameters import FILES, read_settings, settings_of, track_of, write_settings
@@ -22,8 +23,8 @@ def test_there_is_one_file_for_each_algorithm():
     assert sorted(path.stem for path in FILES.iterdir()) == sorted(ALGORITHMS)
 
 
-@pytest.mark.parametrize("env_id", TRACKS)
 @pytest.mark.parametrize("algo", ALGORITHMS)
+@table("env_id", TRACKS)
 def test_every_file_is_sound_for_every_track(algo, env_id):
     assert type(read_settings(algo, env_id)) is ALGORITHMS[algo]
 
@@ -54,7 +55,7 @@ def test_hyperparameters_that_are_given_go_before_the_file(tmp_path):
         TrainConfig(algo="sac", hyperparameters=given)
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "message"),
     [
         (

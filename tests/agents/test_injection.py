@@ -9,8 +9,9 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+import tables
 
-from agents.cli import progress_bar, told_in_one_line
+from agents.cli import told_in_one_line
 from agents.commands import main
 from agents.commands.identify import show as show_identified
 from agents.commands.rig_file import from_record
@@ -19,11 +20,12 @@ from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, s
 from agents.evaluation.leaderboard import print_table
 from agents.evaluation.report import write_report
 from agents.evaluation.rollout import evaluate
-from agents.results import show, spinner, table
+from agents.results import show, table
 from agents.running.experiment import design
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import write_settings
 from estimator import Rig, identify
+from estimator.progress import _bar, progress
 
 NAMES = [
     "<script>alert(1)</script>", "\"><img src=x onerror='alert(1)'>", "&lt;b&gt;", "=cmd|' /C calc'!A0", "+1+1", "-2",
@@ -37,7 +39,7 @@ RIG = {
 }  # fmt: skip
 #: For what takes long: all of it at once, and what there is no room for.
 SHARP = ["<img src=x onerror=1>\x1b[2J\n[/]$\\frac{$\u202e'", "=cmd|' '!A0", "_hidden", "n" * 300, "$" * 300]
-names = pytest.mark.parametrize("name", NAMES, ids=lambda name: ascii(name[:24]))
+names = tables.table("name", NAMES)
 
 
 def is_tame(text):
@@ -65,23 +67,22 @@ def evaluation():
     return evaluate(["uniform"], systems=4, options={"horizon": 8})[0]
 
 
-sharp = pytest.mark.parametrize("name", SHARP, ids=lambda name: ascii(name[:24]))
-
-
-@sharp
-def test_a_policy_in_pages_and_figures(name, evaluation, tmp_path):
-    named, other = replace(evaluation, policy=name), replace(evaluation, policy="other")
-    settings = {"env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 0, "options": {"own": name}}
+def test_policies_in_pages_and_figures(evaluation, tmp_path):
+    named = [replace(evaluation, policy=name) for name in SHARP]
+    settings = {"env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 0, "options": {"own": SHARP}}
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of layouts that have no room
-        write_report(tmp_path / "report.html", [named, other], settings, ["evaluate.py", name])
-        for figure in (figure_of_contraction([named, other]), figure_of_inputs([named, other])):
+        write_report(tmp_path / "report.html", named, settings, ["evaluate.py", *SHARP])
+        for figure in (figure_of_contraction(named), figure_of_inputs(named)):
             save(figure, tmp_path / "figure.png")
-        (legend,) = figure_of_contraction([named, other]).legends
-    assert len(legend.get_texts()) == 2
+        (legend,) = figure_of_contraction(named).legends
+    assert len(legend.get_texts()) == len(SHARP)
     page = Elements((tmp_path / "report.html").read_text())
     assert not page.found & {"script", "img", "b", "onerror"}
-    assert named.title in page.text
+    assert all(one.title in page.text for one in named)
+
+
+sharp = pytest.mark.parametrize("name", SHARP, ids=lambda name: ascii(name[:24]))
 
 
 @names
@@ -123,13 +124,15 @@ def test_an_error_is_one_line(name, capsys):
 
 
 @names
-def test_what_is_being_done(name, capsys):
-    with spinner("Evaluating") as say:
-        say(f"Evaluating {name}")
-    with progress_bar() as bar:
-        bar.disable = False
-        bar.add_task(name, total=1)
-        bar.refresh()
+def test_what_is_being_done(name, capsys, monkeypatch):
+    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
+    with progress("Evaluating") as tell:
+        tell(0.5, name)
+    said = capsys.readouterr().err
+    assert is_tame(said)
+    assert len(said.splitlines()) == 1 + said.startswith("\n")  # where a line was begun before
+    with _bar() as show_bar:
+        show_bar(0.5, name)
 
 
 @sharp

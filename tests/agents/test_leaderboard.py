@@ -7,6 +7,7 @@ from unittest.mock import ANY
 import matplotlib.image
 import numpy as np
 import pytest
+from tables import table
 
 import agents.evaluation.figures
 import agents.evaluation.rollout
@@ -16,6 +17,7 @@ from agents.evaluation.leaderboard import (
     METRICS,
     leaderboard,
     print_estimators,
+    print_headline,
     print_table,
     summarise,
     two_way_table,
@@ -92,7 +94,7 @@ def test_centres_are_means_and_medians():
         assert entry["high"] <= values.max()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@table("seed", range(5))
 def test_intervals_contain_the_centre(seed):
     for name, entry in summarise(make_evaluation(seed=seed, systems=12)).items():
         center = entry.get("mean", entry.get("median"))
@@ -178,12 +180,16 @@ def table_of(capsys, *evaluations):
     print_table(list(evaluations), "a title")
     lines = capsys.readouterr().out.splitlines()
     assert any("a title" in line for line in lines)
-    head = ["".join(parts) for parts in zip(*_rows(lines, "┃"), strict=True)][1:]  # long names are folded
-    body = _rows(lines, "│")
-    cells = {}
-    for centers, intervals in zip(body[::2], body[1::2], strict=True):
-        assert intervals[0] == ""
-        cells[centers[0]] = list(zip(centers[1:], intervals[1:], strict=True))
+    assert max(map(len, lines)) <= 80
+    head, cells = [], {}
+    begins = [k for k, line in enumerate(lines) if line.startswith("┏")]
+    for begin, end in zip(begins, [*begins[1:], None], strict=True):  # a wide table comes in parts
+        part = lines[begin:end]
+        head += ["".join(parts) for parts in zip(*_rows(part, "┃"), strict=True)][1:]  # long names are folded
+        body = _rows(part, "│")
+        for centers, intervals in zip(body[::2], body[1::2], strict=True):
+            assert intervals[0] == ""
+            cells.setdefault(centers[0], []).extend(zip(centers[1:], intervals[1:], strict=True))
     return head, cells
 
 
@@ -272,6 +278,17 @@ def test_ten_columns_are_not_cut(capsys):
     assert all(text.strip("-0123456789.,[] ") == "" for row in cells.values() for cell in row for text in cell)
 
 
+def test_the_chief_figures_are_a_line_for_each_policy(capsys):
+    metrics = {name: np.full(3, value) for name, (value, _, _) in CONSTANTS.items()}
+    trained = "runs/ppo-amplitude-v0-12"
+    print_headline([make_evaluation(trained, **metrics), make_evaluation("prbs", **metrics)], "a title")
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = [line.split() for line in lines if line.startswith((trained, "prbs"))]
+    cells = ["12.35", "±", "0.00", "87.7", "±", "0.0", "75.0", "0.0"]
+    assert rows == [[trained, *cells], ["prbs", *cells]]
+
+
 def load_strictly(path):
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
@@ -331,7 +348,7 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
     check_picture(folder / "excitations.png", 1440, 480, colours=2)
 
 
-@pytest.mark.parametrize("policies", [1, 10])
+@table("policies", [1, 10])
 def test_contraction_shows_the_quartiles_of_every_policy(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
     figure = figure_of_contraction(evaluations, "title")
@@ -356,7 +373,7 @@ def test_contraction_shows_losses_too():
     assert low <= losses.lines[0].get_ydata().min()
 
 
-@pytest.mark.parametrize("policies", [1, 10])
+@table("policies", [1, 10])
 def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
     panels = figure_of_inputs(evaluations).axes
@@ -376,7 +393,7 @@ def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(poli
         assert frequencies[-1] == pytest.approx(0.5 / SAMPLING_STEP)
 
 
-@pytest.mark.parametrize("updates", [1, 2, 30])
+@table("updates", [1, 2, 30])
 def test_learning_curve_shows_returns_over_samples(updates):
     curve = [(4096 * (i + 1), 0.5 * i + 0.1, np.nan if i == 0 else float(i)) for i in range(updates)]
     axes = figure_of_learning(curve, "information_gain").axes[0]

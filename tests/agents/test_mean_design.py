@@ -12,7 +12,7 @@ from estimator.engine.feeding import older_inputs
 from estimator.lanes import LANES
 
 sys.path.append(str(Path(__file__).parents[1] / "estimator"))
-from filtering import CASES
+from reference.plants import CASES
 
 SAMPLES, PENALTY = 30, 5.0
 

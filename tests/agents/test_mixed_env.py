@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from tables import table
 
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.family import draw_rig
@@ -79,7 +80,7 @@ def test_a_run_says_what_it_varied_and_goes_on(tmp_path):
         resume(run.folder)
 
 
-@pytest.mark.parametrize(
+@table(
     ("settings", "named"),
     [
         ({"vary": {"horizon": [64, 16]}}, r"vary\['horizon'\] must be two positive numbers, the lower one first"),

@@ -1,6 +1,7 @@
 """Policies of a user's own: made from instances, classes, functions and models, and evaluated as any other."""
 
 import os
+import re
 import sys
 
 import gymnasium as gym
@@ -9,11 +10,12 @@ import pytest
 import torch
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNormalize
+from tables import table
 
 from agents import make_policy, save_policy
+from agents.evaluation.protocol import fingerprint
 from agents.evaluation.rollout import evaluate
 from agents.policies.learned import load_policy
-from agents.studies import baselines
 from agents.training import TrainConfig, train
 from agents.training.algorithms import PPOSettings
 from agents.vec_env import DuffingVecEnv
@@ -52,7 +54,7 @@ def test_a_class_is_called_with_what_it_takes():
         make_policy(Push, power=2)
 
 
-@pytest.mark.parametrize("function", [against_displacement, lambda x: against_displacement(x)[:, 0]])
+@table("function", [against_displacement, lambda x: against_displacement(x)[:, 0]])
 def test_a_function_of_observations_is_a_policy(function):
     policy, seen = make_policy(function), observations()
     actions, state = policy.predict(seen, "state")
@@ -62,7 +64,7 @@ def test_a_function_of_observations_is_a_policy(function):
     np.testing.assert_array_equal(single, actions[0])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@table("dtype", [torch.float32, torch.float64])
 def test_a_module_of_torch_is_a_policy(dtype):
     torch.manual_seed(0)
     network, seen = torch.nn.Linear(FEATURES, 1, dtype=dtype), observations()
@@ -73,13 +75,13 @@ def test_a_module_of_torch_is_a_policy(dtype):
     assert np.abs(actions).max() == 1
 
 
-@pytest.mark.parametrize("given", [np.zeros((3, 2)), np.zeros(2), np.array([0, np.nan, 0])])
+@table("given", [np.zeros((3, 2)), np.zeros(2), np.array([0, np.nan, 0])])
 def test_a_function_that_gives_something_else_is_refused(given):
     with pytest.raises(ValueError, match="policy must give a finite action for each of 3 observations"):
         make_policy(lambda seen: given).predict(observations(3))
 
 
-@pytest.mark.parametrize(
+@table(
     ("thing", "options", "message"),
     [(3, {}, "policy must have predict, or be a function"), (Push(0), {"strength": 1}, "options must be none")],
 )
@@ -131,13 +133,12 @@ def test_what_a_policy_refuses_is_told_with_its_name(monkeypatch):
         evaluate([Picky()], **SHORT)
 
 
-@pytest.mark.parametrize(
+@table(
     ("actions", "told"),
     [
         (np.full((4, 1), np.nan, dtype=np.float32), "must be finite, but row 0 is nan"),
         (np.zeros(4, dtype=np.float32), r"must have shape \(4, 1\), but have \(4,\)"),
     ],
-    ids=["nan", "shape"],
 )
 def test_whose_actions_are_none_is_told_with_its_name(actions, told):
     class Broken(Push):
@@ -154,7 +155,7 @@ def normalised_model(kind=PPO, **settings):
     return kind("MlpPolicy", envs, seed=0, device="cpu", **steps, **settings).learn(32), envs
 
 
-@pytest.mark.parametrize("kind", [PPO, A2C, SAC, TD3])
+@table("kind", [PPO, A2C, SAC, TD3])
 def test_the_normaliser_goes_with_the_policy(tmp_path, kind):
     model, envs = normalised_model(kind, **({"batch_size": 32} if kind is PPO else {}))
     save_policy(tmp_path / "mine", model)
@@ -177,7 +178,7 @@ def test_elu_is_played(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
+@table(
     ("settings", "message"),
     [
         ({"policy_kwargs": {"activation_fn": torch.nn.GELU}}, "but has the activation gelu"),
@@ -233,7 +234,7 @@ def normalised(env):
     return NormalizeObservation(env)
 
 
-@pytest.mark.parametrize(
+@table(
     ("wrap", "name"),
     [(normalised, "NormalizeObservation"), (Halved, "Halved"), (Three, "Three"), (Stacked, "Stacked")],
 )
@@ -277,21 +278,13 @@ def test_an_archive_says_how_it_is_converted(tmp_path):
         make_policy(str(tmp_path / "model.zip"))
 
 
-def test_an_algorithm_as_it_comes_is_trained_and_saved(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    baselines.main(baselines.Config("ppo", steps=100))
-    policy = make_policy("runs/sb3-ppo-short-v0-0")
-    assert policy.card["steps"] == 2048  # a roll-out of PPO as it comes
-    assert policy.predict(observations(), deterministic=True)[0].shape == (50, 1)
-
-
 def sequence(between=torch.nn.ReLU, *after):
     torch.manual_seed(0)
     return torch.nn.Sequential(torch.nn.Linear(FEATURES, 8), between(), torch.nn.Linear(8, 1), *after)
 
 
-@pytest.mark.parametrize("between", [torch.nn.Tanh, torch.nn.ReLU, torch.nn.ELU])
-@pytest.mark.parametrize("after", [(), (torch.nn.Tanh(),)])
+@table("between", [torch.nn.Tanh, torch.nn.ReLU, torch.nn.ELU])
+@table("after", [(), (torch.nn.Tanh(),)])
 def test_a_network_alone_is_saved_with_what_it_sees(tmp_path, between, after):
     model, seen = sequence(between, *after), observations()
     mean, std = np.full(FEATURES, 0.1), np.linspace(0.2, 1.0, FEATURES)
@@ -306,7 +299,7 @@ def test_a_network_alone_is_saved_with_what_it_sees(tmp_path, between, after):
     np.testing.assert_allclose(make_policy(str(tmp_path)).predict(seen)[0], plain, atol=1e-6)
 
 
-@pytest.mark.parametrize(
+@table(
     ("model", "message"),
     [
         (sequence(torch.nn.GELU), r"but is \['linear', 'gelu', 'linear'\]"),
@@ -324,7 +317,7 @@ def test_a_network_alone_that_could_not_be_played_is_refused(tmp_path, model, me
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize(
+@table(
     ("normalizer", "message"),
     [
         ((np.zeros(FEATURES), np.zeros(FEATURES), 10.0), "normalizer.std must be positive, but is 0.0 somewhere"),
@@ -356,7 +349,7 @@ def test_a_normaliser_that_cannot_be_played_is_refused(tmp_path, normalizer, mes
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("kind", ["network", "algorithm"])
+@table("kind", ["network", "algorithm"])
 def test_weights_that_are_not_finite_are_refused(tmp_path, kind):
     model = sequence() if kind == "network" else PPO("MlpPolicy", gym.make("duffing_env/Short-v0"), device="cpu")
     layer = model[2] if kind == "network" else model.policy.action_net
@@ -377,7 +370,7 @@ def test_a_network_for_other_observations_is_told_with_its_name():
 HISTORY = {"observation": "history", "history": 10}
 
 
-@pytest.mark.parametrize("how", ["saved", "trained", "card", "config"])
+@table("how", ["saved", "trained", "card", "config"])
 def test_a_policy_plays_the_observation_that_it_learned_from(tmp_path, how):
     """A history of ten samples has as many entries as the posterior."""
     mine = str(tmp_path / "mine")
@@ -430,7 +423,7 @@ def test_a_run_is_not_replaced_and_a_policy_is(tmp_path):
         assert make_policy(tmp_path / "mine").card["steps"] == steps
 
 
-@pytest.mark.parametrize(
+@table(
     ("card", "message"),
     [
         (
@@ -461,7 +454,7 @@ def test_the_card_of_another_policy_says_nothing_of_the_network(tmp_path):
     assert load_policy(tmp_path / "second").card["network"]["activation"] == "relu"
 
 
-@pytest.mark.parametrize("failing", [1, 2, 3, 4])
+@table("failing", [1, 2, 3, 4])
 def test_a_policy_that_is_half_written_is_no_policy(tmp_path, monkeypatch, failing):
     """Each file is renamed once beside the policy, and once into its place."""
     save_policy(tmp_path, sequence(), {"steps": 1})
@@ -480,7 +473,67 @@ def test_a_policy_that_is_half_written_is_no_policy(tmp_path, monkeypatch, faili
     assert all(path.is_file() for path in tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["efe", "ppo/short", "velocity-sign", "prbs"])
+def test_an_environment_of_stable_baselines3_is_taken_as_it_is(name):
+    envs = DuffingVecEnv("duffing_env/Short-v0", 2, seed=0, max_input=0.1)
+    expected, _ = make_policy(name, envs.envs).predict(envs.reset(), deterministic=True)
+    for held in (envs, VecCheckNan(envs), VecNormalize(envs, norm_obs=False)):
+        actions, _ = make_policy(name, held).predict(envs.envs.shown, deterministic=True)
+        np.testing.assert_array_equal(actions, expected)
+    normalised = VecNormalize(envs)
+    if name == "prbs":
+        np.testing.assert_array_equal(make_policy(name, normalised).predict(normalised.reset())[0], expected)
+    else:
+        with pytest.raises(ValueError, match=r"VecNormalize changes them, .* without it, or choose a signal"):
+            make_policy(name, VecCheckNan(normalised))
+    with pytest.raises(ValueError, match=r"env must take inputs as actions, but .* Discrete\(5\); make it without"):
+        make_policy(name, DuffingVecEnv("duffing_env/Short-v0", 2, seed=0, levels=5))
+
+
+def test_a_model_does_not_normalise_twice():
+    envs = VecNormalize(DuffingVecEnv("duffing_env/Short-v0", 2, seed=0))
+    model = PPO("MlpPolicy", envs, n_steps=4, batch_size=8, device="cpu")
+    make_policy(model, envs.venv)
+    with pytest.raises(ValueError, match=r"env must show its observations as they are, .* VecNormalize, too"):
+        make_policy(model, envs)
+
+
 def test_a_normaliser_beside_an_algorithm_is_refused(tmp_path):
     model = PPO("MlpPolicy", DuffingVecEnv("duffing_env/Short-v0", 2, seed=0), device="cpu")
     with pytest.raises(ValueError, match="normalizer must be None for an algorithm"):
         save_policy(tmp_path, model, normalizer=(0.0, 1.0, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (
+            "os:system",
+            "policy must be an object or a function of your own, but os:system is <built-in function system>",
+        ),
+        ("os:path", "policy must be an object or a function of your own, but os:path is <module"),
+        ("os:makedirs", "policy must be one, but os:makedirs fails: TypeError"),
+        ("os:nothing", "os has no 'nothing'; name one it has"),
+        ("enum:Enum", "policy must be one, but enum:Enum fails: TypeError"),
+        ("decimal:Context", "policy must have predict, or be a function of observations"),
+        ("broken_of_tests:policy", "'broken_of_tests' cannot be imported: SyntaxError"),
+        ("leaving_of_tests:policy", "'leaving_of_tests' cannot be imported: SystemExit: 3"),
+        ("needing_of_tests:policy", "needing_of_tests needs another package: No module named 'no_such_package'"),
+        ("failing_of_tests:policy", "policy must be one, but failing_of_tests:policy fails: KeyError: 'gone' ("),
+        (".:policy", "cannot be imported"),
+    ],
+)
+def test_what_is_no_policy_is_refused_in_a_sentence(policy, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken_of_tests.py").write_text("policy = (\n")
+    (tmp_path / "leaving_of_tests.py").write_text("raise SystemExit(3)\n")
+    (tmp_path / "needing_of_tests.py").write_text("import no_such_package\n")
+    (tmp_path / "failing_of_tests.py").write_text("def policy(seen):\n    return {}['gone']\n")
+    with pytest.raises(ValueError, match=re.escape(message)):
+        evaluate([policy], **SHORT)
+
+
+def test_an_object_of_a_module_has_the_fingerprint_of_its_class(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "object_of_tests.py").write_text("class Still:\n    predict = None\npolicy = Still()\n")
+    assert fingerprint("object_of_tests:policy") == fingerprint("object_of_tests:Still") != ""

@@ -1,5 +1,9 @@
-"""The planner: what it imagines against the structured update's twin, its limits, its batches and its goals."""
+"""The planner, sample by sample and in blocks: its limits, its batches and its goals.
 
+All that compiles the search of a model is in this file: one process then compiles most of it only once.
+"""
+
+import copy
 import itertools
 from types import SimpleNamespace
 
@@ -7,14 +11,21 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import t
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+from tables import table
 
 import duffing_env
+from agents.planner import block_policy, blocks
+from agents.planner.block_policy import BlockPlanner
+from agents.planner.imagination import Terms
 from agents.planner.motion import View, reach_of, swing_of
 from agents.planner.policy import Planner
+from agents.planner.search import search
 from agents.policies import make_policy
 from duffing_env.experiment import SimulatedExperiment
 from estimator import Channel, Rig
-from estimator.belief import covariance_places
+from estimator.belief import Belief, covariance_places
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -47,6 +58,90 @@ def roll_out(track, n, seed=0, steps=None, options=None, name="efe", **planner):
         early += int((running & terminated).sum())
         running &= ~start
     return np.array(inputs), np.array(outputs), early, gains
+
+
+BELIEVING = pytest.mark.parametrize("name", ["efe", "ppo/short"])
+NOT_SHOWN = "observation must be what the environment of this policy showed last, but "
+
+
+def played(policy, observations, step, steps=3):
+    """Observations of some steps under a policy."""
+    state = None
+    for _ in range(steps):
+        action, state = policy.predict(observations, state)
+        observations = step(action)
+    return observations
+
+
+@BELIEVING
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_it_plays_its_own_environments_through_their_ends(name, mode):
+    envs = make("Short", 3, horizon=5, autoreset_mode=mode)
+    policy, (observations, _) = make_policy(name, envs), envs.reset(seed=0)
+    for k in range(14):
+        actions, _ = policy.predict(observations.astype(np.float64 if k % 2 else np.float32))
+        observations, _, terminated, truncated, _ = envs.step(actions)
+        if mode == "Disabled" and (terminated | truncated).any():
+            policy.predict(observations)
+            observations, _ = envs.reset(options={"reset_mask": np.array([k > 6, True, True])})
+            if k < 6:
+                observations, _ = envs.reset(options={"reset_mask": np.array([True, False, False])})
+
+
+@BELIEVING
+@pytest.mark.parametrize("wrap", [
+    lambda env: env, gym.wrappers.RecordEpisodeStatistics, lambda env: gym.wrappers.TimeLimit(env, 40),
+    gym.wrappers.FlattenObservation,
+])  # fmt: skip
+def test_wrappers_that_leave_observations_alone_are_played(name, wrap):
+    env = wrap(gym.make("duffing_env/Short-v0"))
+    policy = make_policy(name, env)
+    played(policy, env.reset(seed=0)[0], lambda action: env.step(action)[0])
+    # The pair of them goes on from a copy.
+    copied, its = copy.deepcopy((env, policy))
+    one, other = (
+        played(p, e.unwrapped.shown[0], lambda a, e=e: e.step(a)[0]) for e, p in ((env, policy), (copied, its))
+    )
+    np.testing.assert_array_equal(one, other)
+    # A batch of one, as Stable-Baselines3 has it.
+    envs = DummyVecEnv([lambda: Monitor(env)])
+    for its in (policy, make_policy(name, envs)):
+        played(its, envs.reset(), lambda actions: envs.step(actions)[0], steps=50)
+
+
+@BELIEVING
+@pytest.mark.parametrize("wrap", [
+    lambda env: gym.wrappers.TransformObservation(env, lambda seen: 0.0 * seen, env.observation_space),
+    lambda env: gym.wrappers.TransformObservation(env, lambda seen: seen + np.float32(1e-6), env.observation_space),
+    lambda env: gym.wrappers.DelayObservation(env, 3), gym.wrappers.NormalizeObservation,
+    lambda env: gym.wrappers.RescaleObservation(env, np.float32(-1), np.float32(1)),
+    gym.wrappers.TimeAwareObservation,
+])  # fmt: skip
+def test_wrappers_that_change_observations_are_refused(name, wrap):
+    env = wrap(gym.make("duffing_env/Short-v0"))
+    policy = make_policy(name, env)
+    with pytest.raises(ValueError, match=NOT_SHOWN if name == "efe" else f"{NOT_SHOWN}|observation must have 22"):
+        played(policy, env.reset(seed=0)[0], lambda action: env.step(action)[0])
+
+
+@BELIEVING
+@pytest.mark.parametrize("rows", [3, 4])
+def test_another_environment_than_its_own_is_refused(name, rows):
+    envs, other = make("Short", 3), make("Short", rows)
+    envs.reset(seed=0)
+    policy, (observations, _) = make_policy(name, envs), other.reset(seed=0)
+    message = f"{NOT_SHOWN}entry . of environment 0 is .* in place of 0; .* make it for the environment that is played"
+    with pytest.raises(ValueError, match=message if rows == 3 else r"3 environments|has shape \(4, 22\) in place of"):
+        played(policy, observations, lambda actions: other.step(actions)[0])
+    left_behind, _ = envs.reset(seed=0)
+    envs.step(np.ones((3, 1), np.float32))
+    with pytest.raises(ValueError, match=NOT_SHOWN):
+        policy.predict(left_behind)
+
+
+def test_the_planner_needs_the_posterior_to_be_shown():
+    with pytest.raises(ValueError, match=r"env must show the posterior, .* but its observation is 'history'"):
+        make_policy("efe", make("Short", 2, observation="history", history=20))
 
 
 @pytest.mark.parametrize("track", ["Amplitude", "Power"])
@@ -136,7 +231,7 @@ def test_single_environments_are_planned_for_as_rows_are():
         observation, *_ = env.step(action)
 
 
-@pytest.mark.parametrize(
+@table(
     ("options", "words"),
     [
         ({"horizon": 0}, "horizon must be a whole number"),
@@ -174,7 +269,7 @@ def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
 @pytest.mark.parametrize(
     ("track", "options", "systems", "most_early"),
     [
-        ("Amplitude-v1", {"horizon": 96}, 16, 0),
+        pytest.param("Amplitude-v1", {"horizon": 96}, 16, 0, marks=pytest.mark.slow),
         # Now and then an episode ends early: of strong process noise, or near where the difference equation blows up.
         pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, 16, 1, marks=pytest.mark.slow),
         pytest.param("WienerHammerstein", {"horizon": 48}, 16, 0, marks=pytest.mark.slow),  # seconds of compilation
@@ -277,7 +372,7 @@ def test_under_a_budget_plans_follow_the_differential_equation_too():
     assert np.all(np.max(windows, axis=0) > 0.5 * (inputs**2).sum(axis=0))
 
 
-@pytest.mark.parametrize("track", ["Short-v0", "Short-v1"])
+@table("track", ["Short-v0", "Short-v1"])
 def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track):
     """As the module says: exceeded with probability ``risk`` by outputs that all are at the margin."""
     env, freedom = gym.make(f"duffing_env/{track}"), 4 + (2 + np.arange(48) / 16) ** 2
@@ -286,24 +381,36 @@ def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track):
         np.testing.assert_allclose(margin, t(freedom).isf(risk / 48), rtol=1e-12)
 
 
-def test_moves_become_shorter_towards_the_end():
-    envs = make("Pendulum-v1", 3, horizon=60)
+#: Of about 27 samples in a period, and of Eq. (1), whose planner the tests of runs compile.
+SLOW_RIG = {
+    "step": 1e-3, "input": {"unit": "N", "limit": 20.0}, "output": {"unit": "m", "range": 0.01},
+    "guess": {"m": (0.38, 0.42), "c": (5.0, 8.0), "a": (2.1e4, 2.3e4), "b": (0.5e8, 2e8)},
+}  # fmt: skip
+
+
+def test_on_a_rig_moves_of_several_samples_become_shorter_towards_the_end():
+    options = {"rig": SLOW_RIG, "horizon": 60, "noise_hypotheses": 1}
+    envs = make("Rig", 3, **options)
     policy = make_policy("efe", envs, seed=0)
     observations, _ = envs.reset(seed=0)
-    state, moves, left = None, [], np.zeros(3)
+    state, moves, left, gains = None, [], np.zeros(3), np.zeros(3)
     for _ in range(envs.horizon):
         begun = left == 0
         actions, state = policy.predict(observations, state)
         if begun.all():
             moves.append(state.held + 1)
         left = state.held
-        observations, *_ = envs.step(actions)
+        observations, rewards, terminated, *_ = envs.step(actions)
+        assert not terminated.any()
+        gains += rewards
     lengths = np.array(moves)
     assert (lengths == lengths[:, :1]).all(), "all plan at the same samples"
     assert lengths[0, 0] == policy.terms.pace == 3
     assert (np.diff(lengths[:, 0]) <= 0).all()
     assert set(lengths[:, 0].tolist()) == {1, 3}
     assert lengths[:, 0].sum() == envs.horizon
+    *_, chance = roll_out("Rig", 3, options=options, name="prbs")
+    assert gains.mean() > chance.mean() + 0.5
 
 
 def precisions(belief, plan):
@@ -321,6 +428,40 @@ def precisions(belief, plan):
         z = np.array([theta @ [z[0], z[0] ** 3, z[1], u], z[0]])
         known.append(np.linalg.inv(P[2:, 2:]))
     return np.array(known)
+
+
+def random_belief(rng):
+    """A belief about Eq. (2) near those of the tracks."""
+    coefficients = np.array([1.8, -0.4, -0.93, 0.38])
+    scale = np.concatenate([[0.02, 0.02], 0.03 * np.abs(coefficients)])
+    factor = np.eye(6) + 0.3 * np.tril(rng.normal(0, 1, (6, 6)), -1)
+    cov = np.outer(scale, scale) * (factor @ factor.T)
+    state = rng.uniform(0.1, 0.3, 2) * [1, 0.5]
+    noises = (2.0, 2.0 * 0.01**2), (3.0, 3.0 * 0.02**2)
+    return Belief.of(difference(), np.concatenate([state, coefficients]), cov, *noises)
+
+
+@table("left", [4, 200])
+def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
+    horizon = 4
+    # What is known after one move, two and four counts; a plan to the end is worth what is known there.
+    weights = np.array([1.0, 1.0, 0.0, 1.0]) if left > horizon else np.array([0.0, 0.0, 0.0, 1.0])
+    terms = Terms(0.15, np.inf, 10.0, np.full(left, 2.0), walk=np.zeros(4), scales=np.ones(2))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        belief = random_belief(rng)
+        rate = 0.1 * np.linalg.inv(belief.coefficients_cov)
+        plans, others = np.zeros((2, 1, horizon))
+        rates, words = rate[None].copy(), rng.integers(1, 2**63, (1, 4), dtype=np.uint64)
+        arguments = belief.record[None].copy(), np.array([left]), horizon, 60, terms, np.zeros((1, 2))
+        search(difference()).plan(*arguments, plans, others, rates, words, np.empty(1), np.empty(1, dtype=np.int64))
+
+        def worth(inputs, belief=belief, rate=rate):
+            to_come = (left - 1 - np.arange(horizon))[:, None, None] * rate
+            return 0.5 * np.linalg.slogdet(precisions(belief, inputs)[1:] + to_come)[1] @ weights
+
+        best = max(worth(inputs) for inputs in itertools.product((-0.15, 0.0, 0.15), repeat=horizon))
+        assert worth(plans[0]) >= best - 1e-4
 
 
 @pytest.mark.parametrize(("track", "moves"), [("Amplitude-v0", 44), ("Short-v0", 24)])
@@ -361,3 +502,42 @@ def test_what_moves_teach_counts_the_less_the_later():
         assert known(found) @ -np.diff(weights) > worths.max() - little
         others += worths[np.argmax(tried[:, -1])] < worths.max() - 2 * little
     assert others > 0  # the end alone would have chosen other plans
+
+
+def test_blocks_begin_with_the_episode_in_a_batch():
+    """Where a step only begins the next episode, no block goes into it."""
+    envs = gym.make_vec("duffing_env/Short-v0", 2, vectorization_mode="vector_entry_point", horizon=24)
+    policy = make_policy("efe-block-16", envs)
+    observations, _ = envs.reset(seed=0)
+    state, played = None, []
+    for _ in range(2 * 25):
+        actions, state = policy.predict(observations, state)
+        observations, _, terminated, _, _ = envs.step(actions)
+        assert not terminated.any()
+        played.append(actions[:, 0])
+    first, over, second = np.split(np.array(played), [24, 25])
+    np.testing.assert_array_equal(over, 0.0)
+    for episode in (first, second[:24]):
+        assert (np.abs(episode).max(axis=0) > 0.5).all()
+        assert (np.count_nonzero(episode[:16], axis=0) > 12).all()
+
+
+def test_a_safe_block_is_tried_nearer_to_the_limit(monkeypatch):
+    """It tells more then, and is as safe."""
+    env = gym.make("duffing_env/Short-v0", max_output=0.3).unwrapped
+    observation, _ = env.reset(seed=0)
+    told = {}
+
+    def best_block(view, systems, futures, candidates, amplitude, bound, played):
+        found = blocks.best_block(view, systems, futures, candidates, amplitude, bound, played)
+        told[blocks._HALVINGS] = blocks.expected(view, systems, futures.limit, found[0])[0]
+        assert found[1] == 1.0
+        assert found[2] < bound
+        return found
+
+    monkeypatch.setattr(block_policy, "best_block", best_block)
+    for halvings in (0, blocks._HALVINGS):
+        monkeypatch.setattr(blocks, "_HALVINGS", halvings)
+        BlockPlanner(env, block=24, risk=0.1).predict(observation)
+    never, often = told.values()
+    assert often > never + 0.02

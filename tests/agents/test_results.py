@@ -1,11 +1,62 @@
-"""How results are printed."""
+"""How results are printed: in 80 characters, and in any encoding."""
 
-from agents.results import show, table
+import io
+import subprocess
+import sys
+
+import pytest
+
+from agents.cli import told_in_one_line
+from agents.results import say, show, table
+
+WORDS = [f"column {i} of many" for i in range(30)]
 
 
-def test_a_table_for_the_manual_is_as_wide_as_its_cells(capsys):
-    titles = [f"column {i} of many" for i in range(30)]
-    show(table(titles, [["a value that is long"] * 30], markdown=True))
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
-    assert [cell.strip() for cell in lines[0].strip().strip("|").split("|")] == titles
-    assert lines[2].count("a value that is long") == 30
+@pytest.mark.parametrize("columns", ["60", "80", "400"])
+@pytest.mark.parametrize("markdown", [False, True])
+def test_a_table_that_is_too_wide_is_several_with_the_same_labels(capsys, monkeypatch, columns, markdown):
+    monkeypatch.setenv("COLUMNS", columns)
+    rows = [["first", *["a value that is long"] * 29], ["a policy with a name " * 9, *map(str, range(1000, 1029))]]
+    show(table(WORDS, rows, markdown=markdown, title="once"))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= min(80, int(columns))
+    told = "\n".join(lines)
+    assert told.count("once") == 1
+    assert all(str(number) in told for number in range(1000, 1029))
+    if markdown:
+        heads = [cell.strip() for line in lines if WORDS[0] in line for cell in line.strip().strip("|").split("|")]
+        assert [head for head in heads if head != WORDS[0]] == WORDS[1:]
+
+
+def test_a_text_is_broken_between_words_and_a_path_is_not(capsys):
+    path = "/" + "folder-of-a-run/" * 8
+    say("word " * 40 + path + "\n  indented")
+    *words, whole, last = capsys.readouterr().out.splitlines()
+    assert " ".join(words) == ("word " * 40).strip()
+    assert max(map(len, words)) <= 80
+    assert (whole, last) == (path, "  indented")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp437", "utf-8"])
+def test_letters_that_an_encoding_lacks_are_spelled(encoding, monkeypatch):
+    text = "m x'' + b x³ ± γ N s²/mm é 語 …"
+    stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", stream)
+    with told_in_one_line("x"):
+        show(text, table(("", "mean"), [["c", "1 N s/mm³"]]))
+    stream.flush()
+    told = stream.buffer.getvalue().decode(encoding)
+    if encoding == "utf-8":
+        assert told.startswith(text)
+    if encoding == "ascii":
+        assert told.startswith("m x'' + b x^3 +/- gamma N s^2/mm e ? ...\n")
+        assert "1 N s/mm^3" in told
+        assert "-----" in told
+
+
+def test_a_command_ends_well_on_a_terminal_of_ascii(tmp_path):
+    code = "from agents.commands import main; main(['export', 'prbs', '-o', 'größe³.csv', '--samples', '32'])"
+    environment = {"PYTHONIOENCODING": "ascii", "PATH": "", "PYTHONPATH": str(sys.path[0]), "PYTHONUTF8": "1"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, cwd=tmp_path, env=environment, timeout=300)
+    assert done.stderr == b""
+    assert done.stdout.startswith(b"grosse^3.csv: 32 samples") or done.stdout.startswith(b"gro?e^3.csv: 32 samples")

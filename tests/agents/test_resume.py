@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -55,6 +56,14 @@ def log(folder):
     return list(csv.DictReader((folder / "progress.csv").read_text().splitlines()))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_systems():
+    """What is evaluated on the way is no subject here: on 4 systems instead of 128."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("agents.training.heldout._SYSTEMS", 4)
+        yield
+
+
 class Stop(Exception):
     """Ends a training from within."""
 
@@ -69,6 +78,18 @@ def stopped(algo, folder, at, **settings):
     with pytest.raises(Stop):
         train(config(algo, folder, eval_every=128, **settings), stop)
     return folder
+
+
+@pytest.fixture(scope="module")
+def stopped_once(tmp_path_factory):
+    """A run of PPO that ended at 400 samples."""
+    return stopped("ppo", tmp_path_factory.mktemp("stopped") / "run", at=400)
+
+
+@pytest.fixture
+def run_of_400(stopped_once, tmp_path):
+    """A copy of it, in a folder whose name has a space."""
+    return Path(shutil.copytree(stopped_once, tmp_path / "my run"))
 
 
 KILLED = """
@@ -135,19 +156,6 @@ def test_the_schedule_and_the_log_go_on(tmp_path):
     assert updates == [4, 8, 12, 20, 24, 28]
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_algorithm_is_resumed(tmp_path, algo):
-    folder = stopped(algo, tmp_path / "run", at=400)
-    before = load_progress(latest_checkpoint(folder))
-    assert before.steps == 256
-    assert before.updates > 0
-    run = resume(folder)
-    assert make_policy(str(folder)).card["steps"] == STEPS
-    assert [point[:2] for point in run.curve[: len(before.curve)]] == [point[:2] for point in before.curve]
-    rows = (folder / "evaluations.csv").read_text().splitlines()
-    assert [int(row.split(",")[0]) for row in rows[1:]] == list(range(0, STEPS + 1, 128))
-
-
 @pytest.mark.parametrize(
     ("algo", "settings"),
     [
@@ -158,8 +166,14 @@ def test_every_algorithm_is_resumed(tmp_path, algo):
 )
 def test_a_resumed_run_is_the_one_that_was_never_stopped(tmp_path, algo, settings):
     folder = stopped(algo, tmp_path / "run", at=640, **settings)
-    assert load_progress(latest_checkpoint(folder)).steps == 512
-    resume(folder)
+    before = load_progress(latest_checkpoint(folder))
+    starts = getattr(settings.get("hyperparameters", tiny(algo)), "learning_starts", 0)
+    assert (before.steps, before.updates > 0) == (512, starts < 512)
+    run = resume(folder)
+    assert make_policy(str(folder)).card["steps"] == STEPS
+    assert [point[:2] for point in run.curve[: len(before.curve)]] == [point[:2] for point in before.curve]
+    rows = (folder / "evaluations.csv").read_text().splitlines()
+    assert [int(row.split(",")[0]) for row in rows[1:]] == list(range(0, STEPS + 1, 128))
     whole = train(config(algo, tmp_path / "whole", eval_every=128, **settings)).folder
     for name in ("policy.safetensors", "evaluations.csv"):
         assert (folder / name).read_bytes() == (whole / name).read_bytes(), name
@@ -219,17 +233,19 @@ def test_only_the_latest_checkpoint_holds_the_state(tmp_path):
     assert earlier.card["steps"] == 256
 
 
-def test_the_script_resumes(tmp_path, monkeypatch, capsys):
-    folder = stopped("ppo", tmp_path / "run", at=400)
-    monkeypatch.setattr(sys, "argv", ["train.py", "--resume", str(folder), "--systems", "0"])
+def test_the_script_resumes(run_of_400, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "400")
+    monkeypatch.setattr(sys, "argv", ["train.py", "--resume", str(run_of_400), "--systems", "0"])
     runpy.run_path(str(Path(agents.__file__).parents[1] / "train.py"), run_name="__main__")
-    assert f"The run is in {folder}" in capsys.readouterr().out.replace("\n", "")
-    assert make_policy(str(folder)).card["steps"] == STEPS
+    assert f"The run is in {run_of_400}" in " ".join(capsys.readouterr().out.split())
+    assert make_policy(str(run_of_400)).card["steps"] == STEPS
 
 
 def test_a_finished_run_is_not_resumed(tmp_path):
     train(replace(config("ppo", tmp_path / "run"), steps=128))
-    with pytest.raises(ValueError, match=r"resume must be a run that was stopped, but .*run is finished"):
+    with pytest.raises(
+        ValueError, match=r"must be a run that was stopped, but .*run is finished; .* train --begin .*run"
+    ):
         resume(tmp_path / "run")
     with pytest.raises(ValueError, match=r"resume must be a run folder, .* but .*none is not one; name a"):
         resume(tmp_path / "none")
@@ -242,8 +258,8 @@ def test_a_configuration_of_something_else_is_refused(tmp_path):
             resume(tmp_path)
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path):
-    folder = stopped("ppo", tmp_path / "run", at=400)
+def test_a_damaged_checkpoint_is_refused(run_of_400):
+    folder = run_of_400
     checkpoint = latest_checkpoint(folder)
     whole = (checkpoint / TENSORS).read_bytes()
     for damage in (whole[:-10], b""):
@@ -281,21 +297,22 @@ def test_after_a_signal_the_update_is_finished_and_all_is_kept(tmp_path, number,
     ("where", "left"),
     [("_make_envs", "nothing was kept"), ("_Training._learn", "nothing was kept; begin again with: duffing-env train")],
 )
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), Stopped(signal.SIGTERM)])
-def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, monkeypatch, where, left, error):
-    def stop(*arguments):
-        raise error
+def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, monkeypatch, where, left):
+    for number, error in ((signal.SIGINT, KeyboardInterrupt()), (signal.SIGTERM, Stopped(signal.SIGTERM))):
 
-    monkeypatch.setattr(f"agents.training.runs.{where}", stop)
-    with pytest.raises(Stopped) as caught:
-        train(config("ppo", tmp_path / "run"))
-    assert caught.value.signum == getattr(error, "signum", signal.SIGINT)
-    assert caught.value.left == left + (f" --resume {tmp_path / 'run'}" if "begin" in left else "")
+        def stop(*arguments, error=error):
+            raise error
+
+        monkeypatch.setattr(f"agents.training.runs.{where}", stop)
+        folder = tmp_path / f"run-{number}"
+        with pytest.raises(Stopped) as caught:
+            train(config("ppo", folder))
+        assert caught.value.signum == number
+        assert caught.value.left == left + (f" --resume {folder}" if "begin" in left else "")
 
 
-def test_a_stop_before_the_first_update_of_a_resumed_run_says_how_to_go_on(tmp_path, monkeypatch):
-    folder = stopped("ppo", tmp_path / "my run", at=400)
+def test_a_stop_before_the_first_update_of_a_resumed_run_says_how_to_go_on(run_of_400, monkeypatch):
     monkeypatch.setattr("agents.training.runs._Training._learn", lambda self: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Stopped) as caught:
-        resume(folder)
-    assert caught.value.left == f"go on with: duffing-env train --resume '{folder}'"
+        resume(run_of_400)
+    assert caught.value.left == f"go on with: duffing-env train --resume '{run_of_400}'"

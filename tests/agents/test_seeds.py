@@ -5,6 +5,7 @@ import json
 from dataclasses import replace
 
 import pytest
+from tables import table
 
 from agents.commands.train import main
 from agents.training import PPOSettings, TrainConfig, train, train_seeds, tune
@@ -67,7 +68,7 @@ def test_what_was_moved_goes_on_where_it_is(tmp_path, monkeypatch):
         list(train_seeds(replace(moved, begin=tmp_path / "b" / "other"), 2))
 
 
-@pytest.mark.parametrize(
+@table(
     ("words", "message"),
     [
         (["--ray"], "ray spreads several trainings, but there is one"),

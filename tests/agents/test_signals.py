@@ -1,17 +1,26 @@
 """Excitation policies: batches, episodes, seeds, limits, and what each signal looks like."""
 
+import copy
+import pickle
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from tables import table
 
 from agents.policies import POLICIES, make_policy
 from agents.policies.excitations import EXCITATIONS, draw_prbs, draw_recorded, draw_regime, draw_uniform
+from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_SAMPLES, SignalPolicy
 from duffing_env import silverbox
+from estimator import Channel, Rig
+
+GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
+RIG = Rig(1e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03, noise=5e-6), guess=GUESS)
 
 
 def stand_in(**attributes):
@@ -41,12 +50,36 @@ def play(policy, rows, steps, episode_starts=None):
     return np.array(volts)
 
 
+@pytest.mark.parametrize("name", [*EXCITATIONS, *FEEDBACK])
+@pytest.mark.parametrize("track", ["Short-v0", "Rig-v0"])
+def test_a_policy_goes_on_from_a_copy(name, track):
+    """Also within another process, which has the bytes alone."""
+    rig = {"rig": RIG} if track == "Rig-v0" else {}
+    policy = make_policy(name, gym.make(f"duffing_env/{track}", horizon=20, **rig), seed=4)
+    seen = np.zeros((2, 35 if rig else 22))
+    _, state = policy.predict(seen)
+    copies = [copy.deepcopy((policy, state)), pickle.loads(pickle.dumps((policy, state)))]
+    copies.append(pickle.loads(cloudpickle.dumps((policy, state))))
+    starts = [[k % 7 == 0, k == 20] for k in range(1, 30)]
+
+    def goes_on(policy, state):
+        played = []
+        for start in starts:
+            actions, state = policy.predict(seen, state, start)
+            played.append(actions)
+        return np.array(played)
+
+    expected = goes_on(policy, state)
+    for copied in copies:
+        np.testing.assert_array_equal(goes_on(*copied), expected)
+
+
 @pytest.fixture
 def without_record(monkeypatch):
     monkeypatch.setattr(silverbox, "record_available", lambda: False)
 
 
-@pytest.mark.parametrize("name", EXCITATIONS)
+@table("name", EXCITATIONS)
 def test_shapes_and_types_of_batch_and_single(name):
     policy = make_policy(name, stand_in(max_input=0.1, horizon=50))
     for rows in (1, 4):
@@ -61,7 +94,7 @@ def test_shapes_and_types_of_batch_and_single(name):
     assert policy.predict(np.zeros(7), state, episode_start=True)[0].shape == (1,)
 
 
-@pytest.mark.parametrize("name", EXCITATIONS)
+@table("name", EXCITATIONS)
 def test_actions_stay_in_range(name):
     # Both regimes exceed 10 mV, so the limit has to clip them.
     policy = make_policy(name, stand_in(max_input=0.01, horizon=400))
@@ -143,7 +176,7 @@ def test_reset_starts_over_and_takes_a_seed():
     np.testing.assert_array_equal(other, play(counting_policy(seed=2), rows=2, steps=8))
 
 
-@pytest.mark.parametrize("name", ["square", "velocity-sign", "efe-myopic", "efe-block-16", lambda seen: seen[:, 0]])
+@table("name", ["square", "velocity-sign", "efe-myopic", "efe-block-16", lambda seen: seen[:, 0]])
 def test_what_is_no_array_is_refused_by_name(name):
     env = gym.make("duffing_env/Amplitude-v0")
     observation, _ = env.reset(seed=0)
@@ -171,7 +204,7 @@ def test_mismatched_batches_are_refused():
         policy.predict(np.zeros((2, 3, 4)))
 
 
-@pytest.mark.parametrize("max_input", [0.0, -0.1, np.inf, np.nan])
+@table("max_input", [0.0, -0.1, np.inf, np.nan])
 def test_senseless_limits_are_refused(max_input):
     with pytest.raises(ValueError, match="max_input must be positive and finite"):
         SignalPolicy("uniform", draw_uniform(0.1), max_input=max_input)
@@ -193,7 +226,7 @@ def test_uniform_is_white_and_fills_its_range():
     assert abs(np.mean(u[1:] * u[:-1])) < 0.01 * u.var()
 
 
-@pytest.mark.parametrize("hold", [1, 4])
+@table("hold", [1, 4])
 def test_prbs_has_two_values_and_keeps_each_for_hold_samples(hold):
     u = draw_prbs(0.2, hold)(np.random.default_rng(2), 40_001)  # no multiple of 4
     assert u.shape == (40_001,)
@@ -225,7 +258,7 @@ def test_reference_policies_play_stretches_of_the_record(record):
         assert is_stretch_of(volts, single)
 
 
-@pytest.mark.parametrize("regime", ["multisine", "arrow"])
+@table("regime", ["multisine", "arrow"])
 def test_reference_policies_work_without_the_record(without_record, regime):
     synthesise = getattr(silverbox, f"synthesise_{regime}")
     stretch = draw_regime(regime)(np.random.default_rng(4), 500)
@@ -248,7 +281,7 @@ def test_stretches_start_uniformly_over_the_regime(monkeypatch):
     )
 
 
-@pytest.mark.parametrize("name", ["silverbox-multisine", "silverbox-arrow"])
+@table("name", ["silverbox-multisine", "silverbox-arrow"])
 def test_replay_plays_the_recorded_input_from_its_first_sample(name):
     recorded = np.random.default_rng(7).uniform(-0.14, 0.14, 40)
     env = stand_in(max_input=0.15, horizon=30, recorded_input=recorded)
@@ -300,7 +333,7 @@ def test_a_path_loads_the_trained_policy(tmp_path, monkeypatch):
     assert make_policy(str(tmp_path), seed=3) == ("loaded", tmp_path, 3)
 
 
-@pytest.mark.parametrize("name", ["prbs", "efe", "ppo/universal"])
+@table("name", ["prbs", "efe", "lookahead"])
 def test_the_name_of_an_environment_is_none(name):
     with pytest.raises(ValueError, match="env must be an environment, but is 'duffing_env/Short-v1'; pass what gym"):
         make_policy(name, "duffing_env/Short-v1")

@@ -1,7 +1,7 @@
 """Steps of a whole plan: against a plain NumPy reference, and what limits and margins do to them."""
 
 import numpy as np
-import pytest
+from tables import table
 
 from agents.planner.steps import nudge, rivals_for, step
 
@@ -56,8 +56,8 @@ def case(seed, horizon, near_at):
     return rivals, plan, (teaching, near, sensitivities, weights)
 
 
-@pytest.mark.parametrize("horizon", [1, 7, 40])
-@pytest.mark.parametrize("seed", range(3))
+@table("horizon", [1, 7, 40])
+@table("seed", range(3))
 def test_steps_are_those_of_newton(seed, horizon):
     near = np.random.default_rng(seed + 10).uniform(-3.0, 2.0, min(horizon, 12))
     rivals, plan, told = case(seed, horizon, near)

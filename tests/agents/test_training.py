@@ -3,6 +3,7 @@
 import csv
 import json
 import platform
+import subprocess
 import sys
 from dataclasses import asdict, replace
 from importlib.metadata import version
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file
+from tables import table
 
 import agents.vec_env
 from agents import make_policy
@@ -19,7 +21,9 @@ from agents.commands.train import Config
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.leaderboard import summarise
 from agents.evaluation.rollout import evaluate
-from agents.training import PPOSettings, TrainConfig, train
+from agents.results import write_json
+from agents.training import PPOSettings, TrainConfig, resume, train
+from agents.training.config import describe
 from agents.training.hyperparameters import settings_of
 from agents.training.runs import _make_envs
 
@@ -38,7 +42,7 @@ def torch_threads():
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Runs of 20,000 samples: twice with seed 0, once with seed 1."""
+    """Runs of five updates: twice with seed 0, once with seed 1."""
     folder = tmp_path_factory.mktemp("runs")
     seeds = {"first": 0, "again": 0, "other": 1}
     return {
@@ -175,6 +179,14 @@ def test_a_training_can_begin_with_the_network_of_a_policy(runs, tmp_path):
     before, after = (load_file(folder / "policy.safetensors") for folder in (runs["first"].folder, begun.folder))
     for name, tensor in before.items():
         np.testing.assert_allclose(after[name], tensor, atol=1e-6)
+    # All samples count that it ever learned from, and again where it is gone on with.
+    steps = [make_policy(str(place)).card["steps"] for place in (runs["first"].folder, *begun.folder.glob("**/0*"))]
+    assert steps[0] == 20480
+    assert make_policy(str(begun.folder)).card["steps"] == max(steps[1:]) == 20480 + 4096
+    again = replace(SMALL, learning_rate=1e-12)
+    settings |= {"output": tmp_path / "further", "begin": begun.folder}
+    further = train(TrainConfig(**settings, hyperparameters=again))
+    assert make_policy(str(further.folder)).card["steps"] == 20480 + 2 * 4096
     with pytest.raises(ValueError, match="begin must be a policy with the network of the training"):
         tiny(tmp_path / "other", begin=runs["first"].folder)
     with pytest.raises(ValueError, match=r"begin must be the folder of a policy, but .*nowhere has no policy"):
@@ -196,7 +208,7 @@ def test_hyperparameters_reach_the_algorithm(tmp_path):
     assert int(rows[1]["train/n_updates"]) == 3
 
 
-@pytest.mark.parametrize(("checkpoints", "expected"), [(1, [512]), (2, [256, 512]), (4, [128, 256, 384, 512])])
+@table(("checkpoints", "expected"), [(1, [512]), (2, [256, 512]), (4, [128, 256, 384, 512])])
 def test_checkpoints_are_evenly_spaced(tmp_path, checkpoints, expected):
     run = tiny(tmp_path / "run", steps=512, checkpoints=checkpoints)
     assert sorted(int(path.name) for path in (run.folder / "checkpoints").iterdir()) == expected
@@ -218,12 +230,11 @@ def test_a_folder_that_holds_a_run_is_refused_untouched(runs):
 
 
 def test_a_training_in_which_no_episode_ended_says_so(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
     settings = {"hyperparameters": TINY, "systems": 0, "reward": "information_gain"}
     Config(steps=256, output=tmp_path / "run", options={"max_output": 10.0}, **settings).run()
-    told = capsys.readouterr().out
-    assert "256 samples" in told
-    assert "no episode has ended" in told
+    told, said = capsys.readouterr()
+    assert "left: no episode has ended" in " ".join(said.split())
     assert "No episode ended, so there is no learning curve" in told
     assert "nan" not in told
     assert not (tmp_path / "run" / "learning_curve.png").exists()
@@ -248,7 +259,7 @@ def test_another_observation_than_the_posterior_has_no_foresight(tmp_path, seen)
     assert (run.folder / "policy.json").exists()
 
 
-@pytest.mark.parametrize(
+@table(
     ("settings", "message"),
     [
         ({"algo": np.ones(2)}, r"algo must be one of \['ppo', .*\], but is array"),
@@ -268,7 +279,7 @@ def test_senseless_settings_are_refused_before_anything_is_written(tmp_path, set
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
+@table(
     ("settings", "message"),
     [
         ({"num_envs": 0}, "num_envs must be at least 1, but is 0"),
@@ -312,3 +323,47 @@ def test_sac_beats_signals_that_do_not_look(tmp_path):
         for evaluation in evaluate([str(run.folder), "uniform"], env, systems=128, seed=1)
     )
     assert learned["low"] > uniform["high"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="this system has no such locks")
+@pytest.mark.parametrize("begin", [train, lambda config: resume(config.output)], ids=["train", "resume"])
+def test_a_folder_that_another_trains_in_is_refused_untouched(tmp_path, begin):
+    (tmp_path / "run").mkdir()
+    holds = "import sys; from pathlib import Path; from estimator.files import hold\n"
+    holds += "hold('output', Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    words = [sys.executable, "-c", holds, tmp_path / "run"]
+    other = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert other.stdout.readline() == "held\n"
+    config = TrainConfig(steps=256, output=tmp_path / "run", torch_threads=1, hyperparameters=TINY)
+    if begin is not train:
+        write_json(tmp_path / "run" / "config.json", describe(config))
+    before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    with pytest.raises(ValueError, match="must be a folder that nobody else writes to, but another process does"):
+        begin(config)
+    assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+    other.kill()  # the kernel lets go of the folder
+    other.communicate()
+    assert begin(config).folder == tmp_path / "run"
+
+
+def test_of_two_trainings_in_one_folder_the_second_refuses(tmp_path):
+    seen = []
+
+    def second(steps, found):
+        with pytest.raises(ValueError, match="output must be a new"):
+            tiny(tmp_path / "run", seed=1)
+        with pytest.raises(ValueError, match="resume must be a folder that nobody else writes to"):
+            resume(tmp_path / "run")
+        seen.append(steps)
+
+    train(
+        TrainConfig(steps=256, output=tmp_path / "run", torch_threads=1, hyperparameters=TINY, eval_every=256), second
+    )
+    assert seen == [0, 256]
+    assert json.loads((tmp_path / "run" / "policy.json").read_text())["config"]["seed"] == 0
+
+
+def test_settings_that_make_no_sense_leave_no_folder(tmp_path):
+    with pytest.raises(ValueError, match="begin must be the folder of a policy"):
+        tiny(tmp_path / "a" / "run", begin=tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -17,6 +17,14 @@ ENV = "duffing_env/Short-v0"
 TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=128, hidden=(4,))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_systems():
+    """Trials are scored on 8 systems instead of 128."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("agents.training.heldout._SYSTEMS", 8)
+        yield
+
+
 @pytest.fixture
 def optuna():
     return pytest.importorskip("optuna", reason="Optuna is not installed; it is the extra tune")
@@ -134,7 +142,6 @@ def test_several_trainings_that_are_stopped_go_on_by_the_same_command(words, wor
 def test_a_search_says_how_its_best_is_trained_with(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(agents.commands.train, "tune", lambda *arguments, **options: tmp_path / "the best.toml")
     main("duffing-env train", ["--env", "Short-v0", "--tune", "3"])
-    *_, told = capsys.readouterr().out.splitlines()
-    assert told.endswith(
+    assert " ".join(capsys.readouterr().out.split()).endswith(
         f"the same command, with --settings '{tmp_path / 'the best.toml'}' in place of --tune and --output"
     )

@@ -42,6 +42,7 @@ def test_steps_are_those_of_single_environments(track, rows, reward):
     ours = DuffingVecEnv(track, rows, seed=5, reward=reward, **OPTIONS)
     theirs = reference(rows, 5, track, reward=reward, **OPTIONS)
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
+    assert ours.reset_infos == theirs.reset_infos
     limits_reached, times_up, prior = 0, 0, ours.envs.belief(0)
     for actions in random_actions(rows, 3 * HORIZON):
         observations, rewards, dones, infos = ours.step(actions)
@@ -50,10 +51,13 @@ def test_steps_are_those_of_single_environments(track, rows, reward):
         np.testing.assert_array_equal(rewards, expected_rewards)
         np.testing.assert_array_equal(dones, expected_dones)
         assert (observations.dtype, rewards.dtype, dones.dtype) == (np.float32, np.float32, np.bool_)
+        assert ours.reset_infos == theirs.reset_infos
         for done, info, expected in zip(dones, infos, expected_infos, strict=True):
             if not done:
-                assert info == {}
+                assert info == expected
+                assert [type(value) for value in info.values()] == [type(value) for value in expected.values()]
                 continue
+            assert info.keys() - expected.keys() == {"belief", "truth"}
             np.testing.assert_array_equal(info["terminal_observation"], expected["terminal_observation"])
             assert info["TimeLimit.truncated"] is expected["TimeLimit.truncated"]
             assert {name: info[name] for name in GAINS} == {name: expected[name] for name in GAINS}
@@ -157,11 +161,12 @@ def test_what_stable_baselines_asks_of_its_environments():
     assert envs.observation_space == gym.make(TRACK).observation_space
     assert envs.action_space == gym.make(TRACK).action_space
     envs.reset()
-    assert envs.reset_infos == [{}, {}, {}, {}]
+    nothing = {"information_gain": 0.0, "log_posterior_gain": 0.0, "diverged": False}
+    assert envs.reset_infos == [nothing] * 4
     envs.reset_infos[0]["mark"] = 1
-    assert envs.reset_infos[1] == {}
+    assert envs.reset_infos[1] == nothing
     envs.reset()
-    assert envs.reset_infos == [{}, {}, {}, {}]
+    assert envs.reset_infos == [nothing] * 4
     assert envs.get_attr("max_input") == [0.1] * 4
     assert envs.get_attr("horizon", indices=[0, 2]) == [HORIZON] * 2
     assert envs.env_is_wrapped(Monitor) == [True] * 4
@@ -182,6 +187,38 @@ def test_attributes_are_those_of_the_rows_that_are_asked_for():
     np.testing.assert_array_equal(envs.get_attr("records")[3], envs.envs.records[3])
     with pytest.raises(AttributeError, match="nothing_like_it"):
         envs.get_attr("nothing_like_it")
+
+
+SOFT, STIFF = ({"m": 6.5e-6, "c": 2.6e-4, "a": 1.2, "b": b} for b in (0.5, 3.0))
+
+
+@pytest.mark.parametrize("options", [{"truth": SOFT}, [{"truth": SOFT}, {}, {"truth": STIFF}]], ids=["all", "each"])
+def test_options_hold_for_the_next_reset_only(options):
+    ours, theirs = DuffingVecEnv(TRACK, 3, seed=5, **OPTIONS), reference(3, 5, **OPTIONS)
+    for envs in (ours, theirs):
+        envs.set_options(options)
+    for k, _ in enumerate(range(3)):
+        np.testing.assert_array_equal(ours.reset(), theirs.reset())
+        assert ours.get_attr("truth") == theirs.get_attr("truth")
+        assert (ours.get_attr("truth")[0].b == 0.5) == (k == 0)
+    for wrong, message in ({"trth": SOFT}, "options of reset must be among"), ([{}], "options must be a dict, or 3"):
+        ours.set_options(wrong)
+        with pytest.raises(ValueError, match=message):
+            ours.reset()
+
+
+@pytest.mark.parametrize("name", ["max_output", "reward", "terminated_return", "horizon", "hold", "branch", "levels"])
+def test_options_are_not_set(name):
+    envs = DuffingVecEnv(TRACK, 3, seed=5, **OPTIONS)
+    with pytest.raises(AttributeError, match=f"^{name} cannot be set to 0.3 in .* make a new one with {name}="):
+        envs.set_attr(name, 0.3, indices=1)
+    envs.set_attr("stage", 1)
+    envs.set_attr("stage", 2, indices=[1])
+    envs.set_attr("mark", 3, indices=0)
+    assert envs.get_attr("stage") == [1, 2, 1]
+    assert envs.get_attr("mark", 0) == [3]
+    with pytest.raises(AttributeError, match="mark"):
+        envs.get_attr("mark")
 
 
 def test_a_made_environment_may_be_wrapped():

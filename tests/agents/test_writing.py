@@ -33,7 +33,6 @@ from estimator.identification.tables import read_table
 
 resource = pytest.importorskip("resource", reason="this system has no limits of the size of files")
 
-#: Ten milliseconds a sample, so that a run is not late on a busy machine.
 RIG = """step = 1e-2
 [input]
 unit = "N"
@@ -106,23 +105,53 @@ def bench(tmp_path_factory):
     return place
 
 
-@pytest.fixture(params=["limit", "disk"])
-def place(request, bench, tmp_path, monkeypatch):
-    """The folder, and what makes that nothing more can be written: a limit of 100 bytes, or a full disk of its own."""
-    monkeypatch.setattr(protocol, "SYSTEMS", 8)
-    folder = tmp_path / "place"
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """Figures are made and written, but not drawn, which takes most of a second for a page; clocks jump."""
+    clock = JumpingClock()
+
+    def savefig(figure, buffer, format, **options):
+        buffer.write({"svg": "<svg></svg>", "png": bytes(1000)}[format])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("matplotlib.figure.Figure.savefig", savefig)
+        patch.setattr(protocol, "SYSTEMS", 8)
+        for module in ("run", "simulated"):
+            patch.setattr(f"agents.running.{module}.RealClock", lambda: clock)
+        yield
+
+
+@pytest.fixture(scope="module")
+def written(bench, tmp_path_factory):
+    """A folder in which every command has written."""
+    place = tmp_path_factory.mktemp("written") / "place"
+    shutil.copytree(bench, place)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        for words in WRITERS:
+            assert command(words, patch, place) == 0, words
+            shutil.rmtree(place / "new", ignore_errors=True)
+    assert content(place).keys() >= {name for names in WRITERS.values() for name in names}
+    return place
+
+
+@pytest.fixture
+def place(written, tmp_path, monkeypatch):
+    """A copy of it."""
+    monkeypatch.chdir(shutil.copytree(written, tmp_path / "place"))
+    return tmp_path / "place"
+
+
+@pytest.fixture
+def small_disk(written, tmp_path, monkeypatch):
+    """A copy on a disk of its own."""
+    folder = tmp_path / "disk"
     folder.mkdir()
-    if request.param == "limit":
-        shutil.copytree(bench, folder, dirs_exist_ok=True)
-        monkeypatch.chdir(folder)
-        yield folder, lambda: limited(100)
-        return
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder], capture_output=True).returncode:
-        pytest.skip("this user can mount no disk")
+        yield None  # this user can mount no disk
+        return
     try:
-        shutil.copytree(bench, folder, dirs_exist_ok=True)
-        monkeypatch.chdir(folder)
-        yield folder, lambda: filled(folder)
+        yield shutil.copytree(written, folder, dirs_exist_ok=True)
     finally:
         monkeypatch.chdir(tmp_path)
         subprocess.run(["umount", folder], check=True)
@@ -134,12 +163,11 @@ def content(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in files if "new/" not in str(path)}
 
 
-def command(words, monkeypatch, capsys, folder):
-    """Exit status and messages."""
+def command(words, monkeypatch, folder):
+    """Exit status."""
     name, *rest = words.split()
     monkeypatch.setattr(sys, "argv", ["duffing-env", name, *rest])
     monkeypatch.setattr(policies, "TRAINED", folder)
-    status = 0
     try:
         if name == "ship":
             monkeypatch.setattr(sys, "argv", ["ship.py", *rest])
@@ -147,66 +175,76 @@ def command(words, monkeypatch, capsys, folder):
         else:
             main()
     except SystemExit as stop:
-        status = stop.code
-    return status, capsys.readouterr().err
+        return stop.code
+    return 0
 
 
-@pytest.mark.parametrize("words", WRITERS, ids=lambda words: " ".join(words.split()[:2]))
-def test_a_full_disk_is_one_line_and_leaves_everything_as_it_was(words, place, monkeypatch, capsys):
-    folder, full = place
-    status, messages = command(words, monkeypatch, capsys, folder)
-    assert status == 0, messages
-    before = content(folder)
-    assert before.keys() >= set(WRITERS[words])
-    shutil.rmtree(folder / "new", ignore_errors=True)
-    with full():
-        status, messages = command(words, monkeypatch, capsys, folder)
-    assert status == 2
-    assert len(messages.splitlines()) == 1, messages
-    assert "make room" in messages
-    assert "File too large" in messages or "No space left" in messages
-    assert content(folder) == before
-    assert not [path for path in folder.rglob(".*") if path.is_file() or path.name.startswith(".checkpoint")]
-    shutil.rmtree(folder / "new", ignore_errors=True)
-    assert command(words, monkeypatch, capsys, folder)[0] == 0
+every_command = pytest.mark.parametrize("words", WRITERS, ids=lambda words: " ".join(words.split()[:2]))
 
 
-@pytest.mark.parametrize("place", ["limit"], indirect=True)
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("words", WRITERS, ids=lambda words: " ".join(words.split()[:2]))
-def test_a_signal_while_it_writes_is_one_line_and_leaves_everything_as_it_was(
-    words, number, status, place, monkeypatch, capsys
-):
+@every_command
+def test_a_full_disk_is_one_line_and_leaves_everything_as_it_was(words, place, small_disk, monkeypatch, capsys):
+    """With a limit of 100 bytes for a file, and on a disk that is full."""
+    before = content(place)
+    for folder, full in ((place, lambda: limited(100)), (small_disk, lambda: filled(small_disk))):
+        if folder is None:
+            continue
+        monkeypatch.chdir(folder)
+        capsys.readouterr()
+        with full():
+            status = command(words, monkeypatch, folder)
+        messages = capsys.readouterr().err
+        assert status == 2
+        assert len(messages.splitlines()) == 1, messages
+        assert "make room" in messages
+        assert "File too large" in messages or "No space left" in messages
+        assert content(folder) == before
+        assert not [path for path in folder.rglob(".*") if path.is_file() or path.name.startswith(".checkpoint")]
+    shutil.rmtree(place / "new", ignore_errors=True)
+    monkeypatch.chdir(place)
+    assert command(words, monkeypatch, place) == 0
+
+
+@every_command
+def test_a_signal_while_it_writes_is_one_line_and_leaves_everything_as_it_was(words, place, monkeypatch, capsys):
     """The signal comes when the first file is there under its temporary name, or a line is about to be added."""
-    folder, _ = place
-    before = content(folder)
-    sent = []
+    before = content(place)
+    for number, status in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
+        sent = []
 
-    def disturbed(call):
-        def first(*arguments, **options):
-            if not sent:
-                sent.append(number)
-                os.kill(os.getpid(), number)
-            return call(*arguments, **options)
+        def disturbed(call, number=number, sent=sent):
+            def first(*arguments, **options):
+                if not sent:
+                    sent.append(number)
+                    os.kill(os.getpid(), number)
+                return call(*arguments, **options)
 
-        return first
+            return first
 
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", disturbed(os.replace))
-        patch.setattr(board, "append_atomically", disturbed(board.append_atomically))
-        found, messages = command(words, monkeypatch, capsys, folder)
-    assert sent
-    assert found == status
-    assert len(messages.splitlines()) == 1, messages
-    assert "stopped" in messages
-    assert content(folder) == before
-    assert not [path for path in folder.rglob(".*") if path.is_file()]
+        capsys.readouterr()
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "replace", disturbed(os.replace))
+            patch.setattr(board, "append_atomically", disturbed(board.append_atomically))
+            found = command(words, patch, place)
+        messages = capsys.readouterr().err
+        assert sent
+        assert found == status
+        assert len(messages.splitlines()) == 1, messages
+        assert "stopped" in messages
+        assert content(place) == before
+        assert not [path for path in place.rglob(".*") if path.is_file()]
+        shutil.rmtree(place / "new", ignore_errors=True)
 
 
 @pytest.mark.parametrize("algo", ["ppo", "sac"])
-def test_a_training_goes_on_from_what_was_written_before_the_disk_was_full(tmp_path, algo):
+def test_a_training_goes_on_from_what_was_written_before_the_disk_was_full(tmp_path, monkeypatch, algo):
+    monkeypatch.setattr("agents.training.heldout._SYSTEMS", 4)
     small = {"num_envs": 8, "batch_size": 16, "hidden": (4,)}
-    own = {"n_steps": 16} if algo == "ppo" else {"buffer_size": 400, "learning_starts": 32}
+    own = (
+        {"n_steps": 16}
+        if algo == "ppo"
+        else {"buffer_size": 400, "learning_starts": 32, "train_freq": 4, "gradient_steps": 2}
+    )
     config = TrainConfig(
         algo=algo, env=SHORT, steps=1024, checkpoints=4, eval_every=128, output=tmp_path / "run",
         hyperparameters=ALGORITHMS[algo](**small, **own),
@@ -226,6 +264,28 @@ def test_a_training_goes_on_from_what_was_written_before_the_disk_was_full(tmp_p
     assert latest_checkpoint(tmp_path / "run").name == "000000256"
     assert not list((tmp_path / "run").glob(".*"))
     assert resume(tmp_path / "run").curve[-1][0] == 1024
+
+
+@pytest.mark.parametrize("room", [0, 1], ids=["log", "checkpoint"])
+def test_a_training_whose_disk_is_full_before_its_first_checkpoint_leaves_nothing(tmp_path, room):
+    """There is room for config.json: what does not fit is the log, or, after its rows, the policy."""
+    small = ALGORITHMS["ppo"](num_envs=8, batch_size=16, hidden=(64,), n_steps=16)
+    config = TrainConfig(
+        env=SHORT, steps=1024, eval_every=1024, output=tmp_path / "made" / "run", hyperparameters=small
+    )
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(steps, found):
+        size = 5000 if room else 20
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+
+    try:
+        with pytest.raises(OSError, match=r"File too large; make room.*'.*" + ("policy" if room else "progress.csv")):
+            train(config, fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
+    assert train(config).curve[-1][0] == 1024
 
 
 def test_a_run_ends_with_its_input_at_zero_and_whole_rows(bench, tmp_path):

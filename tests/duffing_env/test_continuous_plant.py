@@ -4,8 +4,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from reference.filters import continuous_step
 from scipy.integrate import solve_ivp
-from twin import continuous_step, to_rates
+from twin import to_rates
 
 from duffing_env.continuous import ContinuousExperiment
 from duffing_env.kernel import _plant_of

@@ -1,105 +1,39 @@
 """The single environment: Gymnasium's contract, and what the class docstring promises."""
 
 import copy
+import dataclasses
 import json
-import pickle
 import re
 import threading
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from checkers import assert_checkers_are_content
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
+from playing import assert_refused, assert_same, continue_with, play, same
 from rounding import U32
-from twin import PAIRS, to_coefficients
+from twin import to_coefficients
 
 from duffing_env.env import DuffingEnv
-from estimator import Parameters
-from estimator.belief import Belief
+from duffing_env.experiment import SimulatedExperiment
+from duffing_env.vector_env import DuffingVectorEnv
 
 TRACK = "duffing_env/Amplitude-v0"
-FACTORISATIONS = ("structured", "mean_field")
 SHORT = {"horizon": 20}
-TIGHT = {"max_output": 0.2, "horizon": 64}  # random inputs end most episodes early
 
 
 def random_actions(seed, steps=10_000):
     return np.random.default_rng(seed).uniform(-1, 1, (steps, 1)).astype(np.float32)
 
 
-def play(env, actions, seed=None):
-    """One episode: all that `reset` and `step` gave."""
-    told = [env.reset(seed=seed)]
-    for action in actions:
-        told.append(env.step(action))
-        if told[-1][2] or told[-1][3]:
-            break
-    return told
-
-
-def continue_with(env, actions):
-    """All the steps, and the resets after those that end an episode."""
-    told = []
-    for action in actions:
-        told.append(env.step(action))
-        if told[-1][2] or told[-1][3]:
-            told.append(env.reset())
-    return told
-
-
-def same(first, second):
-    """Whether two records of play are the same, bit for bit."""
-    if isinstance(first, Belief):
-        return np.array_equal(first.record, second.record)
-    if isinstance(first, np.ndarray):
-        return first.dtype == second.dtype and np.array_equal(first, second)
-    if isinstance(first, dict):
-        return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
-    if isinstance(first, list | tuple):
-        return len(first) == len(second) and all(same(a, b) for a, b in zip(first, second, strict=True))
-    return type(first) is type(second) and first == second
-
-
-def overwrite(env, name, value):
-    """Put a value into the plant's or the belief's state."""
-    batch = env.unwrapped._batch
-    batch._blocks[0, batch._place[name], 0] = value
-
-
-@pytest.mark.parametrize(("factorisation", "reward"), PAIRS)
-def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(factorisation, reward):
-    assert_checkers_are_content(lambda: gym.make(TRACK, factorisation=factorisation, reward=reward))
-
-
-def test_spaces_are_bounded_float32_and_each_environment_has_its_own():
+def test_the_observation_is_bounded():
     env = DuffingEnv()
     assert env.observation_space == gym.spaces.Box(
         np.float32([-10] * 4 + [-20] * 4 + [-1] * 6 + [-20] * 2 + [-2] * 2 + [-1, -2, 0, 0]),
         np.float32([10] * 4 + [5] * 4 + [1] * 6 + [20] * 2 + [2] * 2 + [1, 2, 1, 1]),
         dtype=np.float32,
     )
-    assert env.action_space == gym.spaces.Box(-1, 1, (1,), np.float32)
-    assert DuffingEnv().observation_space is not env.observation_space
-    assert DuffingEnv().action_space is not env.action_space
-
-
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
-def test_what_a_step_gives_has_the_types_that_trainers_check(factorisation):
-    env = DuffingEnv(factorisation=factorisation, **SHORT)
-    (first, nothing), *steps = play(env, random_actions(0), seed=0)
-    assert nothing == {"information_gain": 0.0, "log_posterior_gain": 0.0, "diverged": False}
-    for observation, reward, terminated, truncated, info in [(first, 0.0, False, False, nothing), *steps]:
-        assert type(observation) is np.ndarray
-        assert observation.dtype == np.float32
-        assert observation.shape == (22,)
-        assert observation.flags.c_contiguous
-        assert type(reward) is float
-        assert type(terminated) is bool
-        assert type(truncated) is bool
-        assert info.keys() == nothing.keys()
-        assert [type(value) for value in info.values()] == [float, float, bool]
 
 
 def test_observations_are_given_away():
@@ -121,48 +55,12 @@ def test_the_first_observation_says_that_nothing_is_known_yet():
         np.testing.assert_array_equal(observation, DuffingEnv().reset(seed=99)[0])
 
 
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
-def test_a_seed_repeats_a_whole_episode(factorisation):
-    env = DuffingEnv(factorisation=factorisation, **TIGHT)
-    first = play(env, random_actions(0), seed=7)
-    assert same(first, play(env, random_actions(0), seed=7))
-    assert same(first, play(DuffingEnv(factorisation=factorisation, **TIGHT), random_actions(0), seed=7))
-    assert not same(first, play(env, random_actions(0), seed=8))
-
-
-def test_reset_without_a_seed_goes_on_and_differs():
-    def three_episodes():
-        env = DuffingEnv(**TIGHT)
-        return [play(env, random_actions(0), seed=seed) for seed in (3, None, None)]
-
-    episodes = three_episodes()
-    assert not same(episodes[0], episodes[1])
-    assert not same(episodes[1], episodes[2])
-    assert same(episodes, three_episodes())
-    unseeded = [play(DuffingEnv(**TIGHT), random_actions(0)) for _ in range(2)]
-    assert not same(*unseeded)
-
-
 def test_a_generator_that_is_put_in_is_used_at_the_next_reset():
     env = DuffingEnv(**SHORT)
     expected = play(env, random_actions(0), seed=4)
     env.reset(seed=5)
     env.np_random = np.random.default_rng(4)
     assert same(play(env, random_actions(0)), expected)
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
-def test_copies_made_within_an_episode_continue_alike_and_apart(copied):
-    env = gym.make(TRACK, **TIGHT)
-    env.reset(seed=0)
-    for action in random_actions(0, 5):
-        env.step(action)
-    twin, witness = copied(env), copied(env)
-    expected = continue_with(env, random_actions(1, 200))
-    assert sum(len(step) == 2 for step in expected) > 1  # it went on into further episodes
-    assert same(continue_with(twin, random_actions(1, 200)), expected)
-    assert not same(continue_with(env, random_actions(1, 200)), expected)
-    assert same(continue_with(witness, random_actions(1, 200)), expected)
 
 
 def test_steps_outside_an_episode_are_refused():
@@ -181,32 +79,31 @@ def test_steps_outside_an_episode_are_refused():
 
 
 NO_NUMBERS = [
-    "a", [None], {}, 1j, [10**400], np.array([None]), np.array(["x"]), np.array([1j]), np.array([{}]),
-    np.ma.masked, np.ma.masked_array([0.5], [True]), lambda: 0.5,
+    "a", "0.5", ["0.5"], b"0.5", np.array(["0.5"]), np.array("0.5", object), [None], {}, 1j, [10**400],
+    np.array([None]), np.array(["x"]), np.array([1j]), np.array([{}]), np.ma.masked,
+    np.ma.masked_array([0.5], [True]), lambda: 0.5,
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("action", [[np.nan], [np.inf], -np.inf, [], [0.1, 0.2], np.zeros((2, 1)), None, *NO_NUMBERS])
-def test_actions_that_are_no_number_are_refused_and_change_nothing(action):
+def test_actions_that_are_no_number_are_refused_and_change_nothing():
     env, untouched = DuffingEnv(**SHORT), DuffingEnv(**SHORT)
     for each in (env, untouched):
         each.reset(seed=0)
         each.step([0.5])
-    with pytest.raises(ValueError, match=r"action must be one finite number in \[-1, 1\], but is"):
-        env.step(action)
-    assert same(continue_with(env, random_actions(0, 40)), continue_with(untouched, random_actions(0, 40)))
+    given = [[np.nan], [np.inf], -np.inf, [], [0.1, 0.2], np.zeros((2, 1)), None, *NO_NUMBERS]
+    message = "action must be one finite number in [-1, 1], but is"
+    assert_refused((lambda action=action: env.step(action), message) for action in given)
+    assert_same(continue_with(env, random_actions(0, 40)), continue_with(untouched, random_actions(0, 40)))
 
 
-@pytest.mark.parametrize("beyond", [1.5, 1e30, 1e300, np.float32(3), [[7.0]], 2])
-def test_actions_are_clipped(beyond):
-    steps = []
-    for action in (1.0, beyond):
-        env = DuffingEnv(**SHORT)
+def test_actions_are_clipped():
+    env, given = DuffingEnv(**SHORT), []
+    for action in (1.0, 1.5, 1e30, 1e300, np.float32(3), [[7.0]], 2):
         env.reset(seed=0)
-        steps.append([env.step(action), env.step(-np.asarray(action))])
-    assert same(*steps)
-    assert steps[0][0][0][18] == 1.0
-    assert steps[0][1][0][18] == -1.0
+        given.append([env.step(action), env.step(-np.asarray(action))])
+        assert same(given[-1], given[0]), action
+    assert given[0][0][0][18] == 1.0
+    assert given[0][1][0][18] == -1.0
 
 
 def test_feedback_at_resonance_reaches_the_limit_and_terminates():
@@ -252,104 +149,27 @@ def test_no_time_limit_but_the_horizon():
     np.testing.assert_allclose([step[0][20] for step in episode], 1 - np.arange(301) / 300, rtol=2 * U32)
 
 
-@pytest.mark.parametrize(("factorisation", "reward"), PAIRS)
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [*(("X_x1", value) for value in (np.nan, np.inf, -np.inf, 1e200, 1e70)), ("X_x2", np.inf), ("theta1", 1e300)],
-)
-def test_numbers_that_are_not_finite_end_the_episode_flagged(factorisation, reward, name, value):
-    env = DuffingEnv(factorisation=factorisation, reward=reward)
-    env.reset(seed=0)
-    for action in random_actions(0, 10):
-        env.step(action)
-    overwrite(env, name, value)
-    before = env.belief
-    observation, received, terminated, truncated, info = env.step([0.5])
-    assert (received, terminated, truncated, info["diverged"]) == (0.0, True, False, True)
-    assert info["information_gain"] == info["log_posterior_gain"] == 0.0
-    assert observation in env.observation_space
-    assert same(env.belief, before)
-    assert isinstance(env.truth, Parameters)
-    observation, _ = env.reset()
-    assert observation in env.observation_space
-    assert np.isfinite(env.step([0.5])[1])
-
-
-EXTREMES = [
-    {"max_output": 1e-4},
-    {"max_output": 1e300},
-    {"max_output": 1e6, "max_input": 1e3},
-    {"max_output": 1e250, "max_input": 1e200},
-    {"max_input": 1e-12},
-    {"spread": 0.999},
-    {"spread": 1e-6},
-    {"process_noise": 1e-9},
-    {"process_noise": 1.0},
-    {"measurement_noise": 1e-9},
-    {"measurement_noise": 10.0},
-    {"noise_shape": 1e-3},
-    {"noise_shape": 1e9},
-    {"horizon": 1},
-    # A mean-field covariance of the state loses its determinant to rounding, and the free energy becomes NaN.
-    {"max_output": 4000.0, "max_input": 300.0, "process_noise": 3e-9, "measurement_noise": 3e-9, "spread": 0.999},
-]
-
-
-#: The iterations of a structured update are generated: another kernel for another number.
-MANY = [pytest.param("structured", "information_gain", {"iterations": n}, marks=pytest.mark.slow) for n in (1, 50)]
-
-
-@pytest.mark.parametrize(
-    ("factorisation", "reward", "options"),
-    [pytest.param(*pair.values, options, marks=pair.marks) for pair in PAIRS for options in [{}, *EXTREMES]] + MANY,
-    ids=str,
-)
-def test_observations_stay_in_their_space_and_rewards_finite(factorisation, reward, options):
-    env = DuffingEnv(factorisation=factorisation, reward=reward, **options)
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        actions = rng.uniform(-1, 1, (256, 1)) if seed % 2 else rng.choice([-1.0, 1.0], (256, 1))
-        for step in play(env, actions, seed=seed):
-            assert step[0] in env.observation_space
-            if len(step) == 5:
-                numbers = step[1], step[4]["information_gain"], step[4]["log_posterior_gain"]
-                assert np.isfinite(numbers).all(), numbers
-
-
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
-def test_gains_sum_to_the_change_of_the_belief(factorisation):
-    env = DuffingEnv(factorisation=factorisation, reward="parameter_error")
-    prior = env.belief
-    for seed in range(10):
-        steps = play(env, random_actions(seed), seed=seed)[1:]
-        final, truth = env.belief, env.truth
-        gain = sum(step[4]["information_gain"] for step in steps)
-        np.testing.assert_allclose(gain, prior.entropy() - final.entropy(), rtol=1e-9)
-        density = sum(step[4]["log_posterior_gain"] for step in steps)
-        coefficients = to_coefficients(truth)
-        np.testing.assert_allclose(density, final.log_prob(coefficients) - prior.log_prob(coefficients), rtol=1e-7)
-        assert -1 <= sum(step[1] for step in steps) <= 1
-
-
-def test_the_belief_and_truth_of_an_episode_stay_as_they_were():
+def test_the_truth_of_an_episode_stays_as_it_was():
     env = DuffingEnv(**SHORT)
     play(env, random_actions(0), seed=0)
-    belief, truth = env.belief, env.truth
-    kept = copy.deepcopy((belief, truth))
-    assert same((env.belief, env.truth), kept)  # until the next reset
+    truth, kept = env.truth, dict(env.truth)
+    assert env.truth == truth  # until the next reset
     play(env, random_actions(1))
-    assert same((belief, truth), kept)
+    assert dict(truth) == kept
     assert truth != env.truth
-    assert not same(belief, env.belief)
 
 
 def test_structured_beliefs_are_calibrated_and_precise():
     # 200 episodes: the squared distance of the truth from the mean, in standard deviations, is 4 on average.
-    env = DuffingEnv()
+    envs = DuffingVectorEnv(200)
+    envs.reset(seed=0)
+    endings = [None] * 200
+    for action in np.random.default_rng(0).uniform(-1, 1, (256, 200, 1)).astype(np.float32):
+        _, _, terminated, truncated, infos = envs.step(action)
+        for row in np.flatnonzero(terminated | truncated):
+            endings[row] = endings[row] or (infos["belief"][row], infos["truth"][row])
     distances, errors = [], []
-    for seed in range(200):
-        play(env, random_actions(seed), seed=seed)
-        belief, truth = env.belief, env.truth
+    for belief, truth in endings:
         deviation = to_coefficients(truth) - belief.coefficients_mean
         distances.append(deviation @ np.linalg.solve(belief.coefficients_cov, deviation))
         errors.append(abs(belief.physical()[0][0] / truth.m - 1))
@@ -357,23 +177,8 @@ def test_structured_beliefs_are_calibrated_and_precise():
     assert np.median(errors) < 0.003
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"horizn": 3}, "unexpected keyword argument 'horizn': .* did you mean 'horizon'"),
-        ({"reward": "informationgain"}, "did you mean 'information_gain'"),
-        ({"factorisation": "meanfield"}, "factorisation must be one of"),
-        ({"max_input": -1}, "max_input must be a number from 1e-12 to 1e\\+300, but is -1"),
-        ({"render_mode": "ansi"}, "render_mode must be one of"),
-    ],
-)
-def test_bad_options_are_refused_with_a_remedy(options, message):
-    with pytest.raises(ValueError, match=message):
-        DuffingEnv(**options)
-
-
 def test_specifications_travel_as_json():
-    options = {"reward": "log_posterior", "factorisation": "mean_field", "iterations": 4, "horizon": 30, "spread": 0.2}
+    options = {"reward": "log_posterior", "horizon": 30, "spread": 0.2, "max_slew": 0.1, "branch": "test"}
     env = gym.make(TRACK, **options)
     text = env.spec.to_json()
     assert json.loads(text)["kwargs"].items() >= options.items()
@@ -381,6 +186,56 @@ def test_specifications_travel_as_json():
     assert again.unwrapped.experiment == env.unwrapped.experiment
     assert same(play(env, random_actions(0), seed=0), play(again, random_actions(0), seed=0))
     assert gym.make(env.spec).unwrapped.experiment == env.unwrapped.experiment
+
+
+@pytest.mark.parametrize("travels", [False, True])
+def test_a_specification_takes_other_options(travels):
+    """What follows from the old ones is no limit of what is made with new ones."""
+    spec = gym.make("duffing_env/Short-v0", max_input=1e-3, max_output=0.5).spec
+    assert spec.max_episode_steps == copy.deepcopy(spec).max_episode_steps == 48
+    spec = EnvSpec.from_json(spec.to_json()) if travels else dataclasses.replace(spec)
+    env = gym.make(spec, horizon=60, max_output=0.4)
+    assert (env.spec.max_episode_steps, env.spec.kwargs["max_output"]) == (60, 0.4)
+    assert gym.wrappers.TimeAwareObservation(env).max_timesteps == 60
+    assert len(play(env, np.zeros((80, 1)), seed=0)) == 61
+    for mode in ("vector_entry_point", "sync"):
+        envs = gym.make_vec(spec, num_envs=2, vectorization_mode=mode, horizon=60)
+        envs.reset(seed=0)
+        assert mode == "sync" or envs.spec.max_episode_steps == 60
+        ends = [envs.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(60)]
+        assert ends == [False] * 59 + [True]
+    limited = gym.make(spec, max_episode_steps=9).spec
+    assert limited.max_episode_steps == gym.make(limited, horizon=60).spec.max_episode_steps == 9
+    assert gym.make_vec(spec, num_envs=2, max_episode_steps=9).spec.max_episode_steps == 9
+
+
+def test_options_are_read_and_not_set():
+    env = gym.make("duffing_env/Short-v0")
+    envs = gym.vector.SyncVectorEnv([lambda: env])
+    for name in (field.name for field in dataclasses.fields(SimulatedExperiment)):
+        before = env.get_wrapper_attr(name)
+        assert before == getattr(env.unwrapped.experiment, name)
+        sets = (
+            lambda name=name: setattr(env.unwrapped, name, 0.3),
+            lambda name=name: env.set_wrapper_attr(name, 0.3),
+            lambda name=name: env.set_wrapper_attr(name, 0.3, force=False),
+            lambda name=name: envs.set_attr(name, 0.3),
+        )
+        for call in sets:
+            with pytest.raises(AttributeError, match=f"^{name} cannot be set to 0.3 in .* make a new one with {name}="):
+                call()
+        assert env.get_wrapper_attr(name) is before
+    assert not env.set_wrapper_attr("stage", 2, force=False)
+    env.set_wrapper_attr("stage", 2)
+    assert env.get_wrapper_attr("stage") == 2
+
+
+def test_a_tensor_that_requires_a_gradient_is_refused_with_what_to_do():
+    torch = pytest.importorskip("torch")
+    env = DuffingEnv(**SHORT)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^action must be .*; pass action.detach\(\)"):
+        env.step(torch.zeros(1, requires_grad=True))
 
 
 def test_closing_twice_is_fine():

@@ -4,9 +4,8 @@ import gymnasium as gym
 import numba
 import numpy as np
 import pytest
-from checkers import assert_checkers_are_content
-from gymnasium.vector import AutoresetMode
-from test_vector_env import BOTH_ENDS, PARAMETERS, play_beside_singles, random_actions, roll_out
+from playing import assert_refused, random_actions, roll_out
+from specimens import all_that_is_given
 
 from duffing_env.env import DuffingEnv
 from duffing_env.own import Beliefs
@@ -16,23 +15,12 @@ from estimator.physical import coefficients_of
 from estimator.priors import silverbox_prior
 from estimator.units import Scales
 
-TRACK = "duffing_env/Amplitude-v0"
-
-
-def means(beliefs):
-    """An observation: what is believed of the coefficients, and the logarithms of their standard deviations."""
-    stds = np.sqrt(np.diagonal(beliefs.coefficients_cov, axis1=1, axis2=2))
-    return np.concatenate([beliefs.coefficients_mean, np.log(stds)], axis=1)
+PARAMETERS = ("m", "c", "a", "b")
 
 
 def gain(before, after, u, y, truth):
     """A reward: the information gain, once more."""
     return 0.5 * (np.linalg.slogdet(before.coefficients_cov)[1] - np.linalg.slogdet(after.coefficients_cov)[1])
-
-
-def told(before, after, u, y, truth):
-    """A reward that uses all it is told."""
-    return after.mean[:, 0] + before.noises[:, 0] + u + y + truth.m + truth["b"]
 
 
 @numba.njit
@@ -41,35 +29,10 @@ def compiled(before, after, u, y, truth):
     return after.mean[0] + before.noises[0] + u + y + truth.m + truth.b
 
 
-OWN = [
-    {"observation": "history", "history": 5},
-    {"observation": "privileged"},
-    {"observation": means, "reward": gain},
-    {"reward": told, "input_cost": 0.1},
-    {"reward": compiled, "hold": 3},
-    {"observation": "history", "history": 3, "hold": 3, "reward": told},
-]
-
-
-@pytest.mark.parametrize("options", OWN, ids=range(len(OWN)))
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_rows_are_single_environments(mode, options):
-    steps = play_beside_singles(5, 80, mode=mode, **BOTH_ENDS, **options)
-    ended = np.array([(step[2].sum(), step[3].sum()) for step in steps]).sum(axis=0)
-    assert (ended > 3).all()
-
-
-@pytest.mark.parametrize("options", OWN[:4], ids=range(4))
-def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(options):
-    space = gym.make(TRACK, **options).observation_space
-    assert space.dtype == np.float32
-    assert np.isfinite([space.low, space.high]).all()
-    assert_checkers_are_content(lambda: gym.make(TRACK, **options))
-
-
 def test_the_compiled_reward_is_the_other():
     first, second = (
-        roll_out(DuffingVectorEnv(40, reward=reward), random_actions(20, 40)) for reward in (told, compiled)
+        roll_out(DuffingVectorEnv(40, reward=reward), random_actions(20, 40))
+        for reward in (all_that_is_given, compiled)
     )
     for one, other in zip(first[1:], second[1:], strict=True):
         np.testing.assert_allclose(one[1], other[1], rtol=1e-15)
@@ -107,8 +70,24 @@ def test_the_information_gain_once_more():
         np.testing.assert_array_equal(other[0], one[0])
 
 
+def test_what_is_paid_for_a_held_action_is_for_all_its_samples():
+    envs, plain = (DuffingVectorEnv(4, reward=all_that_is_given, hold=hold, horizon=9) for hold in (3, 1))
+    envs.reset(seed=0)
+    plain.reset(seed=0)
+    before = Beliefs(difference(), envs.records)
+    actions = random_actions(1, 4)[0]
+    _, rewards, *_ = envs.step(actions)
+    for _ in range(3):
+        observations, *_ = plain.step(actions)
+    u, y = 0.15 * observations[:, 18], plain._batch.quantity("Y_y")
+    after = Beliefs(difference(), plain.records)
+    expected = after.mean[:, 0] + before.noises[:, 0] + u + y + plain.truth.m + plain.truth.b
+    np.testing.assert_allclose(rewards, expected, rtol=1e-6)
+
+
 def test_a_sample_that_breaks_the_belief_pays_nothing():
-    steps = play_beside_singles(8, 200, max_output=1e300, spread=0.9, horizon=60, reward=told)
+    envs = DuffingVectorEnv(8, max_output=1e300, spread=0.9, horizon=60, reward=all_that_is_given)
+    steps = roll_out(envs, random_actions(200, 8), 7)[1:]
     diverged = np.array([step[4]["diverged"] for step in steps])
     rewards = np.array([step[1] for step in steps])
     assert diverged.sum() > 3
@@ -139,29 +118,39 @@ def test_privileged_shows_the_true_coefficients():
     np.testing.assert_array_equal(seen[:, :22], DuffingVectorEnv(5).reset(seed=0)[0])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"observation": "all"}, r"observation must be one of \['posterior', .*\] or a function, but is 'all'"),
-        (
-            {"observation": lambda beliefs: beliefs.mean[0]},
-            r"observation must give finite numbers of shape \(n, entries\)",
-        ),
-        ({"observation": lambda beliefs: np.zeros((len(beliefs.mean), 0))}, r"finite numbers of shape \(n, entries\)"),
-        ({"history": 0}, "history must be a whole number from 1"),
-        (
-            {"reward": gain, "terminal": True},
-            "terminal and terminated_return must be left out with a reward of one's own",
-        ),
-        ({"mean": {"k": 1.0}}, r"mean must give some of the parameters \['m', 'c', 'a', 'b'\], but is"),
-        ({"mean": {"m": -1.0}}, r"mean\['m'\] must be a number from"),
-        ({"prior": 3}, "prior must be an estimator.Belief or None, but is 3"),
-        ({"prior": silverbox_prior(difference("linear"))}, "prior must be of the model 'difference.*', but is of"),
-    ],
-)
-def test_bad_options_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        DuffingEnv(**options)
+BAD = [
+    ({"observation": "all"}, "observation must be one of ['posterior', "),
+    ({"observation": "all"}, " or a function, but is 'all'"),
+    ({"observation": lambda beliefs: beliefs.mean[0]}, "observation must give finite numbers of shape (n, entries)"),
+    ({"observation": lambda beliefs: np.zeros((len(beliefs.mean), 0))}, "finite numbers of shape (n, entries)"),
+    ({"history": 0}, "history must be a whole number from 1"),
+    (
+        {"reward": gain, "terminal": True},
+        "terminal and terminated_return must be left out with a reward of one's own",
+    ),
+    ({"mean": {"k": 1.0}}, "mean must give some of the parameters ['m', 'c', 'a', 'b'], but is"),
+    ({"mean": {"m": -1.0}}, "mean['m'] must be a number from"),
+    ({"prior": 3}, "prior must be an estimator.Belief or None, but is 3"),
+    ({"prior": silverbox_prior(difference("linear"))}, "prior must be of the model 'difference"),
+]
+#: An array is no name.
+NO_NAMES = [
+    ("Amplitude-v0", "observation", np.ones(3)),
+    ("Amplitude-v0", "reward", np.ones(3)),
+    ("Amplitude-v1", "estimator", np.ones(3)),
+    ("Rig-v0", "factorisation", np.ones(3)),
+    ("SilverboxReplay-v0", "nonlinear", np.ones(3)),
+    ("SilverboxReplay-v0", "data", 1.0),
+]
+
+
+def test_bad_options_are_refused():
+    assert_refused((lambda options=options: DuffingEnv(**options), message) for options, message in BAD)
+    assert_refused(
+        (lambda track=track, given=given: gym.make(f"duffing_env/{track}", **given), f"{name} must be ")
+        for track, name, value in NO_NAMES
+        for given in ({name: value},)
+    )
 
 
 def test_an_observation_keeps_its_number_of_entries():
@@ -173,18 +162,21 @@ def test_an_observation_keeps_its_number_of_entries():
         env.step([0.5])
 
 
-@pytest.mark.parametrize("given", [0.0, np.full(3, np.nan), np.zeros((3, 1))], ids=str)
-def test_a_reward_that_is_none_is_refused(given):
-    envs = DuffingVectorEnv(3, reward=lambda *told: given)
-    envs.reset(seed=0)
-    with pytest.raises(ValueError, match="reward must give 3 finite numbers for 3 environments, but gave"):
+def test_a_reward_that_is_none_is_refused():
+    def step_with(given):
+        envs = DuffingVectorEnv(3, reward=lambda *told: given)
+        envs.reset(seed=0)
         envs.step(np.zeros((3, 1)))
+
+    message = "reward must give 3 finite numbers for 3 environments, but gave"
+    assert_refused((lambda given=given: step_with(given), message) for given in (0.0, [np.nan] * 3, np.zeros((3, 1))))
 
 
 def test_a_prior_of_ones_own_is_where_episodes_start():
     prior = silverbox_prior()
-    steps = play_beside_singles(3, 40, prior=prior, horizon=15)
-    assert np.isfinite([step[0] for step in steps]).all()
+    envs = DuffingVectorEnv(3, prior=prior, horizon=15)
+    for observations, *_ in roll_out(envs, random_actions(20, 3)):
+        assert np.isfinite(observations).all()
     env = DuffingEnv(prior=prior)
     env.reset(seed=0)
     np.testing.assert_array_equal(env.belief.record, prior.record)
@@ -207,28 +199,3 @@ def test_oscillators_are_drawn_about_a_mean_of_ones_own():
         np.testing.assert_allclose(means[row], mean)
         np.testing.assert_allclose(covs[row], cov)
     assert moved.belief(0) != usual.belief(0)
-
-
-@pytest.mark.parametrize(
-    ("track", "name"),
-    [
-        ("Amplitude-v0", "observation"),
-        ("Amplitude-v0", "reward"),
-        ("Amplitude-v1", "estimator"),
-        ("Rig-v0", "factorisation"),
-        ("SilverboxReplay-v0", "nonlinear"),
-        ("SilverboxReplay-v0", "data"),
-    ],
-)
-def test_an_array_is_no_name(track, name):
-    value = 1.0 if name == "data" else np.ones(3)
-    with pytest.raises(ValueError, match=f"{name} must be "):
-        gym.make(f"duffing_env/{track}", **{name: value})
-
-
-def test_what_is_no_seed_and_no_options_is_refused():
-    envs = DuffingVectorEnv(3)
-    with pytest.raises(ValueError, match="seed must be a whole number or 3 of them"):
-        envs.reset(seed=np.array(3))
-    with pytest.raises(ValueError, match="options of reset must be a dict or None"):
-        envs.reset(options=np.array(3))

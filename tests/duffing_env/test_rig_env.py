@@ -1,22 +1,19 @@
 """Rig-v0: a rig of one's own as the environment, simulated and around its plant."""
 
 import json
-import re
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
+from playing import assert_refused
+from specimens import RIG, Bench
 
 from agents import make_policy
-from duffing_env.batch import spawn_seeds
 from duffing_env.rig_env import RigExperiment
-from estimator import Channel, OnlineEstimator, Rig
-from estimator.free_run import free_run
+from estimator import OnlineEstimator, Rig
 from estimator.physical import coefficients_of
 
-GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
-RIG = Rig(1e-3, input=Channel("N", limit=6, noise=0.02), output=Channel("m", range=0.03, noise=5e-6), guess=GUESS)
+GUESS = RIG.guess
 ID = "duffing_env/Rig-v0"
 
 
@@ -38,26 +35,10 @@ def played(envs, steps=256, seed=1):
     return endings
 
 
-def test_gymnasium_s_checker_takes_a_rig_as_json():
+def test_a_rig_may_be_json():
     env = gym.make(ID, rig=json.loads(json.dumps(RIG.to_dict())))
-    check_env(env.unwrapped, skip_render_check=True)
     assert gym.make(gym.spec(ID), rig=RIG.to_dict()).unwrapped.experiment == env.unwrapped.experiment
-
-
-def test_single_equals_vector_to_the_bit():
-    single, many = gym.make(ID, rig=RIG).unwrapped, make_vec(33)
-    together, _ = many.reset(seed=5)
-    row = 32
-    alone, _ = single.reset(seed=spawn_seeds(5, 33)[row])
-    np.testing.assert_array_equal(alone, together[row])
-    rng = np.random.default_rng(2)
-    for _ in range(40):
-        actions = rng.uniform(-1, 1, (33, 1)).astype(np.float32)
-        together, rewards, *_ = many.step(actions)
-        alone, reward, *_ = single.step(actions[row])
-        np.testing.assert_array_equal(alone, together[row])
-        assert reward == rewards[row]
-    assert single.belief == many.unwrapped.belief(row)
+    assert env.unwrapped.experiment == gym.make(ID, rig=RIG).unwrapped.experiment
 
 
 def test_truth_is_drawn_from_the_guess_in_the_rig_s_units():
@@ -88,41 +69,23 @@ def test_intervals_hold_the_truth_with_noises_unknown():
     assert np.median(errors) < 0.003
 
 
-class Bench:
-    """The bench itself, in newtons and metres; the engine's equation without noise."""
-
-    def __init__(self):
-        model = RIG.model
-        self.coefficients = coefficients_of(
-            model, {"m": 0.42, "c": 0.5, "a": 2400.0, "b": 4e7, "u0": 0.0, "y0": 0.0}, RIG.scales
-        )
-        self.told = []
-
-    def reset(self):
-        self.told = []
-
-    def step(self, u):
-        self.told.append(u)
-        return RIG.scales.output * free_run(RIG.model, self.coefficients, np.array(self.told) / RIG.scales.input)[-1]
-
-
 def test_around_the_plant_inputs_and_outputs_are_in_its_units():
     bench = Bench()
     env = gym.make(ID, rig=RIG, plant=bench, horizon=60).unwrapped
     env.reset(seed=0)
     actions = np.repeat(np.random.default_rng(3).choice([-1.0, 1.0], 10), 6)
     for action in actions:
-        _, _, terminated, truncated, _ = env.step([action])
+        observation, _, terminated, truncated, _ = env.step([action])
     assert truncated
     assert not terminated
-    assert set(np.abs(bench.told)) == {6.0}
-    outputs = RIG.scales.output * free_run(RIG.model, bench.coefficients, np.array(bench.told) / RIG.scales.input)
+    assert set(np.abs(bench.inputs)) == {6.0}
+    np.testing.assert_allclose(observation[32], bench.outputs[-1] / 0.03, rtol=1e-6)
     mean, std, unit = env.belief.parameters()["m"]
-    assert abs(mean - 0.42) < 5 * std
+    assert abs(mean - bench.truth["m"]) < 5 * std < 0.2
     assert unit == "kg"
     # What the estimator of the same rig makes of the same pairs: those of an environment.
     estimator = OnlineEstimator(rig=Rig.from_dict(RIG.to_dict() | {"delay": -1}))
-    estimator.run(bench.told, outputs)
+    estimator.run(bench.inputs, bench.outputs)
     np.testing.assert_allclose(env.belief.coefficients_mean, estimator.belief.coefficients_mean, rtol=1e-6, atol=1e-9)
 
 
@@ -134,26 +97,23 @@ def test_the_planner_plays_it():
     assert np.abs(actions).max() > 0.5
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "look_ahead", "spline"])
-def test_an_input_that_is_smooth_goes_linearly_from_one_action_to_the_next(interpolation):
-    assert RigExperiment(rig={**RIG.to_dict(), "interpolation": interpolation}).degree == 1
+def test_an_input_that_is_smooth_goes_linearly_from_one_action_to_the_next():
+    for interpolation in ("linear", "look_ahead", "spline"):
+        assert RigExperiment(rig={**RIG.to_dict(), "interpolation": interpolation}).degree == 1
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_errors_name_the_option():
+    far = {**RIG.to_dict()["output"], "offset": 0.6 * RIG.output.range}
+    cases = [
         ({}, "rig must be a Rig, a dictionary or a file name, but is None"),
         ({"rig": Rig(1.0, guess=GUESS)}, "rig must have input.limit to be played, but has none"),
         ({"rig": {**RIG.to_dict(), "delay": 1}}, "rig must have no delay for an environment, but has 1"),
         (
-            {"rig": {**RIG.to_dict(), "output": {**RIG.to_dict()["output"], "offset": 0.6 * RIG.output.range}}},
+            {"rig": {**RIG.to_dict(), "output": far}},
             "output.offset must be within half of the range, which the motion is guessed by, but is",
         ),
         ({"rig": RIG, "max_input": 1.5}, "max_input must be at most 1, the rig's own limit, but is 1.5"),
         ({"rig": RIG, "spread": 0.2}, "spread must be left out for a rig"),
         ({"rig": RIG, "factorisation": "mean_field"}, "factorisation must be 'structured' for a rig"),
-    ],
-)
-def test_errors_name_the_option(options, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        RigExperiment(**options)
+    ]
+    assert_refused((lambda options=options: RigExperiment(**options), message) for options, message in cases)

@@ -1,7 +1,5 @@
 """A rig around its plant: it gets what is promised, and the estimator gets what it gives."""
 
-import copy
-import pickle
 import threading
 from contextlib import nullcontext
 from dataclasses import replace
@@ -9,9 +7,10 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
-from checkers import assert_checkers_are_content
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import SyncVectorEnv
+from playing import assert_refused, random_actions
+from specimens import VOLTS, Difference, around
 
 from agents import make_policy
 from duffing_env.env import DuffingEnv
@@ -21,29 +20,10 @@ from estimator import Channel, OnlineEstimator, Rig
 from estimator.belief import Belief
 from estimator.models.difference import difference
 from estimator.models.pendulum import PENDULUM
-from estimator.parameters import SAMPLING_STEP
 from estimator.priors import silverbox_prior, weak_prior
 from estimator.rig_prior import begun_again, rig_prior
 
-#: In volts, as the tracks are, so that the same numbers go into the same estimator.
-VOLTS = Rig(SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
 GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
-
-
-class Difference:
-    """Eq. (2) without noise; takes down what was asked of it."""
-
-    def __init__(self):
-        self.inputs, self.resets = [], 0
-
-    def reset(self):
-        self.x = self.last = 0.0
-        self.resets += 1
-
-    def step(self, u):
-        self.inputs.append(u)
-        self.x, self.last = 1.5 * self.x - 1.4 * self.x**3 - 0.95 * self.last + 0.4 * u, self.x
-        return self.x
 
 
 class Scripted:
@@ -62,42 +42,21 @@ class Scripted:
         return output
 
 
-def around(plant, factorisation="structured", **options):
-    """The rig in volts around a plant, with the estimator of Amplitude-v0."""
-    usual = {"prior": silverbox_prior().factorised(factorisation), "noise_hypotheses": 1}
-    usual |= {"max_input": 0.15, "max_output": 0.6, "factorisation": factorisation}
-    return RigEnv(rig=VOLTS, plant=plant, **usual | options)
-
-
-def actions(count, seed=0):
-    return np.random.default_rng(seed).uniform(-1.2, 1.2, (count, 1)).astype(np.float32)
-
-
-@pytest.mark.parametrize(
-    ("factorisation", "reward"),
-    [
-        ("structured", "information_gain"),
-        pytest.param("structured", "free_energy", marks=pytest.mark.slow),
-        ("mean_field", "information_gain"),
-        pytest.param("mean_field", "free_energy", marks=pytest.mark.slow),  # seconds of compilation
-    ],
-)
-def test_a_plant_that_gives_the_simulated_outputs_gives_the_same_episode_to_the_bit(factorisation, reward):
-    options = {"factorisation": factorisation, "reward": reward, "max_output": 0.25}
-    simulated = DuffingEnv(**options)
-    told, outputs, played = [simulated.reset(seed=3)], [], actions(256)
+def test_a_plant_that_gives_the_simulated_outputs_gives_the_same_episode_to_the_bit():
+    simulated = DuffingEnv(max_output=0.25)
+    given, outputs, played = [simulated.reset(seed=3)], [], random_actions(256)[:, 0]
     for action in played:
-        told.append(simulated.step(action))
+        given.append(simulated.step(action))
         outputs.append(simulated._batch.quantity("Y_y")[0])
-        if told[-1][2]:
+        if given[-1][2]:
             break
-    assert told[-1][2]
-    env = around(Scripted(outputs), **options)
-    np.testing.assert_array_equal(env.reset(seed=99)[0], told[0][0])
-    for action, expected in zip(played, told[1:], strict=False):
-        observation, received, terminated, truncated, info = env.step(action)
+    assert given[-1][2]
+    env = around(Scripted(outputs), max_output=0.25)
+    np.testing.assert_array_equal(env.reset(seed=99)[0], given[0][0])
+    for action, expected in zip(played, given[1:], strict=False):
+        observation, _, terminated, truncated, info = env.step(action)
         np.testing.assert_array_equal(observation, expected[0])
-        assert (received, terminated, truncated) == expected[1:4]
+        assert (terminated, truncated) == expected[2:4]
         assert info["information_gain"] == expected[4]["information_gain"]
     np.testing.assert_array_equal(env.belief.record, simulated.belief.record)
     assert sorted(info) == ["diverged", "information_gain"]
@@ -164,15 +123,14 @@ def test_a_plant_that_fails_ends_the_episode_flagged_with_the_belief_before(outp
     assert env.plant_error is None
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
-def test_an_output_may_be_an_array_of_one_number(shape):
-    told = []
-    for outputs in ([0.01, -0.02], [np.full(shape, 0.01), np.full(shape, -0.02, dtype=np.float64)]):
-        env = around(Scripted(outputs))
+def test_an_output_may_be_an_array_of_one_number():
+    seen = []
+    for wrap in (float, *(lambda y, shape=shape: np.full(shape, y) for shape in ((), (1,), (1, 1)))):
+        env = around(Scripted([wrap(0.01), wrap(-0.02)]))
         env.reset(seed=0)
-        told.append([env.step([0.5])[0] for _ in outputs])
+        seen.append([env.step([0.5])[0] for _ in range(2)])
         assert env.plant_error is None
-    np.testing.assert_array_equal(*told)
+        np.testing.assert_array_equal(seen[-1], seen[0])
 
 
 def test_a_plant_that_cannot_be_reset_begins_no_episode():
@@ -203,11 +161,6 @@ def test_refused_actions_do_not_reach_the_plant():
     assert plant.inputs == []
 
 
-@pytest.mark.parametrize("factorisation", ["structured", "mean_field"])
-def test_checkers_of_gymnasium_and_stable_baselines3_do_not_even_warn(factorisation):
-    assert_checkers_are_content(lambda: around(Difference(), factorisation))
-
-
 def test_policies_find_their_limits():
     env = around(Difference(), horizon=30, max_input=0.05, max_output=1.0)
     observation, _ = env.reset()
@@ -230,13 +183,13 @@ def test_nobody_knows_the_truth():
             around(Difference(), reward=reward)
 
 
-@pytest.mark.parametrize(
-    ("plant", "options", "message"),
-    [
-        (object(), {}, r"methods reset\(\) and step\(u\), but .* has no reset"),
-        (type("Half", (), {"reset": print})(), {}, r"has no step\(\)"),
-        (Difference, {}, r"object with reset and step, but is the class Difference; pass Difference\(\)"),
-        (Difference(), {"prior": "flat"}, r"prior must be an estimator.Belief or None, but is 'flat'"),
+def test_bad_arguments_are_refused_with_a_remedy():
+    cases = [
+        (object(), {}, "methods reset() and step(u), but <object"),
+        (object(), {}, " has no reset()"),
+        (type("Half", (), {"reset": print})(), {}, "has no step()"),
+        (Difference, {}, "object with reset and step, but is the class Difference; pass Difference()"),
+        (Difference(), {"prior": "flat"}, "prior must be an estimator.Belief or None, but is 'flat'"),
         (Difference(), {"prior": weak_prior(PENDULUM, np.ones(3), np.eye(3))}, "of a model with one sensor"),
         (Difference(), {"horizon": 0}, "horizon must be a whole number"),
         (Difference(), {"spread": 0.1}, "unexpected keyword argument 'spread'"),
@@ -247,11 +200,10 @@ def test_nobody_knows_the_truth():
             "prior must have the rig's scales, limit and range, but has ",
         ),
         (Difference(), {"prior": None}, "rig must have guess to be played, but has none"),
-    ],
-)
-def test_bad_arguments_are_refused_with_a_remedy(plant, options, message):
-    with pytest.raises(ValueError, match=message):
-        around(plant, **options)
+    ]
+    assert_refused(
+        (lambda plant=plant, options=options: around(plant, **options), message) for plant, options, message in cases
+    )
 
 
 def test_a_prior_of_ones_own_is_where_episodes_start():
@@ -271,7 +223,8 @@ def test_an_episode_does_not_begin_where_the_record_of_its_prior_ended():
     cov[0, 0] = cov[1, 1] = 1e-8
     ended = Belief.of(prior.model, mean, cov, prior.noises[:2], prior.noises[2:], scales=prior.scales)
     np.testing.assert_allclose(begun_again(ended).record, prior.record, rtol=1e-9, atol=1e-15)
-    env = around(Difference(), prior=ended)
+    # As tests/specimens.py has it: with hypotheses.
+    env = around(Difference(), prior=ended, reward="information_gain", noise_hypotheses=3)
     env.reset()
     np.testing.assert_allclose(env.belief.state_mean, prior.state_mean)
     np.testing.assert_allclose(env.belief.state_cov, prior.state_cov)
@@ -279,7 +232,6 @@ def test_an_episode_does_not_begin_where_the_record_of_its_prior_ended():
     assert begun_again(outputs) is outputs, "its states are outputs"
 
 
-@pytest.mark.slow  # a kernel of its own
 def test_the_noises_are_as_likely_at_first_as_to_the_estimator_of_the_rig():
     rig = Rig(1e-3, input=Channel("N", limit=6), output=Channel("m", range=0.03), guess=GUESS)
     env = RigEnv(rig=rig, plant=Scripted([1e-4, 2e-4, 5e-4]))
@@ -315,7 +267,7 @@ def test_several_plants_are_several_environments():
 
 def test_one_plant_is_not_driven_by_two_environments():
     plant = Difference()
-    options = {"prior": silverbox_prior(), "noise_hypotheses": 1, "max_input": 0.15}
+    options = {"prior": silverbox_prior(), "noise_hypotheses": 1, "max_input": 0.15, "reward": "free_energy"}
     envs = gym.make_vec("duffing_env/Rig-v0", num_envs=2, rig=VOLTS, plant=plant, vectorization_mode="sync", **options)
     envs.reset()
     with pytest.raises(ResetNeeded, match=r"plant must not be shared.*one plant is one environment; for several use"):
@@ -335,18 +287,6 @@ def test_an_environment_is_made_anew_around_a_plant_of_another():
     del first, env
     second.reset()
     second.step([1.0])
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
-def test_copies_continue_apart(copied):
-    env = around(Difference(), max_output=1.0)
-    env.reset()
-    for action in actions(20):
-        env.step(action)
-    twin = copied(env)
-    for action in actions(20, seed=1):
-        np.testing.assert_array_equal(env.step(action)[0], twin.step(action)[0])
-    assert twin.plant is not env.plant
 
 
 def test_it_is_drawn():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import stats
+from specimens import COMPILED
 from twin import PARAMETERS, TwinContinuousEnv, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
@@ -10,7 +11,7 @@ from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment import SimulatedExperiment
 from duffing_env.kernel import RESET_BY_HAND
-from duffing_env.model_env import ModelEnv
+from duffing_env.model_env import ModelExperiment
 from duffing_env.tracks import TRACKS
 from duffing_env.vector_env import DuffingVectorEnv
 
@@ -30,8 +31,15 @@ def begun(size, **options):
 # --- Drawn for every episode ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("reward", ["information_gain", pytest.param("fisher", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("equation", ENVS)
+@pytest.mark.parametrize(
+    ("equation", "reward"),
+    [
+        ("difference", "information_gain"),
+        ("difference", "fisher"),
+        ("continuous", "expected_free_energy"),
+        pytest.param("continuous", "fisher", marks=pytest.mark.slow),
+    ],
+)
 def test_an_environment_with_unknown_noises_follows_its_twin(equation, reward):
     env, twin = ENVS[equation]
     assert_env_follows_twin(env(reward=reward, **UNKNOWN), twin(0, **UNKNOWN), reward, 0)
@@ -79,11 +87,14 @@ def test_the_truth_tells_them_at_the_end_of_an_episode():
 
 
 def test_every_sensor_has_a_noise_of_its_own():
-    env = ModelEnv(**TRACKS["duffing_env/Pendulum-v0"]["kwargs"], noise_range=10.0)
+    (own,) = (environment for environment in COMPILED if environment.name == "own model")
+    env = own.make(noise_range=10.0)
     env.reset(seed=0)
     noises = dict(list(env.truth.items())[3:])
-    assert list(noises) == ["process_noise", "measurement_noise_angle", "measurement_noise_velocity"]
-    assert len(set(noises.values())) == 3
+    assert list(noises) == ["process_noise", "measurement_noise_y", "measurement_noise_speed"]
+    factors = np.array(list(noises.values())) / [1e-6, 1e-4, 3e-4]
+    assert len(set(factors)) == 3
+    assert (np.abs(np.log(factors)) < np.log(10) / 2).all()
 
 
 # --- Guessed ---------------------------------------------------------------------------------------------------------
@@ -99,6 +110,6 @@ def test_the_prior_is_centred_at_the_guess():
 
 def test_the_guess_of_further_sensors_is_as_far_off_as_that_of_the_first():
     told = TRACKS["duffing_env/Pendulum-v0"]["kwargs"]
-    env = ModelEnv(**told, sensor_noise=(4e-6,), measurement_noise_guess=3e-6)
-    stds = np.sqrt(env.belief.noises[1::2] / env.belief.noises[::2])
+    belief = ModelExperiment(**told, sensor_noise=(4e-6,), measurement_noise_guess=3e-6).believed
+    stds = np.sqrt(belief.noises[1::2] / belief.noises[::2])
     np.testing.assert_allclose(stds, [told["process_noise"], 3e-6, 12e-6], rtol=1e-12)

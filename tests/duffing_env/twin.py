@@ -7,13 +7,13 @@ priors and the twins of the circuit.
 from dataclasses import replace
 from functools import cache
 
-import mean_field_reference as reference
 import numpy as np
-import pytest
-from mean_field_reference import LOG_2PI, expected_log_normal, gamma_divergence
+import reference.mean_field
+from reference.filters import continuous_step, difference_step, moved, oscillator, predicted, runge_kutta, seen
+from reference.mean_field import LOG_2PI, mean_field_step
+from reference.structured import structured_update
 from rounding import U32
 
-from duffing_env.rewards import REWARDS
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
@@ -21,29 +21,21 @@ from estimator.priors import log_uniform_moments, weak_prior
 
 #: An observation is rounded to float32; what is rounded agrees to 1e-9 of a belief's units, see `assert_beliefs_agree`.
 ROUNDED = {"rtol": 2 * U32, "atol": 1e-8}
-#: Every factorisation beside every reward. Three rewards read of a mean-field belief what they read of another: their
-#: kernels, each of which is seconds of compilation, are left to the evidence.
-PAIRS = [
-    pytest.param(
-        factorisation,
-        reward,
-        marks=[pytest.mark.slow]
-        * (factorisation == "mean_field" and reward in ("fisher", "expected_free_energy", "simulation_error")),
-    )
-    for factorisation in ("structured", "mean_field")
-    for reward in REWARDS
-]
-
 PARAMETERS = ("m", "c", "a", "b")
 ITERATIONS = {"structured": 3, "mean_field": 10}
 
 
-class Moments(reference.Moments):
+class Moments(reference.mean_field.Moments):
     """A belief over two states and four coefficients."""
 
     @classmethod
     def of(cls, belief):
         return cls(belief.mean, belief.cov, tuple(belief.noises[:2]), tuple(belief.noises[2:]))
+
+    @classmethod
+    def like(cls, moments):
+        """The same of other moments."""
+        return cls(moments.mean, moments.cov, moments.gamma, moments.xi)
 
     @property
     def coefficients(self):
@@ -85,102 +77,6 @@ def from_rates(coefficients):
     return np.array([SAMPLING_STEP**2, SAMPLING_STEP * damping, stiffness, cubic]) / gain
 
 
-def difference_step(mean, u):
-    """Eq. (2) at the mean (6,) of (x_t, x_{t-1}, θ, η): the states after it, derivatives (6, 6), and noise (2, 2)."""
-    x, last_x, t1, t2, t3, e = mean
-    jacobian = np.eye(6)
-    jacobian[0] = [t1 + 3 * t2 * x**2, t3, x, x**3, last_x, u]
-    jacobian[1] = [1, 0, 0, 0, 0, 0]
-    return np.array([t1 * x + t2 * x**3 + t3 * last_x + e * u, x]), jacobian, np.diag([1.0, 0.0])
-
-
-def runge_kutta(slope, whole, substeps=8):
-    """A sample of Runge and Kutta's method of order 4, of the rate of change ``slope(tau, whole)``."""
-    h = 1 / substeps
-    for n in range(substeps):
-        k1 = slope(n * h, whole)
-        k2 = slope((n + 0.5) * h, whole + h / 2 * k1)
-        k3 = slope((n + 0.5) * h, whole + h / 2 * k2)
-        k4 = slope((n + 1) * h, whole + h * k3)
-        whole = whole + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return whole
-
-
-def oscillate(state, coefficients, last_u, u):
-    """(x, x') after a sample of x'' = g u - c x' - k x - b x³; the input goes linearly. Also of complex numbers."""
-    k, b, c, g = coefficients
-
-    def slope(tau, state):
-        x, v = state
-        return np.array([v, g * (last_u + tau * (u - last_u)) - c * v - k * x - b * x**3])
-
-    return runge_kutta(slope, np.asarray(state))
-
-
-def continuous_step(mean, last_u, u):
-    """Eq. (1) at the mean (6,) of (x, x', k, b, c, g), as `difference_step`.
-
-    The derivatives are the imaginary parts of complex steps, exact to rounding. The noise is N of N' = A N + N Aᵀ +
-    diag(0, 3), with A the Jacobian of the right-hand side on the way.
-    """
-    nudged = mean[:, None] + 1e-30j * np.eye(6)
-    moved = oscillate(nudged[:2], nudged[2:], last_u, u)
-    k, b, c, g = mean[2:]
-
-    def slope(tau, whole):
-        (x, v), N = whole[0], whole[1:]
-        A = np.array([[0.0, 1.0], [-k - 3 * b * x**2, -c]])
-        acceleration = g * (last_u + tau * (u - last_u)) - c * v - k * x - b * x**3
-        return np.vstack([[v, acceleration], A @ N + N @ A.T + np.diag([0.0, 3.0])])
-
-    whole = runge_kutta(slope, np.vstack([mean[:2], np.zeros((2, 2))]))
-    return whole[0], np.vstack([moved.imag / 1e-30, np.eye(6)[2:]]), whole[1:]
-
-
-def structured_update(prior, step, y, iterations):
-    """A Kalman step on the joint Gaussian of states, coefficients and the sample's noise, in turn with q(γ) and q(ξ).
-
-    Args:
-        prior: the belief before.
-        step: where its mean moves, its derivatives, and the noise of unit strength, as `difference_step` gives them.
-        y: the output, which shows the first state.
-        iterations: how often.
-
-    Returns:
-        The posterior, and the sample's free energy [nats].
-    """
-    moved, jacobian, noise = step
-    d = len(prior.mean)
-    T = np.hstack([jacobian, np.eye(d)[:, :2]])  # from (states and coefficients before, w, w') to those after
-    gamma, xi = prior.gamma, prior.xi
-    for _ in range(iterations):
-        q, r = gamma[1] / gamma[0], xi[1] / xi[0]
-        P = np.zeros((d + 2, d + 2))
-        P[:d, :d], P[d:, d:] = prior.cov, q * noise
-        S = T[0] @ P @ T[0] + r
-        gain = P @ T[0] / S
-        deviation = gain * (y - moved[0])
-        posterior = P - np.outer(gain, T[0] @ P)
-        w_power = (deviation[d] ** 2 + posterior[d, d]) / noise[0, 0]
-        v_power = (y - moved[0] - T[0] @ deviation) ** 2 + T[0] @ posterior @ T[0]
-        gamma = prior.gamma[0] + 0.5, prior.gamma[1] + w_power / 2
-        xi = prior.xi[0] + 0.5, prior.xi[1] + v_power / 2
-    # w' given w is as before the sample, and falls out.
-    told = -entropy(posterior[: d + 1, : d + 1])
-    told -= expected_log_gaussian((deviation[:d], posterior[:d, :d]), P[:d, :d])
-    told += 0.5 * np.log(noise[0, 0]) - expected_log_normal(w_power, gamma) - expected_log_normal(v_power, xi)
-    told += gamma_divergence(gamma, prior.gamma) + gamma_divergence(xi, prior.xi)
-    mean = np.concatenate([moved, prior.mean[2:]]) + T @ deviation
-    cov = T @ posterior @ T.T
-    return Moments(mean, (cov + cov.T) / 2, gamma, xi), told
-
-
-def mean_field_update(prior, u, y, iterations, as_published=False):
-    """The six updates of the paper, ``iterations`` times: the posterior, and the sample's free energy [nats]."""
-    posterior, told = reference.mean_field_step(prior, u, y, iterations, as_published, evaluated=1)
-    return Moments(posterior.mean, posterior.cov, posterior.gamma, posterior.xi), told[-1]
-
-
 def log_det(cov):
     """log det of a covariance, from that of its correlations, which are better conditioned."""
     std = np.sqrt(np.diag(cov))
@@ -195,11 +91,6 @@ def entropy(cov):
 def log_normal(deviation, cov):
     """Log density of a Gaussian."""
     return -0.5 * (len(cov) * LOG_2PI + log_det(cov) + deviation @ np.linalg.solve(cov, deviation))
-
-
-def expected_log_gaussian(q, cov):
-    """E_q log N(0, cov) of a Gaussian q (mean, covariance)."""
-    return log_normal(q[0], cov) - 0.5 * np.trace(np.linalg.solve(cov, q[1]))
 
 
 @cache
@@ -339,33 +230,24 @@ class TwinEnv:
 
     def _update(self):
         if self.factorisation == "mean_field":
-            self.belief, self.free_energy = mean_field_update(
-                self.belief, self._input_of_the_model(), self.y, self.iterations
-            )
+            self.belief, energies = mean_field_step(self.belief, self.u, self.y, self.iterations, evaluated=1)
+            self.belief, self.free_energy = Moments.like(self.belief), energies[-1]
         else:
             step = self._model_step(self.belief.mean)
             self.belief, self.free_energy = structured_update(self.belief, step, self.y, self.iterations)
 
-    def _input_of_the_model(self):
-        return self.u
-
     def _fisher_gain(self):
         """Increase of ½ log det(Λ0 + F): a Kalman filter for states and coefficients, linearised at the truth."""
-        _, jacobian, noise = self._model_step(np.array([*self.state, *self.to_coefficients(self.truth)]))
-        cov = jacobian @ self.ideal_cov @ jacobian.T
-        cov[:2, :2] += self.process_noise**2 * noise
-        gain = cov[:, 0] / (cov[0, 0] + self.measurement_noise**2)
-        before, self.ideal_cov = self.ideal_cov, cov - np.outer(gain, cov[0])
+        step = self._model_step(np.array([*self.state, *self.to_coefficients(self.truth)]))
+        before = self.ideal_cov
+        self.ideal_cov = seen(predicted(before, step, self.process_noise**2), self.measurement_noise**2).cov
         return 0.5 * (log_det(before[2:, 2:]) - log_det(self.ideal_cov[2:, 2:]))
 
     def _expected_gain(self):
         """½ log det C less that after an output, whatever it is: a Kalman step with the noises as believed."""
         belief = self.belief
-        _, jacobian, noise = self._model_step(belief.mean)
-        cov = jacobian @ belief.cov @ jacobian.T
-        cov[:2, :2] += belief.gamma[1] / belief.gamma[0] * noise
-        c = cov[:, 0]
-        after = cov - np.outer(c, c) / (c[0] + belief.xi[1] / belief.xi[0])
+        cov = predicted(belief.cov, self._model_step(belief.mean), belief.gamma[1] / belief.gamma[0])
+        after = seen(cov, belief.xi[1] / belief.xi[0]).cov
         return 0.5 * (log_det(cov[2:, 2:]) - log_det(after[2:, 2:]))
 
     def free_run(self, coefficients):
@@ -438,24 +320,19 @@ class TwinContinuousEnv(TwinEnv):
         state, told = np.zeros(2), []
         with np.errstate(all="ignore"):
             for u in self.max_input * multisine():
-                state = oscillate(state, coefficients, u, u)
+                state = moved(oscillator(), state, coefficients, (u,))
                 told.append(state[0])
         return np.array(told)
 
     def _move(self):
         # A pair of numbers for each of eight sub-steps, and one for the sensor.
         h = 1 / 8
-        k, b, c, g = to_rates(self.truth)
-        state = self.state
+        rates, plant, state = to_rates(self.truth), oscillator(), self.state
         # Increments of a Wiener process and of its integral, which moves x by `process_noise` in a sample.
         spread = np.linalg.cholesky(np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]]))
         for _ in range(8):
-
-            def slope(tau, state):
-                return h * np.array([state[1], g * self.u - c * state[1] - k * state[0] - b * state[0] ** 3])
-
             increments = np.sqrt(3) * self.process_noise * spread @ self.stream.normal_pair()
-            state = runge_kutta(slope, state, 1) + increments[::-1]
+            state = runge_kutta(lambda z, _: h * np.array(plant.move(z, rates, self.u)), state) + increments[::-1]
         self.state = state
         self.y = self.state[0] + self.measurement_noise * self.stream.normal_pair()[1]
 

@@ -13,23 +13,26 @@ TRUTH = Parameters(zip(difference().coefficients, coefficients_of(difference(), 
 #: The physical equation as the Silverbox needs it.
 ODE = duffing(offsets=True, feedthrough=True, noise="held")
 
+#: Of a difference equation that nobody else has.
+TERMS = (Term(1), Term(3), Term(0, 1), Term(1, 1), Term(tap=0), Term(tap=1), Term(tap=2))
+
+#: As a rig with a guess is estimated, with an input that is known a sample later.
+AHEAD = {"model": duffing(offsets=True), "rig": Rig.silverbox("look_ahead"), "expectations": "sigma_points"}
+
 ONE_TAP, OWN_TAPS = Rig.silverbox("zero_order", 1), Rig.silverbox("zero_order", 0)
 
 KINDS = {
     "paper": lambda: OnlineEstimator(),
-    "mean field": lambda: OnlineEstimator(rig=OWN_TAPS, factorisation="mean_field", iterations=4),
+    "mean field": lambda: OnlineEstimator(rig=OWN_TAPS, factorisation="mean_field"),
     "published": lambda: OnlineEstimator(factorisation="mean_field", as_published=True),
-    "three-tap": lambda: OnlineEstimator(difference("three-tap"), rig=OWN_TAPS),
-    "own terms, drift": lambda: OnlineEstimator(
-        difference((Term(1), Term(0, 1), Term(tap=2), Term(1, 1))), rig=OWN_TAPS, drift=0.01
-    ),
+    "own terms, drift": lambda: OnlineEstimator(difference(TERMS), rig=OWN_TAPS, drift=0.01),
     "ode": lambda: OnlineEstimator(ODE),
-    "ode, held input": lambda: OnlineEstimator(duffing(), rig=Rig.silverbox("zero_order")),
+    "ode, held input": lambda: OnlineEstimator(duffing(offsets=True), rig=Rig.silverbox("zero_order")),
     "ode, look-ahead": lambda: OnlineEstimator(ODE, rig=Rig.silverbox("look_ahead"), iterations=2),
-    "ode, sigma points": lambda: OnlineEstimator(ODE, expectations="sigma_points", drift=1e-3),
+    "ode, sigma points": lambda: OnlineEstimator(**AHEAD, drift=1e-3),
     "ensemble": lambda: OnlineEstimator(noise_hypotheses=3),
-    "large ensemble": lambda: OnlineEstimator(difference("offset"), noise_hypotheses=13, drift=0.01),
-    "ode ensemble": lambda: OnlineEstimator(duffing(), rig=Rig.silverbox("look_ahead"), noise_hypotheses=3),
+    "large ensemble": lambda: OnlineEstimator(noise_hypotheses=13, drift=0.01),
+    "ode ensemble": lambda: OnlineEstimator(**AHEAD, noise_hypotheses=3),
 }
 
 

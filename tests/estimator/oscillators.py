@@ -10,10 +10,10 @@ from estimator.models.duffing import KINDS, duffing
 from estimator.physical import coefficients_of
 from estimator.units import Scales
 
-#: A bench of 0.4 kg at 1 kHz, and a softening oscillator at 100 Hz: truth, step, amplitude, sensor noise, and samples
+#: A bench of 0.4 kg at 1 kHz, and a softening oscillator at 200 Hz: truth, step, amplitude, sensor noise, and samples
 #: that the input is held for.
 BENCH = ({"m": 0.4, "c": 0.6, "a": 2500.0, "b": 4e7}, 1e-3, 6.0, 5e-6, 8)
-SOFT = ({"m": 1.0, "c": 0.5, "a": 400.0, "b": -4000.0}, 1e-2, 6.0, 1e-4, 4)
+SOFT = ({"m": 1.0, "c": 0.5, "a": 400.0, "b": -4000.0}, 5e-3, 6.0, 1e-4, 8)
 
 #: Two wells, 8 mm off the hill between them, that the motion leaves again and again.
 WELLS = ({"m": 0.4, "c": 0.6, "a": -2500.0, "b": 4e7}, 1e-3, 6.0, 2e-6, 16)

@@ -2,7 +2,7 @@
 
 import numba
 import numpy as np
-import pytest
+from tables import table
 
 from estimator.arrays import aligned, copy, copy_scaled, fill, highest
 
@@ -31,7 +31,7 @@ def address(rows, size):
     return matrix, matrix.ctypes.data
 
 
-@pytest.mark.parametrize("shape", [(1, 8), (3, 1216), (5, 3)])
+@table("shape", [(1, 8), (3, 1216), (5, 3)])
 def test_an_aligned_matrix_begins_with_a_cache_line(shape):
     kept = [address(*shape) for _ in range(9)]  # kept, so that each lies elsewhere
     for matrix, place in kept:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special
+from tables import table
 
 from estimator import elementary
 from estimator.elementary import digamma, expected_log_gamma, gamma_step_divergence, log, log_gamma_half_step
@@ -44,21 +45,21 @@ def test_log_on_a_dense_sample():
     assert (np.abs(_each(4, x) - np.log(x)) <= 4 * np.spacing(np.abs(np.log(x)))).all()
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@table("shape", SHAPES)
 def test_digamma_equals_scipy(shape):
     # Beside 1 where digamma passes through 0 at 1.46.
     assert digamma(shape) == pytest.approx(special.digamma(shape), rel=4 * EPS, abs=5e-14)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@table("shape", SHAPES)
 def test_log_gamma_half_step_in_fifty_digits(shape):
     with mpmath.workdps(50):
         exact = float(mpmath.loggamma(mpmath.mpf(shape) + 0.5) - mpmath.loggamma(mpmath.mpf(shape)))
     assert log_gamma_half_step(shape) == pytest.approx(exact, rel=4 * EPS, abs=2e-14)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("ratio", [1e-14, 1e-8, 1e-3, 1.0, 1e3])
+@table("shape", SHAPES)
+@table("ratio", [1e-14, 1e-8, 1e-3, 1.0, 1e3])
 def test_gamma_step_divergence_in_fifty_digits(shape, ratio):
     rate = 1.3
     with mpmath.workdps(50):

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimators import OWN_TAPS, record
+from estimators import AHEAD, record
 from scipy.special import logsumexp
+from tables import table
 
-from estimator import Channel, OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
+from estimator import Channel, OnlineEstimator, Rig, difference, recorded_prior, silverbox_prior
 from estimator.belief import Belief
 from estimator.ensemble import FARTHEST, LEVELS, displaced, first_weights, matched_gamma, priors, side_by_side
 from estimator.inference.mixture import SWITCHING, foretell, leave_out, mixing, switch, weigh
@@ -16,13 +17,10 @@ from estimator.rig_prior import rig_prior
 
 RATIOS = 5
 MODELS = {
-    "paper": (difference(), Rig.silverbox("zero_order", 1), silverbox_prior()),
-    "three-tap": (difference("three-tap"), OWN_TAPS, recorded_prior(difference("three-tap"))),
-    "look-ahead": (duffing(), Rig.silverbox("look_ahead"), recorded_prior(duffing())),
+    "paper": {"model": difference(), "rig": Rig.silverbox("zero_order", 1), "prior": silverbox_prior()},
+    "look-ahead": AHEAD | {"prior": recorded_prior(AHEAD["model"])},
 }
-ANY_MODEL = pytest.mark.parametrize(
-    "model", [pytest.param(name, marks=[pytest.mark.slow] * (name == "look-ahead")) for name in MODELS]
-)
+ANY_MODEL = pytest.mark.parametrize("model", MODELS)
 
 
 @pytest.fixture(scope="module")
@@ -30,19 +28,18 @@ def samples():
     return record(200)
 
 
-def ensemble(name, **options):
-    model, rig, prior = MODELS[name]
-    return OnlineEstimator(model, prior, rig, noise_hypotheses=RATIOS, **options)
+def ensemble(name):
+    return OnlineEstimator(**MODELS[name], noise_hypotheses=RATIOS)
 
 
 def members(name):
     """The same members as estimators of their own, with the priors that the documentation says."""
-    model, rig, prior = MODELS[name]
+    model, prior = MODELS[name]["model"], MODELS[name]["prior"]
     for level in (1 / 3, 1, 3):
         for factor in (1 / 30, 30**-0.5, 1, 30**0.5, 30):
             g_shape, g_rate, n_shape, n_rate = displaced(prior.noises, factor, level)
             moved = Belief.of(model, prior.mean, prior.cov, (g_shape, g_rate), (n_shape, n_rate))
-            yield OnlineEstimator(model, moved, rig)
+            yield OnlineEstimator(**MODELS[name] | {"prior": moved})
 
 
 # --- The mixture ---------------------------------------------------------------------------------------------------
@@ -77,7 +74,7 @@ def take(weights, energies, predictions, free_energies, forecasts):
     return shares[:, -1]
 
 
-@pytest.mark.parametrize("scale", [0.1, 10.0, 1000.0])
+@table("scale", [0.1, 10.0, 1000.0])
 def test_weigh_equals_its_twin(scale):
     rng = np.random.default_rng(0)
     energies = scale * rng.standard_normal((4, 50, 3))
@@ -155,24 +152,24 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
     assert rate / shape == pytest.approx(variances.mean(), rel=0.003)
     assert 1 / shape == pytest.approx(variances.var() / variances.mean() ** 2, rel=0.01)
     # The same in compiled code, of two noises.
-    records = np.column_stack([np.zeros((2, 2)), shapes, rates, shapes, 2 * rates])
+    records = np.column_stack([np.zeros((2, 6 + 21)), shapes, rates, shapes, 2 * rates])
     np.testing.assert_allclose(
-        mixing(1).mixture(side_by_side(records, LANES), weights)[1][2:], [shape, rate, shape, 2 * rate]
+        mixing(6).mixture(side_by_side(records, LANES), weights)[1][6 + 21 :], [shape, rate, shape, 2 * rate]
     )
 
 
-@pytest.mark.parametrize("n", [1, 8, 32])
-@pytest.mark.parametrize("members", [1, 21, 40])
+@table("n", [1, 8, 32])
+@table("members", [1, 21, 40])
 def test_mixtures_have_the_moments_of_their_finite_members(members, n):
     """Of one system or of several beside each other, also over many blocks; to the last bit the same."""
-    names, rng = 3, np.random.default_rng(members)
+    names, rng = 6, np.random.default_rng(members)
     means, roots = rng.standard_normal((members, n, names)), rng.standard_normal((members, n, names, names))
     covs, noises = roots @ roots.swapaxes(2, 3), rng.uniform(1.0, 5.0, (members, n, 4))
     upper = np.triu_indices(names)
     records = np.concatenate([means, covs[:, :, upper[0], upper[1]], noises], axis=2)
     weights = rng.dirichlet(np.ones(members), n).T.copy()
     if members > 1:
-        records[1, :, 4], records[2, : n // 2 + 1, 0], weights[3] = np.nan, np.inf, 0.0
+        records[1, :, 8], records[2, : n // 2 + 1, 0], weights[3] = np.nan, np.inf, 0.0
     found, size = mixing(names), records.shape[2]
     before = np.full((LANES, size), np.nan)
     blocks = side_by_side(np.concatenate([before, records.reshape(-1, size)]), LANES)
@@ -195,8 +192,8 @@ def test_mixtures_have_the_moments_of_their_finite_members(members, n):
 
 
 def test_a_mixture_of_no_finite_member_is_nothing():
-    records = np.full((2, 3 + 6 + 4), np.nan)
-    assert np.isnan(mixing(3).mixture(side_by_side(records, LANES), np.full(2, 0.5))[1]).all()
+    records = np.full((2, 6 + 21 + 4), np.nan)
+    assert np.isnan(mixing(6).mixture(side_by_side(records, LANES), np.full(2, 0.5))[1]).all()
 
 
 # --- The estimator -------------------------------------------------------------------------------------------------
@@ -235,7 +232,7 @@ def test_predictions_and_free_runs_are_those_of_the_mean(samples, model):
     u, y = samples
     estimator = ensemble(model)
     estimator.run(u, y)
-    alone = OnlineEstimator(estimator.model, estimator.belief, estimator.rig)
+    alone = OnlineEstimator(**MODELS[model] | {"prior": estimator.belief})
     if model == "paper":
         np.testing.assert_array_equal(estimator.predict(u, y), alone.predict(u, y))
         np.testing.assert_array_equal(estimator.simulate(u, y[:5]), alone.simulate(u, y[:5]))
@@ -246,7 +243,7 @@ def test_predictions_and_free_runs_are_those_of_the_mean(samples, model):
 
 
 def test_a_member_that_overflowed_has_no_say(samples):
-    estimator = ensemble("three-tap")
+    estimator = ensemble("look-ahead")
     estimator.run(*samples)
     arrays = estimator.arrays()
     arrays["records"][0], arrays["weights"][0] = np.nan, 0.0

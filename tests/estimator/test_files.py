@@ -5,6 +5,7 @@ import stat
 from pathlib import Path
 
 import pytest
+from tables import table
 
 from estimator.files import append_atomically, check_place, write_atomically
 
@@ -30,7 +31,7 @@ class FullDisk:
         raise OSError("no space left on device")
 
 
-@pytest.mark.parametrize("content", [b"\x00\xffbytes\r\n", "θ and\nη\n", b""])
+@table("content", [b"\x00\xffbytes\r\n", "θ and\nη\n", b""])
 def test_content_arrives_byte_by_byte_and_alone(tmp_path, content):
     path = tmp_path / "made" / "on the way" / "file"
     write_atomically(path, content)
@@ -76,7 +77,7 @@ def test_an_interrupt_before_the_renaming_leaves_nothing_behind(tmp_path, monkey
     assert names(tmp_path) == []
 
 
-@pytest.mark.parametrize("write", [write_atomically, append_atomically])
+@table("write", [write_atomically, append_atomically])
 def test_what_is_no_file_is_refused_and_stays(tmp_path, write):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
@@ -92,7 +93,7 @@ def test_what_is_no_file_is_refused_and_stays(tmp_path, write):
     assert {name: (tmp_path / name).lstat() for name in names(tmp_path)} == before
 
 
-@pytest.mark.parametrize("write", [write_atomically, append_atomically])
+@table("write", [write_atomically, append_atomically])
 def test_a_read_only_file_is_refused_also_to_root(tmp_path, write):
     path = tmp_path / "file"
     path.write_text("old")
@@ -103,7 +104,7 @@ def test_a_read_only_file_is_refused_also_to_root(tmp_path, write):
     assert names(tmp_path) == ["file"]
 
 
-@pytest.mark.parametrize("write", [write_atomically, append_atomically])
+@table("write", [write_atomically, append_atomically])
 def test_a_link_is_followed_and_a_mode_is_kept(tmp_path, write):
     (tmp_path / "there").mkdir()
     target, link = tmp_path / "there" / "file", tmp_path / "link"

@@ -1,9 +1,10 @@
 """Fisher information: against a plain twin, the curvature of the likelihood, the estimator's posterior, and bounds."""
 
-import filtering
 import numpy as np
 import pytest
-from filtering import CASES, of_paper
+from reference.filters import Plant, acting, central, filter_paper, path
+from reference.plants import CASES
+from tables import table
 
 from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior
 from estimator.information import cramer_rao, fisher_information, follow, relative_covariance, sampled
@@ -20,39 +21,36 @@ def draw_systems(rng, n, spread=0.3):
     return coefficients_of(PAPER, {name: CIRCUIT[name] * row for name, row in zip("mcab", factors, strict=True)})
 
 
-def simulate(theta, u, rng=None):
-    """Outputs (T,) of Eq. (2) from rest; without noise where there is no generator."""
-    x, last, y = 0.0, 0.0, np.empty(len(u))
+def simulate(theta, u, rng=None, runs=()):
+    """Outputs (T, *runs) of Eq. (2) from rest; without noise where there is no generator."""
+    x, last, y = np.zeros(runs), np.zeros(runs), np.empty((len(u), *runs))
     for t in range(len(u)):
-        x, last = theta @ np.array([x, x**3, last, u[t]]), x
+        x, last = theta[0] * x + theta[1] * x**3 + theta[2] * last + theta[3] * u[t], x
         if rng is not None:
-            x += Q * rng.standard_normal()
-        y[t] = x + (R * rng.standard_normal() if rng is not None else 0.0)
+            x = x + Q * rng.standard_normal(runs)
+        y[t] = x if rng is None else x + R * rng.standard_normal(runs)
     return y
 
 
-def filtered(theta, u, y, state_std=0.0):
-    """Innovations (T,) and their variances (T,)."""
-    return of_paper(theta, u, y, Q**2, R**2, state_std**2 * np.eye(2))
-
-
 def differentiated(theta, u, y, state_std=0.0):
-    """Slopes (T, 4) of the innovations by central differences, and their variances (T,)."""
-    slopes = np.empty((len(u), 4))
-    for j, h in enumerate(1e-6 * np.array([1.0, 10.0, 1.0, 1.0])):
-        up, down = theta.copy(), theta.copy()
-        up[j] += h
-        down[j] -= h
-        slopes[:, j] = (filtered(up, u, y, state_std)[0] - filtered(down, u, y, state_std)[0]) / (2 * h)
-    return slopes, filtered(theta, u, y, state_std)[1]
+    """Fisher's information from slopes of the filter's innovations by differences."""
+    cov = state_std**2 * np.eye(2)
+    slopes = central(lambda c: filter_paper(c, u, y, Q**2, R**2, cov)[0], theta, 1e-5 * np.array([1, 10, 1, 1]))
+    return slopes.T @ (slopes / filter_paper(theta, u, y, Q**2, R**2, cov)[1][:, None])
 
 
 def log_likelihood(theta, u, y):
-    innovations, variances = filtered(theta, u, y)
-    return -0.5 * np.sum(np.log(variances) + innovations**2 / variances)
+    """Of one record (T,), or of each of outputs (T, runs), without the constant."""
+    innovations, variances = filter_paper(theta, u, y, Q**2, R**2)
+    return -0.5 * np.sum(np.log(variances) + innovations**2 / variances, axis=0)
 
 
-@pytest.mark.parametrize("state_std", [0.0, 1e-3])
+def assert_informations_agree(found, expected, atol):
+    scale = np.outer(*[np.sqrt(np.diag(expected))] * 2)
+    np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=atol)
+
+
+@table("state_std", [0.0, 1e-3])
 def test_without_noise_it_is_what_differences_of_the_filters_innovations_give(state_std):
     # Without noise the innovations are zero, so the gain's own sensitivity has no effect, and F is exact.
     rng = np.random.default_rng(0)
@@ -60,22 +58,15 @@ def test_without_noise_it_is_what_differences_of_the_filters_innovations_give(st
     u = rng.choice([-0.12, 0.12], (5, 60))
     information = fisher_information(PAPER, systems, u, Q, R, state_std=state_std)
     for theta, inputs, F in zip(systems, u, information, strict=True):
-        slopes, variances = differentiated(theta, inputs, simulate(theta, inputs), state_std)
-        expected = slopes.T @ (slopes / variances[:, None])
-        scale = np.sqrt(np.diag(expected))
-        np.testing.assert_allclose(F / np.outer(scale, scale), expected / np.outer(scale, scale), rtol=0, atol=1e-6)
+        assert_informations_agree(F, differentiated(theta, inputs, simulate(theta, inputs), state_std), 1e-6)
 
 
 def test_along_outputs_it_is_that_of_the_filter_on_them():
     rng = np.random.default_rng(1)
     theta, u = TWIN, rng.choice([-0.12, 0.12], 100)
     y = simulate(theta, u, rng)
-    slopes, variances = differentiated(theta, u, y)
-    expected = slopes.T @ (slopes / variances[:, None])
-    scale = np.sqrt(np.diag(expected))
-    F = fisher_information(PAPER, TWIN, u, Q, R, y=y)
     # The gain's sensitivity is left out: it is of the order of the innovation beside the displacement.
-    np.testing.assert_allclose(F / np.outer(scale, scale), expected / np.outer(scale, scale), rtol=0, atol=0.01)
+    assert_informations_agree(fisher_information(PAPER, TWIN, u, Q, R, y=y), differentiated(theta, u, y), 0.01)
 
 
 def test_it_is_the_mean_curvature_of_the_log_likelihood():
@@ -84,14 +75,11 @@ def test_it_is_the_mean_curvature_of_the_log_likelihood():
     F = fisher_information(PAPER, TWIN, u, Q, R)
     scale = 1 / np.sqrt(np.diag(F))
     steps = 0.1 * scale
-    curvatures = np.empty((runs, 4))
-    for i in range(runs):
-        y = simulate(theta, u, rng)
-        middle = log_likelihood(theta, u, y)
-        for j in range(4):
-            h = np.eye(4)[j] * steps
-            sides = log_likelihood(theta + h, u, y) + log_likelihood(theta - h, u, y)
-            curvatures[i, j] = (2 * middle - sides) / steps[j] ** 2
+    y = simulate(theta, u, rng, (runs,))
+    middle, curvatures = log_likelihood(theta, u, y), np.empty((runs, 4))
+    for j, h in enumerate(steps * np.eye(4)):
+        sides = log_likelihood(theta + h, u, y) + log_likelihood(theta - h, u, y)
+        curvatures[:, j] = (2 * middle - sides) / steps[j] ** 2
     standardised = curvatures * scale**2
     error = standardised.std(axis=0) / np.sqrt(runs)
     assert np.all(np.abs(standardised.mean(axis=0) - 1) < 4 * error + 0.01)
@@ -142,7 +130,7 @@ def test_bounds():
     np.testing.assert_allclose(np.sqrt(np.diag(relative))[2:], [a.std(), b.std()], rtol=0.03)
 
 
-@pytest.mark.parametrize(
+@table(
     ("arguments", "words"),
     [
         ({"process_noise": -1.0}, "process_noise must be 0 or more"),
@@ -170,56 +158,53 @@ def test_errors_of_batches_and_of_nothing_learned():
         cramer_rao(fisher_information(PAPER, TWIN, np.zeros(5), Q, R))
 
 
-@pytest.mark.parametrize("case", CASES)
+def along(case, u, q, r, y=None, state=0.0, cov=0.0, coefficients=None):
+    """The filter of a case with matrices; ``cov``: variance of each state before the first sample."""
+    model, interpolation, c, _ = CASES[case]
+    plant, n = Plant.of(model), model.n_states
+    inputs = [acting(plant, u, t, interpolation) for t in range(len(u))]
+    c = c if coefficients is None else coefficients
+    return path(plant, state + np.zeros(n), cov * np.eye(n), c, inputs, q**2, [r**2] * model.n_outputs, y)
+
+
+@pytest.mark.parametrize("case", ["motion", "tanks"])
 def test_of_any_model_it_is_that_of_a_filter_with_matrices(case):
     model, interpolation, c, size = CASES[case]
     u = size * np.random.default_rng(6).uniform(-1, 1, 30)
-    q, r = 2e-3, 1e-3
-    expected = filtering.information(model, interpolation, c, u, q**2, r**2, 1e-6)
-    F = fisher_information(model, c, u, q, r, interpolation=interpolation, state_std=1e-3)
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(F / np.outer(scale, scale), expected / np.outer(scale, scale), rtol=0, atol=1e-5)
+    F = fisher_information(model, c, u, 2e-3, 1e-3, interpolation=interpolation, state_std=1e-3)
+    assert_informations_agree(F, along(case, u, 2e-3, 1e-3, cov=1e-6).information, 1e-9)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_likelihood_of_any_model_is_that_of_a_filter_with_matrices(case):
+    """Of series that begin at rest, and of such that may begin in any motion."""
     model, interpolation, c, size = CASES[case]
-    rng = np.random.default_rng(7)
-    u, q, r = size * rng.uniform(-1, 1, (2, 20)), 2e-5, 1e-5
-    y = np.array([filtering.filtered(model, interpolation, c, row, None, q**2, r**2)[2] for row in u])
-    y += r * rng.standard_normal(y.shape)
-    degree = int(interpolation == "linear")
-    points, rest = np.array([c, c], dtype=np.float64), np.zeros((model.n_states, model.n_states))
-    found = follow(model, points, sampled(model, u, degree), y, np.array([q**2, *[r**2] * model.n_outputs]), rest)
-    for row in range(2):
-        value = filtering.log_likelihood(model, interpolation, c, u[row], y[row], q**2, r**2)
-        assert -found.loss[row] == pytest.approx(value, rel=1e-6)
-        std = 1 / np.sqrt(np.diag(found.information[row]))
-        for j in range(len(c)):
-            h = 1e-3 * std * (np.arange(len(c)) == j)
-            up, down = (
-                filtering.log_likelihood(model, interpolation, c + s * h, u[row], y[row], q**2, r**2) for s in (1, -1)
-            )
-            # In standard deviations. Left out is what S and the gain tell, which is as small as the noise beside u.
-            assert -found.slope[row, j] * std[j] == pytest.approx((up - down) / 2e-3, abs=0.02)
-    np.testing.assert_array_equal(found.information, np.swapaxes(found.information, 1, 2))
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_a_series_may_begin_in_any_motion(case):
-    model, interpolation, c, size = CASES[case]
-    rng = np.random.default_rng(9)
-    u, q, r, spread = size * rng.uniform(-1, 1, (2, 20)), 2e-5, 1e-5, 1e-4
-    begin = 0.3 * size * rng.standard_normal((2, model.n_states))
-    noise = q**2, r**2, 0.0
-    y = np.array([filtering.filtered(model, interpolation, c, u[i], None, *noise, begin[i])[2] for i in range(2)])
-    y += r * rng.standard_normal(y.shape)
-    points, cov = np.array([c, c], dtype=np.float64), spread**2 * np.eye(model.n_states)
-    noises = np.array([q**2, *[r**2] * model.n_outputs])
-    found = follow(model, points, sampled(model, u, int(interpolation == "linear")), y, noises, cov, begin)
-    for row in range(2):
-        value = filtering.log_likelihood(model, interpolation, c, u[row], y[row], q**2, r**2, spread**2, begin[row])
-        assert -found.loss[row] == pytest.approx(value, rel=1e-6)
+    rng, q, r = np.random.default_rng(7), 2e-5, 1e-5
+    points, noises = np.array([c, c], dtype=np.float64), np.array([q**2, *[r**2] * model.n_outputs])
+    for begin, spread in (
+        (np.zeros((2, model.n_states)), 0.0),
+        (0.3 * size * rng.standard_normal((2, model.n_states)), 1e-4),
+    ):
+        u = size * rng.uniform(-1, 1, (2, 20))
+        y = np.array(
+            [along(case, row, q, r, state=state, cov=spread**2).shown for row, state in zip(u, begin, strict=True)]
+        )
+        y += r * rng.standard_normal(y.shape)
+        laid, cov = sampled(model, u, int(interpolation == "linear")), spread**2 * np.eye(model.n_states)
+        found = follow(model, points, laid, y, noises, cov, *((begin,) if spread else ()))
+        for row in range(2):
+            expected = along(case, u[row], q, r, y[row], begin[row], spread**2)
+            assert found.loss[row] == pytest.approx(expected.loss, rel=1e-9)
+            std = 1 / np.sqrt(np.diag(found.information[row]))
+            np.testing.assert_allclose(found.slope[row] * std, expected.slope * std, atol=1e-6)
+            assert_informations_agree(found.information[row], expected.information, 1e-9)
+        np.testing.assert_array_equal(found.information, np.swapaxes(found.information, 1, 2))
+    if model.is_continuous:
+        return
+    # In standard deviations. Left out is what S and the gain tell, which is as small as the noise beside u.
+    for j, h in enumerate(1e-3 * std * np.eye(len(c))):
+        up, down = (along(case, u[1], q, r, y[1], begin[1], spread**2, c + s * h).loss for s in (1, -1))
+        assert found.slope[1, j] * std[j] == pytest.approx((up - down) / 2e-3, abs=0.02)
 
 
 def test_spare_lanes_and_other_series_change_nothing():

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
+from tables import table
 
 from estimator import Rig, difference, duffing
 from estimator.inputs import feed
@@ -24,20 +25,20 @@ U = np.random.default_rng(0).standard_normal(40)
 BEFORE = np.concatenate([[0.0, 0.0, 0.0], U])
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@table("delay", [0, 1])
 def test_taps_are_the_inputs_before(delay):
     found = rows(difference("three-tap"), Rig.silverbox("zero_order", delay), U)
     expected = np.array([[BEFORE[3 + t - delay - i] for i in range(3)] for t in range(40)])
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize(("delay", "back"), [(-1, 0), (0, 1), (1, 2)])
+@table(("delay", "back"), [(-1, 0), (0, 1), (1, 2)])
 def test_a_held_input_acts_from_its_sample_on(delay, back):
     found = rows(duffing(), Rig.silverbox("zero_order", delay), U)
     np.testing.assert_array_equal(found[:, 0], BEFORE[3 - back : 43 - back])
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@table("delay", [0, 1])
 def test_linear_goes_from_input_to_input(delay):
     found = rows(duffing(), Rig.silverbox("linear", delay), U)
     np.testing.assert_array_equal(found[:, 0], BEFORE[2 - delay : 42 - delay])
@@ -62,7 +63,7 @@ def test_look_ahead_is_the_quintic_through_its_window():
     assert not delayed.waits  # the next input but for the delay is known
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@table("delay", [0, 1])
 def test_spline_is_that_through_all_inputs(delay):
     found = rows(duffing(), Rig.silverbox("spline", delay), U)
     spline = make_interp_spline(np.arange(40), U, k=5)
@@ -73,7 +74,7 @@ def test_spline_is_that_through_all_inputs(delay):
         rows(duffing(), Rig.silverbox("spline"), U[:5])
 
 
-@pytest.mark.parametrize("interpolation", ["look_ahead", "spline"])
+@table("interpolation", ["look_ahead", "spline"])
 def test_a_band_limited_input_is_met_between_the_samples(interpolation):
     time = np.arange(400.0)
     wave = lambda t: np.sin(0.6 * np.pi * t) + np.cos(0.35 * np.pi * t)  # noqa: E731

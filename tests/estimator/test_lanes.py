@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import table
 
 from estimator import lanes
 from estimator.lanes import LANES, lanewise, of_lane, part, rows
@@ -69,7 +70,7 @@ def test_one_lane_is_touched_or_none():
     np.testing.assert_array_equal(np.argwhere(changed), [[2, 5], [3, 5]])
 
 
-@pytest.mark.parametrize("uniform", ["factor", "factor shift a"])
+@table("uniform", ["factor", "factor shift a"])
 def test_a_parameter_is_a_row_or_uniform(uniform):
     with pytest.raises(ValueError, match=r"(shift|a) of add_and_multiply must be a row or uniform, and not both"):
         lanewise(LAYOUT, "total product", uniform=uniform)(add_and_multiply)
@@ -150,10 +151,17 @@ def test_functions_within_functions_are_named_apart():
     """Those of two kinds would have one name, and the linker would take one for the other (`estimator.lanes.part`)."""
     root = Path(__file__).parents[2]
     unnamed = []
+
+    def look(node, within, name):
+        for child in ast.iter_child_nodes(node):
+            is_function = isinstance(child, ast.FunctionDef)
+            if is_function and within:
+                names = [ast.unparse(decorator) for decorator in child.decorator_list]
+                unnamed.extend(f"{name}: {child.name}" for decorator in names if decorator in ("jit", "kernel"))
+            look(child, within or is_function, name)
+
     for path in [p for package in ("estimator", "duffing_env", "agents") for p in (root / package).rglob("*.py")]:
-        for outer in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            for inner in ast.walk(outer) if isinstance(outer, ast.FunctionDef) else ():
-                if isinstance(inner, ast.FunctionDef) and inner is not outer:
-                    names = [ast.unparse(decorator) for decorator in inner.decorator_list]
-                    unnamed += [f"{path.name}: {inner.name}" for name in names if name in ("jit", "kernel")]
+        if path.parent.name == "__pycache__":  # generated
+            continue
+        look(ast.parse(path.read_text(encoding="utf-8")), False, path.name)
     assert unnamed == []

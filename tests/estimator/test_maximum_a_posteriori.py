@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from filtering import of_paper
+from reference.filters import filter_paper
 from scipy.optimize import minimize
 
 from estimator import SILVERBOX_TWIN, difference, silverbox_prior, weak_prior
@@ -31,7 +31,7 @@ def simulate(systems, samples, rng, process=NOISES[0]):
 
 def objective(psi, u, y):
     """L(ψ) of the module's docstring, with matrices."""
-    innovations, variances = of_paper(psi, u, y, NOISES[0] ** 2, NOISES[1] ** 2, PRIOR.state_cov)
+    innovations, variances = filter_paper(psi, u, y, NOISES[0] ** 2, NOISES[1] ** 2, PRIOR.state_cov)
     pull = psi - PRIOR.coefficients_mean
     loss = 0.5 * (innovations**2 / variances + np.log(variances)).sum()
     return loss + 0.5 * pull @ np.linalg.solve(PRIOR.coefficients_cov, pull)

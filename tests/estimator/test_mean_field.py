@@ -5,7 +5,7 @@ import re
 import numba
 import numpy as np
 import pytest
-from mean_field_reference import (
+from reference.mean_field import (
     LAYOUT,
     Moments,
     assert_same_moments,
@@ -43,7 +43,7 @@ def updated(block, iterations, as_published=False, pieces=PIECES):
 @pytest.mark.parametrize("as_published", [False, True])
 def test_update_equals_its_equations(as_published, nonlinear):
     rng = np.random.default_rng(0)
-    for iterations in range(1, 11):
+    for iterations in (1, 2, 3, 10):
         priors = [random_prior(rng, nonlinear) for _ in range(LANES)]
         for _ in range(2):
             u, y = samples(rng, LANES)

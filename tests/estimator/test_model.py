@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from tables import table
 
 from estimator.engine.derive import calculus, symbol
 from estimator.free_run import free_run
@@ -19,7 +20,7 @@ TANK = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
+@table(
     ("given", "words"),
     [
         (
@@ -55,7 +56,7 @@ def test_powers_too_high_for_a_product_are_refused():
         calculus(Model(**{**TANK, "rates": ("u - loss*x**17",)}))
 
 
-@pytest.mark.parametrize(
+@table(
     ("term", "words"),
     [
         (Term(lag1=-2), "lag1 of a term must be a whole number from 0 to 16, but is -2"),
@@ -70,17 +71,24 @@ def test_terms_are_products_of_whole_powers(term, words):
         difference((Term(1), term))
 
 
-@pytest.mark.parametrize("power", ["0.5", "1.5", "(-1/2)", "2.0", "9", "(-3)", "0.3", "loss", "(loss - 1)"])
-def test_any_power_is_what_it_says(power):
-    x, loss = 1.7, 0.4
-    model = Model(**{**TANK, "rates": (), "next_state": (f"u + loss*x**{power}",)})
-    expected = loss * x ** eval(power, {"loss": loss})
-    assert free_run(model, [loss], [0.25], [x])[0] == pytest.approx(0.25 + expected, rel=1e-14)
-    slope = calculus(model).by[0][0].subs({symbol("x"): x, symbol("loss"): loss})
-    assert float(slope) == pytest.approx(expected * eval(power, {"loss": loss}) / x, rel=1e-12)
+def test_any_power_is_what_it_says():
+    powers = ["0.5", "1.5", "(-1/2)", "2.0", "9", "(-3)", "0.3", "loss", "(loss - 1)"]
+    x, loss, names = 1.7, 0.4, [f"c{i}" for i in range(len(powers))]
+    terms = " + ".join(f"{name}*x**{power}" for name, power in zip(names, powers, strict=True))
+    coefficients = {"loss": "1", **dict.fromkeys(names, "1")}
+    model = Model(**{**TANK, "coefficients": coefficients, "rates": (), "next_state": (f"u + {terms}",)})
+    (slopes,) = calculus(model).by[0][:1]
+    for name, power in zip(names, powers, strict=True):
+        given = dict(zip(coefficients, [loss, *(1.3 * (name == other) for other in names)], strict=True))
+        exponent = eval(power, {"loss": loss})
+        assert free_run(model, list(given.values()), [0.25], [x])[0] == pytest.approx(
+            0.25 + 1.3 * x**exponent, rel=1e-14
+        )
+        slope = slopes.subs({symbol("x"): x, **{symbol(c): value for c, value in given.items()}})
+        assert float(slope) == pytest.approx(1.3 * exponent * x ** (exponent - 1), rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["coefficients", "u", "state"])
+@table("name", ["coefficients", "u", "state"])
 def test_a_free_run_is_of_numbers(name):
     given = {"coefficients": [0.4], "u": [0.25], "state": [1.0]}
     with pytest.raises(ValueError, match=f"{name} must be numbers"):
@@ -97,9 +105,7 @@ def test_free_runs_of_many_systems_are_those_of_each():
     assert free_run(model, c, u[0]).shape == (3, 4)
 
 
-@pytest.mark.parametrize(
-    ("c", "u", "state"), [((2, 1), (3, 4), (1,)), ((1,), (), (1,)), ((2,), (4,), (1,)), ((1,), (4,), (2, 3))]
-)
+@table(("c", "u", "state"), [((2, 1), (3, 4), (1,)), ((1,), (), (1,)), ((2,), (4,), (1,)), ((1,), (4,), (2, 3))])
 def test_a_free_run_names_the_shapes_that_do_not_fit(c, u, state):
     with pytest.raises(ValueError, match="or one more axis, of systems, but have"):
         free_run(Model(**TANK), np.ones(c), np.ones(u), np.ones(state))
@@ -113,7 +119,7 @@ def test_the_information_of_powers_is_that_of_differences():
     assert found[0, 0] == pytest.approx((slope**2).sum() / 0.02**2, rel=1e-6)
 
 
-@pytest.mark.parametrize("magnitude", ["abs({})", "sqrt({}**2)"])
+@table("magnitude", ["abs({})", "sqrt({}**2)"])
 def test_a_magnitude_is_what_numpy_says(magnitude):
     """Of a number on either side of 0, at it, and of what SymPy does not know to be real."""
     moves = f"u + loss*{magnitude.format('x')} + {magnitude.format('log(loss)')}"

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from tables import table
 
 from estimator import offline as module
 from estimator.offline import PEMNARX, network, network_jacobian
@@ -56,7 +57,7 @@ def test_network_term_by_term():
     np.testing.assert_allclose(network(TRUTH, z), expected, rtol=1e-13)
 
 
-@pytest.mark.parametrize("units", [0, 1, 4])
+@table("units", [0, 1, 4])
 def test_jacobian_against_central_differences(units):
     rng = np.random.default_rng(units)
     parameters, z = rng.standard_normal(4 + 5 * units), rng.standard_normal((20, 3))
@@ -91,8 +92,8 @@ def test_no_units_is_linear_least_squares():
     assert model.training_mse == pytest.approx(np.mean((columns @ coefficients - y[2:]) ** 2), rel=1e-9)
 
 
-@pytest.mark.parametrize("delay", [0, 1])
-@pytest.mark.parametrize("given", [2, 5])
+@table("delay", [0, 1])
+@table("given", [2, 5])
 def test_simulate_against_a_plain_loop(delay, given):
     u, y_init = np.random.default_rng(4).standard_normal(300), [0.1, -0.2, 0.3, 0.0, 0.05][:given]
     expected = plain_simulate(TRUTH, MEAN, u, y_init, delay)
@@ -101,7 +102,7 @@ def test_simulate_against_a_plain_loop(delay, given):
     np.testing.assert_array_equal(simulated[:given], y_init)
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@table("delay", [0, 1])
 def test_predict_against_a_plain_loop(delay):
     u, y = np.random.default_rng(5).standard_normal((2, 40))
     expected = [plain_network(TRUTH, MEAN, (y[t - 1], y[t - 2], u[t - delay])) for t in range(2, 40)]
@@ -110,7 +111,7 @@ def test_predict_against_a_plain_loop(delay):
     np.testing.assert_array_equal(predicted[:2], y[:2])
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@table("delay", [0, 1])
 def test_an_input_acts_input_delay_samples_later(delay):
     model = with_parameters(TRUTH, input_delay=delay)
     u, y = np.zeros(20), np.zeros(20)
@@ -157,7 +158,7 @@ def test_steep_units_saturate():
     np.testing.assert_array_equal(simulated[2:], [0.0, 0.3])
 
 
-@pytest.mark.parametrize(
+@table(
     ("arguments", "message"),
     [
         ({"units": -1}, "units must be a whole number from 0"),
@@ -172,7 +173,7 @@ def test_bad_configuration(arguments, message):
         PEMNARX(**arguments)
 
 
-@pytest.mark.parametrize(
+@table(
     ("u", "y", "message"),
     [
         (np.arange(40.0), np.arange(39.0), "one length of at least 2, but have 40 and 39"),
@@ -188,7 +189,7 @@ def test_bad_record(u, y, message):
         PEMNARX(units=2).fit(u, y)
 
 
-@pytest.mark.parametrize(
+@table(
     ("u", "y_init", "message"),
     [
         ([0.0, 0.0, np.inf], [0.0, 0.0], "u[2] is inf"),

@@ -3,11 +3,11 @@
 import copy
 import pickle
 import re
-import time
 
 import numpy as np
 import pytest
 from estimators import KINDS, ODE, ONE_TAP, OWN_TAPS, TRUTH, assert_same, motion, pendulum_estimator, record
+from tables import table
 
 from estimator import (
     SILVERBOX_TWIN,
@@ -25,10 +25,10 @@ from estimator.models.pendulum import PENDULUM
 FACTORISATIONS = ("structured", "mean_field")
 
 #: Kinds that fit the record.
-FITS = ("paper", "published", "three-tap", "ode", "ode, look-ahead", "ensemble")
+FITS = ("paper", "published", "own terms, drift", "ode", "ode, look-ahead", "ensemble")
 
 #: Kinds that take no missing outputs, or that fit the record so badly that they run away in a gap.
-MISFITS = ("mean field", "published", "own terms, drift")
+MISFITS = ("mean field", "published")
 
 
 @pytest.fixture(scope="module")
@@ -52,19 +52,20 @@ def test_run_is_repeated_update(kind, samples, monkeypatch, capsys):
             forecasts.append(single.forecasts[0])
     in_parts = [parts.run(u[a:b], y[a:b]) for a, b in ((0, 1), (1, 2), (2, 50), (50, 50), (50, 120))]
     monkeypatch.setattr("estimator.online._SAMPLES_BETWEEN_REPORTS", 70)
+    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
     np.testing.assert_array_equal(shown.run(u, y, progress=True), free_energies)
     np.testing.assert_array_equal(each, free_energies)
     np.testing.assert_array_equal(forecasts, whole.forecasts)
     np.testing.assert_array_equal(np.concatenate(in_parts), free_energies)
     for other in (single, parts, shown):
         assert_same(whole, other)
-    assert "Identifying" in capsys.readouterr().out
+    assert "Identifying" in capsys.readouterr().err
     assert whole.free_energy == free_energies[-1, -1]
     assert len(free_energies) == 120 - whole.waits
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("bad", [1e200, 1e154])  # after the second the belief may be finite, its free energy is not
+@table("kind", KINDS)
+@table("bad", [1e200, 1e154])  # after the second the belief may be finite, its free energy is not
 def test_unchanged_after_an_update_that_raised(kind, bad, samples):
     estimator, untouched = KINDS[kind](), KINDS[kind]()
     for each in (estimator, untouched):
@@ -83,7 +84,7 @@ def test_unchanged_after_an_update_that_raised(kind, bad, samples):
     assert_same(estimator, untouched)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@table("kind", KINDS)
 def test_copies_and_pickles_go_on_alike(kind, samples):
     u, y = samples
     estimator = KINDS[kind]()
@@ -95,7 +96,7 @@ def test_copies_and_pickles_go_on_alike(kind, samples):
         assert_same(estimator, other)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@table("kind", KINDS)
 def test_rewind_forgets_the_state_and_keeps_what_was_learned(kind, samples):
     u, y = samples
     estimator, first = KINDS[kind](), KINDS[kind]().belief
@@ -115,7 +116,7 @@ def test_rewind_forgets_the_state_and_keeps_what_was_learned(kind, samples):
     assert estimator.belief.entropy() < once or estimator.settings.drift
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in MISFITS])
+@table("kind", [kind for kind in KINDS if kind not in MISFITS])
 def test_nothing_is_learned_from_a_gap(kind, samples):
     u, y = samples
     estimator = KINDS[kind]()
@@ -131,11 +132,11 @@ def test_nothing_is_learned_from_a_gap(kind, samples):
     if estimator.settings.drift:
         assert (variances > 1).all()
     else:
-        np.testing.assert_allclose(variances, 1.0, rtol=1e-3)
+        np.testing.assert_allclose(variances, 1.0, rtol=1e-3 if estimator.settings.noise_hypotheses == 1 else 1e-2)
     np.testing.assert_array_equal(np.isfinite(estimator.forecasts), True)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@table("kind", KINDS)
 def test_asking_changes_nothing(kind, samples):
     u, y = samples
     asked, untouched = KINDS[kind](), KINDS[kind]()
@@ -200,8 +201,8 @@ def test_defaults():
     assert OnlineEstimator(ODE).belief == recorded_prior(ODE)
 
 
-@pytest.mark.parametrize("delay", [0, 1])
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
+@table("delay", [0, 1])
+@table("factorisation", FACTORISATIONS)
 def test_predict_and_simulate_equal_plain_loops(samples, factorisation, delay):
     u, y = samples
     estimator = OnlineEstimator(rig=Rig.silverbox("zero_order", delay), factorisation=factorisation)
@@ -236,24 +237,27 @@ def test_a_free_run_may_diverge(model):
 
 @pytest.mark.parametrize("interpolation", ["linear", "zero_order"])
 def test_a_known_oscillator_is_found(interpolation):
+    models = {"linear": ODE, "zero_order": duffing(offsets=True)}  # ODE's offsets and feedthrough are 0
     truth = recorded_prior(duffing()).coefficients_mean * [0.8, 0.85, 1.2, 1.25]
     rng = np.random.default_rng(0)
     u = np.convolve(rng.uniform(-0.3, 0.3, 403), np.full(4, 0.5), mode="valid")
     states = motion(u, truth, interpolation)
     y = states[:, 0] + 3e-4 * rng.standard_normal(400)
-    estimator = OnlineEstimator(duffing(), rig=Rig.silverbox(interpolation))
+    estimator = OnlineEstimator(models[interpolation], rig=Rig.silverbox(interpolation))
     free_energies = estimator.run(u, y)
     assert np.diff(free_energies, axis=1).max() <= 1e-9
     belief = estimator.belief
     std = np.sqrt(np.diag(belief.coefficients_cov))
-    assert (np.abs(belief.coefficients_mean - truth) < 3.5 * std).all()
-    assert (std < 0.01 * truth).all()  # from 30 %
+    off = np.abs(belief.coefficients_mean - [*truth, *[0.0] * (len(std) - 4)])
+    assert (off < 3.5 * std).all()
+    assert (std[:4] < 0.01 * truth).all()  # from 30 %
     assert belief.xi_mean == pytest.approx(3e-4**-2, rel=0.6)  # its prior says 1 mV, and is not forgotten yet
     assert (np.abs(belief.state_mean - states[-1]) < 3.5 * np.sqrt(np.diag(belief.state_cov))).all()
     # Another hold is another input: its intervals do not hold the truth.
-    other = OnlineEstimator(duffing(), rig=Rig.silverbox("linear" if interpolation == "zero_order" else "zero_order"))
+    hold = "linear" if interpolation == "zero_order" else "zero_order"
+    other = OnlineEstimator(models[hold], rig=Rig.silverbox(hold))
     other.run(u, y)
-    wrong = (other.belief.coefficients_mean - truth) / np.sqrt(np.diag(other.belief.coefficients_cov))
+    wrong = (other.belief.coefficients_mean[:4] - truth) / np.sqrt(np.diag(other.belief.coefficients_cov))[:4]
     assert np.abs(wrong).max() > 10
 
 
@@ -271,16 +275,16 @@ def test_a_held_noise_is_a_force_over_a_sample():
 def test_look_ahead_waits_for_the_next_input(samples):
     u, y = samples
     rig = Rig.silverbox("look_ahead")
-    estimator, shorter, untouched = (OnlineEstimator(ODE, rig=rig) for _ in range(3))
+    estimator, shorter, untouched = (OnlineEstimator(ODE, rig=rig, iterations=2) for _ in range(3))
     estimator.update(u[0], y[0])
     assert np.isnan(estimator.free_energy)
     assert estimator.forecasts.shape == (0, 2)
     np.testing.assert_array_equal(estimator.belief.record, untouched.belief.record)
-    assert estimator.run(u[1:200], y[1:200]).shape == (199, 3)
+    assert estimator.run(u[1:200], y[1:200]).shape == (199, 2)
     shorter.run(u[:200], y[:200])
     assert_same(estimator, shorter)
     # The belief does not know the last output yet, and knows the last input: it acts on the sample before.
-    other_output, other_input = OnlineEstimator(ODE, rig=rig), OnlineEstimator(ODE, rig=rig)
+    other_output, other_input = (OnlineEstimator(ODE, rig=rig, iterations=2) for _ in range(2))
     other_output.run(u[:200], np.append(y[:199], 9.9))
     assert estimator.belief == other_output.belief
     other_input.run(np.append(u[:199], 0.9), y[:200])
@@ -289,11 +293,12 @@ def test_look_ahead_waits_for_the_next_input(samples):
 
 def test_spline_takes_records_and_no_samples(samples, monkeypatch):
     u, y = samples
-    estimator, shown = (OnlineEstimator(ODE, rig=Rig.silverbox("spline")) for _ in range(2))
+    estimator, shown = (OnlineEstimator(ODE, rig=Rig.silverbox("spline"), iterations=2) for _ in range(2))
     with pytest.raises(ValueError, match=re.escape("interpolation must not be 'spline' for single samples; use run()")):
         estimator.update(u[0], y[0])
-    assert estimator.run(u, y).shape == (300, 3)
+    assert estimator.run(u, y).shape == (300, 2)
     monkeypatch.setattr("estimator.online._SAMPLES_BETWEEN_REPORTS", 70)
+    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
     shown.run(u, y, progress=True)  # in one piece: a spline through a part of the record is another one
     assert_same(estimator, shown)
 
@@ -328,8 +333,8 @@ def test_two_sensors():
 # --- What is refused -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("factorisation", FACTORISATIONS)
-@pytest.mark.parametrize(
+@table("factorisation", FACTORISATIONS)
+@table(
     ("u", "y", "message"),
     [
         (np.nan, 0.1, "u must be finite, but u[0] is nan; remove or interpolate"),
@@ -347,7 +352,7 @@ def test_what_is_no_sample_is_refused(samples, factorisation, u, y, message):
     assert_same(estimator, untouched)
 
 
-@pytest.mark.parametrize(
+@table(
     ("change", "message"),
     [
         (lambda u, y: (u, y[:-1]), "u and y must have one length, but have 300 and 299; cut the longer one"),
@@ -373,7 +378,7 @@ def test_unchanged_after_a_run_that_raised(samples, change, message):
     assert_same(estimator, untouched)
 
 
-@pytest.mark.parametrize(
+@table(
     ("call", "message"),
     [
         (lambda: Rig(1.0, "linear", 2000), "delay (for linear) must be a whole number from 0 to 1000, but is 2000"),
@@ -461,20 +466,3 @@ def test_free_energy_over_the_record(record, factorisation, prior):
         assert rises.max() <= 1e-9
     else:  # coordinate descent but for the linearisation, which moves with the iterations
         assert np.mean(rises > 1e-9) <= 1e-4
-
-
-@pytest.mark.slow  # a time, which a busy machine makes longer
-def test_the_record_takes_less_than_a_second(record):
-    # 0.2 s where this was written; the published run took 239 to 289 s.
-    u, y = record.multisine.u, record.multisine.y
-    seconds = []
-    for _ in range(3):
-        estimator = OnlineEstimator(
-            None, published_run_prior(), OWN_TAPS, factorisation="mean_field", as_published=True
-        )
-        estimator.run(u[:100], y[:100])  # compiles where no test before has
-        start = time.perf_counter()
-        estimator.run(u, y)
-        seconds.append(time.perf_counter() - start)
-    assert len(u) == 90_972
-    assert min(seconds) < 1.0

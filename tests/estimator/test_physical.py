@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tables import table
 
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
@@ -98,7 +99,7 @@ def test_coefficients_round_trip(theta1, theta2, theta3, eta, sign, step):
     assert abs(back[3] - sign * eta) <= rounding * eta
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@table("name", PLANTS)
 def test_a_batch_goes_there_and_back_as_its_rows_do(name):
     model, parameters = PLANTS[name]
     many = batch(parameters, np.random.default_rng(1), (2, 3))
@@ -115,7 +116,7 @@ def test_a_batch_goes_there_and_back_as_its_rows_do(name):
             np.testing.assert_allclose(whole[index], single, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@table("name", PLANTS)
 def test_slopes_equal_central_differences(name):
     model, parameters = PLANTS[name]
     points, size = coefficients_of(model, parameters), vector(model, parameters)
@@ -153,7 +154,7 @@ def test_a_model_without_parameters_has_its_coefficients():
     np.testing.assert_array_equal(physical_slopes(model, points)[1], np.eye(model.n_coefficients))
 
 
-@pytest.mark.parametrize("step", [0.0, -1.0, np.inf, np.nan])
+@table("step", [0.0, -1.0, np.inf, np.nan])
 def test_a_step_that_is_none_is_named(step):
     message = f"step must be a number from 1e-30 to 1e+30, but is {step}; give the seconds"
     with pytest.raises(ValueError, match=re.escape(message)):
@@ -196,7 +197,7 @@ HEAT = {
 DIMENSIONS = {"cap": (1, -1, 1), "cond": (1, -1, 0)}
 
 
-@pytest.mark.parametrize("order", [1, -1])
+@table("order", [1, -1])
 def test_maps_are_read_by_name_in_whatever_order_they_are_written(order):
     inverse = {"gain": "step/cap", "loss": "step*cond/cap"}
     written = {"inverse": inverse, "dimensions": DIMENSIONS}

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from estimators import ONE_TAP, OWN_TAPS, pendulum_estimator, record
+from tables import table
 
 from estimator import OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
 from estimator.posteriors import posteriors
@@ -57,7 +58,7 @@ def test_several_sensors(records):
     np.testing.assert_allclose(beliefs[1].record, estimator.belief.record, rtol=1e-6, atol=1e-14)
 
 
-@pytest.mark.parametrize(
+@table(
     ("call", "message"),
     [
         (lambda u: posteriors(u[0], u[0], silverbox_prior()), "u and y must have one shape (n, T), but have (40,)"),

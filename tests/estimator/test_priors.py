@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from tables import table
 
 from estimator import (
     CONTINUOUS_TWIN,
@@ -68,7 +69,7 @@ def test_log_uniform_moments_have_converged(spread, monkeypatch):
     assert np.abs((cov - finer_cov) / np.outer(deviations, deviations)).max() < 1e-10
 
 
-@pytest.mark.parametrize("name", MODELS)
+@table("name", MODELS)
 def test_no_spread_is_the_map_itself(name):
     mean, cov = log_uniform_moments(MODELS[name], OSCILLATOR, 0.0)
     np.testing.assert_allclose(mean, coefficients_of(MODELS[name], OSCILLATOR), rtol=1e-13)
@@ -150,7 +151,7 @@ def test_mean_field_begins_without_correlations_of_states_theta_and_eta():
     assert joint.factorised("structured") == joint
 
 
-@pytest.mark.parametrize(
+@table(
     ("call", "message"),
     [
         (lambda: silverbox_prior(process_noise=0.0), "process_noise must be a number from 1e-60 to 1e+60, but is 0.0"),

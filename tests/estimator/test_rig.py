@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import table
 
 from estimator import Channel, OnlineEstimator, Rig, load_estimator, save_estimator
 from estimator.electronic_duffing import electronic_duffing
@@ -19,6 +20,8 @@ from estimator.units import Scales
 
 GUESS = {"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (-1e8, 1e8)}
 BENCH = Rig(1e-3, input=Channel("N", limit=20.0), output=Channel("m", range=0.03), guess=GUESS)
+#: Whose estimator other tests compile.
+AHEAD = replace(BENCH, interpolation="look_ahead")
 TOML = """
 step = 1e-3
 interpolation = "linear"
@@ -46,7 +49,7 @@ def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
     assert Rig.of(tomllib.loads(TOML)) == rig == Rig.of(json.loads(json.dumps(rig.to_dict())))
 
 
-@pytest.mark.parametrize(
+@table(
     "rig",
     [
         Rig(0.1),
@@ -63,7 +66,7 @@ def test_a_saved_rig_is_the_same(rig, tmp_path):
         rig.save("a\0b")
 
 
-@pytest.mark.parametrize(
+@table(
     ("change", "message"),
     [
         ({"stepp": 1.0}, "rig must have keys of"),
@@ -134,7 +137,7 @@ def test_a_file_that_is_named_like_a_rig_that_ships_is_found(tmp_path, monkeypat
     assert Rig.of("./beam") == Rig(3)
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "settings"),
     [
         ("electronic-duffing", {}),
@@ -154,7 +157,7 @@ def test_the_board_s_files_are_those_of_its_potentiometers(name, settings):
         assert low < value < high
 
 
-@pytest.mark.parametrize(
+@table(
     ("change", "message"),
     [
         ({"p1": 0.0}, "to 1, but is 0.0; give the potentiometer's division ratio"),
@@ -170,7 +173,7 @@ def test_potentiometers_are_checked(change, message):
         electronic_duffing(**change)
 
 
-@pytest.mark.parametrize(
+@table(
     ("input_unit", "output_unit", "order", "units"),
     [
         ("N", "m", 0, ("kg", "N s/m", "N/m", "N/m³")),
@@ -200,13 +203,14 @@ def test_numbers_do_not_depend_on_the_units():
     """The same bench in newtons and metres, and in millinewtons and micrometres."""
     small = Rig(
         1e-3,
+        "look_ahead",
         input=Channel("mN", limit=20e3),
         output=Channel("um", range=0.03e6),
         guess={name: tuple(v * (1e-3 if name != "b" else 1e-15) for v in GUESS[name]) for name in GUESS},
     )
     rng = np.random.default_rng(0)
     u, y = rng.choice([-6.0, 6.0], 300), 0.01 * rng.standard_normal(300).cumsum() / 10
-    one, other = OnlineEstimator(rig=BENCH), OnlineEstimator(rig=small)
+    one, other = OnlineEstimator(rig=AHEAD), OnlineEstimator(rig=small)
     assert one.settings.noise_hypotheses == (7, 7)
     one.run(u, y)
     other.run(1e3 * u, 1e6 * y)
@@ -217,13 +221,13 @@ def test_numbers_do_not_depend_on_the_units():
 
 
 def test_an_estimator_of_a_rig_is_saved_whole(tmp_path):
-    estimator = OnlineEstimator(rig=BENCH)
+    estimator = OnlineEstimator(rig=AHEAD)
     rng = np.random.default_rng(1)
     u, y = rng.choice([-6.0, 6.0], 40), 1e-3 * rng.standard_normal(40)
     estimator.run(u[:20], y[:20])
     save_estimator(estimator, tmp_path / "e.npz")
     other = load_estimator(tmp_path / "e.npz")
-    assert (other.rig, other.scales) == (BENCH, BENCH.scales)
+    assert (other.rig, other.scales) == (AHEAD, AHEAD.scales)
     for one in (estimator, other):
         one.run(u[20:], y[20:])
     assert other.belief == estimator.belief
@@ -237,3 +241,31 @@ def test_the_instrument_comes_from_the_file_that_the_rig_comes_from(tmp_path, mo
     Path("beam").write_text("step = 0.5\ninstrument = 3\n")
     with pytest.raises(ValueError, match="beam must be a rig file, but is not: instrument must be a table, but is 3"):
         Rig.with_instrument("./beam")
+
+
+@pytest.mark.parametrize(
+    ("where", "channel", "message"),
+    [
+        ("input", {"limit": -1}, "input.limit must be a number from 1e-30 to 1e+30, but is -1; leave it out"),
+        ("output", {"range": 1e300}, "output.range must be a number from 1e-30 to 1e+30, but is 1e+300"),
+        ("output", {"limit": -1}, "output must have no limit, but has -1; use range"),
+        ("input", {"range": "wide"}, "input must have no range, but has 'wide'; use limit"),
+        ("input", {"noise": 0.0}, "input.noise must be a number"),
+        ("output", {"noise": 0.0}, "output.noise must be a number"),
+        ("output", {"offset": "x"}, "output.offset must be a number"),
+        ("input", {"unit": ""}, "input.unit must be a short text"),
+        ("output", {"column": 3}, "output.column must be a name"),
+        ("output", {"kind": "speed"}, "output.kind must be one of"),
+        ("input", {"limits": 3}, "input must have keys of"),
+    ],
+)
+def test_an_error_says_of_which_channel(where, channel, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Rig.from_dict({"step": 1e-3, where: channel})
+
+
+def test_a_channel_alone_says_whose_limit_or_range_is_wrong():
+    with pytest.raises(ValueError, match="limit of an input must be a number"):
+        Channel(limit=-1)
+    with pytest.raises(ValueError, match="range of an output must be a number"):
+        Channel(range=np.inf)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from llvmlite import binding
+from tables import table
 
 from estimator.straight import straight, straight_within
 from estimator.straight.translation import vectorised
@@ -283,7 +284,7 @@ def test_turns_of_short_loops_go_side_by_side(lines, turns):
     binding.parse_assembly(module)
 
 
-@pytest.mark.parametrize(
+@table(
     ("function", "arguments", "said"),
     [
         (keeps, (np.zeros(4), 1.0), "'range(4)' in keeps keeps ['a'], which must go into a block; compile it with jit"),

@@ -2,17 +2,17 @@
 
 import socketserver
 import threading
-import time
+from collections import Counter
 
 import numpy as np
 
-from agents.running.clock import RealClock
+from agents.running.clock import JumpingClock
 from agents.running.simulated import SimulatedPlant
 from estimator import Channel, Rig
 
 TRUTH = {"m": 1.05, "c": 1.1, "a": 145.0, "b": 9e4}
 
-#: 2 Hz, sampled at 50 Hz: slow enough for a busy machine.
+#: 2 Hz, sampled at 50 Hz.
 RIG = Rig(
     0.02,
     input=Channel("N", limit=4.0, noise=0.01),
@@ -48,7 +48,7 @@ TABLE = {
     "play": "INIT",
     "outputs": "FETC:OUT?",
     "inputs": "FETC:IN?",
-    "timeout": 0.5,
+    "timeout": 600.0,
 }
 
 
@@ -57,16 +57,25 @@ class Scpi:
 
     Args:
         rig: behind it.
-        fault: after so many outputs: ``stall`` gives none any more, ``lose`` closes the connection, ``slow`` takes two
-            and a half sampling steps for every fifth.
-        after: outputs until then.
+        fault: ``stall`` answers nothing until ``quiet`` is set, ``lose`` closes the connection, ``slow`` takes two and
+            a half sampling steps for every fifth line.
+        word: with which the lines begin that meet the fault.
+        after: such lines that do not yet.
+
+    Attributes:
+        clock: of the instrument, and of the run where both are in one process.
+        ticks: whether its time passes by itself, a sampling step at each output that is asked for: for a run in another
+            process, whose clock jumps from tick to tick.
+        answered: outputs that were given, sample by sample.
+        stalled, quiet: whether it waits, and whether it is to go on.
     """
 
-    def __init__(self, rig=RIG, fault=None, after=30):
-        self.plant, self.fault, self.after = SimulatedPlant(rig, TRUTH, clock=RealClock()), fault, after
-        self.step, self.answered, self.lines = rig.step, 0, []
+    def __init__(self, rig=RIG, fault=None, word="MEAS?", after=30):
+        self.clock, self.ticks = JumpingClock(), False
+        self.plant, self.fault, self.word, self.after = SimulatedPlant(rig, TRUTH, clock=self.clock), fault, word, after
+        self.step, self.lines, self.heard, self.answered = rig.step, [], Counter(), 0
         self.lock, self.silence, self.block = threading.Lock(), 2.0, None
-        self.quiet = threading.Event()
+        self.stalled, self.quiet = threading.Event(), threading.Event()
         outer = self
 
         class Handler(socketserver.StreamRequestHandler):
@@ -105,10 +114,16 @@ class Scpi:
     def obey(self, line):
         self.lines.append(line)
         word, _, value = line.partition(" ")
-        if word == "MEAS?":
-            return self._measure()
+        if word == self.word and self.heard[word] >= self.after:
+            self._fail()
+        self.heard[word] += 1
         with self.lock:
             match word:
+                case "MEAS?":
+                    if self.ticks:
+                        self.clock.wait(self.clock.now() + self.step)
+                    self.answered += 1
+                    return self.plant.read()
                 case "WDOG":
                     self.silence = float(value)
                 case "OUTP":
@@ -123,14 +138,12 @@ class Scpi:
                 case "FETC:OUT?" | "FETC:IN?":
                     return ",".join(map(repr, self.block["OUT?" in word]))
 
-    def _measure(self):
-        broken = self.answered >= self.after
-        if broken and self.fault == "stall":
-            self.quiet.wait()
-        if broken and self.fault == "lose":
-            raise ConnectionError
-        if broken and self.fault == "slow" and self.answered % 5 == 0:
-            time.sleep(2.5 * self.step)
-        with self.lock:
-            self.answered += 1
-            return self.plant.read()
+    def _fail(self):
+        match self.fault:
+            case "stall":
+                self.stalled.set()
+                self.quiet.wait()
+            case "lose":
+                raise ConnectionError
+            case "slow" if self.heard[self.word] % 5 == 0:
+                self.clock.wait(self.clock.now() + 2.5 * self.step)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import drag
 import numpy as np
-from engine_reference import EPS, Belief, Plant
+from reference.filters import EPS, Plant
+from reference.plants import DRAG as SIGNED_DRAG
+from reference.plants import VAN_DER_POL
+from reference.structured import Belief
 
 from estimator.engine.rows import input_rows
 from estimator.models.difference import difference
@@ -15,19 +17,8 @@ from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM
 from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
 
-#: An oscillator that no other file knows: what somebody who adds a plant has to write.
-VAN_DER_POL = Model(
-    name="van_der_pol",
-    states={"x": "V", "v": "V"},
-    coefficients={"excitation": "1", "stiffness": "1", "gain": "1"},
-    rates=("v", "excitation*(1 - x**2)*v - stiffness*x + gain*u"),
-    noise=("0", "sqrt(3)"),
-    outputs={"y": "x"},
-    substeps=4,
-)
-
 #: Drag, which is quadratic in the speed, and a sensor that shows no sign.
-DRAG = replace(drag.DRAG, outputs={"y": "abs(x)"})
+DRAG = replace(SIGNED_DRAG, outputs={"y": "abs(x)"})
 
 
 @dataclass(frozen=True)

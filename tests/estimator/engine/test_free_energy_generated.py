@@ -5,7 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from engine_cases import CASES, get_belief, random_belief
-from engine_reference import EPS, update
+from reference.filters import EPS, difference_step, seen
+from reference.mean_field import expected_log_gaussian, expected_log_normal, gamma_divergence, gaussian_entropy
+from reference.structured import update
+from scipy.linalg import block_diag
 from scipy.stats import norm
 from test_structured_generated import LANES, some_samples, updated
 
@@ -33,6 +36,31 @@ def test_free_energies_equal_their_definition(name):
         # Digamma and log Gamma of shapes up to 1e3 are up to 6e3 in size, and cancel to numbers of order one.
         tolerance = EPS * case.operations * expected.condition * 10 + 6e3 * 8 * EPS
         np.testing.assert_allclose(out, total, rtol=tolerance, atol=tolerance * (1 + np.abs(total).max()))
+
+
+def test_the_reference_has_the_free_energy_of_the_joint_gaussian():
+    """Of the quantities before a sample and its process noise, with q(γ) and q(ξ): entropies and divergences."""
+    case = CASES["paper"]
+    for belief, inputs, y in some_samples(case, 8):
+        step, d = difference_step(belief.mean, inputs[0]), len(belief.mean)
+        T = np.append(step.jacobian[0], 1.0)  # from these to the displacement
+        gamma, xi = belief.gamma, belief.xi[0]
+        for _ in range(ITERATIONS):
+            q, r = gamma[1] / gamma[0], xi[1] / xi[0]
+            P = block_diag(belief.cov, q)
+            gain, _, posterior = seen(P, r, T)
+            deviation = gain * (y[0] - step.moved[0])
+            w_power = deviation[d] ** 2 + posterior[d, d]
+            v_power = (y[0] - step.moved[0] - T @ deviation) ** 2 + T @ posterior @ T
+            gamma = belief.gamma[0] + 0.5, belief.gamma[1] + w_power / 2
+            xi = belief.xi[0][0] + 0.5, belief.xi[0][1] + v_power / 2
+        energy = -gaussian_entropy(posterior)
+        energy -= expected_log_gaussian((deviation[:d], posterior[:d, :d]), (np.zeros(d), belief.cov))
+        energy -= expected_log_normal(w_power, gamma) + expected_log_normal(v_power, xi)
+        energy += gamma_divergence(gamma, belief.gamma) + gamma_divergence(xi, belief.xi[0])
+        found = update(case.plant, 2, belief, inputs, y, ITERATIONS)
+        assert found.free_energies[0][-1] == pytest.approx(energy, rel=1e-9, abs=1e-9)
+        np.testing.assert_allclose([found.belief.gamma, found.belief.xi[0]], [gamma, xi], rtol=1e-9)
 
 
 def traced(iterations):

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from engine_cases import CASES, Case, assert_agrees, block, get_belief, put_belief, random_belief
-from engine_reference import EPS, Plant, update
+from reference.filters import EPS, Plant
+from reference.structured import update
+from tables import table
 from test_structured_generated import LANES, some_samples, updated
 
 from estimator.engine import tasks
@@ -14,7 +16,7 @@ from estimator.engine.points import ROUNDING
 from estimator.engine.rows import input_rows
 from estimator.models.model import Model
 
-NAMES = ["duffing", "duffing, all terms", "cubic", "pendulum", "wiener-hammerstein", "van der pol"]
+NAMES = ["duffing, all terms", "cubic", "pendulum", "wiener-hammerstein", "van der pol"]
 
 
 def generated(case):
@@ -144,7 +146,7 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
     assert name != "paper" or not flagged  # which has no steps to be too long
 
 
-@pytest.mark.parametrize(
+@table(
     ("entries", "flagged"),
     [
         ({}, False),

@@ -1,21 +1,16 @@
-"""What a policy for all oscillators is worth on unseen ones of the family, beside the planner and the fixed signals.
+"""What policies are worth on unseen oscillators of the family, beside the planner.
 
-    python -m agents.studies.universal --policies ppo/universal prbs prbs-4 uniform silverbox-multisine
+    python -m agents.studies.family --policies lookahead prbs prbs-4 uniform silverbox-multisine
 
 plays every policy on the same oscillators, one of each rig that is drawn (`agents.training.family`), in the branch
 ``test`` of the seeds. D-efficiency is exp(2 (I - I_efe) / K), with I the information gained about the K coefficients
 and I_efe that of the planner on the same oscillator with the same noise.
-
-    python -m agents.studies.universal --policies runs/rule prbs --ship
-
-writes a run's policy into the package, as ppo/universal, with these figures on its card.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +19,12 @@ import numpy.typing as npt
 from agents.cli import RIG_TRACK, followed, run_script
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.entries import check_policies
-from agents.policies import TRAINED, make_policy
-from agents.policies.learned import CARD
+from agents.loading import of_ones_own
+from agents.policies import make_policy
 from agents.results import show, table, write_json
-from agents.studies.ship import card_of, put
-from agents.training.family import FAMILY, Member, draw_member
+from agents.training.family import Member, draw_member
 
-PLANNER, SHIPPED = "efe", "ppo/universal"
+PLANNER = "efe"
 
 #: Of the family's draws: another word than that of any training.
 _BRANCH = 2
@@ -40,7 +34,7 @@ _BRANCH = 2
 class Config:
     """Judge policies on the family of oscillators."""
 
-    policies: tuple[str, ...] = ("ppo/universal", "prbs", "prbs-4", "uniform", "silverbox-multisine")
+    policies: tuple[str, ...] = ("lookahead", "prbs", "prbs-4", "uniform", "silverbox-multisine")
     """Names or run folders, beside the planner."""
     systems: int = 256
     """Rigs, one oscillator of each."""
@@ -48,14 +42,10 @@ class Config:
     """Of rigs, oscillators and noise."""
     output: Path | None = None
     """Folder for results as JSON."""
-    ship: bool = False
-    """Whether the first of the policies, a run folder, becomes ppo/universal."""
 
     def __post_init__(self) -> None:
         if not self.policies or self.systems < 2:
             raise ValueError(f"policies must be some and systems at least 2, but are {self.policies}, {self.systems}")
-        if self.ship and not (Path(self.policies[0]) / CARD).is_file():
-            raise ValueError(f"policies must begin with a run folder to ship, but begin with {self.policies[0]!r}")
 
 
 def unseen(count: int, seed: int = 0) -> list[Member]:
@@ -71,7 +61,8 @@ def play(member: Member, policy: str, seed: int) -> tuple[float, float, float]:
     state, start = None, np.ones(1, dtype=np.bool_)
     gained, terminated = 0.0, np.zeros(1, dtype=np.bool_)
     for _ in range(envs.horizon):
-        actions, state = chosen.predict(observations, state, start, deterministic=True)
+        with of_ones_own(policy, "policy"):
+            actions, state = chosen.predict(observations, state, start, deterministic=True)
         start = np.zeros(1, dtype=np.bool_)
         observations, _, terminated, truncated, infos = envs.step(actions)
         gained += float(infos["information_gain"][0])
@@ -123,19 +114,12 @@ def main(config: Config) -> None:
     rows.append(["ended early", "", *(f"{100 * e.mean():.1f} %" for e in ended)])
     rows.append(["90 % intervals that cover", "", *(f"{c.mean():.3f}" for c in covered)])
     rows.append(["information / nat", "", *(f"{g.mean():.2f}" for g in gains)])
-    heading = "D-efficiency beside efe: median / 10 % quantile"
-    show(heading, table(("oscillators", "number", *names), rows, markdown=True))
     if config.output is not None:
         config.output.mkdir(parents=True, exist_ok=True)
         told = {"gains": gains.tolist(), "ended": ended.tolist(), "covered": covered.tolist()}
-        write_json(config.output / "universal.json", {"policies": names, **told})
-    if config.ship:
-        own = efficiency[1]
-        first = {name: [float(np.median(own[mask])), float(np.quantile(own[mask], 0.1))] for name, mask in groups}
-        scores = {"systems": config.systems, "seed": config.seed, "efficiency": first}
-        run, folder = Path(config.policies[0]), TRAINED / SHIPPED
-        put(folder, run, card_of(run) | {"track": FAMILY, "version": version("duffing-env"), "scores": scores})
-        print(folder)
+        write_json(config.output / "family.json", {"policies": names, **told})
+    heading = "D-efficiency beside efe: median / 10 % quantile"
+    show(heading, table(("oscillators", "number", *names), rows, markdown=True, labels=2))
 
 
 if __name__ == "__main__":

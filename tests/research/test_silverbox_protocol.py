@@ -221,12 +221,6 @@ def test_free_energy_ranks_models_as_their_simulation_errors_do(results):
     assert by_error == sorted(names, key=lambda name: rows[name]["free_energy"]) == list(reversed(names))
 
 
-@pytest.mark.slow  # a time, which a busy machine makes longer
-@pytest.mark.parametrize(("name", "bound"), [("ODE spline +e, 2 passes", 5e-6), ("paper structured", 2e-6)])
-def test_identification_takes_microseconds_a_sample(results, name, bound):
-    assert results[0]["rows"][name]["seconds_per_sample"] <= bound
-
-
 def test_results_are_written_whole(results):
     found, folder, _ = results
     assert json.loads((folder / "new" / "results.json").read_text()) == json.loads(json.dumps(found))

@@ -7,6 +7,7 @@ from scipy.optimize import linprog
 from agents.planner.ascent import Limits
 from agents.planner.programme import Programme
 
+pytest.importorskip("highspy", reason="pip install 'duffing-env[oracle]'")
 SAMPLES, STATES, RADIUS = 12, 2, 0.05
 
 
@@ -62,3 +63,9 @@ def test_what_no_small_change_leads_within_the_limits_has_no_solution_and_the_ne
     delta, _ = programme.best(u, gradient, shown, slopes, RADIUS)
     wanted, _ = reference(u, gradient, shown, slopes, limits, 0)
     assert gradient @ delta == pytest.approx(-wanted.fun, rel=1e-6)
+
+
+def test_without_highspy_it_says_which_extra_brings_it(monkeypatch):
+    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"^highspy is not installed; get it with: .*duffing-env\[oracle\]'$"):
+        Programme(SAMPLES, STATES, 0, Limits(0.52, 0.51, 0.1, np.inf))

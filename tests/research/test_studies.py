@@ -6,7 +6,8 @@ import pytest
 from agents.evaluation.batch import TESTED
 from agents.evaluation.metrics import information
 from agents.evaluation.rollout import roll_out
-from agents.studies import pendulum, robustness
+from agents.policies import make_policy
+from agents.studies import baselines, pendulum, robustness
 
 
 def test_the_pendulum_is_the_published_one_and_its_posterior_exact():
@@ -63,3 +64,11 @@ def test_cases_that_are_none_are_refused(cases):
         robustness.Config(cases=cases)
     with pytest.raises(ValueError, match=r"versions must be of \[0, 1\], but are \[2\]"):
         robustness.Config(versions=(2,))
+
+
+def test_an_algorithm_as_it_comes_is_trained_and_saved(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    baselines.main(baselines.Config("ppo", steps=100))
+    policy = make_policy("runs/sb3-ppo-short-v0-0")
+    assert policy.card["steps"] == 2048  # a roll-out of PPO as it comes
+    assert policy.predict(np.zeros((50, 22)), deterministic=True)[0].shape == (50, 1)

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
@@ -114,3 +115,16 @@ def test_no_card_that_ships_tells_of_a_machine(tmp_path, runs):
     found = card_of(run)
     assert found["config"]["output"] == "mine"
     assert found["command"] == ["train.py", "--output", "mine", "--seed", "1"]
+
+
+@pytest.mark.parametrize("name", policies.trained_policies())
+def test_a_policy_that_ships_does_what_its_card_says(name):
+    card = make_policy(name).card
+    (evaluation,) = evaluate([name], card["config"]["env"], systems=16)
+    # Of several training seeds the card tells all, and which of them ships.
+    place = card["seeds"].index(card["shipped"]["seed"])
+    for metric, slack in (("information_gain", 0.05), ("coverage", 0.02)):
+        values = evaluation.metrics[metric]
+        told = card["scores"][metric]
+        expected = told["seeds"][place] if "seeds" in told else told["mean"]
+        assert abs(values.mean() - expected) < 4 * values.std() / np.sqrt(16) + slack

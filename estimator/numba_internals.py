@@ -1,0 +1,23 @@
+"""What this project uses of Numba's insides, which may change with any version: the versions that it works with.
+
+Raises:
+    ImportError: at import, with another version of Numba.
+"""
+
+import numba
+
+if not (0, 60) <= tuple(map(int, numba.__version__.split(".")[:2])) < (0, 69):
+    raise ImportError(
+        f"numba must be at least 0.60 and below 0.69, whose insides duffing-env uses, but is {numba.__version__}; "
+        "get one with: pip install 'numba>=0.60,<0.69'",
+        name="numba",
+    )
+
+from numba.core import cgutils, event
+from numba.core.caching import _Cache
+from numba.core.compiler import CompileResult
+from numba.core.extending import _Intrinsic
+from numba.core.runtime import rtsys
+from numba.core.serialize import dumps
+
+__all__ = ["CompileResult", "_Cache", "_Intrinsic", "cgutils", "dumps", "event", "rtsys"]

@@ -1,0 +1,245 @@
+"""One model and one environment of every sort. A kernel takes seconds to compile: tests use those of these.
+
+Every environment of the list is another combination of what is compiled in (`duffing_env.layout.Kind`), but for the
+last ones, which share the first's and differ in what a kernel is told. Episodes are short, so that random actions
+end some at the limit and some at the horizon.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from reference.plants import DRAG
+
+from duffing_env.continuous import ContinuousEnv
+from duffing_env.env import DuffingEnv
+from duffing_env.model_env import ModelEnv, ModelVectorEnv
+from duffing_env.replay import SilverboxReplayEnv
+from duffing_env.rig_env import RigEnv, RigVectorEnv
+from duffing_env.vector_env import ContinuousVectorEnv, DuffingVectorEnv, SilverboxReplayVectorEnv
+from estimator import Channel, Rig
+from estimator.models.difference import difference
+from estimator.models.duffing import duffing
+from estimator.models.pendulum import PENDULUM
+from estimator.parameters import SAMPLING_STEP
+from estimator.priors import silverbox_prior
+
+# --- Models --------------------------------------------------------------------------------------------------------
+
+#: A model of one's own: a bend, and two sensors.
+SEEN_TWICE = replace(DRAG, name="drag_seen_twice", outputs={"y": "x", "speed": "v"})
+
+#: In newtons and metres.
+RIG = Rig(
+    1e-3, input=Channel("N", limit=6, noise=0.02), output=Channel("m", range=0.03, noise=5e-6),
+    guess={"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)},
+)  # fmt: skip
+#: In volts, as the tracks are, so that the same numbers go into the same estimator.
+VOLTS = Rig(SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
+
+MODELS = {
+    "difference": difference(),
+    "linear difference": difference("linear"),
+    "cubic difference": difference("cubic"),
+    "duffing": duffing(),
+    "rig": RIG.model,
+    "pendulum": PENDULUM,
+    "own": SEEN_TWICE,
+}
+
+# --- Plants --------------------------------------------------------------------------------------------------------
+
+
+class Difference:
+    """Eq. (2) without noise, for `VOLTS`; takes down what was asked of it."""
+
+    def __init__(self):
+        self.inputs, self.resets = [], 0
+
+    def reset(self):
+        self.x = self.last = 0.0
+        self.resets += 1
+
+    def step(self, u):
+        self.inputs.append(u)
+        self.x, self.last = 1.5 * self.x - 1.4 * self.x**3 - 0.95 * self.last + 0.4 * u, self.x
+        return self.x
+
+
+class Bench:
+    """Eq. (1) without noise in newtons and metres, for `RIG`, by the midpoint rule; takes down what it got and gave."""
+
+    truth = {"m": 0.42, "c": 0.5, "a": 2400.0, "b": 4e7}  # noqa: RUF012
+
+    def reset(self):
+        self.x = self.v = 0.0
+        self.inputs, self.outputs = [], []
+
+    def step(self, u):
+        m, c, a, b = self.truth.values()
+        self.inputs.append(u)
+        for _ in range(20):
+            x, v = self.x + 2.5e-5 * self.v, self.v + 2.5e-5 * (u - c * self.v - a * self.x - b * self.x**3) / m
+            self.x, self.v = self.x + 5e-5 * v, self.v + 5e-5 * (u - c * v - a * x - b * x**3) / m
+        self.outputs.append(self.x)
+        return self.x
+
+
+def around(plant, factorisation="structured", **options):
+    """`VOLTS` around a plant, with the estimator of Amplitude-v0."""
+    usual = {"prior": silverbox_prior().factorised(factorisation), "noise_hypotheses": 1, "reward": "free_energy"}
+    usual |= {"max_input": 0.15, "max_output": 0.6, "factorisation": factorisation}
+    return RigEnv(rig=VOLTS, plant=plant, **usual | options)
+
+
+def around_difference(**options):
+    """`around` a new `Difference`."""
+    return around(Difference(), **options)
+
+
+def around_bench(**options):
+    """`RIG` around a new `Bench`."""
+    return RigEnv(rig=RIG, plant=Bench(), **options)
+
+
+# --- The record ----------------------------------------------------------------------------------------------------
+
+
+def on_the_record(envs, actions):
+    """The recorded inputs in parts of the largest, whatever the actions: but off the record for those beyond 1."""
+    played = np.minimum(envs._batch.quantity("ELAPSED").astype(int), envs.horizon - 1)
+    recorded = envs.recorded_input[played] / envs.max_input
+    return (recorded + np.where(np.abs(np.ravel(actions)) > 1, 0.1, 0.0)).astype(np.float32)
+
+
+class OnTheRecord(SilverboxReplayEnv):
+    """Stays on the record, for whoever acts at random."""
+
+    def step(self, action):
+        return super().step(on_the_record(self, action))
+
+
+class OnTheRecordVector(SilverboxReplayVectorEnv):
+    """Many of them."""
+
+    single = OnTheRecord
+
+    def step(self, actions):
+        return super().step(on_the_record(self, actions)[:, None])
+
+
+# --- Observations and rewards of one's own -------------------------------------------------------------------------
+
+
+def means(beliefs):
+    """An observation: what is believed of the coefficients, and the logarithms of their standard deviations."""
+    stds = np.sqrt(np.diagonal(beliefs.coefficients_cov, axis1=1, axis2=2))
+    return np.concatenate([beliefs.coefficients_mean, np.log(stds)], axis=1)
+
+
+def all_that_is_given(before, after, u, y, truth):
+    """A reward that uses all its arguments."""
+    return after.mean[:, 0] + before.noises[:, 0] + u + y + truth.m + truth["b"]
+
+
+# --- Environments --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Environment:
+    """How an environment is made.
+
+    Attributes:
+        name: for the test's name.
+        single: makes one.
+        vector: makes some; None where there is no such.
+        options: of both.
+        sums: whether a held action gives the sum of what its samples give.
+    """
+
+    name: str
+    single: Callable[..., Any]
+    vector: Callable[..., Any] | None
+    options: dict[str, Any] = field(default_factory=dict)
+    sums: bool = True
+
+    def make(self, **options):
+        return self.single(**self.options | options)
+
+    def make_vec(self, rows, **options):
+        return self.vector(rows, **self.options | options)
+
+    @property
+    def on_record(self):
+        return self.single is OnTheRecord
+
+    @property
+    def has_plant(self):
+        return self.single in (around_difference, around_bench)
+
+
+TIGHT = {"horizon": 22, "max_output": 0.22}
+GUESSED = {"noise_hypotheses": 3, "process_noise_guess": 1.5e-3, "noise_range": 10.0}
+KNOWN = {"noise_range": 1.0, "noise_hypotheses": 1}
+
+difference_env = partial(Environment, single=DuffingEnv, vector=DuffingVectorEnv)
+continuous_env = partial(Environment, single=ContinuousEnv, vector=ContinuousVectorEnv)
+replay_env = partial(Environment, single=OnTheRecord, vector=OnTheRecordVector, sums=False)
+
+#: Another kernel each.
+COMPILED = [
+    difference_env("difference", options=TIGHT),
+    difference_env(
+        "fisher", options={"reward": "fisher", "max_output": 1e300, "spread": 0.9, "horizon": 60,
+                           "terminated_return": -5.0},
+    ),
+    difference_env(
+        "expected free energy",
+        options=TIGHT | {"reward": "expected_free_energy", "noise_range": 10.0, "terminal": True},
+    ),
+    difference_env("simulation error", options=TIGHT | {"reward": "simulation_error", "jump": 0.3, "drift": 0.01}),
+    difference_env("hypotheses", options=TIGHT | GUESSED | {"reward": "free_energy"}),
+    difference_env("mean field", options=TIGHT | {"reward": "free_energy", "factorisation": "mean_field"}),
+    continuous_env("continuous", options=TIGHT | KNOWN | {"reward": "expected_free_energy"}),
+    continuous_env(
+        "continuous hypotheses", options=TIGHT | {"noise_hypotheses": 3, "reward": "parameter_error", "max_slew": 0.1},
+    ),
+    continuous_env("nlarx", options=TIGHT | KNOWN | {"estimator": "nlarx", "iterations": 1, "reward": "log_posterior"}),
+    replay_env("replay", options={"reward": "free_energy", "max_output": 0.6}),
+    replay_env(
+        "linear mean field replay",
+        options={"reward": "free_energy", "factorisation": "mean_field", "nonlinear": False},
+    ),
+    Environment("rig", RigEnv, RigVectorEnv, {"rig": RIG, "noise_hypotheses": 3, "max_output": 0.045, "horizon": 22}),
+    Environment("bench", around_bench, None, {"noise_hypotheses": 3, "max_output": 0.045, "horizon": 22}),
+    Environment("plant", around_difference, None, {"max_output": 0.2, "horizon": 22}),
+    Environment("own model", ModelEnv, ModelVectorEnv, {
+        "system": SEEN_TWICE, "mean": {"stiffness": 0.3, "drag": 0.1, "gain": 0.3}, "spread": 0.2,
+        "process_noise": 1e-6, "measurement_noise": 1e-4, "sensor_noise": (3e-4,), "max_input": 0.5,
+        "max_output": 0.7, "horizon": 22,
+    }),
+]  # fmt: skip
+
+#: What the first's kernel is told.
+ENVIRONMENTS = [
+    *COMPILED,
+    difference_env(
+        "limits", options=TIGHT | {"max_rms": 0.06, "max_slew": 0.04, "input_cost": 0.3, "reward": "log_posterior",
+                                   "max_output": 0.14},
+    ),
+    difference_env("history", options=TIGHT | {"observation": "history", "history": 3}, sums=False),
+    difference_env("privileged", options=TIGHT | {"observation": "privileged", "reward": "parameter_error"}),
+    difference_env("own functions", options=TIGHT | {"observation": means, "reward": all_that_is_given}, sums=False),
+]  # fmt: skip
+
+
+def each(chosen=lambda environment: True, of=ENVIRONMENTS):
+    """Parameters of a test: the environments that are chosen."""
+    return [pytest.param(environment, id=environment.name) for environment in of if chosen(environment)]
+
+
+#: Those that can be many at once.
+VECTORS = each(lambda environment: environment.vector is not None)
