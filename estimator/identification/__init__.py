@@ -42,6 +42,8 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
             act. An output that is NaN is missing; a record is cut where an input is.
         progress: tell on stderr how far it is, where it takes more than 5 seconds.
 
+    Where no input varies, or a file has none, the oscillator decays freely: c/m, a/m and b/m are then what is told.
+
     Returns:
         Parameters with intervals, warnings of the checks, forecasts, and the belief to go on with.
 
@@ -69,6 +71,8 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     """
     rig = Rig.of(rig)
     read = records_of(records, rig)
+    is_free = not any(one.u.any() for one in read)
+    rig = replace(rig, guess=None) if is_free else rig
     with shown("Identifying") if progress else nullcontext(untold) as tell:
         scales = _scales(rig, read)
         u = tuple(one.u / scales.input for one in read)
@@ -78,21 +82,27 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         found = search(Problem(rig, scales, u, tuple(one - origin for one in y), origin, times=times), tell)
         problem = found.fitter.problem
         # Forecasts, and checks that compare the equation with others, are of the most probable place of a ridge.
-        along = spread(found, JUDGED)
+        along = found if is_free else spread(found, JUDGED)
         belief, noises = posterior(problem, along)
         tell(0.9, "checking the result")
         forecasts = foreseen(found, belief)
         parameters = deviations_of(belief, along.ridges)
         warnings = examine(problem, found, along.ridges, belief, parameters, noises["input"], read, forecasts)
     history = partial(contraction, problem, along, parameters)
-    return Result(rig, belief, warnings, tuple(read), forecasts, noises, history, along.ridges)
+    foresee = partial(foreseen, found, belief)
+    return Result(rig, belief, warnings, tuple(read), forecasts, noises, history, foresee, along.ridges)
 
 
 def _scales(rig: Rig, records: list[Record]) -> Scales:
     """The rig's, and the records' largest where the rig has none."""
     largest = max(float(np.abs(one.u).max()) for one in records)
+    is_free = largest == 0.0
+    largest = largest or 1.0
     widest = max(float(np.nanmax(np.abs(one.y))) for one in records)
     scales = rig.scales
+    if is_free:  # of these scales a mass of 1 has the gain 1
+        scales = replace(scales, output=scales.output if rig.output.range else widest)
+        return replace(scales, input=scales.displacement / rig.step**2)
     return replace(
         scales, input=scales.input if rig.input.limit else largest, output=scales.output if rig.output.range else widest
     )

@@ -54,16 +54,21 @@ def of_input(problem: Problem, found: Found) -> list[Finding]:
         if (path, later) != (rig.interpolation, 0)
     ]
     others += [replace(best, delay=rig.delay + later) for later in _LATE]
-    if rig.interpolation in PARTS:
+    # An accelerometer shows a held input itself: that it is sampled after this switches looks like a part of a sample.
+    in_parts = rig.interpolation in PARTS and (rig.output.kind != "acceleration" or _is_smooth(problem))
+    if in_parts:
         others += [replace(best, interpolation=path, delay=rig.delay + part) for path in paths for part in _HALF]
+    if rig.interpolation in PARTS:
         smooth = rig.interpolation != "spline" and not best.lag and _is_smooth(problem)
         others += [replace(best, interpolation="spline")] if smooth else []
-        others += [replace(best, lag=lag) for lag in _LAG] if rig.interpolation in PARTS[:2] else []
     tried = _tried(problem, found, others, own)
+    if (tried is None or tried[1] <= EVIDENCE) and rig.interpolation in PARTS[:2]:
+        tried = _tried(problem, found, [replace(best, lag=best.lag + lag) for lag in _LAG], own)
     if tried is None or tried[1] <= EVIDENCE:
         return []
     better, gain = tried
-    if rig.interpolation in PARTS:
+    # Beside many samples parts of one are no matter, and what lags is not late by more than one.
+    if in_parts and abs(better.delay - rig.delay) <= 1:
         better, gain = _refined(problem, found, better, gain, own)
     return [_finding(problem, better, gain)]
 

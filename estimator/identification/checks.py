@@ -89,6 +89,13 @@ def examine(
         records: as they were read.
         forecasts: of their outputs.
     """
+    if problem.is_free:  # nothing is known of an input, and m is 1
+        return (
+            *_of_records(problem, records),
+            *_of_terms(problem, found),
+            *_of_parameters(problem, found, None, parameters),
+            *_of_residuals(problem, records, forecasts),
+        )
     guess, of_records, noisy = problem.rig.guess, _of_records(problem, records), _error(records, forecasts) > _FINEST
     ways = of_input(problem, found) if noisy else []
     if not ways and (found.is_lost or _of_noise(problem, disturbance)):

@@ -198,6 +198,11 @@ class Problem:
         return record, int(powers[record].argmax())
 
     @cached_property
+    def is_free(self) -> bool:
+        """Whether no input acts: then m is no matter of the records, and counts as 1 in the unit of the scales."""
+        return not any(u.any() for u in self.u)
+
+    @cached_property
     def size(self) -> float:
         """Root mean square of the outputs about their mean."""
         seen = np.concatenate([y[np.isfinite(y)] for y in self.y])
@@ -241,7 +246,12 @@ class Problem:
     def natural(self) -> dict[str, float]:
         """Sizes of the coefficients at which each term is as large as the others."""
         w, x = self.frequency, self.displacement
-        sizes = {"stiffness": w**2, "cubic": w**2 / x**2, "damping": w, "gain": w**2 * x / self.strength}
+        sizes = {
+            "stiffness": w**2,
+            "cubic": w**2 / x**2,
+            "damping": w,
+            "gain": 1.0 if self.is_free else w**2 * x / self.strength,
+        }
         sizes |= {"force": w**2 * x, "output_offset": self.size}
         return sizes | {"cubic_damping": w / (w * x) ** 2, "quintic": w**2 / x**4, "friction": w**2 * x}
 

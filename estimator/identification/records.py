@@ -101,6 +101,8 @@ class Record:
 def records_of(given: Any, rig: Rig) -> list[Record]:
     """Records from a pair (u, y), a file name, or a list of these.
 
+    Where no input varies the records are of a free decay, and inputs are 0.
+
     A record is cut in two where an input is missing; clipped outputs are taken as missing. Pieces of fewer than 8
     outputs are left out, but not a whole record. A record may not be given twice, also with other outputs missing, nor
     may records or the pieces of one share samples (`estimator.identification.shared.shared`): these would count twice.
@@ -167,9 +169,10 @@ def records_of(given: Any, rig: Rig) -> list[Record]:
             f"{found[twice.later].name} must have samples of its own, but from its sample {twice.begin_later} on has "
             f"those of {found[twice.earlier].name} from sample {twice.begin_earlier} on; leave them out of one"
         )
-    for part in "uy":
-        if all(np.ptp(values) == 0 for one in found if len(values := _seen(getattr(one, part)))):
-            raise ValueError(f"{part} must vary, but is constant in all records; excite the system")
+    if all(np.ptp(values) == 0 for one in found if len(values := _seen(one.y))):
+        raise ValueError("y must vary, but is constant in all records; excite the system")
+    if all(np.ptp(one.u) == 0 for one in found):  # a constant force is one of the offsets
+        return [replace(one, u=np.zeros(len(one.u))) for one in found]
     return found
 
 

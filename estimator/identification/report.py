@@ -27,6 +27,9 @@ _SHOWN, _GIVEN = 1500, 20
 
 _MEANINGS = {
     "m": "mass",
+    "c/m": "damping by mass",
+    "a/m": "linear stiffness by mass",
+    "b/m": "cubic stiffness by mass",
     "c": "damping",
     "a": "linear stiffness",
     "b": "cubic stiffness",
@@ -49,14 +52,20 @@ _RESIDUALS = (
 )
 
 
+def _shown(result: Result) -> dict[str, str]:
+    """The parameters that figures show, and their colors."""
+    names = (name for name in result.parameters if name.endswith("/m") or name in "mcab")
+    return dict(zip(names, ("#222", "#06c", "#c40", "#084"), strict=False))
+
+
 def write(result: Result, path: Path, commands: Sequence[str] = ()) -> Path:
     """Write the page; see `Result.report`."""
     parts = ["<h1>Identification</h1>", _checks(result), _parameters(result)]
     parts.append(f"<h2>What each sample told</h2><figure>{svg(_draw_contraction(result))}<figcaption>{_CONTRACTION}")
     parts.append("</figcaption></figure>")
-    for record, forecast in zip(result.records, result.forecasts, strict=True):
+    for record, forecast, run in zip(result.records, result.forecasts, result.foresee(_GIVEN), strict=True):
         parts.append(f"<h2>{escape(record.name)}</h2>{_about(result, record)}")
-        drawn = (_draw_fit(result, record, forecast), _FIT), (_draw_residuals(record, forecast), _RESIDUALS)
+        drawn = (_draw_fit(result, record, forecast, run), _FIT), (_draw_residuals(record, forecast), _RESIDUALS)
         for figure, caption in drawn:
             parts.append(f"<figure>{svg(figure)}<figcaption>{caption}</figcaption></figure>")
     if commands:
@@ -123,8 +132,8 @@ def _draw_contraction(result: Result) -> Figure:
     """Half widths of the intervals of m, c, a and b against the number of outputs."""
     figure, ((axis,),) = _figure(1, 1, 3.2)
     counts = [count for count, _ in result.history]
-    for name, color in zip("mcab", ("#222", "#06c", "#c40", "#084"), strict=True):
-        stds = np.array([told[name][1] for _, told in result.history])
+    for name, color in _shown(result).items():
+        stds = np.array([told[name.partition("/")[0]][1] for _, told in result.history])
         axis.plot(counts, 164.5 * stds / abs(result.parameters[name][0]), color=color, marker=".", label=name)
     axis.set_xscale("log", base=2)
     axis.set_yscale("log")
@@ -137,15 +146,12 @@ def _draw_contraction(result: Result) -> Figure:
     return figure
 
 
-def _draw_fit(result: Result, record: Record, forecast: FloatArray) -> Figure:
+def _draw_fit(result: Result, record: Record, forecast: FloatArray, run: FloatArray) -> Figure:
     """Input; measured, forecast and free run; and the errors of both, over the first samples."""
     figure, axes = _figure(4, 1, 8.5, sharex=True)
     count = min(len(record.u), _SHOWN)
-    seconds, measured = np.arange(count) * result.rig.step, record.y[:count]
-    output, given = result.rig.output, record.y[:_GIVEN]
-    run = np.full(count, np.nan)
-    if np.isfinite(given).all() and len(given) == _GIVEN:
-        run = result.simulate(record.u[:count], given)
+    seconds, measured, run = record.counted(result.rig.step)[:count] * result.rig.step, record.y[:count], run[:count, 0]
+    output = result.rig.output
     driven, shown, far, near = axes[:, 0]
     driven.step(seconds, record.u[:count], where="post", color="#555", linewidth=0.8)
     driven.set_ylabel(plain(f"input [{result.rig.input.unit}]"))

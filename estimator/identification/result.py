@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy.typing as npt
 
@@ -37,6 +38,12 @@ class Finding:
         return f"{self.name}: {self.message}"
 
 
+_T = TypeVar("_T")
+
+#: What a free decay tells: its name, the parameter that it is where m is 1, and powers of displacement and second.
+RATIOS = {"c/m": ("c", (0, 0, -1)), "a/m": ("a", (0, 0, -2)), "b/m": ("b", (0, -2, -2)), "y0": ("y0", (0, 1, 0))}
+
+
 def deviations_of(belief: Belief, ridges: Ridges | None) -> dict[str, tuple[float, float]]:
     """Parameter to mean and standard deviation of a belief, with the spreads along ridges where there are any."""
     spreads = {} if ridges is None else ridges.spreads()
@@ -56,6 +63,7 @@ class Result:
         noises: name to mean and standard deviation: of ``input``, the disturbance of the force as a standard deviation
             per sample, and of ``output``, the sensor's.
         contraction: makes `history`, which takes some fits.
+        foresee: makes forecasts in which the filter is shown so many outputs of each record alone.
         ridges: along which the posterior lies where it is no Gaussian; intervals are then taken along them.
     """
 
@@ -66,12 +74,25 @@ class Result:
     forecasts: tuple[FloatArray, ...]
     noises: Mapping[str, tuple[float, float]]
     contraction: Callable[[], History]
+    foresee: Callable[[int], tuple[FloatArray, ...]]
     ridges: Ridges | None = None
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Parameter to mean and standard deviation, in the rig's units: m, c, a, b and the offsets u0 and y0."""
-        return deviations_of(self.belief, self.ridges)
+        """Parameter to mean and standard deviation, in the rig's units: m, c, a, b and the offsets u0 and y0.
+
+        Of a free decay (`is_free`): c/m, a/m, b/m and y0.
+        """
+        return self._told(deviations_of(self.belief, self.ridges))
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the records are of a free decay, without an input."""
+        return not any(one.u.any() for one in self.records)
+
+    def _told(self, of_all: dict[str, _T]) -> dict[str, _T]:
+        """What the records tell of what is given for all parameters."""
+        return {name: of_all[own] for name, (own, _) in RATIOS.items()} if self.is_free else of_all
 
     @property
     def open(self) -> tuple[str, ...]:
@@ -81,6 +102,8 @@ class Result:
     @property
     def units(self) -> dict[str, str]:
         """Parameter to its unit."""
+        if self.is_free:
+            return {name: self.belief.scales.unit(dimension) for name, (_, dimension) in RATIOS.items()}
         return {name: unit for name, (_, _, unit) in self.belief.parameters().items()}
 
     def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
@@ -90,7 +113,7 @@ class Result:
             ValueError: for a probability that is not between 0 and 1.
         """
         gaussian = self.belief.interval(probability)
-        return gaussian if self.ridges is None else gaussian | self.ridges.interval(probability)
+        return self._told(gaussian if self.ridges is None else gaussian | self.ridges.interval(probability))
 
     @cached_property
     def history(self) -> History:
@@ -102,7 +125,13 @@ class Result:
 
     @property
     def estimator(self) -> OnlineEstimator:
-        """A new estimator that begins with what is believed now, for further records."""
+        """A new estimator that begins with what is believed now, for further records.
+
+        Raises:
+            ValueError: after a free decay, which does not tell m.
+        """
+        if self.is_free:
+            raise ValueError("records must have an input for an estimator to go on, but are of a free decay; drive it")
         return OnlineEstimator(self.belief.model, self.belief, self.rig)
 
     def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:

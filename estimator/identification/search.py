@@ -19,6 +19,9 @@ from estimator.physical import coefficients_of
 from estimator.progress import Tell
 from estimator.rig_prior import rig_prior
 
+#: Standard deviation of the gain where no input tells it, and it is 1 by the scales.
+_KNOWN = 1e-6
+
 #: Without a guess a coefficient is believed to be about 0, within so many of its natural sizes.
 _WIDE = 30.0
 
@@ -135,8 +138,11 @@ def prior_of(problem: Problem) -> Prior:
     """What the rig's guess says of the coefficients; next to nothing where there is none."""
     if problem.rig.guess is None:
         natural = problem.natural()
-        stds = np.array([_WIDE * natural[name] for name in problem.model.coefficients])
-        return Prior(np.zeros(len(stds)), np.diag(stds**-2))
+        names = list(problem.model.coefficients)
+        means, stds = np.zeros(len(names)), np.array([_WIDE * natural[name] for name in names])
+        if problem.is_free:
+            means[names.index("gain")], stds[names.index("gain")] = 1.0, _KNOWN
+        return Prior(means, np.diag(stds**-2))
     guess = rig_prior(problem.rig, problem.scales)
     return Prior.of(*problem.inward(guess.coefficients_mean, guess.coefficients_cov))
 
@@ -162,7 +168,7 @@ def search(problem: Problem, tell: Tell) -> Found:
         )
     tell(0.3, "fitting coefficients and noises")
     found = _settled(fitter, looked)
-    if problem.rig.guess is None and found.disturbance > _POOR:
+    if problem.rig.guess is None and not problem.is_free and found.disturbance > _POOR:
         tell(0.6, "looking for another start")
         found = _settled_again(fitter, found)
     return found

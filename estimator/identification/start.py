@@ -70,6 +70,7 @@ def starts(problem: Problem) -> list[FloatArray]:
         unit = equations / scale
         solution = np.linalg.lstsq(unit[:, 1:], unit[:, 0], rcond=1e-8)[0] * scale[0] / scale[1:]
         gain, damping, stiffness, cubic, force, square = solution
+        gain = 1.0 if problem.is_free else gain
         values = dict.fromkeys(names, 0.0) | {"gain": gain, "damping": damping, "cubic": cubic, "force": force}
         # An integrated signal may be displaced: stiffness x + square x² + cubic x³ is a cubic about another middle.
         middle = square / (3 * cubic) if abs(cubic) > 0 else 0.0
@@ -94,7 +95,7 @@ def scattered(problem: Problem, count: int, seed: int) -> list[FloatArray]:
         sizes["stiffness"] *= rng.choice([-1.0, 1.0])
         if sizes["stiffness"] > 0:
             sizes["cubic"] *= rng.choice([-1.0, 1.0])
-        sizes["gain"] *= rng.choice([-1.0, 1.0])
+        sizes["gain"] = 1.0 if problem.is_free else sizes["gain"] * rng.choice([-1.0, 1.0])
         values = dict.fromkeys(names, 0.0) | sizes
         values |= {"force": offset * values["stiffness"], "output_offset": offset}
         found.append(np.array([values[name] for name in names]))
