@@ -51,6 +51,8 @@ def from_record(path: Path, step: float | None = None, source: str | None = None
             f"{path} must have a column of times, such as 'time [s]', but has {list(table.names)}; rename one, or add "
             f"--step SECONDS"
         )
+    if step is not None and own is not None and abs(own / step - 1) > 0.01:
+        raise ValueError(f"{path}: times are {own:.6g} s apart, but the step is {step:.6g} s; mend one of them")
     if step is None:
         # Times are written with some digits, and their mean difference is off by the last of them.
         step = float(f"{own:.6g}")

@@ -15,7 +15,7 @@ KINDS = {
     "acceleration": ("acceleration", "acc", "a"),
 }
 _OUTPUTS = ("y", "output", "out", "response", "x", *(word for words in KINDS.values() for word in words))
-_TIMES = ("t", "time", "timestamp", "datetime", "clock", "zeit", "seconds", "sec", "msec")
+_TIMES = ("t", "time", "timestamp", "datetime", "zeit", "seconds", "sec", "msec")
 
 #: What a time column may be in [s].
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
