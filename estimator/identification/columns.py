@@ -61,7 +61,7 @@ def unit_of(name: str) -> str | None:
 def is_unit(word: str) -> bool:
     """Whether a word, which may stand in brackets, is a unit, or stands for none."""
     bare = re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", word.strip())
-    return bare != word.strip() or bare in _NONE or bare in SECONDS or bool(_UNITS.fullmatch(bare))
+    return bare != word.strip() or bare.lower() in (*_NONE, "none") or bare in SECONDS or bool(_UNITS.fullmatch(bare))
 
 
 def time_unit(path: Path, name: str) -> float:
@@ -100,9 +100,9 @@ def with_unit(path: Path, name: str, unit: str) -> str:
         ValueError: where the name has another.
     """
     told, below = unit_of(name), re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", unit.strip())
-    if told and below not in _NONE and plain(told) != plain(below):
+    if told and below.lower() not in (*_NONE, "none") and plain(told) != plain(below):
         raise ValueError(f"{path}: {name!r:.60} must have one unit, but {below!r:.40} stands below; mend one")
-    return name if told or below in _NONE else f"{name} [{below}]"
+    return name if told or below.lower() in (*_NONE, "none") else f"{name} [{below}]"
 
 
 def chosen(

@@ -254,9 +254,8 @@ def _first_row(fields: Sequence[Sequence[str]], separator: str | None) -> int | 
     """Where the numbers begin: the first of some lines in a row that hold numbers, in as many columns."""
     for k, words in enumerate(fields):
         following = [one for one in fields[k : k + 2 * _SHOWN] if any(word.strip() for word in one)][:_SHOWN]
-        if _is_row(words, separator) and all(
-            len(one) == len(words) and _is_row(one, separator) for one in following[: max(1, len(following))]
-        ):
+        alike = all(len(one) == len(words) and _is_row(one, separator) for one in following)
+        if len(following) > 1 and _is_row(words, separator) and alike:
             return k
     # A file of few lines, or with a bad one among the first.
     return next((k for k, words in enumerate(fields) if _is_row(words, separator)), None)

@@ -59,7 +59,7 @@ def test_files(tmp_path):
     whole = bytearray((tmp_path / "r.mat").read_bytes())
     whole[176] ^= 1  # an unknown kind of number, of which SciPy's reader dies
     (tmp_path / "r.mat").write_bytes(whole)
-    with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file .*, but is not: the reader died"):
+    with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file, but is not: the reader died"):
         records_of(tmp_path / "r.mat", Rig(0.01))
     (tmp_path / "r.mat").write_bytes(b"none")
     with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file"):
@@ -300,7 +300,7 @@ def test_an_absurd_number_is_refused_by_record_and_sample(tmp_path):
 
 def written(u, y, kind, step=0.01):
     """A record as an instrument writes it, and the rig whose step it has."""
-    rows = list(zip(step * np.arange(len(u)), u, y, strict=True))
+    rows = list(zip((step * np.arange(len(u))).tolist(), u.tolist(), y.tolist(), strict=True))
     match kind:
         case "scope":
             head = "Model,SCOPE\nHorizontal Units,s\nSample Interval,0.01\n\nTIME,CH1,CH2\n"
@@ -353,7 +353,7 @@ def test_a_record_of_another_rate_is_identified_with_the_rest():
 
 def test_lost_lines_and_values_over_range_are_missing(tmp_path):
     u, y = simulated(SOFT, samples=400)
-    lines = [f"{0.01 * k:.2f},{a!r},{b!r}" for k, (a, b) in enumerate(zip(u, y, strict=True))]
+    lines = [f"{0.01 * k:.2f},{a!r},{b!r}" for k, (a, b) in enumerate(zip(u.tolist(), y.tolist(), strict=True))]
     lines[50] = "0.50,1.0,∞"
     del lines[200:203]
     (tmp_path / "r.csv").write_text("\n".join(["time [s],force [N],displacement [m]", *lines]), encoding="utf-8")
