@@ -60,7 +60,7 @@ def table(
 
     Args:
         titles: of the columns.
-        rows: their cells.
+        rows: their cells; a shorter row ends with empty ones.
         markdown: whether the manual is to take the table as it is.
         title: above the table.
         labels: columns that say what a row is, and stand in each of several tables.
@@ -68,7 +68,7 @@ def table(
     from rich.box import MARKDOWN, SIMPLE_HEAD
     from rich.table import Table
 
-    cells = [[printable(cell, "\n") for cell in row] for row in rows]
+    cells = [[printable(cell, "\n") for cell in row] + [""] * (len(titles) - len(row)) for row in rows]
 
     def made(places: Sequence[int]) -> Any:
         found = Table(

@@ -193,7 +193,7 @@ def test_missing_peers_are_rows_that_say_so(
     monkeypatch.setattr(silverbox, "REPETITIONS", 1)
     monkeypatch.setattr("benchmarks.timing.LONG_ENOUGH", 0.0)
     found = silverbox.compare(sections, outcomes)
-    printed = capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
     for title in (*PEERS, OFFLINE):
         package = title.split()[0].replace("dynamax", "jax")  # its row imports jax first
         reason = f"ModuleNotFoundError: No module named '{package}"
