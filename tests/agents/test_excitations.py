@@ -338,5 +338,5 @@ def test_export_refuses_and_writes_nothing(tmp_path, name, options, message):
 def test_export_from_the_command_line(tmp_path, capsys):
     path = tmp_path / "prbs.csv"
     main(["export", "prbs-4", "--samples", "32", "--output", str(path)])
-    assert "32 samples" in capsys.readouterr().out
+    assert "32 samples" in " ".join(capsys.readouterr().out.split())
     np.testing.assert_array_equal(np.loadtxt(path, delimiter=",", skiprows=1)[:, 1], draw_signal("prbs-4", samples=32))
