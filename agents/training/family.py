@@ -15,8 +15,8 @@ from agents.cli import RIG_TRACK
 #: What is trained on it, in the place of a track.
 FAMILY = "family"
 
-#: Scale of the rewards, to returns of about 1: a critic that errs by more takes all of the clipped gradient.
-SCALE = 0.3
+#: Samples that show how features vary: about the middle of `SAMPLES`, on a logarithmic scale.
+TYPICAL = 256
 
 #: Kinds of stiffness, and how often each is drawn.
 KINDS = {"hardening": 0.5, "softening": 0.25, "double-well": 0.25}
