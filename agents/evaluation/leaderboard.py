@@ -85,6 +85,7 @@ HEADLINE = {
     "efficiency": "D-efficiency / %",
     "coverage": "intervals cover / %",
     "ended_early": "ended early / %",
+    "decision_time": "decision / µs",
 }
 _WITH_SPREAD = ("information_gain", "efficiency")
 

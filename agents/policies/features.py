@@ -42,8 +42,8 @@ FIRST_INPUTS = ("up", "none", "down")
 #: it shows at rest and braking; ``reach``: the highest while braking, with its margin; ``taught``: what two samples at
 #: rest teach, and ``braked`` what braking does.
 NAMES = (
-    "log_std_mean", "log_std_max", "log_gamma", "log_xi", "time_left", "thrift", "last_input", "last_output",
-    "now", "velocity", "log_deviation", "lowest", "highest",
+    "log_std_mean", "log_std_max", "log_gamma", "log_xi", "time_left", "thrift", "reserve", "push",
+    "last_input", "last_output", "now", "velocity", "log_deviation", "lowest", "highest",
     *(f"{what}_{first}" for what in ("next", "rest", "peak", "reach", "taught", "braked") for first in FIRST_INPUTS),
     "free_2", "free_3", "free_4", "to_come", "still_open",
 )  # fmt: skip
@@ -58,7 +58,7 @@ _MOVES = 5
 MARGIN = 8.0
 
 #: Where the energy is limited a push has at most so many times the size that what is left would last for to the end.
-HASTE = 3.0
+HASTE = 4.0
 
 #: By how much covariances of float32 correlations are made positive definite.
 _RIDGE = 1e-6
@@ -84,6 +84,7 @@ class Setting(NamedTuple):
             what it does in a sample.
         pace: samples of a move.
         margin: predictive standard deviations that the shield keeps from the limit.
+        haste: where the energy is limited, a push has at most so many times the size that what is left would last for.
     """
 
     center: FloatArray
@@ -100,6 +101,7 @@ class Setting(NamedTuple):
     shaken: float
     pace: float
     margin: float
+    haste: float
 
 
 class Features(NamedTuple):
@@ -275,12 +277,13 @@ def compiled(view: View) -> Any:
             sign = -1.0
             turn(start)
         left = max(1.0, o[at.time_left] * s.samples)
-        share, thrift, push = left, 1.0, 1.0
+        share, thrift, reserve, push = left, 1.0, 1.0, 1.0
         if s.energy < np.inf:
             # What is still to come takes time and energy.
             share = 0.5 * (share + o[at.budget_left] * s.samples)
-            thrift = min(1.0, np.sqrt(max(0.0, o[at.budget_left]) * s.energy / left) / s.max_input)
-            push = min(1.0, HASTE * thrift)
+            reserve = np.sqrt(max(0.0, o[at.budget_left]) * s.energy) / s.max_input
+            thrift = min(1.0, reserve / np.sqrt(left))
+            push = min(1.0, s.haste * thrift)
         process, sensor = s.process * np.exp(-o[at.noise]), s.sensor * np.exp(-o[at.noise + 1])
         variance = process + sensor
         to_come = _foresee(C, s.rate, share / variance, unknown, scratch)
@@ -300,9 +303,10 @@ def compiled(view: View) -> Any:
             mean += o[at.log_std + a]
             widest = max(widest, o[at.log_std + a])
         f[0], f[1], f[2], f[3] = mean / k, widest, o[at.noise], o[at.noise + 1]
-        f[4], f[5], f[6], f[7] = o[at.time_left], thrift, sign * o[at.last_input], sign * o[at.last_output]
-        f[8], f[9] = start[now] / s.limit, start[velocity] * s.pace / s.limit
-        f[10], f[11], f[12] = 0.5 * np.log(variance / s.limit**2) + 7.0, span[0], span[1]
+        f[4], f[5], f[6], f[7] = o[at.time_left], thrift, reserve, push
+        f[8], f[9] = sign * o[at.last_input], sign * o[at.last_output]
+        f[10], f[11] = start[now] / s.limit, start[velocity] * s.pace / s.limit
+        f[12], f[13], f[14] = 0.5 * np.log(variance / s.limit**2) + 7.0, span[0], span[1]
         f[OTHERS] = to_come
         total = 0.0
         for a in range(k):
@@ -386,6 +390,7 @@ class FeatureMap:
             shaken=shaken_of(experiment, swing),
             pace=float(swing.pace),
             margin=MARGIN,
+            haste=HASTE,
         )
         return cls(setting, view, own=own)
 

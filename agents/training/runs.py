@@ -22,6 +22,7 @@ from agents.results import check_folder, write_json
 from agents.stopping import Stopper, telling
 from agents.training import family
 from agents.training.checkpoints import (
+    FOLDER,
     Progress,
     begin_with,
     drop_states,
@@ -42,6 +43,9 @@ LEARNING = "learning_curve.png"
 
 #: Samples that the network had learned from that a run began with (``begin``): all of them count.
 BEFORE = "steps_before"
+
+#: Folder of the policy before its first update.
+UNTRAINED = f"{FOLDER}/{0:09d}"
 
 #: Environments whose episodes under random choices show how features vary.
 EXAMPLES = 64
@@ -78,7 +82,8 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
 
     - ``config.json``: the resolved configuration, the command and the versions,
     - ``policy.safetensors``, ``policy.json``: the policy,
-    - ``checkpoints/STEPS/``: the policy on the way, after the update that these samples were for,
+    - ``checkpoints/STEPS/``: the policy on the way, after the update that these samples were for; that of 0 samples is
+      the untrained one,
     - ``progress.csv``: Stable-Baselines3's log,
     - ``evaluations.csv``, ``best/``: where ``eval_every`` is given, the policy's worth on held-out systems before the
       first update and on the way, and the policy that was best by its log posterior gain,
@@ -192,12 +197,15 @@ class _Training:
             logs.append(self._board)
         with closing(Log(self._folder, logs, self._progress.steps)) as logger:
             self._model.set_logger(logger)
+            if self._progress.steps == 0:
+                save_checkpoint(self._folder, self._model, self._card(), None)
             if self._config.eval_every > 0 and not self._held_out.has_begun:
                 self._evaluate()
             self._learn()
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
         if not all(math.isnan(mean) for *_, mean in curve):
-            save(figure_of_learning(curve, self._config.reward), self._folder / LEARNING)
+            figure = figure_of_learning(curve, self._config.reward, self._held_out.gains)
+            save(figure, self._folder / LEARNING)
         write_policy(self._folder, self._model, self._card())
         drop_states(self._folder)
         self._envs.close()
