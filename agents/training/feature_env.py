@@ -20,6 +20,12 @@ SCALE = 5.0
 _LEAST_STD = 0.05
 
 
+def has_potential(envs: Any) -> bool:
+    """Whether Ψ is what is still to come in unwrapped environments (`FeatureVecEnv`)."""
+    setup = envs.experiment.setup
+    return not setup.drifts and setup.budget == np.inf
+
+
 class Normalizer:
     """Features with mean 0 and standard deviation 1, where random choices are played; as they are before `fit`."""
 
@@ -57,7 +63,8 @@ class FeatureVecEnv(VecEnvWrapper):
     covariance of the belief's coefficients and J the information that the rest of the episode will bring at the rate
     of a swing at the limit; Ψ is 0 when the episode has ended. It is a difference of potentials, so without a discount
     no policy gains by it (Ng, Harada and Russell 1999). But without it most information is gained in the first samples
-    of an episode, whatever the input, and the rest weighs little.
+    of an episode, whatever the input, and the rest weighs little. Where the energy is limited no swing at the limit is
+    kept up, and where the belief forgets nothing is known for good: there rewards stay as they are.
 
     The end of an episode is an end, by time too: there is nothing to gain after it, and the features show it coming.
 
@@ -68,14 +75,14 @@ class FeatureVecEnv(VecEnvWrapper):
         venv: the environments, with any input between the limits as an action.
         own: whether the observation itself stands behind the features.
         levels: as of `DuffingVecEnv`.
-        in_nats: whether the reward counts information that nothing takes away again, so that Ψ is added to it.
+        in_nats: whether the reward counts information, so that Ψ is added to it.
     """
 
     def __init__(self, venv: DuffingVecEnv, *, own: bool = True, levels: int = 0, in_nats: bool = True) -> None:
         self._map = FeatureMap.of(venv.envs.unwrapped, own=own)
         self.features = self._map.describe()
         self.normalizer = Normalizer(self._map.size)
-        self._weight = np.float32(in_nats)
+        self._weight = np.float32(in_nats and has_potential(venv.envs.unwrapped))
         self._levels = np.linspace(-1.0, 1.0, levels) if levels else None
         space = gym.spaces.Box(-BOUND, BOUND, (self._map.size,), np.float32)
         super().__init__(venv, space, gym.spaces.Discrete(levels) if levels else venv.action_space)

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from agents.evaluation.batch import make
 from agents.policies.features import BOUND, FeatureMap, Features
-from agents.training.feature_env import Normalizer
+from agents.training.feature_env import Normalizer, has_potential
 from agents.vec_env import BatchVecEnv, rows_of, told_of
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.checks import shown
@@ -53,6 +53,7 @@ class _Group:
         observations, self.infos = self.envs.reset(seed=int(rng.integers(2**31)))
         self.shown: Features = self.map(observations)
         self.left = self.envs.horizon
+        self.weight = np.float32(has_potential(self.envs))
 
     def told(self, **others: Any) -> list[dict[str, Any]]:
         """The infos of its rows at the last reset or step."""
@@ -150,7 +151,7 @@ class MixedVecEnv(BatchVecEnv):
             group.shown = group.map(observations)
             group.left -= 1
             after = np.where(ended, np.float32(0), group.shown.to_come)
-            rewards[mine] = self._scale * (gained + after - before)
+            rewards[mine] = self._scale * (gained + group.weight * (after - before))
             self._returns[mine] += gained
             self._lengths[mine] += 1
             dones[mine] = ended | (group.left == 0)

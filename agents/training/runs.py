@@ -321,9 +321,8 @@ def _with_features(config: TrainConfig, rows: int, seed: int) -> tuple[Any, int]
         draw = partial(draw_options, env_id=config.env, options=config.options, ranges=config.vary)
         return MixedVecEnv(rows, seed, draw, own=own, **mixed), made.horizon
     envs = DuffingVecEnv(config.env, rows, seed=seed, **options)
-    experiment = envs.envs.unwrapped.experiment
-    in_nats = config.reward in IN_NATS and not experiment.setup.drifts
-    return FeatureVecEnv(envs, own=own, levels=levels, in_nats=in_nats), int(experiment.samples)
+    samples = int(envs.envs.unwrapped.experiment.samples)
+    return FeatureVecEnv(envs, own=own, levels=levels, in_nats=config.reward in IN_NATS), samples
 
 
 @contextmanager

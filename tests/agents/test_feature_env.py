@@ -1,5 +1,7 @@
 """Training with features: rewards, normalised features, imitation, and policies that act the same from their file."""
 
+import json
+
 import numpy as np
 import pytest
 from tables import table
@@ -17,7 +19,7 @@ from agents.vec_env import DuffingVecEnv
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 #: Too narrow for the shield to keep all within.
-NARROW = {"horizon": 24, "max_output": 0.1, "process_noise": 0.04}
+NARROW = {"horizon": 24, "max_output": 0.14, "process_noise": 0.04}
 TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
 
 
@@ -83,18 +85,19 @@ def test_what_is_seen_is_normalised_over_random_choices():
     other = Normalizer(first.observation_space.shape[0])
     other.fit(seen_through(rows=32), 20, seed=1)
     assert not np.array_equal(other.mean, first.normalizer.mean)
+    rng = np.random.default_rng(0)  # the same choices again
     normalised = [first.reset()]
-    rng = np.random.default_rng(3)
     for _ in range(20):
         normalised.append(first.step(rng.uniform(-1, 1, (32, 1)).astype(np.float32))[0])
-        values = first.shown.values
-        expected = np.clip((values - first.normalizer.mean) / first.normalizer.std, -BOUND, BOUND)
-        np.testing.assert_array_equal(normalised[-1], expected)
-    varied = first.normalizer.std > 0.1
+        expected = (first.shown.values - first.normalizer.mean) / first.normalizer.std
+        np.testing.assert_array_equal(normalised[-1], np.clip(expected, -BOUND, BOUND))
+    least = first.normalizer.std.min()  # of what is constant
+    assert least == np.float32(0.05)
+    kept = np.abs(expected).max(axis=0) < BOUND
+    found, varied = np.concatenate(normalised)[:, kept], first.normalizer.std[kept] > least
+    np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=1e-2)
+    np.testing.assert_allclose(found.std(axis=0)[varied], 1.0, atol=1e-2)
     assert varied.sum() > 20
-    assert np.abs(np.mean(np.concatenate(normalised), axis=0)[varied]).max() < 0.3
-    assert np.abs(np.std(np.concatenate(normalised), axis=0)[varied] - 1).max() < 0.3
-    assert (first.normalizer.std >= 0.05).all()  # what is constant is divided by no less
 
 
 def test_episodes_are_gone_on_with_where_they_were_recalled():
@@ -131,7 +134,7 @@ def test_a_policy_acts_the_same_from_its_file(tmp_path, algo, settings):
     save_policy(tmp_path, model)
     policy, other = load_policy(tmp_path), make_policy(str(tmp_path), make(POWER, 6))
     assert policy.network.features
-    assert policy.card["features"] == envs.features
+    assert policy.card["features"] == json.loads(json.dumps(envs.features))
     shown, state, own_state, starts = envs.reset(), None, None, np.ones(6, dtype=bool)
     for _ in range(30):
         choices, state = model.predict(shown, state, starts, deterministic=True)
@@ -145,49 +148,47 @@ def test_a_policy_acts_the_same_from_its_file(tmp_path, algo, settings):
         policy.predict(np.zeros((3, 58), dtype=np.float32))
 
 
+def agreement(choose, envs):
+    """The share of an episode's decisions that are to the side of those of velocity-sign."""
+    teacher, agreed = make_policy("velocity-sign", envs), []
+    shown, _ = envs.reset(seed=0)
+    for _ in range(80):
+        wanted, _ = teacher.predict(shown)
+        agreed.append(choose(shown)[:, 0] * wanted[:, 0] > 0)
+        shown, *_ = envs.step(wanted)
+    return np.mean(agreed)
+
+
 @pytest.mark.parametrize("levels", [0, 3])
 def test_a_network_learns_what_another_policy_decides(levels):
-    """Pumping with velocity-sign is what it agrees with, in its own episodes: seldom before, mostly after."""
-    asked = PPOSettings(num_envs=32, n_steps=16, batch_size=64, hidden=(16,), levels=levels)
+    """In the other's own episodes it agrees seldom before, and mostly after."""
+    asked = PPOSettings(num_envs=32, n_steps=16, batch_size=64, hidden=(64,), levels=levels)
     envs = seen_through(rows=32, fitted=True, levels=levels)
-    model = asked.make(envs, seed=0)
+    model, found, told = asked.make(envs, seed=1), FeatureMap.of(envs.venv.envs), []
 
-    def agreement():
-        teacher = make_policy("velocity-sign", envs.venv.envs)
-        shown, agreed = envs.reset(), []
-        for _ in range(60):
-            choices, _ = model.predict(shown, deterministic=True)
-            wanted = teacher.predict(envs.observations)[0][:, 0]
-            decided = envs.shown.act(np.linspace(-1, 1, 3)[choices] if levels else choices[:, 0])[:, 0]
-            agreed.append(decided * wanted > 0.5)
-            shown, *_ = envs.step(choices)
-        return np.mean(agreed)
+    def choose(shown):
+        features = found(shown)
+        choices, _ = model.predict(envs.normalizer(features.values), deterministic=True)
+        return features.act(np.linspace(-1, 1, levels)[choices] if levels else choices[:, 0])
 
-    before, told = agreement(), []
+    before = agreement(choose, make(AMPLITUDE, 32))
     imitate(model, envs, "velocity-sign", 8192, 0, told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0
-    assert agreement() > max(0.85, before + 0.2)
+    assert before < 0.5 < 0.8 < agreement(choose, make(AMPLITUDE, 32))
 
 
 def test_a_run_begins_with_what_was_imitated(tmp_path):
-    """So that a run that hardly learns by reward decides as its teacher; the same again by the same seed."""
-    settings = PPOSettings(num_envs=16, n_steps=16, batch_size=64, hidden=(16,), levels=3, learning_rate=1e-9)
-    envs = make(AMPLITUDE, 16)
-    teacher = make_policy("velocity-sign", envs)
-    agreed, weights = [], []
-    for name, more in (("plain", {}), *((name, {"imitate": "velocity-sign"}) for name in ("one", "again"))):
-        config = TrainConfig(steps=256, imitations=4096, output=tmp_path / name, hyperparameters=settings, **more)
-        folder = train(config).folder
-        policy, (shown, _) = make_policy(str(folder), envs), envs.reset(seed=0)
-        same = []
-        for _ in range(40):
-            wanted, _ = teacher.predict(shown)
-            same.append(policy.predict(shown, deterministic=True)[0] * wanted > 0.5)
-            shown, *_ = envs.step(wanted)
-        agreed.append(np.mean(same))
-        weights.append((folder / "policy.safetensors").read_bytes())
-    assert agreed[1] > max(0.8, agreed[0] + 0.2)
+    """So a run that learns next to nothing by reward decides as its teacher; the same again by the same seed."""
+    settings = PPOSettings(num_envs=32, n_steps=16, batch_size=64, hidden=(64,), levels=3, learning_rate=1e-9)
+    envs, agreed, weights = make(AMPLITUDE, 32), [], []
+    for name, teacher in (("plain", None), ("one", "velocity-sign"), ("again", "velocity-sign")):
+        run = tmp_path / name
+        train(TrainConfig(seed=1, steps=512, imitate=teacher, imitations=8192, output=run, hyperparameters=settings))
+        policy = make_policy(str(run), envs)
+        agreed.append(agreement(lambda shown, by=policy: by.predict(shown, deterministic=True)[0], envs))
+        weights.append((run / "policy.safetensors").read_bytes())
+    assert agreed[0] < 0.5 < 0.8 < agreed[1]
     assert weights[1] == weights[2]
 
 
