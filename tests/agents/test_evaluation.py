@@ -574,7 +574,7 @@ def test_what_is_shown_changes_nothing_of_what_is_measured(shown):
 def test_what_is_compared_where_the_posterior_is_not_seen_are_signals():
     assert usual_policies(TRACK, {"observation": "history"}) == ("prbs", "uniform")
     assert usual_policies(TRACK, {"hold": 4}) == ("ppo/amplitude", "prbs", "uniform")
-    assert {"efe", "lookahead", "ppo/amplitude"} < set(usual_policies(TRACK, {"observation": "posterior"}))
+    assert {"efe", "shield", "ppo/amplitude"} < set(usual_policies(TRACK, {"observation": "posterior"}))
 
 
 def test_a_function_as_an_observation_is_not_compared_on():

@@ -240,7 +240,7 @@ def test_two_programs_may_add_at_once(tmp_path, entry):
 def test_the_board_that_ships_is_of_what_ships():
     entries = board.read(board.SHIPPED)
     shown = {entry["name"] for entry in entries if entry["track"] == SHORT}
-    assert {"ppo/short", "lookahead", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
+    assert {"ppo/short", "shield", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
     for entry in entries:
         # What has a name without a training has learned nothing.
         assert (entry["budget"] == "none") == (entry["name"] in POLICIES), entry["name"]

@@ -160,7 +160,9 @@ def test_the_schedule_and_the_log_go_on(tmp_path):
     ("algo", "settings"),
     [
         *((algo, {}) for algo in ALGORITHMS),
-        ("ppo", {"hyperparameters": ALGORITHMS["ppo"](**ON_POLICY, foresight=True, levels=4, entropy_bonus=0.1)}),
+        ("ppo", {"hyperparameters": ALGORITHMS["ppo"](**ON_POLICY, levels=4, entropy_bonus=0.1)}),
+        ("ppo", {"hyperparameters": ALGORITHMS["ppo"](**ON_POLICY, features=False)}),
+        ("ppo", {"imitate": "velocity-sign", "imitations": 512}),
         ("sac", {"hyperparameters": ALGORITHMS["sac"](**OFF_POLICY | {"learning_starts": 600})}),
     ],
 )

@@ -250,9 +250,9 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("seen", ["history", "privileged"])
-def test_another_observation_than_the_posterior_has_no_foresight(tmp_path, seen):
+def test_another_observation_than_the_posterior_has_no_features(tmp_path, seen):
     with pytest.raises(
-        ValueError, match=f"observation must be 'posterior' with foresight, but is '{seen}'; add --ppo.no-foresight"
+        ValueError, match=f"observation must be 'posterior' with features, but is '{seen}'; add --ppo.no-features"
     ):
         TrainConfig(env="Short-v0", options={"observation": seen})
     run = tiny(tmp_path / "run", env="Short-v0", options={"observation": seen})

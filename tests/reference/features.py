@@ -68,12 +68,12 @@ def features(observation, s: Setting):
     sign = -1.0 if x < before else 1.0
     x, before = sign * x, sign * before
     left = max(1.0, o["time_left"] * s.samples)
-    share, thrift, push = left, 1.0, 1.0
+    share, thrift, reserve, push = left, 1.0, 1.0, 1.0
     if np.isfinite(s.energy):
         share = (left + o["budget_left"] * s.samples) / 2
-        thrift = min(1.0, np.sqrt(o["budget_left"] * s.energy / left) / s.max_input)
-        height = np.abs(roll(theta, x, before, lambda t, velocity: 0.0, limit)[0]).max() / limit
-        push = min(1.0, max(thrift, s.haste * height / s.moved))
+        reserve = np.sqrt(o["budget_left"] * s.energy / s.max_input**2)
+        thrift = min(1.0, reserve / np.sqrt(left))
+        push = min(1.0, s.haste * thrift)
     process, sensor = s.process * np.exp(-o["log_gamma"]), s.sensor * np.exp(-o["log_xi_y"])
     variance = process + sensor
     J = share / variance * s.rate
@@ -108,7 +108,7 @@ def features(observation, s: Setting):
         most = max(found[name]) + 1e-12
         found[name] = [(up - down) / most, (none - max(up, down)) / most, np.log(most * left + 1e-3)]
     log_stds = [o[f"log_std_{name}"] for name in COEFFICIENTS]
-    values = [np.mean(log_stds), max(log_stds), o["log_gamma"], o["log_xi_y"], o["time_left"], thrift, push]
+    values = [np.mean(log_stds), max(log_stds), o["log_gamma"], o["log_xi_y"], o["time_left"], thrift, reserve, push]
     values += [sign * o["last_input"], sign * o["last_y"], x / limit, (x - before) / limit]
     values += [0.5 * np.log(variance / limit**2) + 7, low, high, *np.concatenate(list(found.values())), *free]
     values += [to_come, np.log(np.trace(W @ s.rate) / (2 * variance) * s.samples + 1e-6)]
