@@ -29,7 +29,7 @@ def test_faults_are_named(change, name):
 
 
 def test_a_gross_outlier_stands_first():
-    u, y = simulated(BENCH)
+    u, y = simulated(BENCH, samples=1024)
     y[700], y[3] = 1e3, -80.0
     first = identify(rig_of(BENCH), (u, y)).warnings[0]
     assert first.name == "outliers"
@@ -51,7 +51,7 @@ def test_a_blow_that_rings_out_in_a_long_silence_is_no_outlier():
 
 @pytest.mark.parametrize("late", [4, 12, 24, 45])
 def test_a_large_delay_is_found_step_by_step(late):
-    u, y = simulated(BENCH)
+    u, y = simulated(BENCH, samples=1024)
     delay = 0
     for _ in range(6):
         warnings = identify(rig_of(BENCH, delay=delay), (u[late:], y[:-late])).warnings
@@ -108,7 +108,7 @@ def test_a_guess_that_leads_the_fit_astray_is_named_and_nothing_else(change, sli
     ("channel", "factor"), [("input", 4.45), ("input", 1 / 4.45), ("output", 3), ("output", 1 / 3)]
 )
 def test_a_wrong_scale_is_told_from_a_wrong_step(channel, factor):
-    u, y = simulated(BENCH)
+    u, y = simulated(BENCH, samples=1024)
     records = (u / factor, y) if channel == "input" else (u, y / factor)
     (warning,) = identify(rig_of(BENCH, guess=GUESS), records).warnings
     assert warning.name == "guess"
@@ -119,7 +119,7 @@ def test_a_wrong_scale_is_told_from_a_wrong_step(channel, factor):
 @pytest.mark.parametrize("kind", ["velocity", "acceleration"])
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_wrong_step_is_named_whatever_the_sensor_shows(kind, factor):
-    u, y = simulated(BENCH, kind=kind)
+    u, y = simulated(BENCH, samples=1024, kind=kind)
     wrong = replace(rig_of(BENCH, kind, guess=GUESS), step=factor * BENCH[1])
     (message,) = (one.message for one in identify(wrong, (u, y)).warnings if one.name == "step")
     told = re.findall(r"if the sampling step were about (\S+) times the rig's", message)
