@@ -128,7 +128,7 @@ def test_a_wrong_step_is_named_whatever_the_sensor_shows(kind, factor):
 
 @pytest.mark.parametrize(("kind", "noise"), [("displacement", 0.0), ("velocity", 1e-8)])
 def test_a_record_without_noise_is_judged_by_no_check(kind, noise):
-    (m, c, a, b), h, (u, _) = BENCH[0].values(), BENCH[1] / 8, simulated(BENCH)
+    (m, c, a, b), h, (u, _) = BENCH[0].values(), BENCH[1] / 8, simulated(BENCH, samples=1024)
     rates = lambda x, force: np.array([x[1], (force - c * x[1] - a * x[0] - b * x[0] ** 3) / m])  # noqa: E731
     x, shown = np.zeros(2), []
     for force in u:
@@ -168,7 +168,7 @@ def test_a_wrong_step_and_a_parameter_that_does_nothing_are_named():
 
 def test_a_bench_s_own_disturbance_is_no_fault_of_a_weak_input():
     weak = (BENCH[0], BENCH[1], 0.05, 5e-6, 8)
-    records = simulated(weak, force=0.1)
+    records = simulated(weak, samples=1024, force=0.1)
     for limit, names in ((None, {"not_identified", "process_noise"}), (6.0, {"not_identified"})):
         rig = Rig(BENCH[1], input=Channel("N", limit=limit), output=Channel("m"))
         assert {warning.name for warning in identify(rig, records).warnings} == names
@@ -190,7 +190,7 @@ def test_short_steps_that_a_converter_held_are_no_blows():
 
 
 def test_a_search_that_failed_is_no_wrong_equation(monkeypatch):
-    record = simulated(WELLS, 7, kind="acceleration", start=np.sqrt(2500.0 / 4e7))
+    record = simulated(WELLS, 7, 1024, kind="acceleration", start=np.sqrt(2500.0 / 4e7))
     monkeypatch.setattr(sys.modules["estimator.identification.search"], "_TRIES", 0)
     (warning,) = identify(rig_of(WELLS, "acceleration"), record).warnings
     assert warning.name == "search_failed"
