@@ -15,7 +15,6 @@ def test_the_twin_is_identified_from_the_record(record):
     assert residual == pytest.approx(2.292e-3, rel=1e-3)
 
 
-@pytest.mark.slow  # seconds of compilation
 def test_the_continuous_twin_is_identified_from_the_record(record):
     found = identify_continuous_twin(record)
     # The constants are those of the tracks and stay. Since they were identified the estimator weighs the two noises a
