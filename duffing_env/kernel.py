@@ -124,7 +124,7 @@ def compiled(kind: Kind) -> Kernel:
     ):  # fmt: skip
         """Step some blocks, or start episodes in them.
 
-        Few functions and no more layers: every layer is compiled, and everything below it once more with it.
+        Few functions and no more layers: each is translated anew for every kind.
         """
         setup = unpack(packed)
         for b in range(first, stop):

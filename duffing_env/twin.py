@@ -10,7 +10,7 @@ import numpy as np
 
 from duffing_env.silverbox import SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, duffing
-from estimator.parameters import SAMPLING_STEP, Parameters
+from estimator.parameters import Parameters
 from estimator.physical import to_physical
 
 
@@ -29,18 +29,17 @@ def identify_twin(record: SilverboxRecord) -> tuple[Parameters, float]:
     return parameters, float(np.sqrt(squares[0] / len(regressors)))
 
 
-def identify_continuous_twin(record: SilverboxRecord) -> dict[str, float]:
-    """Stiffness, damping, gain and cubic stiffness of the differential equation, from the record's multisine part.
+def identify_continuous_twin(record: SilverboxRecord) -> Parameters:
+    """The parameters (m, c, a, b) of the differential equation, from the record's multisine part.
 
     By `duffing` with the spline through all inputs. Its offsets and feedthrough are identified along, and left away:
-    they are the circuit's and the sensor's, not the oscillator's. In seconds and volts.
+    they are the circuit's and the sensor's, not the oscillator's.
     """
     model = duffing(offsets=True, feedthrough=True, noise="held")
     estimator = OnlineEstimator(model, rig=Rig.silverbox("spline"))
     estimator.run(record.multisine.u, record.multisine.y)
-    scales = {"stiffness": -2, "damping": -1, "gain": -2, "cubic": -2}
-    found = estimator.belief.coefficients()
-    return {name: found[name][0] * SAMPLING_STEP**power for name, power in scales.items()}
+    found = estimator.belief.parameters()
+    return Parameters({name: found[name][0] for name in "mcab"})
 
 
 def main() -> None:
@@ -48,8 +47,8 @@ def main() -> None:
     twin, residual = identify_twin(load_record())
     print(f"m = {twin.m:.4e} s², c = {twin.c:.4e} s, a = {twin.a:.4f}, b = {twin.b:.4f} V⁻²")
     print(f"one-step residual {1e3 * residual:.3f} mV root mean square")
-    continuous = identify_continuous_twin(load_record())
-    print(", ".join(f"{name} {continuous[name]:.6g}" for name in ("stiffness", "damping", "gain", "cubic")))
+    m, c, a, b = identify_continuous_twin(load_record()).values()
+    print(f"1/m = {1 / m:.6g} s⁻², c/m = {c / m:.6g} s⁻¹, a/m = {a / m:.6g} s⁻², b/m = {b / m:.6g} s⁻² V⁻²")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from estimator.engine.feeding import input_degree
 from estimator.engine.rows import path_results
 from estimator.engine.tasks import path
 from estimator.inputs import lengths_of
-from estimator.lanes import kernel
+from estimator.lanes import jit, kernel
 from estimator.models.model import Model
 from estimator.parameters import FloatArray
 from estimator.physical import physical_slopes, to_physical
@@ -292,63 +292,113 @@ _MISSING = 1e18
 _LANES = 8
 
 
+class _Places(NamedTuple):
+    """How many moments of the state, coefficients, sensors and totals a loop has, and the first row of what it needs.
+
+    Where it has no such row, it is -1.
+    """
+
+    moments: int
+    k: int
+    p: int
+    n_totals: int
+    coefficient: int
+    noise: int
+    input: int
+    span: int
+    live: int
+    total: int
+    shown: int
+    foreseen: int
+    spread: int
+
+
+# What does not depend on the model is compiled for all models at once, which takes as long as for one.
+
+
+@jit
+def _begin(W, at, first, lanes, points, lengths, begin, noises):
+    """Lay the series from ``first`` on side by side; gives the length of the longest."""
+    W[:] = 0.0
+    longest = 0
+    for j in range(_LANES):
+        i = first + min(j, lanes - 1)  # a spare lane repeats the last one
+        longest = max(longest, lengths[i])
+        W[at.live * _LANES + j] = 1.0
+        for c in range(at.k):
+            W[(at.coefficient + c) * _LANES + j] = points[i, c]
+        for c in range(at.moments):
+            W[c * _LANES + j] = begin[i, c]
+        for c in range(1 + at.p):
+            W[(at.noise + c) * _LANES + j] = noises[i, c]
+    return longest
+
+
+@jit
+def _load(W, at, first, lanes, t, inputs, y, spans, lengths, noises):
+    """Lay out the next sample of each."""
+    for j in range(_LANES):
+        i = first + min(j, lanes - 1)
+        runs = t < lengths[i]
+        for c in range(inputs.shape[2]):
+            W[(at.input + c) * _LANES + j] = inputs[i, t, c] if runs else 0.0
+        if at.span >= 0:
+            W[at.span * _LANES + j] = spans[i, t] if runs else 1.0
+        if at.shown >= 0:
+            whole = True
+            for c in range(at.p):
+                seen = runs and not np.isnan(y[i, t, c])
+                whole = whole and seen
+                W[(at.shown + c) * _LANES + j] = y[i, t, c] if seen else 0.0
+                W[(at.noise + 1 + c) * _LANES + j] = noises[i, 1 + c] * (1.0 if seen else _MISSING)
+            W[at.live * _LANES + j] = 1.0 if whole else 0.0
+
+
+@jit
+def _store(W, at, first, lanes, t, lengths, noises, totals, forecasts):
+    """Take what the sample gave: forecasts, and the totals of those whose last one it was."""
+    for j in range(lanes):
+        if at.shown >= 0 and len(forecasts) and t < lengths[first + j]:
+            for c in range(at.p):
+                forecasts[first + j, t, c, 0] = W[(at.foreseen + c) * _LANES + j]
+                forecasts[first + j, t, c, 1] = W[(at.spread + c) * _LANES + j] + noises[first + j, 1 + c]
+        if t + 1 == lengths[first + j]:
+            for c in range(at.n_totals):
+                totals[first + j, c] = W[(at.total + c) * _LANES + j]
+            for c in range(at.total):  # it is over, and goes on at rest
+                W[c * _LANES + j] = 0.0
+
+
 @cache
 def follower(model: Model, degree: int, observed: bool, timed: bool = False) -> Any:
     """The compiled loop of `follow`, with totals (n, 2 + K + K (K + 1)/2) packed."""
     task = path(model, degree, observed=observed, lanes=_LANES, timed=timed)
-    sample, at, size = task.sample, task.layout, len(task.layout)
-    n, k, p = model.n_states, model.n_coefficients, model.n_outputs
-    first_total, first_coefficient, live = at["LOSS"], at[next(iter(model.coefficients))], at["LIVE"]
-    first_input, first_noise = at["U_0"], at["Q"]
-    shown, n_totals = at[f"Y_{next(iter(model.outputs))}"] if observed else -1, len(path_results(model))
-    first_sensor = next(iter(model.outputs))
-    foreseen, spread = (at[f"{what}_{first_sensor}"] if observed else -1 for what in ("SHOWN", "SPREAD"))
-    span = at["SPAN"] if timed else -1
-    moments = n + n * (n + 1) // 2
+    sample, rows, size = task.sample, task.layout, len(task.layout)
+    n, sensor = model.n_states, next(iter(model.outputs))
+    at = _Places(
+        moments=n + n * (n + 1) // 2,
+        k=model.n_coefficients,
+        p=model.n_outputs,
+        n_totals=len(path_results(model)),
+        coefficient=rows[next(iter(model.coefficients))],
+        noise=rows["Q"],
+        input=rows["U_0"],
+        span=rows["SPAN"] if timed else -1,
+        live=rows["LIVE"],
+        total=rows["LOSS"],
+        shown=rows[f"Y_{sensor}"] if observed else -1,
+        foreseen=rows[f"SHOWN_{sensor}"] if observed else -1,
+        spread=rows[f"SPREAD_{sensor}"] if observed else -1,
+    )
 
     @kernel(kind=f"{model.name}_{model.digest}_{degree}_{int(observed)}_{int(timed)}")
     def run(points, inputs, y, spans, lengths, begin, noises, totals, forecasts):
         W = np.empty(size * _LANES)
         for first in range(0, len(inputs), _LANES):
             lanes = min(_LANES, len(inputs) - first)
-            W[:] = 0.0
-            longest = 0
-            for j in range(_LANES):
-                i = first + min(j, lanes - 1)  # a spare lane repeats the last one
-                longest = max(longest, lengths[i])
-                W[live * _LANES + j] = 1.0
-                for c in range(k):
-                    W[(first_coefficient + c) * _LANES + j] = points[i, c]
-                for c in range(moments):
-                    W[c * _LANES + j] = begin[i, c]
-                for c in range(1 + p):
-                    W[(first_noise + c) * _LANES + j] = noises[i, c]
-            for t in range(longest):
-                for j in range(_LANES):
-                    i = first + min(j, lanes - 1)
-                    runs = t < lengths[i]
-                    for c in range(inputs.shape[2]):
-                        W[(first_input + c) * _LANES + j] = inputs[i, t, c] if runs else 0.0
-                    if timed:
-                        W[span * _LANES + j] = spans[i, t] if runs else 1.0
-                    if observed:
-                        whole = True
-                        for c in range(p):
-                            seen = runs and not np.isnan(y[i, t, c])
-                            whole = whole and seen
-                            W[(shown + c) * _LANES + j] = y[i, t, c] if seen else 0.0
-                            W[(first_noise + 1 + c) * _LANES + j] = noises[i, 1 + c] * (1.0 if seen else _MISSING)
-                        W[live * _LANES + j] = 1.0 if whole else 0.0
+            for t in range(_begin(W, at, first, lanes, points, lengths, begin, noises)):
+                _load(W, at, first, lanes, t, inputs, y, spans, lengths, noises)
                 sample(W)
-                for j in range(lanes):
-                    if observed and len(forecasts) and t < lengths[first + j]:
-                        for c in range(p):
-                            forecasts[first + j, t, c, 0] = W[(foreseen + c) * _LANES + j]
-                            forecasts[first + j, t, c, 1] = W[(spread + c) * _LANES + j] + noises[first + j, 1 + c]
-                    if t + 1 == lengths[first + j]:
-                        for c in range(n_totals):
-                            totals[first + j, c] = W[(first_total + c) * _LANES + j]
-                        for c in range(first_total):  # it is over, and goes on at rest
-                            W[c * _LANES + j] = 0.0
+                _store(W, at, first, lanes, t, lengths, noises, totals, forecasts)
 
     return run

@@ -19,6 +19,7 @@ from typing import Any
 import numba
 
 from estimator.compiled import Compiled
+from estimator.inner import Inner
 from estimator.straight import straight, straight_within
 
 #: Systems in a block. A multiple of the vector width (8 doubles in AVX-512); 32 lanes of ~120 rows stay within 32 KiB.
@@ -29,7 +30,7 @@ LANES = 32
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "nogil": True, "no_cfunc_wrapper": True}
 
 #: Compile a function that other compiled functions call.
-jit = numba.njit(**OPTIONS)
+jit = partial(Inner, options=OPTIONS)
 
 
 def rows(*groups: str, start: int = 0) -> dict[str, int]:

@@ -15,9 +15,27 @@ if not (0, 60) <= tuple(map(int, numba.__version__.split(".")[:2])) < (0, 69):
 
 from numba.core import cgutils, event
 from numba.core.caching import _Cache
-from numba.core.compiler import CompileResult
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder
+from numba.core.compiler_machinery import register_pass
 from numba.core.extending import _Intrinsic
+from numba.core.registry import CPUDispatcher
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
+from numba.core.typed_passes import NativeLowering
 
-__all__ = ["CompileResult", "_Cache", "_Intrinsic", "cgutils", "dumps", "event", "rtsys"]
+__all__ = [
+    "CPUDispatcher",
+    "CompileResult",
+    "CompilerBase",
+    "DefaultPassBuilder",
+    "JITCodeLibrary",
+    "NativeLowering",
+    "_Cache",
+    "_Intrinsic",
+    "cgutils",
+    "dumps",
+    "event",
+    "register_pass",
+    "rtsys",
+]

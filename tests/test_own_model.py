@@ -15,7 +15,7 @@ from duffing_env.model_env import ModelEnv, ModelVectorEnv
 
 OPTIONS = {
     "system": VAN_DER_POL,
-    "mean": {"excitation": 0.2, "stiffness": 0.4, "gain": 0.3},
+    "mean": {"stiffness": 0.4, "friction": 0.2, "gain": 0.3},
     "spread": 0.2,
     "process_noise": 2e-3,
     "measurement_noise": 2e-3,

@@ -219,8 +219,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         """
         W = memory.ways[0]
         moves = min(len(best), _LATE_HORIZON)
-        ways = _MOST_BLOCKS * LANES if terms.firm > 0.0 else ways_for(terms.cells)
-        fewer = ways if terms.firm > 0.0 else ways - LANES
+        ways, fewer = ways_for(terms.cells, terms.firm > 0.0)
         pace = pace_for(left, moves, terms.pace)
         steps = min(len(best), -(-left // pace))  # to the end, and a bit beyond: no limit is left unseen
         if left <= _LATE * pace:
@@ -308,15 +307,18 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
 
 
 @jit
-def ways_for(cells):
-    """How many ways are followed through a map with so many cells along an axis: whole blocks.
+def ways_for(cells, is_firm):
+    """How many ways are followed through a map with so many cells along an axis, and how many far ahead: whole blocks.
 
     Example:
-        >>> [ways_for(cells) for cells in (22, 25, 35, 38)]
-        [64, 64, 128, 128]
+        >>> [ways_for(cells, False) for cells in (22, 25, 35, 38)], ways_for(25, True)
+        ([(64, 32), (64, 32), (128, 96), (128, 96)], (128, 128))
     """
+    if is_firm:
+        return LANES * _MOST_BLOCKS, LANES * _MOST_BLOCKS
     blocks = round(cells * cells / (_CELLS_PER_WAY * LANES))
-    return LANES * max(_FEWEST_BLOCKS, min(blocks, _MOST_BLOCKS))
+    ways = LANES * max(_FEWEST_BLOCKS, min(blocks, _MOST_BLOCKS))
+    return ways, ways - LANES
 
 
 @jit

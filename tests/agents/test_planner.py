@@ -269,7 +269,7 @@ def test_a_plan_of_the_whole_episode_has_neither_goal_nor_cost():
 @pytest.mark.parametrize(
     ("track", "options", "systems", "most_early"),
     [
-        pytest.param("Amplitude-v1", {"horizon": 96}, 16, 0, marks=pytest.mark.slow),
+        ("Amplitude-v1", {"horizon": 48}, 8, 0),
         # Now and then an episode ends early: of strong process noise, or near where the difference equation blows up.
         pytest.param("Pendulum", {"horizon": 48, "max_input": 4.0, "max_output": 1.5}, 16, 1, marks=pytest.mark.slow),
         pytest.param("WienerHammerstein", {"horizon": 48}, 16, 0, marks=pytest.mark.slow),  # seconds of compilation

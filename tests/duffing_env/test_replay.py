@@ -60,13 +60,10 @@ class TestWithTheRecord:
             (1, {}),
             (1, {"factorisation": "mean_field", "nonlinear": False}),
             (0, {"factorisation": "mean_field", "nonlinear": False, "as_published": True, "prior": "published_run"}),
-            pytest.param(
-                1, {"factorisation": "mean_field", "as_published": True, "prior": "published_run"},
-                marks=pytest.mark.slow,  # kernels of their own
-            ),
+            (1, {"factorisation": "mean_field", "as_published": True, "prior": "published_run"}),
             pytest.param(
                 0, {"prior": "paper_text", "nonlinear": False, "iterations": 5}, marks=pytest.mark.slow
-            ),
+            ),  # a kernel of its own
         ],
         ids=str,
     )  # fmt: skip

@@ -29,7 +29,7 @@ def test_faults_are_named(change, name):
 
 
 def test_a_gross_outlier_stands_first():
-    u, y = simulated(BENCH)
+    u, y = simulated(BENCH, samples=1024)
     y[700], y[3] = 1e3, -80.0
     first = identify(rig_of(BENCH), (u, y)).warnings[0]
     assert first.name == "outliers"
@@ -51,7 +51,7 @@ def test_a_blow_that_rings_out_in_a_long_silence_is_no_outlier():
 
 @pytest.mark.parametrize("late", [4, 12, 24, 45])
 def test_a_large_delay_is_found_step_by_step(late):
-    u, y = simulated(BENCH)
+    u, y = simulated(BENCH, samples=1024)
     delay = 0
     for _ in range(6):
         warnings = identify(rig_of(BENCH, delay=delay), (u[late:], y[:-late])).warnings
@@ -108,7 +108,7 @@ def test_a_guess_that_leads_the_fit_astray_is_named_and_nothing_else(change, sli
     ("channel", "factor"), [("input", 4.45), ("input", 1 / 4.45), ("output", 3), ("output", 1 / 3)]
 )
 def test_a_wrong_scale_is_told_from_a_wrong_step(channel, factor):
-    u, y = simulated(BENCH)
+    u, y = simulated(BENCH, samples=1024)
     records = (u / factor, y) if channel == "input" else (u, y / factor)
     (warning,) = identify(rig_of(BENCH, guess=GUESS), records).warnings
     assert warning.name == "guess"
@@ -119,7 +119,7 @@ def test_a_wrong_scale_is_told_from_a_wrong_step(channel, factor):
 @pytest.mark.parametrize("kind", ["velocity", "acceleration"])
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_wrong_step_is_named_whatever_the_sensor_shows(kind, factor):
-    u, y = simulated(BENCH, kind=kind)
+    u, y = simulated(BENCH, samples=1024, kind=kind)
     wrong = replace(rig_of(BENCH, kind, guess=GUESS), step=factor * BENCH[1])
     (message,) = (one.message for one in identify(wrong, (u, y)).warnings if one.name == "step")
     told = re.findall(r"if the sampling step were about (\S+) times the rig's", message)
@@ -128,7 +128,7 @@ def test_a_wrong_step_is_named_whatever_the_sensor_shows(kind, factor):
 
 @pytest.mark.parametrize(("kind", "noise"), [("displacement", 0.0), ("velocity", 1e-8)])
 def test_a_record_without_noise_is_judged_by_no_check(kind, noise):
-    (m, c, a, b), h, (u, _) = BENCH[0].values(), BENCH[1] / 8, simulated(BENCH)
+    (m, c, a, b), h, (u, _) = BENCH[0].values(), BENCH[1] / 8, simulated(BENCH, samples=1024)
     rates = lambda x, force: np.array([x[1], (force - c * x[1] - a * x[0] - b * x[0] ** 3) / m])  # noqa: E731
     x, shown = np.zeros(2), []
     for force in u:
@@ -168,7 +168,7 @@ def test_a_wrong_step_and_a_parameter_that_does_nothing_are_named():
 
 def test_a_bench_s_own_disturbance_is_no_fault_of_a_weak_input():
     weak = (BENCH[0], BENCH[1], 0.05, 5e-6, 8)
-    records = simulated(weak, force=0.1)
+    records = simulated(weak, samples=1024, force=0.1)
     for limit, names in ((None, {"not_identified", "process_noise"}), (6.0, {"not_identified"})):
         rig = Rig(BENCH[1], input=Channel("N", limit=limit), output=Channel("m"))
         assert {warning.name for warning in identify(rig, records).warnings} == names
@@ -190,7 +190,7 @@ def test_short_steps_that_a_converter_held_are_no_blows():
 
 
 def test_a_search_that_failed_is_no_wrong_equation(monkeypatch):
-    record = simulated(WELLS, 7, kind="acceleration", start=np.sqrt(2500.0 / 4e7))
+    record = simulated(WELLS, 7, 1024, kind="acceleration", start=np.sqrt(2500.0 / 4e7))
     monkeypatch.setattr(sys.modules["estimator.identification.search"], "_TRIES", 0)
     (warning,) = identify(rig_of(WELLS, "acceleration"), record).warnings
     assert warning.name == "search_failed"

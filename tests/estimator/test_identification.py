@@ -16,10 +16,18 @@ from estimator.physical import coefficients_of
 from estimator.rig_prior import about
 from estimator.units import Scales
 
+GUESS = {name: (0.7 * value, 1.4 * value) for name, value in BENCH[0].items()}
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """What is found of `BENCH`, by itself and with a guess."""
+    return {guessed: identify(rig_of(BENCH, guess=GUESS if guessed else None), simulated(BENCH)) for guessed in (0, 1)}
+
 
 @pytest.mark.parametrize(("case", "kind"), [(BENCH, "displacement"), (SOFT, "displacement"), (SOFT, "velocity")])
-def test_nothing_but_a_record_and_a_step_is_needed(case, kind):
-    result = identify(rig_of(case, kind), simulated(case, kind=kind))
+def test_nothing_but_a_record_and_a_step_is_needed(case, kind, bench):
+    result = bench[False] if case is BENCH else identify(rig_of(case, kind), simulated(case, kind=kind))
     assert np.abs(deviations(result, case[0])).max() < 4.5
     assert all(std < 0.01 * abs(case[0][name]) for name, (_, std) in list(result.parameters.items())[:4])
     assert result.warnings == ()
@@ -29,10 +37,8 @@ def test_nothing_but_a_record_and_a_step_is_needed(case, kind):
     assert (low, high) == pytest.approx((mean - 1.645 * std, mean + 1.645 * std), rel=1e-3)
 
 
-def test_a_guess_changes_nothing_that_the_record_tells():
-    u, y = simulated(BENCH)
-    guess = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
-    guessed, alone = identify(rig_of(BENCH, guess=guess), (u, y)), identify(rig_of(BENCH), (u, y))
+def test_a_guess_changes_nothing_that_the_record_tells(bench):
+    guessed, alone = bench[True], bench[False]
     for name in BENCH[0]:  # the guess's own pull is a thousandth of a standard deviation
         mean, std = alone.parameters[name]
         assert guessed.parameters[name] == pytest.approx((mean, std), abs=0.02 * std)
@@ -58,10 +64,9 @@ def test_motions_that_are_fast_for_the_sampling_are_integrated_in_finer_steps():
     assert result.belief.model.substeps > Rig(step).model.substeps
 
 
-def test_noises_are_found():
-    result = identify(rig_of(BENCH), simulated(BENCH))
+def test_noises_are_found(bench):
     for name, truth in (("output", 5e-6), ("input", 3e-3 * 6.0)):
-        mean, std = result.noises[name]
+        mean, std = bench[False].noises[name]
         assert abs(mean - truth) < 5 * std + 0.1 * truth
 
 
@@ -138,9 +143,8 @@ def test_the_motion_before_each_record_is_found(kind):
     np.testing.assert_array_equal(beside, motions(problem, Hypothesis("zero_order", 0, 0.1), other[None], level)[0])
 
 
-def test_the_result_goes_on(tmp_path):
-    u, y = simulated(BENCH)
-    result = identify(rig_of(BENCH), (u, y))
+def test_the_result_goes_on(tmp_path, bench):
+    (u, y), result = simulated(BENCH), bench[False]
     run = result.simulate(u, y[:20])
     assert np.abs(run - y)[:200].max() < 0.02 * np.abs(y).max()
     forecast = result.forecasts[0]
@@ -170,11 +174,10 @@ def test_the_result_goes_on(tmp_path):
 
 @pytest.mark.parametrize("guessed", [False, True])
 @pytest.mark.parametrize("offset", [0.05, 2.0])
-def test_a_sensor_far_off_the_oscillator_changes_nothing_but_its_offset(offset, guessed):
+def test_a_sensor_far_off_the_oscillator_changes_nothing_but_its_offset(offset, guessed, bench):
     # Displacements are of 2 mm; a laser stands 5 cm away, or 2 m.
     u, y = simulated(BENCH)
-    guess = {name: (0.7 * value, 1.4 * value) for name, value in BENCH[0].items()} if guessed else None
-    near, far = identify(rig_of(BENCH, guess=guess), (u, y)), identify(rig_of(BENCH, guess=guess), (u, y + offset))
+    near, far = bench[guessed], identify(rig_of(BENCH, guess=GUESS if guessed else None), (u, y + offset))
     for name in BENCH[0]:
         mean, std = near.parameters[name]
         assert far.parameters[name] == pytest.approx((mean, std), abs=0.2 * std)

@@ -6,18 +6,36 @@ import re
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from tables import table
 
 from estimator import lanes
-from estimator.lanes import LANES, lanewise, of_lane, part, rows
+from estimator.lanes import LANES, jit, lanewise, of_lane, part, rows
 
 LAYOUT = {"a": 0, "b": 1, "total": 2, "product": 3}
 
 
 def block():
     return np.random.default_rng(0).standard_normal(len(LAYOUT) * LANES)
+
+
+def test_an_inner_function_is_called_from_compiled_code_and_from_python():
+    @jit
+    def twice(x, y=1.0):
+        return 2 * x + y
+
+    @numba.njit
+    def caller(x):
+        return twice(x) + twice(1, x)
+
+    assert (caller(3.0), twice(3.0), twice(2, y=2)) == (12.0, 7.0, 6)
+    # For the caller it was compiled for two sorts of arguments. Nothing of them is where Python could enter.
+    assert len(twice.overloads) == 2
+    for compiled in (*twice.overloads.values(), *caller.overloads.values()):
+        engine, named = compiled.library.codegen._engine, compiled.fndesc.llvm_cpython_wrapper_name
+        assert engine.is_symbol_defined(named) == (compiled is caller.overloads[(numba.float64,)])
 
 
 def test_rows_are_numbered_in_order():

@@ -49,7 +49,7 @@ def test_run_is_repeated_update(kind, samples, monkeypatch, capsys):
         single.update(u_t, y_t)
         if len(single.forecasts):  # a sample was used, this one or the one before
             each.append(single.free_energies)
-            forecasts.append(single.forecasts[0])
+            forecasts.extend(single.forecasts)
     in_parts = [parts.run(u[a:b], y[a:b]) for a, b in ((0, 1), (1, 2), (2, 50), (50, 50), (50, 120))]
     monkeypatch.setattr("estimator.online._SAMPLES_BETWEEN_REPORTS", 70)
     monkeypatch.setattr("estimator.progress.EVERY", 0.0)

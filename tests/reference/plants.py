@@ -5,11 +5,12 @@ from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM
 
+#: That of docs/own_model.md, whose kernels are then its.
 VAN_DER_POL = Model(
     name="van_der_pol",
     states={"x": "V", "v": "V"},
-    coefficients={"excitation": "1", "stiffness": "1", "gain": "1"},
-    rates=("v", "excitation*(1 - x**2)*v - stiffness*x + gain*u"),
+    coefficients={"stiffness": "1", "friction": "1", "gain": "1"},
+    rates=("v", "gain*u - stiffness*x + friction*(1 - x**2)*v"),
     noise=("0", "sqrt(3)"),
     outputs={"y": "x"},
     substeps=4,

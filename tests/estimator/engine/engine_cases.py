@@ -126,9 +126,9 @@ CASES = {
     "van der pol": Case(
         VAN_DER_POL,
         Plant(
-            lambda z, c, u: [z[1], c[0] * (1 - z[0] ** 2) * z[1] - c[1] * z[0] + c[2] * u], _first, _white, substeps=4
+            lambda z, c, u: [z[1], c[2] * u - c[0] * z[0] + c[1] * (1 - z[0] ** 2) * z[1]], _first, _white, substeps=4
         ),
-        (0.8, -0.3, 0.5, 0.6, 0.4), degree=1,
+        (0.8, -0.3, 0.6, 0.5, 0.4), degree=1,
     ),
     "drag": Case(
         DRAG,
