@@ -57,8 +57,9 @@ _MOVES = 5
 #: Predictive standard deviations that the shield keeps from the limit on all tracks; chosen on the branch `validation`.
 MARGIN = 8.0
 
-#: Where the energy is limited a push has at most so many times the size that what is left would last for to the end.
-HASTE = 4.0
+#: Where the energy is limited, a push changes the height of a swing by this part of it in a sample: to push in
+#: proportion to the motion takes least energy.
+GROWTH = 0.15
 
 #: By how much covariances of float32 correlations are made positive definite.
 _RIDGE = 1e-6
@@ -84,7 +85,10 @@ class Setting(NamedTuple):
             what it does in a sample.
         pace: samples of a move.
         margin: predictive standard deviations that the shield keeps from the limit.
-        haste: where the energy is limited, a push has at most so many times the size that what is left would last for.
+        moved: by how much the largest input over a sample from rest moves what the first sensor shows, in parts of the
+            limit.
+        growth: where the energy is limited, a push changes the height of a swing by this part of it in a sample, but
+            has no less than the size that what is left would last for.
     """
 
     center: FloatArray
@@ -101,7 +105,8 @@ class Setting(NamedTuple):
     shaken: float
     pace: float
     margin: float
-    haste: float
+    moved: float
+    growth: float
 
 
 class Features(NamedTuple):
@@ -283,14 +288,17 @@ def compiled(view: View) -> Any:
             share = 0.5 * (share + o[at.budget_left] * s.samples)
             reserve = np.sqrt(max(0.0, o[at.budget_left]) * s.energy) / s.max_input
             thrift = min(1.0, reserve / np.sqrt(left))
-            push = min(1.0, s.haste * thrift)
         process, sensor = s.process * np.exp(-o[at.noise]), s.sensor * np.exp(-o[at.noise + 1])
         variance = process + sensor
         to_come = _foresee(C, s.rate, share / variance, unknown, scratch)
         copy_scaled(unknown, 0.5 / variance, unknown)
         noise = variance, 2.0 * variance + s.shaken * process
+        roll(s, start, W, C, unknown, noise, 0.0, False, f, 1)
+        if s.energy < np.inf:
+            push = min(1.0, max(thrift, s.growth * f[REST + 1] / s.moved))
         for which in range(3):
-            roll(s, start, W, C, unknown, noise, push * s.max_input, False, f, which)
+            if which != 1:
+                roll(s, start, W, C, unknown, noise, push * s.max_input, False, f, which)
             roll(s, start, W, C, unknown, noise, push * s.max_input, True, f, which)
         shield(f[REACH], f[REACH + 1], f[REACH + 2], span)
         for what in (TAUGHT, BRAKED):
@@ -390,7 +398,8 @@ class FeatureMap:
             shaken=shaken_of(experiment, swing),
             pace=float(swing.pace),
             margin=MARGIN,
-            haste=HASTE,
+            moved=abs(swing.moved) * float(setup.max_input) / float(setup.max_output),
+            growth=GROWTH,
         )
         return cls(setting, view, own=own)
 
