@@ -348,17 +348,17 @@ def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Finding]:
 def _of_parameters(
     problem: Problem, found: Found, ridges: Ridges | None, parameters: dict[str, tuple[float, float]]
 ) -> list[Finding]:
-    remedy = "this input; the records leave more than a third of it open"
+    by = "this input; the records leave more than a third of it open"
     if ridges is None:
         vague = [name for name, deviation in _told(problem, found).items() if deviation > _VAGUE]
     else:
         ends, span = ridges.interval(ONE), _SPAN
         if _is_one_sine(problem.u):
-            remedy, span = "one settled sine; add a record of another amplitude or frequency", _SPAN_OF_SINE
+            by, span = "one settled sine; add a record of another amplitude or frequency", _SPAN_OF_SINE
         vague = [name for name, (low, high) in ends.items() if high - low > span * max(abs(low), abs(high))]
     warnings = []
     if vague:
-        message = f"{', '.join(vague)}: not identified by {remedy}"
+        message = f"{', '.join(vague)}: not identified by {by}"
         if "b" in vague and (part := _cubic(problem, parameters)) < _LINEAR:
             message += f"; the spring is linear to {100 * part:.2g} %, as far as the oscillator moved"
         warnings.append(Finding("not_identified", message, tuple(vague)))
@@ -370,7 +370,7 @@ def _is_one_sine(inputs: Sequence[FloatArray]) -> bool:
     found = []
     for u in inputs:
         swing = u - u.mean()
-        turns = np.count_nonzero(swing[1:] * swing[:-1] < 0)
+        turns = int(np.count_nonzero(swing[1:] * swing[:-1] < 0))
         quarter = max(1, round(len(u) / max(2 * turns, 1)))
         if turns < 4 or len(u) < 8 * quarter:
             return False
