@@ -7,6 +7,7 @@ sample, or per sample squared.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +21,13 @@ Dimension = tuple[int, int, int]
 #: Smallest and largest size of anything, in its unit: products of several stay within what numbers can hold.
 SIZES = 1e-30, 1e30
 
+#: Units of SI, which prefixes scale; and others, with what each is in SI.
+_BASES, _PREFIXES = "N|V|A|Pa|m", {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "": 1.0, "k": 1e3, "M": 1e6}
+_OTHERS = {"in": (0.0254, "m"), "ft": (0.3048, "m"), "deg": (math.pi / 180, "rad"), "°": (math.pi / 180, "rad")}
+_WHOLE = {"g": (9.80665, "m/s²"), "lb": (4.4482216152605, "N"), "lbf": (4.4482216152605, "N")}
+_WHOLE |= {"mps": (1.0, "m/s"), "mps2": (1.0, "m/s²")}
+_SUFFIXES = {"": "", "/s": "/s", "/s2": "/s²", "/s/s": "/s²", "m": " m", "/V": "/V"}
+
 #: Units that only one kind of output has.
 _KINDS = {"displacement": r"[mµμun]?m|cm|in", "velocity": r"[^/]+/s", "acceleration": r".+/s(²|\^?2|/s)|m?g"}
 
@@ -31,6 +39,41 @@ _ATOM = re.compile(r"([^\s·/\d⁰¹²³⁴⁵⁶⁷⁸⁹⁻^-]+)(?:\^?(-?\d+))
 def kind_of(unit: str) -> str | None:
     """The kind of output that alone has a unit; None for one that tells none, such as V."""
     return next((kind for kind, units in _KINDS.items() if re.fullmatch(units, unit)), None)
+
+
+def plain(unit: str) -> str:
+    """A unit in one way of writing."""
+    for written, usual in (("µ", "u"), ("μ", "u"), ("²", "2"), ("^", ""), ("·", " "), ("*", " ")):
+        unit = unit.replace(written, usual)
+    return unit.replace(" ", "")
+
+
+def coherent(unit: str) -> tuple[float, str]:
+    """A unit as a factor and the unit of SI that it is a part or a multiple of; 1 and itself where it is none such.
+
+    Example:
+        >>> [coherent(unit) for unit in ("mm", "µm/s", "N", "m/s^2", "counts")]
+        [(0.001, 'm'), (1e-06, 'm/s'), (1.0, 'N'), (1.0, 'm/s²'), (1.0, 'counts')]
+    """
+    bare = plain(unit)
+    if bare in _WHOLE:
+        return _WHOLE[bare]
+    found = re.fullmatch(rf"(?:([{''.join(_PREFIXES)}]?)({_BASES})|({'|'.join(_OTHERS)}))(.*)", bare)
+    if found is None or found[4] not in _SUFFIXES:
+        return 1.0, unit
+    factor, base = _OTHERS[found[3]] if found[3] else (_PREFIXES[found[1]], found[2])
+    return factor, base + _SUFFIXES[found[4]]
+
+
+def conversion(of: str, to: str) -> float | None:
+    """By what numbers in one unit are multiplied to be in another; None where these are of different quantities.
+
+    Example:
+        >>> conversion("mm", "m"), conversion("in", "in"), conversion("m", "mm"), conversion("mm", "V")
+        (0.001, 1.0, 1000.0, None)
+    """
+    (factor, base), (other, own) = coherent(of), coherent(to)
+    return factor / other if plain(base) == plain(own) else None
 
 
 @dataclass(frozen=True)

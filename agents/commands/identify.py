@@ -80,15 +80,36 @@ def described(result: Result) -> dict[str, Any]:
         "noises": {name: {"mean": mean, "std": std} for name, (mean, std) in result.noises.items()},
         "warnings": [{"name": warning.name, "message": warning.message} for warning in result.warnings],
         "records": [
-            {"name": one.name, "samples": len(one.u), "missing": one.missing, "clipped": one.clipped}
+            {
+                "name": one.name,
+                "samples": len(one.u),
+                "step": one.step or result.rig.step,
+                "missing": one.missing,
+                "clipped": one.clipped,
+            }
             for one in result.records
         ],
         "rig": result.rig.to_dict(),
     }
 
 
+def steps(result: Result) -> list[str]:
+    """Sentences: the sampling step that was taken, and where it is from."""
+    even = [one.step for one in result.records if one.times is None]
+    agree = "and the times agree" if all(even) else "as some records have no times" if any(even) else "without times"
+    told = [f"The sampling step is {_rate(result.rig.step)} by the rig, {agree}."] if even else []
+    for one in result.records:
+        if one.times is not None and one.step is not None:
+            told.append(f"By its times {one.name.partition(', from sample ')[0]} has steps of {_rate(one.step)}.")
+    return list(dict.fromkeys(told))
+
+
+def _rate(step: float) -> str:
+    return f"{step:.6g} s ({1 / step:.6g} Hz)"
+
+
 def show(result: Result) -> None:
-    """Print a table, and the warnings under it."""
+    """Print the sampling step, a table, and the warnings under it."""
     from rich.text import Text
 
     from agents.results import console, table
@@ -103,6 +124,7 @@ def show(result: Result) -> None:
         value = "open" if name in result.open else f"{mean:.{digits}g}"
         rows.append([name, value, f"{low:.{digits}g} to {high:.{digits}g}", units[name]])
     print_all(
+        *steps(result),
         "m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0",
         table(("", "mean", "90 % interval", "unit"), rows),
     )

@@ -47,13 +47,16 @@ class Init:
         for name in ("step", "input", "output"):
             if getattr(self, name) is not None and (self.source is None or self.source in SHIPPED):
                 raise ValueError(f"{name} goes with a record; add --from data.csv, or leave it out")
+        taken = ""
         if self.source is None:
             text = text_of(ask())
         elif self.source in SHIPPED:
             text = SHIPPED[self.source].read_text(encoding="utf-8")
         else:
-            text = from_record(Path(self.source), self.step, self.input, self.output)
+            text, taken = from_record(Path(self.source), self.step, self.input, self.output)
         write_atomically(self.path, text)
+        if taken:
+            say(taken)
         say(f"Wrote {self.path}: read it, and correct what is not so.")
         data = "data.csv" if self.source is None or self.source in SHIPPED else self.source
         say(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}")

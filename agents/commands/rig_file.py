@@ -13,14 +13,18 @@ from estimator.identification.tables import read_table
 from estimator.models.duffing import KINDS
 from estimator.rig import INTERPOLATIONS, Channel, Rig
 from estimator.rig_text import text_of
+from estimator.units import coherent, conversion
 
 _UNKNOWN = "not known"
 
 
-def from_record(path: Path, step: float | None = None, source: str | None = None, sink: str | None = None) -> str:
-    """The file for a record: step from its column of times, units and kind from the names of its columns.
+def from_record(
+    path: Path, step: float | None = None, source: str | None = None, sink: str | None = None
+) -> tuple[str, str]:
+    """The file for a record, and what was taken from where: the step, and units that are not the columns'.
 
-    A MAT file tells none of these.
+    The step is that of its column of times; units and kind are those of the names of its columns, but as SI has them
+    without a prefix, so that results are in kg and N/m also where a column is in mm. A MAT file tells none of these.
 
     Args:
         path: of a CSV or MAT file.
@@ -43,7 +47,7 @@ def from_record(path: Path, step: float | None = None, source: str | None = None
             raise ValueError(f"{path} must be a CSV file to tell the step, but is a MAT file; add --step SECONDS")
         rig = Rig(step, input=Channel(column=source), output=Channel(column=sink))
         read(path, rig)
-        return text_of(rig, f", from {printable(path.name)}")
+        return text_of(rig, f", from {printable(path.name)}"), _taken(step, "--step")
     table = read_table(path, source, sink)
     own = table.step()
     if step is None and own is None:
@@ -53,16 +57,29 @@ def from_record(path: Path, step: float | None = None, source: str | None = None
         )
     if step is not None and own is not None and abs(own / step - 1) > 0.01:
         raise ValueError(f"{path}: times are {own:.6g} s apart, but the step is {step:.6g} s; mend one of them")
+    by = "--step"
     if step is None:
         # Times are written with some digits, and their mean difference is off by the last of them.
         step = float(f"{own:.6g}")
-    unit = None if table.u is None else table.unit(table.u)
+        by = f"the times in {table.names[table.time or 0]:.60}" if table.names else "the first column"
+    said = [_taken(step, by)]
+    unit, seen = (None if place is None else table.unit(place) for place in (table.u, table.y))
     # A name that says nothing was taken by its place, and stands in the file to be seen.
     shown = [None if place is None or table.is_known(place) else table.names[place] for place in (table.u, table.y)]
-    output = Channel(table.unit(table.y) or "1", kind=table.kind() or "displacement", column=sink or shown[1])
-    rig = Rig(step, input=Channel(unit or "1", column=source or shown[0]), output=output)
+    # A g of an input may be one of weight.
+    bases = [one if one in (None, "g") and k == 0 else coherent(one or "1")[1] for k, one in enumerate((unit, seen))]
+    output = Channel(bases[1] or "1", kind=table.kind() or "displacement", column=sink or shown[1])
+    rig = Rig(step, input=Channel(bases[0] or "1", column=source or shown[0]), output=output)
+    for name, one, base in zip(("input", "output"), (unit, seen), bases, strict=True):
+        if one and base and conversion(one, base) != 1.0:
+            said.append(f"The {name} is in {one}, and is taken in {base}: results are in units of SI.")
     told = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
-    return text_of(rig, f", from {printable(path.name)}{told}")
+    return text_of(rig, f", from {printable(path.name)}{told}"), "\n".join(said)
+
+
+def _taken(step: float, source: str) -> str:
+    """The step that was taken, in words."""
+    return f"The sampling step is {step:.6g} s ({1 / step:.6g} Hz), by {source}."
 
 
 def ask() -> Rig:

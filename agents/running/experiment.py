@@ -25,7 +25,7 @@ from estimator.checks import MOST_SEED, SMALLEST, number, whole
 from estimator.files import write_atomically
 from estimator.free_run import free_run
 from estimator.identification.checks import ENOUGH, SLOWEST
-from estimator.identification.columns import unit_of
+from estimator.identification.columns import headed, unit_of
 from estimator.parameters import FloatArray
 from estimator.physical import propagate
 from estimator.progress import Tell, untold
@@ -88,7 +88,7 @@ class Designed:
 
     def write(self, path: Path) -> None:
         """A CSV file with time [s] and the input, as `identify` reads them beside an output."""
-        name = self.rig.input.column or "u"
+        name = headed(self.rig.input.column or "u", self.rig.input.unit)
         lines = [f"time [s],{name if unit_of(name) else f'{name} [{self.rig.input.unit}]'}"]
         lines += [f"{k * self.rig.step:.9g},{value:.12g}" for k, value in enumerate((self.u + 0.0).tolist())]
         write_atomically(path, "\n".join(lines) + "\n")

@@ -13,6 +13,7 @@ from typing import Any
 
 from agents.results import check_folder, finite, versions
 from estimator.files import append_atomically, hold, write_atomically, writing
+from estimator.identification.columns import headed
 from estimator.rig import Rig
 
 #: Columns of samples.csv. `identify` takes ``time``, ``u`` and ``y``, which are called as the rig calls its columns.
@@ -56,7 +57,7 @@ class Recording:
             raise ValueError(f"out must be a new or empty folder, but {self.folder} holds something; name another one")
         self._manifest = {**manifest, "versions": versions(), "commit": _commit(), "started": _time(), "ended": None}
         self._write_manifest()
-        names = {"u": rig.input.column or "u", "y": rig.output.column or "y"}
+        names = {n: headed(one.column or n, one.unit) for n, one in (("u", rig.input), ("y", rig.output))}
         append_atomically(self.samples, ",".join(names.get(name, name) for name in COLUMNS) + "\n")
 
     @property

@@ -63,7 +63,10 @@ def of_input(problem: Problem, found: Found) -> list[Finding]:
         others += [replace(best, interpolation="spline")] if smooth else []
     tried = _tried(problem, found, others, own)
     if (tried is None or tried[1] <= EVIDENCE) and rig.interpolation in PARTS[:2]:
-        tried = _tried(problem, found, [replace(best, lag=best.lag + lag) for lag in _LAG], own)
+        lagging = [replace(best, lag=best.lag + lag) for lag in _LAG]
+        if rig.interpolation == "linear" and not best.lag:  # what goes linearly resembles what is held and lags
+            lagging += [replace(best, interpolation="zero_order", delay=rig.delay - 1, lag=lag) for lag in _LAG]
+        tried = _tried(problem, found, lagging, own)
     if tried is None or tried[1] <= EVIDENCE:
         return []
     better, gain = tried
@@ -96,8 +99,7 @@ def _refined(problem: Problem, found: Found, better: Hypothesis, gain: float, ow
     others = [replace(better, interpolation=p, delay=middle + d, lag=0.0) for p in paths for d in (*_NEAR, 0.0)]
     others += [
         replace(better, interpolation=p, delay=middle + d, lag=lag)
-        for p in PARTS[:2] if p == better.interpolation or better.lag
-        for d in (-1.0, 0.0) for lag in _LAGS
+        for p in PARTS[:2] for d in (-1.0, 0.0) for lag in _LAGS
     ]  # fmt: skip
     tried = _tried(problem, found, others, own)
     if tried is None or tried[1] <= gain + EVIDENCE:

@@ -37,6 +37,10 @@ _SURE = 1.645
 #: largest width of its central 68 % in parts of the outer end: a factor of five between the ends.
 _VAGUE, _SPAN = 1 / 3, 0.8
 
+#: The same after one settled sine, along whose ridge a walk ends where it may go on beyond a gap; and by how much the
+#: inputs may differ from a sine, in parts of themselves.
+_SPAN_OF_SINE, _SINE = 0.02, 0.01
+
 #: Largest cubic force, in parts of the linear one, of a spring that is called linear.
 _LINEAR = 0.05
 
@@ -344,18 +348,39 @@ def _of_signs(parameters: Mapping[str, tuple[float, float]]) -> list[Finding]:
 def _of_parameters(
     problem: Problem, found: Found, ridges: Ridges | None, parameters: dict[str, tuple[float, float]]
 ) -> list[Finding]:
+    by = "this input; the records leave more than a third of it open"
     if ridges is None:
         vague = [name for name, deviation in _told(problem, found).items() if deviation > _VAGUE]
     else:
-        ends = ridges.interval(ONE)
-        vague = [name for name, (low, high) in ends.items() if high - low > _SPAN * max(abs(low), abs(high))]
+        ends, span = ridges.interval(ONE), _SPAN
+        if _is_one_sine(problem.u):
+            by, span = "one settled sine; add a record of another amplitude or frequency", _SPAN_OF_SINE
+        vague = [name for name, (low, high) in ends.items() if high - low > span * max(abs(low), abs(high))]
     warnings = []
     if vague:
-        message = f"{', '.join(vague)}: not identified by this input; the records leave more than a third of it open"
+        message = f"{', '.join(vague)}: not identified by {by}"
         if "b" in vague and (part := _cubic(problem, parameters)) < _LINEAR:
             message += f"; the spring is linear to {100 * part:.2g} %, as far as the oscillator moved"
         warnings.append(Finding("not_identified", message, tuple(vague)))
     return warnings
+
+
+def _is_one_sine(inputs: Sequence[FloatArray]) -> bool:
+    """Whether all inputs (T,) are sines of one frequency and amplitude."""
+    found = []
+    for u in inputs:
+        swing = u - u.mean()
+        turns = int(np.count_nonzero(swing[1:] * swing[:-1] < 0))
+        quarter = max(1, round(len(u) / max(2 * turns, 1)))
+        if turns < 4 or len(u) < 8 * quarter:
+            return False
+        # Of a sine the sum of two values a quarter earlier and later is that between them, times a constant.
+        middle, beside = swing[quarter:-quarter], swing[2 * quarter :] + swing[: -2 * quarter]
+        factor = float(middle @ beside / (middle @ middle))
+        if np.std(beside - factor * middle) > _SINE * middle.std():
+            return False
+        found.append((middle.std(), np.arccos(np.clip(factor / 2, -1.0, 1.0)) / quarter))
+    return bool((np.ptp(found, axis=0) < _SINE * np.mean(found, axis=0)).all())
 
 
 def _cubic(problem: Problem, parameters: Mapping[str, tuple[float, float]]) -> float:

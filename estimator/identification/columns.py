@@ -6,6 +6,8 @@ import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
+from estimator.units import conversion, plain
+
 #: Names of columns, in lower case, up to the first character that is not a letter.
 _INPUTS = ("u", "input", "force", "f", "in", "drive", "excitation")
 #: Kind of an output to the words that name it.
@@ -46,22 +48,48 @@ def unit_of(name: str) -> str | None:
     """The unit that the name of a column holds; None where it holds none.
 
     Example:
-        >>> [unit_of(name) for name in ("force [N]", "Time/ms", "disp_mm", "Time in ms", "t {s}", "CH1", "x_rel")]
-        ['N', 'ms', 'mm', 'ms', 's', None, None]
+        >>> [unit_of(name) for name in ("force [N]", "Time/ms", "v_mm/s", "Time in ms", "t {s}", "CH1", "x_rel")]
+        ['N', 'ms', 'mm/s', 'ms', 's', None, None]
     """
     if found := re.search(r"(?:\[\s*([^\]]+?)\s*\]|\(\s*([^)]+?)\s*\)|\{\s*([^}]+?)\s*\}|<\s*([^>]+?)\s*>)\s*$", name):
         return next(group for group in found.groups() if group)
-    patterns = [r"\s+in\s+(\S+)\s*$", r"\w\s*/\s*(\S.*?)\s*$"]
+    # Of v_m/s the unit is m/s, and not s.
+    patterns = [r"\s+in\s+(\S+)\s*$", r"[^\W_](?:_+|\s+)(\S+/\S+)\s*$", r"\w\s*/\s*(\S.*?)\s*$"]
     if word_of(name) in (*_TIMES, *_INPUTS, *_OUTPUTS):  # and not Channel A
         patterns.append(r"[^\W_](?:_+|\s+)(\S+)\s*$")
     found = next((one for one in (re.search(p, name) for p in patterns) if one and is_unit(one.group(1))), None)
     return found.group(1) if found else None
 
 
+def bare(name: str) -> str:
+    """The name of a column without the unit behind it.
+
+    Example:
+        >>> [bare(name) for name in ("force [N]", "Time/ms", "CH1")]
+        ['force', 'Time', 'CH1']
+    """
+    unit = unit_of(name)
+    return (
+        name.strip() if unit is None else re.sub(r"(?:\s+in\s+|[\s_/\[({<])*$", "", name[: name.rindex(unit)]).strip()
+    )
+
+
+def headed(name: str, unit: str) -> str:
+    """The name of a column of numbers in a unit: as it is, unless it says another one.
+
+    Example:
+        >>> headed("Weg [mm]", "mm"), headed("Weg [mm]", "m"), headed("Weg", "m")
+        ('Weg [mm]', 'Weg [m]', 'Weg')
+    """
+    told = unit_of(name)
+    return name if told is None or unit == "1" or conversion(told, unit) == 1.0 else f"{bare(name)} [{unit}]"
+
+
 def is_unit(word: str) -> bool:
     """Whether a word, which may stand in brackets, is a unit, or stands for none."""
-    bare = re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", word.strip())
-    return bare != word.strip() or bare.lower() in (*_NONE, "none") or bare in SECONDS or bool(_UNITS.fullmatch(bare))
+    inner = re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", word.strip())
+    known = inner.lower() in (*_NONE, "none") or inner in SECONDS or bool(_UNITS.fullmatch(inner))
+    return known or inner != word.strip()
 
 
 def time_unit(path: Path, name: str) -> float:
@@ -70,11 +98,11 @@ def time_unit(path: Path, name: str) -> float:
     Raises:
         ValueError: where the name holds more than the time, and no unit that is known.
     """
-    unit, bare = unit_of(name), name.strip().lower()
-    if unit is None and word_of(name) in SECONDS and bare not in _TIMES[:1]:
+    unit, whole = unit_of(name), name.strip().lower()
+    if unit is None and word_of(name) in SECONDS and whole not in _TIMES[:1]:
         unit = word_of(name)
     if unit is None:
-        rest = re.sub(r"^[^\W_]+", "", bare).strip(" _-/.:")
+        rest = re.sub(r"^[^\W_]+", "", whole).strip(" _-/.:")
         if not rest or rest in ("value", "stamp", "base", "axis"):
             return 1.0
         unit = rest
@@ -84,13 +112,6 @@ def time_unit(path: Path, name: str) -> float:
             f"{unit!r:.40}; rename the column, such as 'time [ms]'"
         )
     return SECONDS[unit]
-
-
-def plain(unit: str) -> str:
-    """A unit in one way of writing."""
-    for written, usual in (("µ", "u"), ("μ", "u"), ("²", "2"), ("^", ""), ("·", " "), ("*", " ")):
-        unit = unit.replace(written, usual)
-    return unit.replace(" ", "")
 
 
 def with_unit(path: Path, name: str, unit: str) -> str:
@@ -164,20 +185,16 @@ def _named(path: Path, names: Sequence[str], wish: str | None, table: str) -> li
     """The place of the column that a rig names, in a list; an empty one where it names none."""
     if wish is None:
         return []
-    found = [k for k, name in enumerate(names) if _is(name, wish)]
+    # The name as it stands there, or without its unit; or else the file has the same in another unit than the rig.
+    told = wish.strip().lower()
+    found = [k for k, name in enumerate(names) if told in (name.strip().lower(), bare(name).lower())]
+    found = found or [k for k, name in enumerate(names) if bare(wish).lower() == bare(name).lower()]
     if len(found) != 1:
         raise ValueError(
             f"{path} must have one column {wish!r:.60}, which the rig's [{table}] names, but has {list(names)}; mend "
             f"one of them"
         )
     return found
-
-
-def _is(name: str, wish: str) -> bool:
-    """Whether a column is the one that is wished, with or without the unit behind its name."""
-    unit = unit_of(name)
-    bare = name if unit is None else re.sub(r"(?:\s+in\s+|[\s_/\[({<])*$", "", name[: name.rindex(unit)])
-    return wish.strip().lower() in (name.strip().lower(), bare.strip().lower())
 
 
 def _listed(words: Sequence[str]) -> str:

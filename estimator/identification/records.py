@@ -18,7 +18,7 @@ from estimator.extras import need
 from estimator.files import whole_file
 from estimator.identification.sensors import stale
 from estimator.identification.shared import shared
-from estimator.identification.tables import read_table
+from estimator.identification.tables import ALIKE, MOST, read_table
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
 from estimator.units import SIZES
@@ -55,9 +55,6 @@ numpy.savez(buffer, **{name: held[name] for name in names if name in held})
 sys.stdout.buffer.write(buffer.getvalue())
 """
 
-#: Where most steps between times are alike to this part of them, a leap of whole steps is of lines that were lost.
-_ALIKE, _MOST = 0.05, 0.8
-
 #: Some record has the rig's sampling step to this part of it.
 _OTHER = 0.02
 
@@ -77,6 +74,7 @@ class Record:
         bursts: of these.
         repeats: samples for which each output stood; 1 where none was repeated.
         times: (T,) of the samples [s], where these are not the rig's step apart.
+        step: between most samples [s], as its own times say; None where it has none.
         over_range: (T,) whether an output was over range, in a record that is whole.
     """
 
@@ -89,6 +87,7 @@ class Record:
     bursts: int = 0
     repeats: int = 1
     times: FloatArray | None = None
+    step: float | None = None
     over_range: npt.NDArray[np.bool_] | None = field(default=None, repr=False)
 
     def counted(self, step: float) -> FloatArray:
@@ -191,7 +190,7 @@ def _record(name: str, given: tuple[Any, ...], step: float) -> Record:
     for k in np.flatnonzero(np.diff(times) <= 0)[:1]:
         raise ValueError(f"times of {name} must grow, but {times[k + 1]:.9g} s comes after {times[k]:.9g} s; sort them")
     even = np.ptp(times - step * np.arange(len(times))) < 0.01 * step
-    return Record(name, u, y, times=None if even else times)
+    return Record(name, u, y, times=None if even else times, step=float(np.median(np.diff(times))))
 
 
 def _are_same(one: Record, other: Record) -> bool:
@@ -331,8 +330,8 @@ def _read_mat(path: Path, rig: Rig) -> list[Record]:
 
 def _read_text(path: Path, rig: Rig) -> Record:
     table = read_table(path, rig.input.column, rig.output.column)
-    table.check(rig.input, rig.output)
-    return _ranged(str(path), table.inputs, table.columns[table.y], table.times(rig.step), rig.step)
+    record = _ranged(str(path), *table.pair(rig.input, rig.output), table.times(rig.step), rig.step)
+    return replace(record, step=table.step())
 
 
 def _ranged(name: str, u: FloatArray, y: FloatArray, times: FloatArray | None = None, step: float = 0.0) -> Record:
@@ -351,8 +350,8 @@ def _with_lost(
     steps = np.diff(times)
     usual = np.nanmedian(steps)
     leaps = np.round(steps / usual)
-    alike = np.abs(steps - np.maximum(leaps, 1) * usual) < _ALIKE * usual
-    if not np.isfinite(steps).all() or np.mean(np.abs(steps - usual) < _ALIKE * usual) < _MOST or not alike.all():
+    alike = np.abs(steps - np.maximum(leaps, 1) * usual) < ALIKE * usual
+    if not np.isfinite(steps).all() or np.mean(np.abs(steps - usual) < ALIKE * usual) < MOST or not alike.all():
         return u, y, beyond, times
     places = np.concatenate([[0], np.cumsum(np.maximum(leaps, 1)).astype(np.intp)])
     wide = lambda values, fill: np.full(places[-1] + 1, fill, dtype=values.dtype)  # noqa: E731

@@ -8,8 +8,9 @@ import numpy as np
 
 from estimator.belief import Belief
 
-#: Standard deviations by which the stiffness at rest differs from a for sure, and by what part of it that matters.
-_SURE, _MATTERS = 5.0, 1e-3
+#: Standard deviations by which the stiffness at rest differs from a for sure; and by what part of it, or by how many
+#: standard deviations of a itself, that matters.
+_SURE, _MATTERS, _OFF = 5.0, 1e-3, 3.0
 
 
 class Rest(NamedTuple):
@@ -52,5 +53,6 @@ def at_rest(belief: Belief) -> Rest | None:
     stds = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slopes, cov[own], slopes), 0.0))
     away = slopes[0] - np.array([1.0, 0.0, 0.0])
     differs = abs(k - a), float(np.sqrt(max(away @ cov[own] @ away, 0.0)))
-    symmetric = differs[0] < _SURE * differs[1] or differs[0] < _MATTERS * a
+    matters = min(_MATTERS * a, _OFF * float(np.sqrt(cov[at[0], at[0]])))
+    symmetric = differs[0] < _SURE * differs[1] or differs[0] < matters
     return Rest(x, (k, float(stds[0])), (3 * b * x, float(stds[1])), bool(symmetric))

@@ -43,6 +43,13 @@ _SMALLEST, _LARGEST = 0.003, 2.0
 _DRAWN = ("gain", "damping", "stiffness", "cubic")
 
 
+def _inputs(problem: Problem) -> FloatArray:
+    """(T, rows) inputs with the nearest whole delay: only what is held may act a whole sample early."""
+    rig = problem.rig
+    least = -1 if rig.interpolation == "zero_order" else 0
+    return problem.samples_of(rig.interpolation, max(round(rig.delay), least)).inputs
+
+
 def starts(problem: Problem) -> list[FloatArray]:
     """Coefficients (K,) to begin with: one set for each width of the bumps, and each way to lose the drift.
 
@@ -51,7 +58,7 @@ def starts(problem: Problem) -> list[FloatArray]:
     """
     names = list(problem.model.coefficients)
     problem = problem.evened()
-    inputs = problem.samples_of(problem.rig.interpolation, round(problem.rig.delay)).inputs
+    inputs = _inputs(problem)
     found = []
     integrates = KINDS[problem.rig.output.kind] > 0
     middles = _middles(problem)
@@ -123,7 +130,7 @@ def rests(problem: Problem, points: FloatArray) -> FloatArray:
 
 def misfit(problem: Problem) -> float:
     """What the equation leaves of the acceleration at best, in parts of it, over bumps of some widths."""
-    inputs = problem.samples_of(problem.rig.interpolation, round(problem.rig.delay)).inputs
+    inputs = _inputs(problem)
     periods = _PERIODS[1] if KINDS[problem.rig.output.kind] > 0 else 0.0
     left = [1.0]
     for part in _WIDTHS[:2]:

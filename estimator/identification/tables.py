@@ -18,7 +18,6 @@ from estimator.identification.columns import (
     chosen,
     is_channel,
     is_unit,
-    plain,
     time_unit,
     unit_of,
     with_unit,
@@ -27,13 +26,13 @@ from estimator.identification.columns import (
 from estimator.identification.fields import WITH_COMMAS, number, stamp, text_of
 from estimator.parameters import FloatArray
 from estimator.rig import Channel
-from estimator.units import kind_of
+from estimator.units import conversion, kind_of
 
 #: Times may be off an even grid by this part of a step, or by their last digit, and are even all the same.
 _EVEN = 0.005
 
 #: Where most steps are alike to this part of them, a leap of whole steps is of lines that were lost.
-_ALIKE, _MOST = 0.05, 0.8
+ALIKE, MOST = 0.05, 0.8
 
 #: A step is no longer than this many usual ones; what is longer is a gap.
 _LEAP = 3.0
@@ -84,8 +83,8 @@ class Table:
         time, later = self._times()
         steps = time[later] - time[later - 1]
         usual = float(np.median(steps))
-        alike = np.abs(steps - usual) < _ALIKE * usual
-        return float(steps[alike if alike.mean() > _MOST else steps < _LEAP * usual].mean())
+        alike = np.abs(steps - usual) < ALIKE * usual
+        return float(steps[alike if alike.mean() > MOST else steps < _LEAP * usual].mean())
 
     def times(self, step: float) -> FloatArray | None:
         """(T,) times [s] of the lines, where these are not ``step`` apart; None where they are, or there are none.
@@ -170,19 +169,13 @@ class Table:
             )
         return named or told
 
-    def check(self, source: Channel, sink: Channel) -> None:
-        """Refuse names of columns that contradict the channels of a rig; a pure number, 1, contradicts nothing.
+    def pair(self, source: Channel, sink: Channel) -> tuple[FloatArray, FloatArray]:
+        """(T,) inputs and outputs in the units of the channels of a rig: a column in mm is scaled where the rig has m.
 
         Raises:
-            ValueError: naming the column, for another unit, or another kind of output.
+            ValueError: naming the column, for the unit of another quantity, or another kind of output. A pure number,
+                1, contradicts nothing.
         """
-        for place, channel in ((self.u, source), (self.y, sink)):
-            unit = None if place is None else self.unit(place)
-            if unit and channel.unit != "1" and plain(unit) != plain(channel.unit):
-                raise ValueError(
-                    f"{self.path}: {self.names[place or 0]!r:.60} must be in the rig's unit, {channel.unit}, but is in "
-                    f"{unit}; convert the column, or write its unit into the rig"
-                )
         word = word_of(self.names[self.y]) if self.names else ""
         kind = next((one for one, words in KINDS.items() if word in words and len(word) > 1), sink.kind)
         if kind != sink.kind:
@@ -190,6 +183,20 @@ class Table:
                 f"{self.path}: {self.names[self.y]!r:.60} must be the rig's kind of output, {sink.kind}, but is called "
                 f"{kind}; mend one of them"
             )
+        return self.inputs * self._factor(self.u, source), self.columns[self.y] * self._factor(self.y, sink)
+
+    def _factor(self, place: int | None, channel: Channel) -> float:
+        """From the unit of a column to that of its channel; 1 where one of them says none."""
+        unit = None if place is None else self.unit(place)
+        if not unit or channel.unit == "1":
+            return 1.0
+        factor = conversion(unit, channel.unit)
+        if factor is None:
+            raise ValueError(
+                f"{self.path}: {self.names[place or 0]!r:.60} must be in the rig's unit, {channel.unit}, but is in "
+                f"{unit}; convert the column, or write its unit into the rig"
+            )
+        return factor
 
 
 def read_table(path: Path, source: str | None = None, sink: str | None = None) -> Table:

@@ -69,14 +69,18 @@ def run(monkeypatch, capsys):
 
 def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
     monkeypatch.chdir(folder)
-    assert run("rig", "init", "rig.toml", "--from", "record.csv")[0] == 0
+    status, told, _ = run("rig", "init", "rig.toml", "--from", "record.csv")
+    assert status == 0
+    assert "The sampling step is 0.001 s (1000 Hz), by the times in time [ms]." in told
+    assert "The output is in mm, and is taken in m" in told
     rig = Rig.from_file("rig.toml")
-    assert (rig.step, rig.input.unit, rig.output.unit, rig.output.kind) == (1e-3, "N", "mm", "displacement")
+    assert (rig.step, rig.input.unit, rig.output.unit, rig.output.kind) == (1e-3, "N", "m", "displacement")
     status, told, _ = run("identify", "rig.toml", "record.csv", "--report", "out/page.html")
     assert status == 0
     (row,) = [line.split() for line in told.splitlines() if line.split()[:1] == ["m"] and " to " in line]
-    assert float(row[1]) == pytest.approx(4e-4, rel=0.01)
-    assert row[-2:] == ["N", "s²/mm"]
+    assert float(row[1]) == pytest.approx(0.4, rel=0.01)
+    assert row[-1] == "kg"
+    assert "The sampling step is 0.001 s (1000 Hz) by the rig, and the times agree." in told
     assert "No check speaks against this result." in told
     page = Path("out/page.html").read_text()
     assert "duffing-env identify rig.toml record.csv --report out/page.html" in page
@@ -87,10 +91,9 @@ def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
     assert status == 0
     described = json.loads(told)
     assert [one["samples"] for one in described["records"]] == [599, 425]
-    units = {"m": 1e-3, "c": 1e-3, "a": 1e-3, "b": 1e-9}
     for name, truth in TRUTH.items():
         found = described["parameters"][name]
-        assert found["mean"] == pytest.approx(truth * units[name], rel=0.01)
+        assert found["mean"] == pytest.approx(truth, rel=0.01)
         assert found["low"] < found["mean"] < found["high"]
     assert described["warnings"] == []
     assert Rig.from_dict(described["rig"]) == rig
@@ -109,9 +112,9 @@ def test_columns_of_any_name_are_named_once(run, folder, monkeypatch):
     assert "by --input and --output of duffing-env rig init" in told
     assert run("rig", "init", "hart.toml", "--from", "daten.csv", "--input", "Kraft", "--output", "Weg")[0] == 0
     rig = Rig.from_file("hart.toml")
-    assert (rig.input.column, rig.output.column, rig.output.unit) == ("Kraft", "Weg", "mm")
+    assert (rig.input.column, rig.output.column, rig.output.unit) == ("Kraft", "Weg", "m")
     status, told, _ = run("identify", "hart.toml", "daten.csv", "--json")
-    assert json.loads(told)["parameters"]["m"]["mean"] == pytest.approx(4e-4, rel=0.01)
+    assert json.loads(told)["parameters"]["m"]["mean"] == pytest.approx(0.4, rel=0.01)
 
 
 def test_warnings_are_told(run, folder, monkeypatch):
@@ -171,12 +174,12 @@ def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch
 @table(
     ("head", "step", "units", "kind"),
     [
-        ("time [ms],force [N],displacement [mm]", 1.6384e-3, ("N", "mm"), "displacement"),
+        ("time [ms],force [N],displacement [mm]", 1.6384e-3, ("N", "m"), "displacement"),
         ("t (ms),u (V),v (V)", 1.6384e-3, ("V", "V"), "velocity"),
-        ("time [ms],drive [V],response [m/s^2]", 1.6384e-3, ("V", "m/s^2"), "acceleration"),
-        ("ACC (g),F (N),t (ms)", 1.6384e-3, ("N", "g"), "acceleration"),
+        ("time [ms],drive [V],response [m/s^2]", 1.6384e-3, ("V", "m/s²"), "acceleration"),
+        ("ACC (g),F (N),t (ms)", 1.6384e-3, ("N", "m/s²"), "acceleration"),
         ("time,input,output", 1.6384, ("1", "1"), "displacement"),
-        ("time,input,response [deg]", 1.6384, ("1", "deg"), "displacement"),
+        ("time,input,response [deg]", 1.6384, ("1", "rad"), "displacement"),
     ],
 )
 def test_a_rig_takes_what_a_record_tells(run, tmp_path, monkeypatch, head, step, units, kind):

@@ -179,7 +179,8 @@ def test_a_file(name, tmp_path, capsys):
     if "/" in name or len(name) > 200:
         name = name.replace("/", ":")[:200]
     path = record(tmp_path / f"{name}.csv")
-    text = from_record(path)
+    text, said = from_record(path)
+    assert is_tame(said)
     assert tomllib.loads(text).keys() == {"step", "interpolation", "delay", "input", "output"}
     assert is_tame(text)
     result = identify(Rig.from_dict(RIG), [path])

@@ -193,8 +193,8 @@ def test_errors_name_the_record(records, message):
 @table(
     ("names", "message"),
     [
-        ("u [kN],y [mm/s]", "'u [kN]' must be in the rig's unit, N, but is in kN; convert the column"),
-        ("force [N],velocity [m/s]", "'velocity [m/s]' must be in the rig's unit, mm/s, but is in m/s"),
+        ("u [kV],y [mm/s]", "'u [kV]' must be in the rig's unit, N, but is in kV; convert the column"),
+        ("force [N],velocity [counts]", "'velocity [counts]' must be in the rig's unit, mm/s, but is in counts"),
         ("force [N],displacement [mm/s]", "must be the rig's kind of output, velocity, but is called displacement"),
         ("Kraft [N],Strom [A],v [mm/s]", "rename: an input is called u, input, force"),
     ],
@@ -205,6 +205,17 @@ def test_names_of_columns_that_contradict_the_rig_are_refused(tmp_path, names, m
     rig = Rig(0.01, input=Channel("N"), output=Channel("mm/s", kind="velocity"))
     with pytest.raises(ValueError, match=re.escape(message)):
         read(tmp_path / "r.csv", rig)
+
+
+@table(
+    ("names", "factors"),
+    [("u [kN],y [mm/s]", (1e3, 1.0)), ("force_mN,v_m/s", (1e-3, 1e3)), ("force [lbf],v [in/s]", (4.4482216, 25.4))],
+)
+def test_a_column_in_another_unit_of_the_same_quantity_is_converted(tmp_path, names, factors):
+    (tmp_path / "r.csv").write_text("\n".join([names, "1,2", "3,∞", ",4"]), encoding="utf-8")
+    u, y = read(tmp_path / "r.csv", Rig(0.01, input=Channel("N"), output=Channel("mm/s", kind="velocity")))
+    np.testing.assert_allclose(u, factors[0] * np.array([1, 3, np.nan]), rtol=1e-7)
+    np.testing.assert_allclose(y, factors[1] * np.array([2, np.nan, 4]), rtol=1e-7)
 
 
 def test_units_in_another_way_of_writing_and_times_of_another_name_are_taken(tmp_path):

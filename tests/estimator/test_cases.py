@@ -1,0 +1,43 @@
+"""Records as people have them are right, or named for the right reason; and the manual says which is which."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from cases import CASES, Case, answered
+from tables import table
+
+#: Kind to its first case; tests/research has all.
+FIRST = {case.kind: case for case in reversed(CASES)}
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if FIRST[case.kind] is case], ids=str)
+def test_a_record_as_people_have_it_is_right_or_named(case, tmp_path):
+    case.check(tmp_path)
+
+
+@table(
+    ("case", "interpolation", "delay", "verdict", "name"),
+    [
+        (Case("voice_coil", {}, ""), "linear", 1, "named", "interpolation"),  # which resembles what is held and lags
+        (Case("half_sample", {"smoothly": True, "part": 0.75, "samples": 2000}, ""), "spline", -0.75, "right", ""),
+    ],
+)
+def test_the_way_of_the_input_that_a_check_advised_is_judged_again(tmp_path, case, interpolation, delay, verdict, name):
+    made = replace(case.make(), interpolation=interpolation, delay=delay)
+    found, result = next(answered(made, tmp_path))
+    assert (found, [warning.name for warning in result.warnings][:1]) == (verdict, [name] if name else [])
+
+
+def test_two_amplitudes_of_a_sine_tell_what_one_leaves_open(tmp_path):
+    one, other = (Case("settled_sine", {"part": 0.8, "size": size}, "", seed=4).make() for size in (0.3, 0.9))
+    both = replace(one, files={"one.csv": one.files["r.csv"], "other.csv": other.files["r.csv"]})
+    assert next(answered(one, tmp_path))[1].open == ("m", "a", "b")
+    verdict, result = next(answered(both, tmp_path))
+    assert (verdict, result.open) == ("right", ())
+
+
+def test_the_manual_has_the_answer_to_every_case():
+    page = (Path(__file__).parents[2] / "docs" / "cases.md").read_text(encoding="utf-8")
+    rows = [[cell.strip(" `") for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    assert rows[1:] == [[str(case), case.answer, case.then] for case in CASES]
