@@ -1,7 +1,8 @@
-"""Imitation: the network of a model learns what another policy decides, before it learns by reward.
+"""Imitation: the networks of a model learn what another policy decides and is worth, before they learn by reward.
 
 DAgger (Ross, Gordon and Bagnell 2011): in every other environment the teacher's own action is taken, in the others the
-student's, and the teacher says everywhere what it would do. So the student also sees where its own mistakes lead.
+student's, and the teacher says everywhere what it would do. So the student also sees where its own mistakes lead. The
+critic learns the returns of the episodes that end meanwhile: one that knows nothing would unlearn the actor.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _LEARNING_RATE = 1e-3
 def imitate(
     model: Any, envs: FeatureVecEnv, teacher: str, samples: int, seed: int, tell: Callable[[float], None]
 ) -> None:
-    """Let the actor of a model of Stable-Baselines3's PPO choose as another policy does.
+    """Let the actor of a model of Stable-Baselines3's PPO choose as another policy does, and its critic know the worth.
 
     Args:
         model: to teach.
@@ -44,6 +45,8 @@ def imitate(
     taught = np.arange(envs.num_envs) % 2 == 0
     seen: list[npt.NDArray[np.float32]] = []
     wanted: list[npt.NDArray[Any]] = []
+    rewards: list[npt.NDArray[np.float32]] = []
+    ends: list[npt.NDArray[np.bool_]] = []
     shown, state, starts = envs.reset(), None, np.ones(envs.num_envs, dtype=np.bool_)
     while (done := len(seen) * envs.num_envs) < samples:
         actions, state = asked.predict(envs.observations, state, starts, deterministic=True)
@@ -52,10 +55,31 @@ def imitate(
         wanted.append(choices)
         own, _ = model.policy.predict(shown, deterministic=False)
         played = np.where(taught if choices.ndim == 1 else taught[:, None], choices, own)
-        shown, _, starts, _ = envs.step(played)
+        shown, reward, starts, _ = envs.step(played)
+        rewards.append(reward)
+        ends.append(starts)
         if len(seen) % _ROUND == 0 or done + envs.num_envs >= samples:
             _fit(model.policy, optimizer, np.concatenate(seen), np.concatenate(wanted), generator)
         tell(min(1.0, (done + envs.num_envs) / samples))
+    returns = returns_of(np.array(rewards), np.array(ends), model.gamma)
+    known = np.isfinite(returns)
+    if known.any():
+        _fit_critic(model.policy, optimizer, np.array(seen)[known], returns[known], generator)
+
+
+def returns_of(rewards: npt.NDArray[Any], ends: npt.NDArray[np.bool_], discount: float) -> npt.NDArray[np.float32]:
+    """Discounted returns (T, n) from every sample to the end of its episode; NaN where that has not come.
+
+    Example:
+        >>> rewards, ends = np.ones((4, 1), np.float32), np.array([[False], [True], [False], [False]])
+        >>> returns_of(rewards, ends, 0.5).ravel()
+        array([1.5, 1. , nan, nan], dtype=float32)
+    """
+    returns = np.full(rewards.shape, np.nan, dtype=np.float32)
+    after = np.full(rewards.shape[1], np.nan, dtype=np.float32)
+    for t in reversed(range(len(rewards))):
+        after = returns[t] = rewards[t] + np.float32(discount) * np.where(ends[t], np.float32(0), after)
+    return returns
 
 
 def _choices(envs: FeatureVecEnv, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -76,6 +100,19 @@ def _fit(policy: Any, optimizer: Any, seen: Any, wanted: Any, generator: Any) ->
     for _ in range(_EPOCHS):
         for batch in torch.randperm(len(seen), generator=generator).split(_BATCH):
             loss = -policy.get_distribution(seen[batch]).log_prob(wanted[batch]).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+
+
+def _fit_critic(policy: Any, optimizer: Any, seen: Any, returns: Any, generator: Any) -> None:
+    """Lower the squared error of the critic."""
+    import torch
+
+    seen, returns = torch.from_numpy(seen), torch.from_numpy(returns)
+    for _ in range(_EPOCHS):
+        for batch in torch.randperm(len(seen), generator=generator).split(_BATCH):
+            loss = (policy.predict_values(seen[batch])[:, 0] - returns[batch]).square().mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
