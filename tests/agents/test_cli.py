@@ -79,7 +79,7 @@ def test_help_explains_every_option(script, name):
             assert explanation.replace(" ", "") in here, flag
             assert "(default:" in here, flag
             explained += 1
-    assert explained == {"train.py": 33, "evaluate.py": 12}[name]
+    assert explained == {"train.py": 36, "evaluate.py": 12}[name]
 
 
 @table(
@@ -153,7 +153,7 @@ def test_a_bad_value_shows_no_traceback(tmp_path):
 def test_a_bad_reward_is_one_line(script, tmp_path):
     status, told, messages = script("train.py", "--reward", "foo")
     assert status == 2
-    note = "An update takes 16,384 samples, so 5,013,504 will be learned from, not 5,000,000."
+    note = "An update takes 32,768 samples, so 5,013,504 will be learned from, not 5,000,000."
     assert " ".join(told.split()) == note
     (line,) = (line for line in messages.splitlines() if not line.startswith("duffing-env is compiling"))
     assert line.startswith("train.py: ")

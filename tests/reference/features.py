@@ -73,7 +73,8 @@ def features(observation, s: Setting):
         share = (left + o["budget_left"] * s.samples) / 2
         reserve = np.sqrt(o["budget_left"] * s.energy / s.max_input**2)
         thrift = min(1.0, reserve / np.sqrt(left))
-        push = min(1.0, s.haste * thrift)
+        height = np.abs(roll(theta, x, before, lambda t, velocity: 0.0, limit)[0]).max() / limit
+        push = min(1.0, max(thrift, s.growth * height / s.moved))
     process, sensor = s.process * np.exp(-o["log_gamma"]), s.sensor * np.exp(-o["log_xi_y"])
     variance = process + sensor
     J = share / variance * s.rate
