@@ -64,9 +64,15 @@ def test_rewards_differ_from_the_environments_by_a_potential():
     assert 0 < early < 6
 
 
-def test_rewards_that_count_no_information_stay_as_they_are():
-    options = {"reward": "parameter_error", "horizon": 24}
-    plain, envs = DuffingVecEnv(AMPLITUDE, 3, seed=2, **options), seen_through(rows=3, in_nats=False, **options)
+@table(
+    ("env_id", "in_nats", "options"),
+    [(AMPLITUDE, False, {"reward": "parameter_error"}), (POWER, True, {}), (AMPLITUDE, True, {"drift": 0.01})],
+)
+def test_rewards_without_a_potential_stay_as_they_are(env_id, in_nats, options):
+    """Those that count no information, and where it is limited by energy or forgotten."""
+    options = {"horizon": 24, **options}
+    plain = DuffingVecEnv(env_id, 3, seed=2, **options)
+    envs = seen_through(rows=3, env_id=env_id, in_nats=in_nats, **options)
     envs.reset()
     plain.reset()
     for _ in range(5):
