@@ -61,6 +61,9 @@ MARGIN = 8.0
 #: proportion to the motion takes least energy.
 GROWTH = 0.15
 
+#: No episode is longer, and no move.
+_MOST = {"samples": 1e9, "pace": 1e3}
+
 #: By how much covariances of float32 correlations are made positive definite.
 _RIDGE = 1e-6
 
@@ -147,9 +150,11 @@ def _foresee(C, rate, count, W, work):
     for i in range(len(C)):
         for j in range(len(C)):
             work[i, j] = W[i, j] + count * rate[i, j]
-    known += half_log_det(work)
+    growth = half_log_det(work)
+    if growth == -np.inf:  # of a limit so far that numbers end before it: nothing is foreseen
+        return 0.0
     invert(work, W)
-    return known
+    return known + growth
 
 
 @cache
@@ -315,7 +320,7 @@ def compiled(view: View) -> Any:
         f[8], f[9] = sign * o[at.last_input], sign * o[at.last_output]
         f[10], f[11] = start[now] / s.limit, start[velocity] * s.pace / s.limit
         f[12], f[13], f[14] = 0.5 * np.log(variance / s.limit**2) + 7.0, span[0], span[1]
-        f[OTHERS] = to_come
+        f[OTHERS] = to_come / k
         total = 0.0
         for a in range(k):
             for b in range(k):
@@ -416,14 +421,19 @@ class FeatureMap:
         flat = np.asarray(numbers, dtype=np.float64)
         sizes = (k, k, k * k, n)
         size = sum(sizes) + len(Setting._fields) - len(sizes)
-        energy = size - len(Setting._fields) + Setting._fields.index("energy")
-        # All but the energy, which may be without limit, are finite.
-        if flat.shape != (size,) or not np.isfinite(np.delete(flat, energy)).all():
-            raise ValueError(f"setting must be {size} finite numbers, but is {flat.tolist()!r:.200}")
+        if flat.shape != (size,) or np.isnan(flat).any():
+            raise ValueError(f"setting must be {size} numbers, but is {flat.tolist()!r:.200}")
         center, std, rate, scales, others = np.split(flat, np.cumsum(sizes))
         setting = Setting(center, std, rate.reshape(k, k), scales, *others.tolist())
-        if min(std.min(), scales.min(), *others) < 0 or setting.samples < 1 or setting.pace < 1:
-            raise ValueError(f"setting must have positive deviations, sizes and limits, but is {flat.tolist()!r:.200}")
+        limits = {name: getattr(setting, name) for name in Setting._fields[len(sizes) :]}
+        bad = [name for name, value in limits.items() if not (value >= 0 and (value < np.inf or name == "energy"))]
+        bad += [name for name in ("max_input", "max_output", "limit", "moved") if limits[name] == 0]
+        bad += [name for name in ("samples", "pace") if not 1 <= limits[name] <= _MOST[name]]
+        bad += [name for name in ("std", "scales") if not (getattr(setting, name) > 0).all()]
+        bad += ["rate"] if (np.diag(setting.rate) < 0).any() else []
+        if bad or not np.isfinite(np.concatenate([center, std, rate, scales])).all():
+            named = bad[0] if bad else "center, std, rate or scales"
+            raise ValueError(f"setting must be of limits, sizes and deviations, but {named} cannot be that")
         return cls(setting, view, own=own)
 
     def to_tensor(self) -> FloatArray:

@@ -124,7 +124,10 @@ class LearnedPolicy:
         self._description = card.get("features") or {}
         self._map: FeatureMap | None = None
         if network.features and "setting" in tensors:
-            self._map = self._fitting(FeatureMap.from_tensor(tensors["setting"], self._description))
+            found = FeatureMap.from_tensor(tensors["setting"], self._description)
+            if found.size != self._seen:
+                raise ValueError(f"the first layer must take {found.size} features, but takes {self._seen}")
+            self._map = found
         self.normalizer: tuple[FloatArray, FloatArray, float] | None = None
         if network.normalised:
             mean, std = (_tensor(tensors, f"normalizer.{part}", self._seen) for part in ("mean", "std"))

@@ -146,7 +146,12 @@ class PPOSettings(OnPolicySettings):
         """Stable-Baselines3's PPO."""
         from stable_baselines3 import PPO
 
-        return PPO("MlpPolicy", **self._on_policy(envs, seed))
+        buffer: dict[str, Any] = {}
+        if self.features:
+            from agents.training.advantages import TimedRolloutBuffer
+
+            buffer["rollout_buffer_class"] = TimedRolloutBuffer
+        return PPO("MlpPolicy", **self._on_policy(envs, seed), **buffer)
 
 
 @dataclass(frozen=True)

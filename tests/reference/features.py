@@ -112,5 +112,5 @@ def features(observation, s: Setting):
     values = [np.mean(log_stds), max(log_stds), o["log_gamma"], o["log_xi_y"], o["time_left"], thrift, reserve, push]
     values += [sign * o["last_input"], sign * o["last_y"], x / limit, (x - before) / limit]
     values += [0.5 * np.log(variance / limit**2) + 7, low, high, *np.concatenate(list(found.values())), *free]
-    values += [to_come, np.log(np.trace(W @ s.rate) / (2 * variance) * s.samples + 1e-6)]
+    values += [to_come / 4, np.log(np.trace(W @ s.rate) / (2 * variance) * s.samples + 1e-6)]
     return np.clip(values, -BOUND, BOUND), sign, (low, high), push, to_come
