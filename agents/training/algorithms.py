@@ -142,12 +142,15 @@ class OnPolicySettings(AlgorithmSettings):
 class PPOSettings(OnPolicySettings):
     """Hyperparameters of PPO; chosen for a batched environment: large batches, few epochs."""
 
+    advantages_by_time: bool = True
+    """Whether advantages of features count alike at every time of an episode (`agents.training.advantages`)."""
+
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """Stable-Baselines3's PPO."""
         from stable_baselines3 import PPO
 
         buffer: dict[str, Any] = {}
-        if self.features:
+        if self.features and self.advantages_by_time:
             from agents.training.advantages import TimedRolloutBuffer
 
             buffer["rollout_buffer_class"] = TimedRolloutBuffer
