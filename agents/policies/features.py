@@ -6,8 +6,8 @@ rolled out without noise, after a first input up, none or down, and then
 - *at rest*: no further input,
 - *braking*: pushes against the motion.
 
-What the network sees of that is in `NAMES`. Where the model is odd, all of it is turned upright, so that the first
-sensor rises. The *shield* is the interval of choices after which braking still keeps the
+What the network sees of that is in `NAMES`. Where the model is odd, all of it is turned upright, so that the
+motion is upwards. The *shield* is the interval of choices after which braking still keeps the
 first sensor within its limit, with a margin of some predictive standard deviations; between the three first inputs the
 peaks are taken to be linear. Where no input does, it is the one that leads beyond the limit the least. A model without
 a limit on an output has no shield.
@@ -171,6 +171,10 @@ def compiled(view: View) -> Any:
     u, last, older, now, velocity, signal = (
         row[name] for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "SHOWN")
     )
+    # What pumps is a push along the motion itself: along what an accelerometer sees rise, it would brake.
+    rate, states, sensor = (model.rates or ("",))[0], list(model.states), next(iter(model.outputs.values()))
+    aside = states.index(rate) if rate in states and sensor != states[0] else -1
+    velocity = velocity if aside < 0 else row[rate]
     phi = row[f"PHI_{next(iter(model.coefficients))}"]
     pairs = tuple(combinations(range(k), 2))
     odd = (*range(at.state, at.state + n), at.last_input, *range(at.last_output, at.last_output + model.n_outputs))
@@ -221,7 +225,7 @@ def compiled(view: View) -> Any:
 
     @inner
     def turn(start):
-        """Make the first sensor rise."""
+        """Turn the state and the inputs over."""
         for i in range(n):
             start[i] = -start[i]
         for i in (last, older):
@@ -249,7 +253,8 @@ def compiled(view: View) -> Any:
                 taught += square(unknown, W)
             if brakes:
                 if high > 0.5 * s.limit:
-                    high += s.margin * np.sqrt(square(C, W) + (noise[0] if t == 0 else noise[1]))
+                    # What is not known of the coefficients adds up over a move.
+                    high += s.margin * np.sqrt(pace * pace * square(C, W) + (noise[0] if t == 0 else noise[1]))
                 reach = max(reach, high)
             elif which == 1 and (t + 1) % pace == 0 and pace <= t < 4 * pace:
                 f[FREE + t // pace - 1] = W[signal] / s.limit
@@ -319,6 +324,8 @@ def compiled(view: View) -> Any:
         f[4], f[5], f[6], f[7] = o[at.time_left], thrift, reserve, push
         f[8], f[9] = sign * o[at.last_input], sign * o[at.last_output]
         f[10], f[11] = start[now] / s.limit, start[velocity] * s.pace / s.limit
+        if aside >= 0:
+            f[11] = start[velocity] / s.scales[aside]
         f[12], f[13], f[14] = 0.5 * np.log(variance / s.limit**2) + 7.0, span[0], span[1]
         f[OTHERS] = to_come / k
         total = 0.0
