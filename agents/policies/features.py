@@ -54,8 +54,9 @@ BOUND = 10.0
 #: Moves that a rollout looks ahead: the first input, and four. More tell no more.
 _MOVES = 5
 
-#: Predictive standard deviations that the shield keeps from the limit on all tracks; chosen on the branch `validation`.
-MARGIN = 8.0
+#: Predictive standard deviations that the shield keeps from the limit: where the noises are known, and where they are
+#: not, so that these deviations are themselves believed. The same on all tracks; chosen on the branch `validation`.
+MARGIN, UNKNOWN_MARGIN = 8.0, 10.0
 
 #: Where the energy is limited, a push changes the height of a swing by this part of it in a sample: to push in
 #: proportion to the motion takes least energy.
@@ -409,7 +410,7 @@ class FeatureMap:
             sensor=float(np.exp(-setup.log_precisions[1])),
             shaken=shaken_of(experiment, swing),
             pace=float(swing.pace),
-            margin=MARGIN,
+            margin=MARGIN if experiment.noise_hypotheses == 1 else UNKNOWN_MARGIN,
             moved=abs(swing.moved) * float(setup.max_input) / float(setup.max_output),
             growth=GROWTH,
         )
