@@ -36,7 +36,7 @@ def test_ppo_is_as_its_class_says_where_its_file_is_silent():
     )
     others = ("duffing_env/Amplitude-v1", "duffing_env/Rig-v0", "duffing_env/WienerHammerstein-v0")
     assert [read_settings("ppo", other) for other in others] == [amplitude] * 3
-    assert (amplitude.features, amplitude.own, amplitude.levels, amplitude.gamma) == (True, True, 3, 1.0)
+    assert (amplitude.features, amplitude.own, amplitude.levels, amplitude.gamma) == (True, True, 2, 1.0)
     assert (amplitude.n_epochs, amplitude.activation) == (PPOSettings().n_epochs, PPOSettings().activation)
     assert (power.levels, short.n_steps, amplitude.hidden) == (5, 48, (128, 128))
     assert read_settings("ppo", "family").num_envs % LANES == 0
