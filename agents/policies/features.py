@@ -65,6 +65,9 @@ GROWTH = 0.15
 #: No episode is longer, and no move.
 _MOST = {"samples": 1e9, "pace": 1e3}
 
+#: Of a setting, what may be 0.
+_MAY_BE_ZERO = ("rate", "process", "sensor", "shaken", "margin")
+
 #: By how much covariances of float32 correlations are made positive definite.
 _RIDGE = 1e-6
 
@@ -429,19 +432,17 @@ class FeatureMap:
         flat = np.asarray(numbers, dtype=np.float64)
         sizes = (k, k, k * k, n)
         size = sum(sizes) + len(Setting._fields) - len(sizes)
-        if flat.shape != (size,) or np.isnan(flat).any():
+        if flat.shape != (size,):
             raise ValueError(f"setting must be {size} numbers, but is {flat.tolist()!r:.200}")
         center, std, rate, scales, others = np.split(flat, np.cumsum(sizes))
         setting = Setting(center, std, rate.reshape(k, k), scales, *others.tolist())
-        limits = {name: getattr(setting, name) for name in Setting._fields[len(sizes) :]}
-        bad = [name for name, value in limits.items() if not (value >= 0 and (value < np.inf or name == "energy"))]
-        bad += [name for name in ("max_input", "max_output", "limit", "moved") if limits[name] == 0]
-        bad += [name for name in ("samples", "pace") if not 1 <= limits[name] <= _MOST[name]]
-        bad += [name for name in ("std", "scales") if not (getattr(setting, name) > 0).all()]
-        bad += ["rate"] if (np.diag(setting.rate) < 0).any() else []
-        if bad or not np.isfinite(np.concatenate([center, std, rate, scales])).all():
-            named = bad[0] if bad else "center, std, rate or scales"
-            raise ValueError(f"setting must be of limits, sizes and deviations, but {named} cannot be that")
+        value: Any
+        for name, value in zip(Setting._fields, setting, strict=True):
+            held = np.diag(value) if name == "rate" else np.asarray(value)
+            sound = np.isfinite(value).all() or (name == "energy" and value == np.inf)
+            sound &= bool(name == "center" or (held > 0).all() or (name in _MAY_BE_ZERO and (held >= 0).all()))
+            if not sound or (name in _MOST and not 1 <= value <= _MOST[name]):
+                raise ValueError(f"{name} of setting must be positive and finite, but is {value!r:.80}; copy it anew")
         return cls(setting, view, own=own)
 
     def to_tensor(self) -> FloatArray:

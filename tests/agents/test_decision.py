@@ -183,8 +183,8 @@ def test_a_policy_for_all_oscillators_plays_each_but_not_without_one(tmp_path):
     [
         ("setting", lambda t: t[:-1], "setting must be"),
         ("setting", lambda t: t * np.nan, "setting must be"),
-        ("setting", lambda t: -t, "setting must have positive"),
-        ("0.weight", lambda t: t[:, 1:].copy(), "whose observation it sees"),
+        ("setting", lambda t: -t, "of setting must be positive"),
+        ("0.weight", lambda t: t[:, 1:].copy(), "the first layer must take"),
         ("normalizer.mean", lambda t: t[1:], "normalizer.mean must be finite"),
         ("normalizer.std", lambda t: 0 * t, "normalizer.std must be positive, but is 0.0"),
     ],

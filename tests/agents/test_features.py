@@ -204,9 +204,10 @@ def test_a_damaged_setting_is_refused():
         return damaged
 
     at = {name: i - len(found.setting) for i, name in enumerate(found.setting._fields)}
-    cases = [(whole[:-1], "numbers, but is"), (put(0, np.nan), "finite numbers"), (put(9, np.inf), "finite numbers")]
-    cases += [(put(4, -1.0), "positive"), (put(at["samples"], 0.0), "positive")]
-    cases += [(put(at["pace"], 0.0), "positive"), (put(at["energy"], -1.0), "positive")]
+    cases = [(whole[:-1], "numbers, but is"), (put(0, np.nan), "center of setting must be positive")]
+    cases += [(put(9, np.inf), "of setting must be positive and finite")]
+    cases += [(put(4, -1.0), "std of setting"), (put(at["samples"], 0.0), "samples of setting")]
+    cases += [(put(at["pace"], 1e6), "pace of setting"), (put(at["energy"], np.nan), "energy of setting")]
     assert_refused([(lambda t=tensor: FeatureMap.from_tensor(t, description), part) for tensor, part in cases])
 
 
