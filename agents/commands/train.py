@@ -106,7 +106,7 @@ class Config(TrainConfig):
             from agents.evaluation.comparison import compare, usual_policies
 
             untrained = folder / UNTRAINED
-            begun = (f"untrained={untrained}",) if untrained.exists() else ()
+            begun = (str(untrained),) if untrained.exists() else ()
             policies = (*begun, policy, *usual_policies(config.env, config.options))
             compare(policies, config.env, self.systems, config.options, folder, briefly=True)
             print("More, on more systems: duffing-env evaluate --help")

@@ -22,7 +22,6 @@ from agents.results import check_folder, write_json
 from agents.stopping import Stopper, telling
 from agents.training import family
 from agents.training.checkpoints import (
-    FOLDER,
     Progress,
     begin_with,
     drop_states,
@@ -45,7 +44,7 @@ LEARNING = "learning_curve.png"
 BEFORE = "steps_before"
 
 #: Folder of the policy before its first update.
-UNTRAINED = f"{FOLDER}/{0:09d}"
+UNTRAINED = "untrained"
 
 #: Environments whose episodes under random choices show how features vary.
 EXAMPLES = 64
@@ -82,8 +81,8 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
 
     - ``config.json``: the resolved configuration, the command and the versions,
     - ``policy.safetensors``, ``policy.json``: the policy,
-    - ``checkpoints/STEPS/``: the policy on the way, after the update that these samples were for; that of 0 samples is
-      the untrained one,
+    - ``checkpoints/STEPS/``: the policy on the way, after the update that these samples were for,
+    - ``untrained/``: the policy before its first update,
     - ``progress.csv``: Stable-Baselines3's log,
     - ``evaluations.csv``, ``best/``: where ``eval_every`` is given, the policy's worth on held-out systems before the
       first update and on the way, and the policy that was best by its log posterior gain,
@@ -198,7 +197,7 @@ class _Training:
         with closing(Log(self._folder, logs, self._progress.steps)) as logger:
             self._model.set_logger(logger)
             if self._progress.steps == 0:
-                save_checkpoint(self._folder, self._model, self._card(), None)
+                write_policy(self._folder / UNTRAINED, self._model, self._card())
             if self._config.eval_every > 0 and not self._held_out.has_begun:
                 self._evaluate()
             self._learn()

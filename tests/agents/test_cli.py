@@ -267,6 +267,7 @@ def test_train_then_evaluate(script, tmp_path):
     pictures = {"contraction.png", "excitations.png", "learning_curve.png"}
     assert made == pictures | {
         "checkpoints", "config.json", "evaluation.json", "policy.json", "policy.safetensors", "progress.csv",
+        "untrained",
     }  # fmt: skip
     assert any(line.startswith("shield ") for line in told.splitlines())
     for name in (*pictures, "evaluation.json"):
@@ -276,7 +277,7 @@ def test_train_then_evaluate(script, tmp_path):
     assert description["config"]["hyperparameters"]["hidden"] == [6, 5]
     assert description["command"][:5] == ["train.py", "--steps", "512", "--seed", "4"]
     compared = json.loads((tmp_path / "made" / "evaluation.json").read_text())
-    assert list(compared["policies"]) == ["untrained", "made", "ppo/amplitude", "shield", "efe", "prbs", "uniform"]
+    assert list(compared["policies"]) == ["made/untrained", "made", "ppo/amplitude", "shield", "efe", "prbs", "uniform"]
 
     arguments = ["--policies", "made", "prbs", "--options", '{"horizon": 32}', "--systems", 4]
     status, _, messages = script("evaluate.py", *arguments)
