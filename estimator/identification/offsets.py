@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from estimator.identification.problem import Problem
-from estimator.identification.start import misfit
+from estimator.identification.start import misfits
 from estimator.rig import LONGEST_DELAY
 
 #: Delays are tried up to this part of a record, and early answers up to this many samples.
@@ -31,22 +29,12 @@ def offset_of(problem: Problem) -> int | None:
     delays = np.arange(-_EARLY // step * step, longest + 1, step)
     if len(delays) < 5:
         return None
-    own, found = _misfit(problem, 0), np.array([_misfit(problem, int(d)) for d in delays])
+    own, found = float(misfits(problem, np.zeros(1, dtype=int))[0]), misfits(problem, delays)
     middle = int(delays[np.argmin(found)])
     near = np.arange(middle - step, middle + step + 1)
-    fine = np.array([_misfit(problem, int(d)) for d in near])
+    fine = misfits(problem, near)
     best = int(near[np.argmin(fine)])
     beside = np.median(found)
     if not (fine.min() < _LEFT * own and fine.min() < _BESIDE * beside) or abs(best) <= 3:
         return None
     return best
-
-
-def _misfit(problem: Problem, later: int) -> float:
-    """What the equation leaves of the acceleration, in parts of it, if the input acted so much later."""
-    shifted = []
-    for u in problem.u:
-        moved = np.roll(u, later)
-        moved[slice(0, later) if later >= 0 else slice(later, None)] = 0.0
-        shifted.append(moved)
-    return misfit(replace(problem, u=tuple(shifted)))

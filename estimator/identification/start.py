@@ -12,9 +12,11 @@ of the motion, so several widths are tried (Messenger and Bortz 2021 name this w
 from __future__ import annotations
 
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from estimator.identification.problem import Problem, bridged
 from estimator.models.duffing import KINDS
@@ -128,24 +130,6 @@ def rests(problem: Problem, points: FloatArray) -> FloatArray:
     return np.stack([away, -away])
 
 
-def misfit(problem: Problem) -> float:
-    """What the equation leaves of the acceleration at best, in parts of it, over bumps of some widths."""
-    inputs = _inputs(problem)
-    periods = _PERIODS[1] if KINDS[problem.rig.output.kind] > 0 else 0.0
-    left = [1.0]
-    for part in _WIDTHS[:2]:
-        half = max(3, round(part * 2 * np.pi / problem.frequency))
-        rows = [_equations(problem, u, y, half, periods) for u, y in zip(inputs, problem.y, strict=True)]
-        kept = [row for row in rows if row is not None]
-        if not kept or len(equations := np.concatenate(kept)) < 4 * equations.shape[1]:
-            continue
-        scale = np.sqrt(np.mean(equations**2, axis=0))
-        unit = equations / np.where(scale == 0, 1.0, scale)
-        solution = np.linalg.lstsq(unit[:, 1:], unit[:, 0], rcond=1e-8)[0]
-        left.append(float(np.mean((unit[:, 0] - unit[:, 1:] @ solution) ** 2)))
-    return min(left)
-
-
 def _middles(problem: Problem) -> list[float]:
     """Places, counted as the outputs are, where the spring may be without force; just 0 where these have no origin."""
     if not problem.origin:
@@ -154,8 +138,67 @@ def _middles(problem: Problem) -> list[float]:
     return sorted({0.0, -problem.origin, given - problem.origin})
 
 
+def misfits(problem: Problem, delays: NDArray[np.intp]) -> FloatArray:
+    """What the equation leaves of the acceleration at best, in parts of it, over bumps of some widths.
+
+    For every one of some delays by which the input acts later, or earlier where they are negative. Only the input's
+    column depends on the delay, so the others are projected out of it and of the acceleration once.
+    """
+    inputs, longest = _inputs(problem), int(np.abs(delays).max())
+    periods = _PERIODS[1] if KINDS[problem.rig.output.kind] > 0 else 0.0
+    least = np.ones(len(delays))
+    for part in _WIDTHS[:2]:
+        half = max(3, round(part * 2 * np.pi / problem.frequency))
+        pairs = zip(inputs, problem.y, strict=True)
+        kept = [found for u, y in pairs if (found := _framed(problem, u, y, half, periods)) is not None]
+        if not kept:
+            continue
+        rows = np.concatenate([found.rows[found.clean] for found in kept])
+        if len(rows) < 4 * rows.shape[1]:
+            continue
+        forces = []
+        for found in kept:
+            dense = np.convolve(np.pad(found.acting, longest), found.bump, "valid")
+            starts = np.flatnonzero(found.clean) * found.stride + longest
+            forces.append(dense[starts[:, None] - delays])
+        force, acceleration, others = np.concatenate(forces), rows[:, 0], rows[:, 2:]
+        others = others / np.maximum(np.sqrt(np.mean(others**2, axis=0)), 1e-300)
+        left, sizes, _ = np.linalg.svd(others, full_matrices=False)
+        basis = left[:, sizes > 1e-8 * sizes[0]]
+        force = force - basis @ (basis.T @ force)
+        rest = acceleration - basis @ (basis.T @ acceleration)
+        square = np.sum(force**2, axis=0)
+        told = np.divide((rest @ force) ** 2, square, out=np.zeros(len(delays)), where=square > 0)
+        least = np.minimum(least, (rest @ rest - told) / max(acceleration @ acceleration, 1e-300))
+    return least
+
+
+class _Framed(NamedTuple):
+    """Equations integrated against bumps.
+
+    Attributes:
+        rows: (n, 7) columns x'', u, -x', -x, -x³, 1 and -x².
+        clean: (n,) which rows hold no gap and no drift.
+        acting: (T,) the input that acts at every output.
+        bump: (w,) what they are integrated against.
+        stride: samples between two rows.
+    """
+
+    rows: FloatArray
+    clean: NDArray[np.bool_]
+    acting: FloatArray
+    bump: FloatArray
+    stride: int
+
+
 def _equations(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, periods: float) -> FloatArray | None:
-    """(n, 7) columns x'', u, -x', -x, -x³, 1 and -x², integrated against bumps; None for a record that is too short."""
+    """(n, 7) the rows of `_Framed` that are clean; None for a record that is too short."""
+    found = _framed(problem, inputs, y, half, periods)
+    return None if found is None else found.rows[found.clean]
+
+
+def _framed(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, periods: float) -> _Framed | None:
+    """The equations of a record; None for one that is too short."""
     count = len(y)
     if count < 4 * half:
         return None
@@ -188,7 +231,7 @@ def _equations(problem: Problem, inputs: FloatArray, y: FloatArray, half: int, p
     clean = over(np.ones(2 * half + 1), missing.astype(float)) < 0.5
     if order and not _quiet(acting, shown):
         clean[: int(np.ceil(min(2 * np.pi * periods / problem.frequency, count / 4) / stride))] = False
-    return np.stack(columns, axis=1)[clean]
+    return _Framed(np.stack(columns, axis=1), clean, acting, bump, stride)
 
 
 def _quiet(u: FloatArray, y: FloatArray) -> bool:
