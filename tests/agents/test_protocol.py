@@ -164,7 +164,7 @@ def test_the_latest_entry_of_a_name_counts(monkeypatch, tmp_path, entry):
     assert found["seeds"] == 2
 
 
-@table("line", ["", "{", "[]", '{"name": "x"}', '{"name": "x", "track": "y", "score": 3}'])
+@table("line", ["{", "[]", '{"name": "x"}', '{"name": "x", "track": "y", "score": 3}'])
 def test_a_broken_board_is_told(tmp_path, entry, line):
     path = tmp_path / "board.jsonl"
     path.write_text(json.dumps(entry) + "\n" + line + "\n")
