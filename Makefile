@@ -7,9 +7,9 @@ WORKERS ?= 2
 
 .PHONY: demo test test-research docs lint format bench evidence portability compat lock clean
 
-demo: $(READY)  ## train a small policy on Amplitude-v0 and compare it with the reference policies
+demo: $(READY)  ## train a policy on Amplitude-v0 and compare it with the reference policies
 	rm -rf runs/demo
-	$(BIN)/python train.py --steps 100000 --output runs/demo
+	$(BIN)/python train.py --steps 2000000 --eval-every 500000 --output runs/demo
 
 PYTEST = $(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 

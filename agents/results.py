@@ -77,7 +77,7 @@ def table(
         )  # fmt: skip
         for place in places:
             below = "\n".join(cell for row in cells for cell in row[place : place + 1]).splitlines()
-            width = max([10, *map(len, below)])
+            width = max([7, *map(len, below)])
             broken = (textwrap.fill(line, width, break_long_words=False) for line in titles[place].splitlines())
             heading = titles[place] if markdown else "\n".join(broken)
             is_label = place < labels

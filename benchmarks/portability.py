@@ -40,7 +40,7 @@ COMPILED = (
 #: Networks, beside torch's.
 NETWORKS = (
     "tests/agents/test_evaluation.py",
-    "tests/agents/test_foresight.py",
+    "tests/agents/test_features.py",
     "tests/agents/test_learned.py",
     "tests/agents/test_vec_env.py",
 )

@@ -30,7 +30,7 @@ CHECKPOINTS = 50
 ENOUGH = 1_500_000
 PATIENCE = 120.0
 TARGET_SECONDS = 60.0
-OURS = "ours, PPO's settings without foresight"
+OURS = "ours, PPO's settings without features"
 DEFAULTS = {1: "SB3's defaults, DummyVecEnv of 1", 8: "SB3's defaults, DummyVecEnv of 8"}
 USEFUL = "from starting train.py to a useful policy"
 

@@ -10,6 +10,7 @@ EXTRAS = {
     "highspy": "oracle",
     "matplotlib": "report",
     "minari": "datasets",
+    "onnx": "onnx",
     "optuna": "tune",
     "pygame": "human",
     "pyvisa": "instrument",

@@ -23,7 +23,7 @@ class Design:
     posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[POSTERIOR]")] = None
     """What is known: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
     policy: str = "efe"
-    """The planner, a signal, lookahead, or a policy that ships."""
+    """The planner, a signal, or a policy that ships."""
     samples: int = 256
     """Of the experiment."""
     bound: float = 0.05

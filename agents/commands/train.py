@@ -13,7 +13,7 @@ from agents.results import say, warn
 from agents.stopping import telling
 from agents.training import ALGORITHMS, Subject, TrainConfig, resume, train, train_seeds, tune
 from agents.training.family import FAMILY
-from agents.training.runs import LEARNING
+from agents.training.runs import LEARNING, UNTRAINED
 from estimator.checks import whole
 
 DESCRIPTION = """Train a policy that chooses the input, and compare it with the reference policies.
@@ -23,6 +23,7 @@ $ duffing-env train --steps 1000000 --seed 3           shorter, another seed
 $ duffing-env train --reward log_posterior             another reward
 $ duffing-env train --rig rig.toml                     on a rig of your own
 $ duffing-env train --env family                       to play any oscillator
+$ duffing-env train --imitate efe                      from another policy
 $ duffing-env train --algo sac --help                  another algorithm
 $ duffing-env train --algo td3 --tune 50               search hyperparameters
 $ duffing-env train --seeds 5 --ray                    five seeds, on a cluster
@@ -104,7 +105,9 @@ class Config(TrainConfig):
         elif self.systems:
             from agents.evaluation.comparison import compare, usual_policies
 
-            policies = (policy, *usual_policies(config.env, config.options))
+            untrained = folder / UNTRAINED
+            begun = (str(untrained),) if untrained.exists() else ()
+            policies = (*begun, policy, *usual_policies(config.env, config.options))
             compare(policies, config.env, self.systems, config.options, folder, briefly=True)
             print("More, on more systems: duffing-env evaluate --help")
 

@@ -76,6 +76,8 @@ def read(path: Path) -> list[dict[str, Any]]:
     text = whole_file(path, "board must be a file of entries", _LARGEST).read_text(encoding="utf-8", errors="replace")
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip():  # two programs that add at once may leave an empty one
+            continue
         try:
             entry = json.loads(line)
             key = str(entry["track"]), str(entry["name"])

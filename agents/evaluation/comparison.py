@@ -25,7 +25,7 @@ SIGNALS = ("prbs", "uniform")
 def usual_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
     """What is compared on a track where nothing else is asked for.
 
-    That is what ships for it, the same look-ahead without a network, the planner, and two signals.
+    That is what ships for it, the shield alone, the planner, and two signals.
 
     A record can be asked for its own input only; and all but the signals look at the posterior.
     """
@@ -36,8 +36,8 @@ def usual_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
         return SIGNALS
     shipped = [name for name in trained_policies() if load_policy(TRAINED / name).card["track"] == env_id]
     # These decide sample by sample.
-    planners = ["lookahead", "efe"] if options.get("hold", 1) == 1 else []
-    return (*shipped, *planners, *SIGNALS)
+    deciders = ["shield", "efe"] if options.get("hold", 1) == 1 else []
+    return (*shipped, *deciders, *SIGNALS)
 
 
 def compare(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Sequence
 from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,10 +47,25 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure((width, height), layout="constrained", dpi=120)
 
 
-def figure_of_learning(curve: list[tuple[int, float, float]], reward: str) -> Figure:
-    """Mean return of the last episodes over the samples that were trained on, with wall time above."""
-    figure = new_figure(7, 4)
-    axes = figure.add_subplot()
+def figure_of_learning(
+    curve: list[tuple[int, float, float]], reward: str, held_out: Sequence[tuple[int, float]] = ()
+) -> Figure:
+    """Mean return of the last episodes over the samples that were trained on, with wall time above.
+
+    Args:
+        curve: samples, seconds, mean return.
+        reward: its name.
+        held_out: samples, and the information [nats] that the policy of then gains on systems held out, in a panel
+            below; the first is of the untrained network.
+    """
+    figure = new_figure(7, 6.5 if held_out else 4)
+    axes, *below = figure.subplots(2 if held_out else 1, squeeze=False)[:, 0]
+    for panel in below:
+        samples, gains = np.array(held_out, dtype=float).T
+        panel.plot(samples / 1e6, gains, color=_COLOURS[1], marker=".")
+        panel.set(xlabel="samples / 10⁶", ylabel="information / nat, held-out systems")
+        panel.grid(alpha=0.3)
+        panel.set_xlim(0, max(samples[-1] / 1e6, 1e-6))
     steps, seconds, returns = np.array(curve, dtype=float).reshape(-1, 3).T
     axes.plot(steps / 1e6, returns, color=_COLOURS[0], marker="." if len(steps) < _FEW else None)
     axes.set(xlabel="samples / 10⁶", ylabel=f"mean return: {reward.replace('_', ' ')}")

@@ -83,8 +83,9 @@ METRICS = {
 HEADLINE = {
     "information_gain": "information / nat",
     "efficiency": "D-efficiency / %",
-    "coverage": "intervals cover / %",
-    "ended_early": "ended early / %",
+    "coverage": "cover / %",
+    "ended_early": "early / %",
+    "decision_time": "µs",
 }
 _WITH_SPREAD = ("information_gain", "efficiency")
 
@@ -254,7 +255,8 @@ def headline(evaluations: list[Evaluation]) -> Table:
 def print_headline(evaluations: list[Evaluation], title: str) -> None:
     """Print the chief figures, in 80 columns."""
     heads, rows = headline(evaluations)
-    caption = "means over systems ± half of the 95 % bootstrap interval; 90 % intervals that cover"
+    caption = "means over systems ± half of the 95 % bootstrap interval; 90 % intervals that cover;\n"
+    caption += "episodes that a limit ended early; time of a decision"
     if "efficiency" in evaluations[0].metrics:
         caption += f"\n{TERMS['efficiency']}"
     show(table(heads, rows, title=title), caption)

@@ -2,13 +2,11 @@
 
 A plan is made anew at each move, and its later moves will be others. So what move h of a plan teaches counts
 
-    w_h = exp(-(h / faded)^power)
+    w_h = exp(-h / faded)
 
 and a plan is worth the mean of what is known after each of its moves, after move h with the weight w_h - w_{h+1}, and
 with the rest of the weight at its end. Were all moves to count alike, the best plan might be to wait for a move, and so
-at every decision anew. Of plans that reach the end of the episode all do count alike: ``faded`` is infinite. The power
-is 1 for the planner's plans, and 2 for the shorter ways of foresight (`agents.policies.imagined`), of which the first
-moves count alike.
+at every decision anew. Of plans that reach the end of the episode all do count alike: ``faded`` is infinite.
 """
 
 from __future__ import annotations
@@ -56,20 +54,17 @@ def delay_with(record, noise, pace):
 
 
 @jit
-def fade(weights, moves, faded, power):
+def fade(weights, moves, faded):
     """Write the weights of so many moves.
 
     Example:
         >>> weights = np.zeros(4)
-        >>> fade(weights, 3, 2.0, 1.0)
+        >>> fade(weights, 3, 2.0)
         >>> weights.round(2)
         array([1.  , 0.61, 0.37, 0.  ])
-        >>> fade(weights, 3, 2.0, 2.0)
-        >>> weights.round(2)
-        array([1.  , 0.78, 0.37, 0.  ])
     """
     for h in range(moves):
-        weights[h] = np.exp(-((h / faded) ** power))
+        weights[h] = np.exp(-h / faded)
 
 
 @jit

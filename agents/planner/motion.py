@@ -45,6 +45,11 @@ class View(NamedTuple):
             return cls(model, experiment.degree)
         return cls(model, 0, int(experiment.truth_model.is_continuous and experiment.degree == 1))
 
+    @property
+    def kind(self) -> str:
+        """What tells the functions compiled for it from those for others (`estimator.lanes.part`)."""
+        return f"{self.model.name}_{self.model.digest}_{self.degree}_{self.lag}"
+
 
 class Places(NamedTuple):
     """Where the entries of an observation begin.
@@ -245,7 +250,7 @@ def _swinger(view: View) -> Any:
     rate, states = (view.model.rates or ("",))[0], list(view.model.states)
     velocity = at[rate] if rate in states else velocity
 
-    @kernel(kind=f"{view.model.name}_{view.model.digest}_{view.degree}_{view.lag}")
+    @kernel(kind=view.kind)
     def swing(means, max_input, limit, peaks, taught):
         W = np.zeros(size)
         copy(W, n, means, k)

@@ -227,7 +227,7 @@ def search(model: Model, degree: int = 0, lag: int = 0) -> Search:
         M = np.zeros((k, k))
         factorise(rate, M)
         faded = terms.faded + delay_with(record, NOISE, pace)
-        fade(rivals.weights, steps, np.inf if left <= steps * pace else faded, 1.0)
+        fade(rivals.weights, steps, np.inf if left <= steps * pace else faded)
         sizes = terms.cells, _FINEST // terms.cells, _FINE // terms.cells, ways, fewer
         task = Task(record, left, steps, pace, terms, lasts, M, *sizes, np.nan, 1.0)
         follow_up(best, steps, before, pace)

@@ -19,8 +19,8 @@ from agents.planner.block_policy import BlockPlanner
 from agents.planner.policy import Planner
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
-from agents.policies.lookahead import Lookahead
 from agents.policies.own import own_policy, within
+from agents.policies.shield import Shield
 from agents.policies.signals import make_signal
 from estimator.checks import MOST_SEED, hint, shown, whole
 
@@ -55,7 +55,7 @@ POLICIES: dict[str, Callable[..., Policy]] = {
     **FEEDBACK,
     "efe": Planner,
     "efe-myopic": partial(Planner, horizon=1),
-    "lookahead": Lookahead,
+    "shield": Shield,
     **{f"efe-block-{n}": partial(BlockPlanner, block=n) for n in (16, 64, 256)},
 }
 
@@ -88,8 +88,8 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             name; or a function of observations (n, features) that gives actions (n, 1), such as a module of torch.
         env: The environment it is for, single or vector, wrapped or not, or a `VecEnv` of Stable-Baselines3 around
             it: it gives the amplitude limit, the episode's length and, where it replays a record, the recorded
-            input. The planner and most trained policies read its belief and model, do not play without it, and
-            refuse observations that it did not show last. None: a Duffing track with a limit of 0.15 V.
+            input. Planners read its belief and model, do not play without it, and refuse observations
+            that it did not show last. None: a Duffing track with a limit of 0.15 V.
         seed: The seed of the policy's own randomness; of a trained policy, that of the actions it samples.
         options: Further options of a policy that has some, such as `horizon=8` of `"efe"`; a
             trained policy has none.

@@ -17,14 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.asked import check_state, starts
-from agents.policies.foresight import CommonForesight, Foresight
-from agents.policies.imagined import FEATURES
+from agents.policies.decision import Actor, decider
+from agents.policies.features import FeatureMap
 from estimator.checks import number, numbers, whole
 from estimator.files import whole_file
+from estimator.models.model import Model
 
 WEIGHTS = "policy.safetensors"
 CARD = "policy.json"
-FORMAT = 3
+FORMAT = 4
 
 #: File beside them in the folder of a training, which says what the run was made from.
 CONFIG = "config.json"
@@ -57,8 +58,9 @@ class Network:
         memory: name of the LSTM before the layers; None for none.
         levels: evenly spaced actions from -1 to 1, of which the last layer has the log probabilities, up to a constant;
             0 where it has the action itself.
-        foresight: whether the layers see the features of `agents.policies.foresight`, and give what it acts on; the
-            tensor ``foresight`` is that.
+        features: whether the layers see `agents.policies.features` in place of the observation, and the shield bounds
+            the action. The tensor ``setting`` is what observations are relative to; without it they are that of the
+            environment that is played.
         normalised: what the layers see is normalised, to at most so many standard deviations, with the tensors
             ``normalizer.mean`` and ``normalizer.std``; 0 where it is seen as it is.
     """
@@ -69,15 +71,20 @@ class Network:
     spread: str | None = "log_std"
     memory: str | None = None
     levels: int = 0
-    foresight: bool = False
+    features: bool = False
     normalised: float = 0.0
 
 
 class LearnedPolicy:
-    """A trained actor: a network of the observation or, with foresight, of its environment's belief and model.
+    """A trained actor: a function of the observation, and of its memory where it has one.
 
-    One that looks out in its environment (`agents.policies.foresight.CommonForesight`) plays that environment alone.
-    One with a memory was trained with it.
+    With features it is one compiled function of each observation: features, network, shield.
+
+    Attributes:
+        card: see below.
+        network: see below.
+        layers: weight (out, in) and bias (out,) of each.
+        normalizer: mean and standard deviation of what they see, and how many of these they see at most; or None.
 
     Args:
         network: which tensors make it up, and how.
@@ -98,50 +105,51 @@ class LearnedPolicy:
             weight = _tensor(tensors, f"{name}.weight", outputs, inputs)
             return weight, _tensor(tensors, f"{name}.bias", len(weight))
 
-        self.card = card
-        self._squashed = network.squashed
+        self.card, self.network = card, network
         self._activation = ACTIVATIONS[network.activation]
         self._memory = None if network.memory is None else _Memory(network.memory, tensors)
         width = None if self._memory is None else self._memory.units
-        self._layers = []
+        self.layers: list[tuple[FloatArray, FloatArray]] = []
         for name in network.layers[:-1]:
-            self._layers.append(layer(name, width))
-            width = len(self._layers[-1][0])
-        self._layers.append(layer(network.layers[-1], width, network.levels or 1))
+            self.layers.append(layer(name, width))
+            width = len(self.layers[-1][0])
+        self.layers.append(layer(network.layers[-1], width, network.levels or 1))
         self._levels = np.linspace(-1.0, 1.0, network.levels, dtype=np.float32) if network.levels else None
         self._spread: FloatArray | tuple[FloatArray, FloatArray] | None = None
         if network.spread is not None:
             is_tensor = network.spread in tensors
-            last = self._layers[-1][0].shape[1]
+            last = self.layers[-1][0].shape[1]
             self._spread = _tensor(tensors, network.spread, 1) if is_tensor else layer(network.spread, last, 1)
-        self._features = (self._layers[0][0] if self._memory is None else self._memory.from_input).shape[1]
-        self._foresight: Foresight | CommonForesight | None = None
-        self._is_common = bool((card.get("foresight") or {}).get("is_common"))
-        if network.foresight:
-            seen = len(FEATURES)
-            if not self._is_common:
-                self._foresight = Foresight.from_array(tensors["foresight"], card.get("foresight"))
-                seen = self._foresight.features
-            if self._features != seen and not (self._is_common and self._features > seen):
-                raise ValueError(f"the first layer must take {seen} features, but takes {self._features}")
-        self._normalizer: tuple[FloatArray, FloatArray, float] | None = None
+        self._seen = (self.layers[0][0] if self._memory is None else self._memory.from_input).shape[1]
+        self._description = card.get("features") or {}
+        self._map: FeatureMap | None = None
+        if network.features and "setting" in tensors:
+            found = FeatureMap.from_tensor(tensors["setting"], self._description)
+            if found.size != self._seen:
+                raise ValueError(f"the first layer must take {found.size} features, but takes {self._seen}")
+            self._map = found
+        self.normalizer: tuple[FloatArray, FloatArray, float] | None = None
         if network.normalised:
-            mean, std = (_tensor(tensors, f"normalizer.{part}", self._features) for part in ("mean", "std"))
+            mean, std = (_tensor(tensors, f"normalizer.{part}", self._seen) for part in ("mean", "std"))
             number("normalised", network.normalised)
             if std.min() <= 0:
                 raise ValueError(f"normalizer.std must be positive, but is {std.min()} somewhere; take 1 there")
-            self._normalizer = mean, std, float(network.normalised)
-        self._shown = "posterior" if network.foresight else _learned_from(card)
+            self.normalizer = mean, std, float(network.normalised)
+        self._actor: Actor | None = None
+        if network.features and self._memory is None:
+            nothing = np.zeros(self._seen, np.float32), np.ones(self._seen, np.float32), np.inf
+            levels, squashed = network.levels, network.squashed
+            self._actor = Actor.of(self.layers, self.normalizer or nothing, network.activation, levels, squashed)
+        self._shown = "posterior" if network.features else _learned_from(card)
         self._rng = np.random.default_rng(seed)
 
     def move_to(self, env: Any) -> None:
-        """Let a foresight look out in this unwrapped environment, instead of that which it was trained in.
+        """Play this unwrapped environment, with its prior, limits and noises, instead of that of the training.
 
         Raises:
             ValueError: for an environment that shows another observation than the policy learned from, where its card
-                says which. Of a policy with foresight: for an environment that is not one of duffing_env, or is of
-                another model than a policy was trained on that sees its observations too; for one whose actions are no
-                longer known.
+                says which. Of a policy with features: for one that `FeatureMap.of` refuses, or that is of another model
+                than a policy was trained on that sees the observation itself, too.
         """
         shown = observation_of(env)
         if None not in (self._shown, shown) and shown != self._shown:
@@ -150,27 +158,18 @@ class LearnedPolicy:
                 f"env must show the observation {self._shown!r}, which the policy learned from, but shows {shown!r}; "
                 f"make it with the option observation={wanted}"
             )
-        if self._is_common:
-            if self.card["foresight"].get("drives"):
-                raise ValueError(
-                    "policy must choose how much harder to push than a burst, but was trained to drive, as policies "
-                    "once were where the energy is limited; train it again"
-                )
-            foresight = CommonForesight(env, own=self._features > len(FEATURES))
-            if foresight.features != self._features:
-                raise ValueError(
-                    f"env must have {self._features} features for this policy, but has {foresight.features}: it is of "
-                    "another model than the policy was trained on; play lookahead there"
-                )
-            self._foresight = foresight
-        if not isinstance(self._foresight, Foresight):
-            return
-        if not hasattr(env, "experiment"):
+        if self.network.features:
+            self._map = self._fitting(FeatureMap.of(env, own=bool(self._description.get("own"))))
+
+    def _fitting(self, found: FeatureMap) -> FeatureMap:
+        """A map that gives what the network takes."""
+        model = self._description.get("model")
+        if found.size != self._seen or (found.own and model is not None and found.view.model != Model(**model)):
             raise ValueError(
-                f"env must be an environment of duffing_env for a policy with foresight, but is {type(env).__name__}; "
-                "pass None for the environment it was trained in"
+                f"env must be of the model that the policy was trained on, whose observation it sees, but is of "
+                f"{found.view.model.name!r}; play ppo/universal there, or train a policy on it"
             )
-        self._foresight = self._foresight.moved_to(env)
+        return found
 
     def predict(
         self,
@@ -185,38 +184,44 @@ class LearnedPolicy:
         forgets them where ``episode_start``; None is a memory of nothing. Without a memory it is handed on unused.
 
         Raises:
-            ValueError: for an observation of another size, that is not finite, or, where the policy looks out in its
-                environment, that this did not show last.
+            ValueError: for an observation of another size, or that is not finite; for a policy for all oscillators that
+                has no environment.
         """
-        if self._is_common and self._foresight is None:
-            raise ValueError("env must be given to a policy that imagines there, but is None; pass it to make_policy")
+        found, actor = self._map, self._actor
+        if self.network.features and found is None:
+            raise ValueError("env must be given to a policy for all oscillators, but is None; pass it to make_policy")
         if type(observation) is not np.ndarray or observation.dtype.kind != "f":
             observation = numbers("observation", observation)
-        hidden = np.asarray(observation, dtype=np.float32)
-        seen = self._features if self._foresight is None else self._foresight.observation_size
-        if hidden.shape[-1:] != (seen,):
-            raise ValueError(f"observation must have {seen} entries, but has shape {hidden.shape}")
-        if not np.isfinite(hidden).all():
-            raise ValueError(f"observation must be finite, but is {hidden[~np.isfinite(hidden)][0]} somewhere")
-        if self._foresight is not None:
-            view = self._foresight.look(np.atleast_2d(hidden))
-            choices, state = self._choose(view.features, state, episode_start, deterministic)
-            return view.act(choices[:, 0]).reshape(*hidden.shape[:-1], 1), state
-        return self._choose(hidden, state, episode_start, deterministic)
+        seen = np.asarray(observation, dtype=np.float32)
+        size = self._seen if found is None else found.observation_size
+        if seen.shape[-1:] != (size,):
+            raise ValueError(f"observation must have {size} entries, but has shape {seen.shape}")
+        if found is not None and actor is not None and deterministic:
+            rows = np.ascontiguousarray(seen.reshape(-1, size))
+            actions = np.empty((len(rows), 1), dtype=np.float32)
+            if decider(found.view)(rows, found.setting, found.own, actor, actions) < 0:
+                return actions.reshape(*seen.shape[:-1], 1), state
+        if not np.isfinite(seen).all():
+            raise ValueError(f"observation must be finite, but is {seen[~np.isfinite(seen)][0]} somewhere")
+        if found is None:
+            return self._choose(seen, state, episode_start, deterministic)
+        features = found(seen.reshape(-1, size))
+        choices, state = self._choose(features.values, state, episode_start, deterministic)
+        return features.act(choices[:, 0]).reshape(*seen.shape[:-1], 1), state
 
     def _choose(
         self, hidden: FloatArray, state: Any, episode_start: npt.ArrayLike | None, deterministic: bool
     ) -> tuple[FloatArray, Any]:
         """What the network gives for what it sees, (n, 1) or (1,), and the next state."""
-        if self._normalizer is not None:
-            mean, std, most = self._normalizer
+        if self.normalizer is not None:
+            mean, std, most = self.normalizer
             hidden = np.clip((hidden - mean) / std, -most, most)
         if self._memory is not None:
             state = self._memory.update(np.atleast_2d(hidden), state, episode_start)
             hidden = state[0][-1].reshape(*hidden.shape[:-1], -1)
-        for weight, bias in self._layers[:-1]:
+        for weight, bias in self.layers[:-1]:
             hidden = self._activation(hidden @ weight.T + bias)
-        weight, bias = self._layers[-1]
+        weight, bias = self.layers[-1]
         action = hidden @ weight.T + bias
         if self._levels is not None:
             if not deterministic:
@@ -224,7 +229,7 @@ class LearnedPolicy:
             return self._levels[action.argmax(axis=-1)][..., None], state
         if not deterministic and self._spread is not None:
             action += np.exp(self._log_std(hidden)) * self._rng.standard_normal(action.shape, dtype=np.float32)
-        return np.tanh(action) if self._squashed else np.clip(action, -1.0, 1.0), state
+        return np.tanh(action) if self.network.squashed else np.clip(action, -1.0, 1.0), state
 
     def _log_std(self, hidden: FloatArray) -> FloatArray:
         """Log standard deviation of the action; one that is a layer is kept within Stable-Baselines3's limits."""

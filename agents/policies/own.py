@@ -78,10 +78,10 @@ def within(env: Any, is_signal: bool) -> Any:
             f"env must have its environments in this process, but {type(held).__name__} has not; "
             "make it as agents.vec_env.DuffingVecEnv(id, n)"
         )
-    if hasattr(env, "foresight") or env.action_space != getattr(inner, "single_action_space", inner.action_space):
+    if hasattr(env, "features") or env.action_space != getattr(inner, "single_action_space", inner.action_space):
         raise ValueError(
             f"env must take inputs as actions, but {type(env).__name__} takes something else, {env.action_space}; make "
-            "it without levels or foresight"
+            "it without levels or features"
         )
     return inner
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from agents.policies.features import BOUND
 from agents.policies.learned import (
     ACTIVATIONS,
     CARD,
@@ -127,11 +128,11 @@ def write_policy(
         network = replace(network, normalised=float(seen.clip_obs))
         tensors["normalizer.mean"] = seen.obs_rms.mean.astype(np.float32)
         tensors["normalizer.std"] = np.sqrt(seen.obs_rms.var + seen.epsilon).astype(np.float32)
-    foresight = getattr(model.get_env(), "foresight", None)
-    if foresight is not None:
-        network = replace(network, foresight=True)
-        tensors |= foresight.to_tensors()
-        card = card | {"foresight": foresight.describe()}
+    envs: Any = model.get_env()
+    if hasattr(envs, "features"):
+        network = replace(network, features=True, normalised=BOUND)
+        tensors |= envs.tensors
+        card = card | {"features": envs.features}
     _write(folder, network, tensors, card)
 
 
@@ -211,7 +212,7 @@ def _normalizer_of(model: BaseAlgorithm) -> Any:
     from stable_baselines3.common.vec_env import VecCheckNan, VecEnvWrapper, VecMonitor, VecNormalize
 
     found, envs = None, model.get_env()
-    while isinstance(envs, VecEnvWrapper) and not hasattr(envs, "foresight"):
+    while isinstance(envs, VecEnvWrapper) and not hasattr(envs, "features"):
         if isinstance(envs, VecNormalize):
             found = envs if envs.norm_obs else found
         elif not isinstance(envs, VecMonitor | VecCheckNan):

@@ -1,6 +1,6 @@
 """What policies are worth on unseen oscillators of the family, beside the planner.
 
-    python -m agents.studies.family --policies lookahead prbs prbs-4 uniform silverbox-multisine
+    python -m agents.studies.family --policies ppo/universal shield prbs prbs-4 uniform silverbox-multisine
 
 plays every policy on the same oscillators, one of each rig that is drawn (`agents.training.family`), in the branch
 ``test`` of the seeds. D-efficiency is exp(2 (I - I_efe) / K), with I the information gained about the K coefficients
@@ -34,7 +34,7 @@ _BRANCH = 2
 class Config:
     """Judge policies on the family of oscillators."""
 
-    policies: tuple[str, ...] = ("lookahead", "prbs", "prbs-4", "uniform", "silverbox-multisine")
+    policies: tuple[str, ...] = ("ppo/universal", "shield", "prbs", "prbs-4", "uniform", "silverbox-multisine")
     """Names or run folders, beside the planner."""
     systems: int = 256
     """Rigs, one oscillator of each."""

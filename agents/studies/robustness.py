@@ -2,7 +2,7 @@
 
     python -m agents.studies.robustness
 
-plays `efe`, the track's own policy and `lookahead` with other noises, a weaker input, more energy and a longer
+plays `efe`, the track's own policy and `ppo/universal` with other noises, a weaker input, more energy and a longer
 episode, on the tracks of both equations. D-efficiency is exp(2 (F - F_efe) / K), with F the Fisher information [nats]
 at the truth that each episode brought about the K coefficients (`fisher_gain` of `evaluate.py`), and F_efe that of the
 planner on the same system with the same noise.
@@ -31,7 +31,7 @@ CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("max_rms 0.05", "Power", {"max_rms": 0.05}),
     ("horizon 512", "Power", {"horizon": 512}),
 )
-PLANNER, LOOKAHEAD = "efe", "lookahead"
+PLANNER, UNIVERSAL = "efe", "ppo/universal"
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def main(config: Config) -> None:
     tasks = [(version, *CASES[case - 1]) for version in config.versions for case in config.cases]
     for task in followed((f"{task[2]}-v{task[0]}, {task[1]}", task) for task in tasks):
         version, title, name, options = task
-        track, policies = f"{name}-v{version}", (own(name, version), LOOKAHEAD)
+        track, policies = f"{name}-v{version}", (own(name, version), UNIVERSAL)
         for found in judge(f"duffing_env/{track}", options, policies, config.systems):
             cells = [in_line(metrics[key], found[key]) for key in metrics]
             early = f"{int(found['ended_early'].sum())} of {config.systems}"

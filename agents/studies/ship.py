@@ -25,6 +25,8 @@ from agents.evaluation.leaderboard import print_table, summarise
 from agents.evaluation.rollout import evaluate, pooled
 from agents.policies.learned import CARD, WEIGHTS
 from agents.results import show, write_json
+from agents.studies.family import play, unseen
+from agents.training.family import FAMILY
 from estimator.files import write_atomically
 
 
@@ -57,10 +59,14 @@ def ship(config: Config) -> Path:
     env, options, seeds = _recipe(config.runs, cards)
     folder = policies.TRAINED / config.name
     _check_name(config.name, cards[0].get("algorithm"), env, folder / CARD)
-    evaluations = evaluate([str(run) for run in config.runs], env, config.systems, options=options)
-    together = pooled(config.name, evaluations)
-    scores = summarise(together)
-    by = "efficiency" if "efficiency" in scores else "information_gain"
+    if env == FAMILY:
+        scores, by = _on_the_family(config), "information_gain"
+    else:
+        evaluations = evaluate([str(run) for run in config.runs], env, config.systems, options=options)
+        together = pooled(config.name, evaluations)
+        scores = summarise(together)
+        by = "efficiency" if "efficiency" in scores else "information_gain"
+        print_table([together], f"{env}, {config.systems} systems")
     chosen = median_index(scores[by].get("seeds", [0.0]))  # of one seed there are no seeds' own
     card = cards[chosen] | {
         "track": env,
@@ -75,9 +81,16 @@ def ship(config: Config) -> Path:
         },
     }
     put(folder, config.runs[chosen], card)
-    print_table([together], f"{env}, {config.systems} systems")
     show(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
     return folder
+
+
+def _on_the_family(config: Config) -> dict[str, Any]:
+    """The information that every seed gains on unseen oscillators of the family, as the other scores are written."""
+    members = unseen(config.systems)
+    gains = [[play(member, str(run), i)[0] for i, member in enumerate(members)] for run in config.runs]
+    seeds = [float(np.mean(gained)) for gained in gains]
+    return {"information_gain": {"mean": float(np.mean(seeds)), "seeds": seeds}}
 
 
 def _check_name(name: str, algorithm: str | None, env: str, card: Path) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # Hyperparameters by what they may be; whole numbers that are not named here are at least 1.
 _FROM_ZERO = ("learning_starts", "exploration_noise", "dropped_quantiles", "levels", "entropy_bonus")
-_POSITIVE = ("learning_rate", "entropy_weight", "rule_logit")
+_POSITIVE = ("learning_rate", "entropy_weight")
 _SHARES = ("gamma", "gae_lambda", "tau")
 
 
@@ -40,8 +40,12 @@ class AlgorithmSettings(ABC):
     """Discount factor."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
-    foresight: bool = False
-    """Whether the network sees what its belief expects of simple inputs, and is shielded (docs/training.md)."""
+    activation: Literal["relu", "tanh", "elu"] = "relu"
+    """What stands between the layers."""
+    features: bool = True
+    """Whether the network sees features of the observation, and a shield bounds its input (docs/training.md)."""
+    own: bool = True
+    """Whether it sees the observation itself, too; on the family it never does."""
 
     def __post_init__(self) -> None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -87,7 +91,7 @@ class AlgorithmSettings(ABC):
             "learning_rate": lambda left: start * left,
             "gamma": self.gamma,
             "stats_window_size": self.num_envs,
-            "policy_kwargs": {"net_arch": list(self.hidden)},
+            "policy_kwargs": {"net_arch": list(self.hidden), "activation_fn": _module_of(self.activation)},
             "seed": seed,
             "device": "cpu",
         }
@@ -109,8 +113,6 @@ class OnPolicySettings(AlgorithmSettings):
     """Weight of the action's entropy at the start; it falls linearly to 0."""
     levels: int = 0
     """Evenly spaced inputs from one limit to the other that the policy chooses from; 0 for all between."""
-    rule_logit: float = 1.0
-    """Logit, at the start, of the level that foresight holds for the best: the smaller, the more is explored."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -140,11 +142,19 @@ class OnPolicySettings(AlgorithmSettings):
 class PPOSettings(OnPolicySettings):
     """Hyperparameters of PPO; chosen for a batched environment: large batches, few epochs."""
 
+    advantages_by_time: bool = True
+    """Whether advantages of features count alike at every time of an episode (`agents.training.advantages`)."""
+
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """Stable-Baselines3's PPO."""
         from stable_baselines3 import PPO
 
-        return PPO("MlpPolicy", **self._on_policy(envs, seed))
+        buffer: dict[str, Any] = {}
+        if self.features and self.advantages_by_time:
+            from agents.training.advantages import TimedRolloutBuffer
+
+            buffer["rollout_buffer_class"] = TimedRolloutBuffer
+        return PPO("MlpPolicy", **self._on_policy(envs, seed), **buffer)
 
 
 @dataclass(frozen=True)
@@ -259,6 +269,13 @@ ALGORITHMS: dict[str, type[AlgorithmSettings]] = {
     "tqc": TQCSettings,
     "recurrent_ppo": RecurrentPPOSettings,
 }
+
+
+def _module_of(activation: str) -> Any:
+    """The activation as torch has it."""
+    from torch import nn
+
+    return {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU}[activation]
 
 
 def as_written(settings: AlgorithmSettings) -> dict[str, Any]:

@@ -119,7 +119,9 @@ def begin_with(folder: Path, model: BaseAlgorithm) -> None:
         tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(folder / WEIGHTS).items()}
     except OSError as error:
         raise ValueError(f"begin must be the folder of a policy, but {folder} has no {WEIGHTS}; name one") from error
-    tensors.pop("foresight", None)
+    envs: Any = model.get_env()
+    kept = {name: tensors.pop(name).numpy() for name in ("normalizer.mean", "normalizer.std") if name in tensors}
+    tensors.pop("setting", None)
     shapes, own = ({name: tuple(t.shape) for name, t in of.items()} for of in (tensors, model.policy.state_dict()))
     for name in sorted({*shapes, *own}):
         if shapes.get(name) != own.get(name):
@@ -128,6 +130,8 @@ def begin_with(folder: Path, model: BaseAlgorithm) -> None:
                 f"{shapes.get(name, 'none')} in place of {own.get(name, 'none')}; train with its hyperparameters"
             )
     model.policy.load_state_dict(tensors)
+    if kept and hasattr(envs, "normalizer"):
+        envs.normalizer.mean, envs.normalizer.std = kept["normalizer.mean"], kept["normalizer.std"]
 
 
 def restore(checkpoint: Path, model: BaseAlgorithm) -> None:

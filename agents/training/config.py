@@ -61,7 +61,11 @@ class TrainConfig(Subject):
     output: Path | None = None
     """Run folder; runs/ALGO-TRACK-SEED where it is not given, with a number where that exists."""
     begin: Path | None = None
-    """Policy folder whose network to begin with, of the same shape; else the rule of its features, or chance."""
+    """Policy folder whose network to begin with, of the same shape; else it begins at random."""
+    imitate: str | None = None
+    """Policy whose decisions the network learns before it learns by reward, such as efe; with ppo alone."""
+    imitations: int = 200_000
+    """Of these decisions, over all environments."""
     checkpoints: int = 5
     """Checkpoints over the run, evenly spaced."""
     eval_every: int = 0
@@ -83,7 +87,14 @@ class TrainConfig(Subject):
         # A run has its rig in itself, and not the name of a file that may change.
         object.__setattr__(self, "options", with_rig(self.options, self.rig))
         object.__setattr__(self, "rig", None)
-        most = {"steps": 10**12, "checkpoints": 10**4, "torch_threads": 1024, "eval_every": 10**12, "seed": 2**32 - 1}
+        most = {
+            "steps": 10**12,
+            "checkpoints": 10**4,
+            "torch_threads": 1024,
+            "imitations": 10**9,
+            "eval_every": 10**12,
+            "seed": 2**32 - 1,
+        }
         for name, highest in most.items():
             whole(name, getattr(self, name), highest, 0 if name in ("eval_every", "seed") else 1)
         if self.tensorboard:
@@ -106,10 +117,12 @@ class TrainConfig(Subject):
                 f"hyperparameters must be {ALGORITHMS[self.algo].__name__} for {self.algo}, "
                 f"but are {type(self.hyperparameters).__name__}"
             )
-        if self.hyperparameters.foresight and self.env != FAMILY:
+        if self.hyperparameters.features and self.env != FAMILY:
             _check_seen(self)
         if self.vary:
             object.__setattr__(self, "vary", _ranges(self))
+        if self.imitate is not None:
+            _check_imitation(self)
         if (first := getattr(self.hyperparameters, "learning_starts", 0)) >= self.steps:
             raise ValueError(
                 f"learning_starts must be below steps, but is {first} of {self.steps}: nothing would be learned; "
@@ -124,22 +137,33 @@ class TrainConfig(Subject):
 
 
 def _check_seen(config: TrainConfig) -> None:
-    """Refuse an observation that a foresight cannot look out from."""
+    """Refuse an observation that has no features."""
     shown_there = {**spec_of(config.env).kwargs, **config.options}.get("observation", "posterior")
     if shown_there != "posterior":
         raise ValueError(
-            f"observation must be 'posterior' with foresight, but is {shown(shown_there)}; "
-            f"add --{config.algo.replace('_', '-')}.no-foresight"
+            f"observation must be 'posterior' with features, but is {shown(shown_there)}; "
+            f"add --{config.algo.replace('_', '-')}.no-features"
         )
+
+
+def _check_imitation(config: TrainConfig) -> None:
+    """Refuse what cannot learn from another policy's decisions."""
+    if config.algo != "ppo" or not config.hyperparameters.features or config.env == FAMILY or config.vary:
+        raise ValueError(
+            f"imitate needs ppo with features on one track, but algo is {config.algo}, features "
+            f"{config.hyperparameters.features}, env {config.env}, vary {config.vary}; leave imitate out"
+        )
+    if config.begin is not None:
+        raise ValueError(f"imitate must be left out with begin, but is {config.imitate!r}; choose one of them")
 
 
 def _ranges(config: TrainConfig) -> dict[str, list[float]]:
     """What is varied, each from the lowest to the highest value."""
     mapping("vary", config.vary)
-    if config.env == FAMILY or not config.hyperparameters.foresight or config.reward not in IN_NATS:
+    if config.env == FAMILY or not config.hyperparameters.features or config.reward not in IN_NATS:
         raise ValueError(
-            f"vary needs a track, foresight and a reward that counts information ({', '.join(IN_NATS)}), but env is "
-            f"{config.env}, foresight {config.hyperparameters.foresight}, reward {config.reward}; leave vary out"
+            f"vary needs a track, features and a reward that counts information ({', '.join(IN_NATS)}), but env is "
+            f"{config.env}, features {config.hyperparameters.features}, reward {config.reward}; leave vary out"
         )
     if (rows := config.hyperparameters.num_envs) % LANES:
         raise ValueError(

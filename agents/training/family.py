@@ -15,8 +15,8 @@ from agents.cli import RIG_TRACK
 #: What is trained on it, in the place of a track.
 FAMILY = "family"
 
-#: Scale of the rewards, to returns of about 1: a critic that errs by more takes all of the clipped gradient.
-SCALE = 0.3
+#: Samples that show how features vary: about the middle of `SAMPLES`, on a logarithmic scale.
+TYPICAL = 256
 
 #: Kinds of stiffness, and how often each is drawn.
 KINDS = {"hardening": 0.5, "softening": 0.25, "double-well": 0.25}
@@ -28,6 +28,9 @@ KINDS = {"hardening": 0.5, "softening": 0.25, "double-well": 0.25}
 PERIOD, DAMPING, HARDENING, SOFTENING, WELLS = (6.0, 60.0), (0.002, 0.3), (0.1, 5.0), (0.05, 0.3), (0.3, 0.7)
 DRIVE, SENSOR_NOISE, NOISE_RATIO, GUESS = (0.02, 1.0), (1e-4, 1e-2), (0.1, 10.0), (0.1, 0.6)
 SAMPLES, RMS = (64, 1024), (0.1, 0.5)
+
+#: What the sensor shows, and how often.
+SENSORS = {"displacement": 0.7, "velocity": 0.3}
 
 #: How often the energy is limited, and how often the noises are known; where process noise alone may move the
 #: oscillator to, in parts of X.
@@ -82,6 +85,8 @@ def draw_member(rng: np.random.Generator) -> Member:
     width = log_uniform(*GUESS)
     centers = {"m": m, "c": c, "a": a, "b": b}
     guess = {name: tuple(sorted((x * (1.0 - width), x * (1.0 + width)))) for name, x in centers.items()}
+    shows = str(rng.choice(list(SENSORS), p=list(SENSORS.values())))
+    size = 1.0 if shows == "displacement" else omega
     sensor = log_uniform(*SENSOR_NOISE)
     samples = int(log_uniform(*SAMPLES))
     # What white noise alone shakes the oscillator to, by the end or in balance with damping.
@@ -90,7 +95,12 @@ def draw_member(rng: np.random.Generator) -> Member:
     rig = {
         "step": 1.0,
         "input": {"unit": "N", "limit": 1.0, "noise": process * m * np.sqrt(3.0)},
-        "output": {"unit": "m", "range": 1.0, "noise": sensor},
+        "output": {
+            "unit": "m" if shows == "displacement" else "m/s",
+            "kind": shows,
+            "range": size,
+            "noise": sensor * size,
+        },
         "guess": guess,
     }
     options: dict[str, Any] = {"rig": rig, "horizon": samples}

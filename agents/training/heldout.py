@@ -66,6 +66,11 @@ class HeldOut:
         """Samples at the last evaluation."""
         return int(self._rows[-1]["steps"]) if self._rows else 0
 
+    @property
+    def gains(self) -> list[tuple[int, float]]:
+        """Samples, and the information [nats] that was gained then, of every evaluation."""
+        return [(int(row["steps"]), row["information_gain"]) for row in self._rows]
+
     def evaluate(self, model: BaseAlgorithm, card: dict[str, Any]) -> dict[str, float]:
         """Evaluate a model by the mean of its policy, as it would be saved; write the row, and a policy that is best.
 

@@ -13,9 +13,8 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from agents.evaluation.batch import make
-from agents.policies.foresight import CommonForesight
-from agents.policies.imagined import BOUND, FEATURES
-from agents.policies.sight import Sight
+from agents.policies.features import BOUND, FeatureMap, Features
+from agents.training.feature_env import Normalizer, has_potential
 from agents.vec_env import BatchVecEnv, rows_of, told_of
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.checks import shown
@@ -23,8 +22,6 @@ from estimator.lanes import LANES
 
 #: Draws what a group plays next: the id of a track, and the options of its environments.
 Draw = Callable[[np.random.Generator], tuple[str, dict[str, Any]]]
-
-_TO_COME = FEATURES.index("to_come")
 
 
 def draw_options(
@@ -49,13 +46,14 @@ def draw_options(
 class _Group:
     """Rows with the same options, for as long as one of their episodes lasts."""
 
-    def __init__(self, rng: np.random.Generator, draw: Draw, options: dict[str, Any], seen: dict[str, bool]) -> None:
+    def __init__(self, rng: np.random.Generator, draw: Draw, options: dict[str, Any], own: bool) -> None:
         env_id, drawn = draw(rng)
         self.envs: DuffingVectorEnv = make(env_id, LANES, drawn | options)
-        self.foresight = CommonForesight(self.envs, **seen)
+        self.map = FeatureMap.of(self.envs, own=own)
         observations, self.infos = self.envs.reset(seed=int(rng.integers(2**31)))
-        self.view: Sight = self.foresight.look(observations)
+        self.shown: Features = self.map(observations)
         self.left = self.envs.horizon
+        self.weight = np.float32(has_potential(self.envs))
 
     def told(self, **others: Any) -> list[dict[str, Any]]:
         """The infos of its rows at the last reset or step."""
@@ -64,10 +62,10 @@ class _Group:
 
 
 class MixedVecEnv(BatchVecEnv):
-    """Rows in groups of `estimator.lanes.LANES`, each group with options of its own, as `CommonForesight` shows them.
+    """Rows in groups of `estimator.lanes.LANES`, each group with options of its own, seen as features.
 
     A group draws anew when an episode has gone by; the rows that began another on the way, because a limit ended
-    theirs, are cut short. As in `agents.training.foresight_env` the increase of what is still to come is added to the
+    theirs, are cut short. As in `agents.training.feature_env` the increase of what is still to come is added to the
     reward.
 
     Args:
@@ -77,7 +75,7 @@ class MixedVecEnv(BatchVecEnv):
         reward: that counts information.
         scale: of rewards.
         levels: an action is one of so many evenly spaced choices from -1 to 1, by its number; 0: any between.
-        own: as of `CommonForesight`; then all that is drawn has one model.
+        own: whether the observation itself stands behind the features; then all that is drawn has one model.
 
     Raises:
         ValueError: for another number of rows.
@@ -99,20 +97,22 @@ class MixedVecEnv(BatchVecEnv):
         self.render_mode = None
         self._rngs = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(num_envs // LANES)]
         self._scale = scale
-        self._draw, self._seen = draw, {"own": own}
+        self._draw, self._own = draw, own
         self._fixed = {"reward": reward, "autoreset_mode": AutoresetMode.SAME_STEP}
         self._levels = np.linspace(-1.0, 1.0, levels) if levels else None
         self._groups = [self._drawn(rng) for rng in self._rngs]
-        self.foresight = self._groups[0].foresight
+        first = self._groups[0].map
+        self.features = first.describe() if own else {"own": False}
+        self.normalizer = Normalizer(first.size)
         space = gym.spaces.Discrete(levels) if levels else gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-        seen = gym.spaces.Box(-BOUND, BOUND, (self.foresight.features,), np.float32)
+        seen = gym.spaces.Box(-BOUND, BOUND, (first.size,), np.float32)
         super().__init__(num_envs, seen, space)
         self._choices = np.zeros(num_envs)
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64)
         self._started = perf_counter()
 
     def _drawn(self, rng: np.random.Generator) -> _Group:
-        return _Group(rng, self._draw, self._fixed, self._seen)
+        return _Group(rng, self._draw, self._fixed, self._own)
 
     def reset(self) -> VecEnvObs:
         """Show what every row sees; the episodes have begun.
@@ -125,7 +125,12 @@ class MixedVecEnv(BatchVecEnv):
                 f"options must be none where they are drawn, but are {shown(self._options)}; leave them out"
             )
         self.reset_infos = [info for group in self._groups for info in group.told()]
-        return np.concatenate([group.view.features for group in self._groups])
+        return self.normalizer(np.concatenate([group.shown.values for group in self._groups]))
+
+    @property
+    def tensors(self) -> dict[str, npt.NDArray[Any]]:
+        """What a policy's file keeps of it: what observations are relative to is of the environment that is played."""
+        return self.normalizer.to_tensors()
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Take what the network chose."""
@@ -133,27 +138,27 @@ class MixedVecEnv(BatchVecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all groups."""
-        features = np.empty((self.num_envs, self.foresight.features), dtype=np.float32)
+        values = np.empty((self.num_envs, len(self.normalizer.mean)), dtype=np.float32)
         rewards, dones = np.empty(self.num_envs, dtype=np.float32), np.empty(self.num_envs, dtype=np.bool_)
         rows: list[dict[str, Any]] = []
         for g, group in enumerate(self._groups):
             mine = slice(g * LANES, (g + 1) * LANES)
-            before = group.view.features[:, _TO_COME]
-            actions = group.view.act(self._choices[mine])
+            before = group.shown.to_come
+            actions = group.shown.act(self._choices[mine])
             observations, gained, terminated, truncated, group.infos = group.envs.step(actions)
             ended = terminated | truncated
             rows += group.told(**{"TimeLimit.truncated": False})
-            group.view = group.foresight.look(observations)
+            group.shown = group.map(observations)
             group.left -= 1
-            after = np.where(ended, np.float32(0), group.view.features[:, _TO_COME])
-            rewards[mine] = self._scale * (gained + after - before)
+            after = np.where(ended, np.float32(0), group.shown.to_come)
+            rewards[mine] = self._scale * (gained + group.weight * (after - before))
             self._returns[mine] += gained
             self._lengths[mine] += 1
             dones[mine] = ended | (group.left == 0)
             for row in np.flatnonzero(dones[mine]).tolist():
                 at = g * LANES + row
                 rows[at] |= (told_of(group.infos["final_info"], row) if ended[row] else {}) | {
-                    "terminal_observation": group.view.features[row].copy(),
+                    "terminal_observation": self.normalizer(group.shown.values[row]),
                     "TimeLimit.truncated": bool(not ended[row]),
                     "episode": {"r": self._returns[at], "l": self._lengths[at], "t": perf_counter() - self._started},
                 }
@@ -161,8 +166,8 @@ class MixedVecEnv(BatchVecEnv):
             if group.left == 0:
                 group.envs.close()
                 group = self._groups[g] = self._drawn(self._rngs[g])
-            features[mine] = group.view.features
-        return features, rewards, dones, rows
+            values[mine] = group.shown.values
+        return self.normalizer(values), rewards, dones, rows
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """As of `BatchVecEnv`; options of the environments are refused."""

@@ -12,7 +12,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from agents.policies.saving import write_policy
 from agents.results import check_folder, write_json
 from agents.stopping import Stopper, telling
 from agents.training import family
-from agents.training.algorithms import OnPolicySettings
 from agents.training.checkpoints import (
     Progress,
     begin_with,
@@ -38,14 +37,17 @@ from estimator.extras import need
 from estimator.files import held, writing
 from estimator.progress import progress
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
-
 #: Picture of the returns in a run folder.
 LEARNING = "learning_curve.png"
 
 #: Samples that the network had learned from that a run began with (``begin``): all of them count.
 BEFORE = "steps_before"
+
+#: Folder of the policy before its first update.
+UNTRAINED = "untrained"
+
+#: Environments whose episodes under random choices show how features vary.
+EXAMPLES = 64
 
 #: After a signal, the update that is on its way may take so many seconds, before nothing more is saved.
 _PATIENCE = 60.0
@@ -80,6 +82,7 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     - ``config.json``: the resolved configuration, the command and the versions,
     - ``policy.safetensors``, ``policy.json``: the policy,
     - ``checkpoints/STEPS/``: the policy on the way, after the update that these samples were for,
+    - ``untrained/``: the policy before its first update,
     - ``progress.csv``: Stable-Baselines3's log,
     - ``evaluations.csv``, ``best/``: where ``eval_every`` is given, the policy's worth on held-out systems before the
       first update and on the way, and the policy that was best by its log posterior gain,
@@ -165,10 +168,11 @@ class _Training:
             restore(checkpoint, self._model)
         elif config.begin is not None:
             begin_with(config.begin, self._model)
-        elif isinstance(config.hyperparameters, OnPolicySettings):
-            from agents.training.rule import begin_with_rule
+        elif config.imitate is not None:
+            from agents.training.imitation import imitate
 
-            begin_with_rule(self._model, self._envs, config.hyperparameters.rule_logit)
+            with progress("Imitating") as tell:
+                imitate(self._model, self._envs, config.imitate, config.imitations, config.seed, tell)
         self._checkpoints = self._due_checkpoints()
         self._held_out = HeldOut(folder, config, begun)
         self._evaluated = on_evaluation
@@ -192,12 +196,15 @@ class _Training:
             logs.append(self._board)
         with closing(Log(self._folder, logs, self._progress.steps)) as logger:
             self._model.set_logger(logger)
+            if self._progress.steps == 0:
+                write_policy(self._folder / UNTRAINED, self._model, self._card())
             if self._config.eval_every > 0 and not self._held_out.has_begun:
                 self._evaluate()
             self._learn()
         curve = [(steps, at, math.nan if mean is None else mean) for steps, at, mean in self._progress.curve]
         if not all(math.isnan(mean) for *_, mean in curve):
-            save(figure_of_learning(curve, self._config.reward), self._folder / LEARNING)
+            figure = figure_of_learning(curve, self._config.reward, self._held_out.gains)
+            save(figure, self._folder / LEARNING)
         write_policy(self._folder, self._model, self._card())
         drop_states(self._folder)
         self._envs.close()
@@ -280,33 +287,41 @@ class _Training:
         return time.perf_counter() - self._clock
 
 
-def _make_envs(config: TrainConfig, seed: int) -> VecEnv:
-    """The environments of a run, seen as its hyperparameters say."""
-    from agents.evaluation.batch import make
+def _make_envs(config: TrainConfig, seed: int) -> Any:
+    """The environments of a run, seen as its hyperparameters say; features are normalised by the run's own seed."""
     from agents.vec_env import DuffingVecEnv
 
     asked = config.hyperparameters
-    levels = getattr(asked, "levels", 0)
-    options = {"reward": config.reward, **config.options}
-    mixed: dict[str, Any] = {"reward": config.reward, "levels": levels}
+    if not asked.features:
+        options = {"reward": config.reward, **config.options}
+        return DuffingVecEnv(config.env, asked.num_envs, seed=seed, levels=getattr(asked, "levels", 0), **options)
+    envs, samples = _with_features(config, asked.num_envs, seed)
+    examples, _ = _with_features(config, EXAMPLES, config.seed)
+    envs.normalizer.fit(examples, samples, config.seed)
+    return envs
+
+
+def _with_features(config: TrainConfig, rows: int, seed: int) -> tuple[Any, int]:
+    """Environments that show features, and the samples of an episode."""
+    from agents.evaluation.batch import make
+    from agents.training.feature_env import SCALE, FeatureVecEnv
+    from agents.training.mixed_env import MixedVecEnv, draw_options
+    from agents.vec_env import DuffingVecEnv
+
+    options, own = {"reward": config.reward, **config.options}, config.hyperparameters.own
+    levels = getattr(config.hyperparameters, "levels", 0)
+    mixed: dict[str, Any] = {"reward": config.reward, "levels": levels, "scale": SCALE}
     if config.env == family.FAMILY:
-        from agents.training.mixed_env import MixedVecEnv
-
-        return MixedVecEnv(asked.num_envs, seed, family.draw_rig, scale=family.SCALE, **mixed)
-    if not asked.foresight:
-        return DuffingVecEnv(config.env, asked.num_envs, seed=seed, levels=levels, **options)
-    from agents.training.foresight_env import SCALE, ForesightVecEnv, foresight_of
-
+        return MixedVecEnv(rows, seed, family.draw_rig, **mixed), family.TYPICAL
     if config.vary:
-        from agents.training.mixed_env import MixedVecEnv, draw_options
-
         for name, end in ((name, end) for name, ends in config.vary.items() for end in ends):
-            make(config.env, 1, options | {name: end}).close()  # which refuses what the option may not be
+            made = make(config.env, 1, options | {name: end})  # which refuses what the option may not be
+            made.close()
         draw = partial(draw_options, env_id=config.env, options=config.options, ranges=config.vary)
-        return MixedVecEnv(asked.num_envs, seed, draw, scale=SCALE, own=True, **mixed)
-    envs = DuffingVecEnv(config.env, asked.num_envs, seed=seed, **options)
-    foresight = foresight_of(envs.envs, config.env, config.options, config.seed)
-    return ForesightVecEnv(envs, foresight, levels, in_nats=config.reward in IN_NATS)
+        return MixedVecEnv(rows, seed, draw, own=own, **mixed), made.horizon
+    envs = DuffingVecEnv(config.env, rows, seed=seed, **options)
+    samples = int(envs.envs.unwrapped.experiment.samples)
+    return FeatureVecEnv(envs, own=own, levels=levels, in_nats=config.reward in IN_NATS), samples
 
 
 @contextmanager

@@ -128,7 +128,7 @@ def calls() -> st.SearchStrategy[Call]:
                     weights[key] = np.ascontiguousarray(other, dtype=np.asarray(other).dtype.newbyteorder("="))
             elif way == 1:
                 described = draw(
-                    changed({name: card[name] for name in ("format", "network", "foresight") if name in card})
+                    changed({name: card[name] for name in ("format", "network", "features") if name in card})
                 )
             (folder / WEIGHTS).write_bytes(draw(damaged(save(weights))) if way == 2 else save(weights))
             (folder / CARD).write_bytes(

@@ -14,7 +14,7 @@ from estimator import Rig
 from estimator.extras import how_to_get, is_missing
 
 TRACK = "duffing_env/Short-v0"
-SMALL = ["--ppo.num-envs", "8", "--ppo.n-steps", "32", "--ppo.batch-size", "64", "--ppo.no-foresight"]
+SMALL = ["--ppo.num-envs", "8", "--ppo.n-steps", "32", "--ppo.batch-size", "64", "--ppo.no-features"]
 #: 2 Hz, sampled at 50 Hz: slow enough for a busy machine.
 RIG = """step = 0.02
 [input]

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.rigs import accuracy, drawn, experiment, faults, loop, peer_rows, peers, sweep
+from benchmarks.rigs import accuracy, drawn, experiment, faults, loop, peer_rows, peers, sweep, unseen
 from benchmarks.rigs.catalogue import BENCHES
 from estimator.files import write_atomically
 
@@ -114,6 +114,23 @@ class Loop(Spread):
 
 
 @dataclass(frozen=True)
+class Unseen(Written):
+    """256 samples on six rigs that no network was trained on, by policies for any oscillator and by the planner."""
+
+    seeds: int = 20
+    """Episodes of each rig and policy."""
+    rigs: tuple[str, ...] = tuple(unseen.RIGS)
+    """Names of rigs."""
+    policies: tuple[str, ...] = ("ppo/universal", "shield", "prbs")
+    """Who chooses, beside the planner efe."""
+
+    def run(self) -> dict[str, Any]:
+        """Run, print, and return what goes into the file."""
+        gained = unseen.run(self.rigs, self.policies, self.seeds)
+        return {"worth": unseen.show(gained), "gained": gained}
+
+
+@dataclass(frozen=True)
 class Experiment(Spread):
     """The next experiment of 256 samples, designed on a record: what was expected of it beside what came."""
 
@@ -157,6 +174,7 @@ Part = (
     | Annotated[Against, tyro.conf.subcommand("peers")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Loop, tyro.conf.subcommand("loop")]
+    | Annotated[Unseen, tyro.conf.subcommand("unseen")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]
     | Annotated[Drawn, tyro.conf.subcommand("drawn")]
 )

@@ -52,7 +52,7 @@ REFERENCE = {
         "agents.training.TD3Settings",
         "agents.training.TQCSettings",
         "agents.training.RecurrentPPOSettings",
-        "agents.training.foresight_env.ForesightVecEnv",
+        "agents.training.feature_env.FeatureVecEnv",
         "agents.evaluation.rollout",
         "agents.vec_env",
     ],
@@ -173,7 +173,7 @@ def _policies() -> str:
                 f"::: agents.policies.{name}\n"
                 for name in (
                     *("make_policy", "Policy", "signals.SignalPolicy"),
-                    *("learned.LearnedPolicy", "foresight", "foresight.Foresight"),
+                    *("learned.LearnedPolicy", "features", "features.FeatureMap"),
                 )
             ),
         ]
@@ -191,7 +191,7 @@ def _leaderboard() -> str:
 def _shipped(name: str) -> str:
     """What the card of a trained policy says."""
     card = json.loads((TRAINED / name / "policy.json").read_text())
-    sight = ", with foresight" if card.get("network", {}).get("foresight") else ""
+    sight = ", with features" if card.get("network", {}).get("features") else ""
     track = _title(card["config"]["env"])
     return f"{card['algorithm'].upper()} trained on {track}{sight}; see [Training](../training.md)."
 

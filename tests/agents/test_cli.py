@@ -79,7 +79,7 @@ def test_help_explains_every_option(script, name):
             assert explanation.replace(" ", "") in here, flag
             assert "(default:" in here, flag
             explained += 1
-    assert explained == {"train.py": 33, "evaluate.py": 12}[name]
+    assert explained == {"train.py": 36, "evaluate.py": 12}[name]
 
 
 @table(
@@ -153,7 +153,7 @@ def test_a_bad_value_shows_no_traceback(tmp_path):
 def test_a_bad_reward_is_one_line(script, tmp_path):
     status, told, messages = script("train.py", "--reward", "foo")
     assert status == 2
-    note = "An update takes 16,384 samples, so 5,013,504 will be learned from, not 5,000,000."
+    note = "An update takes 32,768 samples, so 5,013,504 will be learned from, not 5,000,000."
     assert " ".join(told.split()) == note
     (line,) = (line for line in messages.splitlines() if not line.startswith("duffing-env is compiling"))
     assert line.startswith("train.py: ")
@@ -267,8 +267,9 @@ def test_train_then_evaluate(script, tmp_path):
     pictures = {"contraction.png", "excitations.png", "learning_curve.png"}
     assert made == pictures | {
         "checkpoints", "config.json", "evaluation.json", "policy.json", "policy.safetensors", "progress.csv",
+        "untrained",
     }  # fmt: skip
-    assert any(line.startswith("lookahead ") for line in told.splitlines())
+    assert any(line.startswith("shield ") for line in told.splitlines())
     for name in (*pictures, "evaluation.json"):
         assert str(Path("made") / name) in told.splitlines()
     description = json.loads((tmp_path / "made" / "config.json").read_text())
@@ -276,7 +277,7 @@ def test_train_then_evaluate(script, tmp_path):
     assert description["config"]["hyperparameters"]["hidden"] == [6, 5]
     assert description["command"][:5] == ["train.py", "--steps", "512", "--seed", "4"]
     compared = json.loads((tmp_path / "made" / "evaluation.json").read_text())
-    assert list(compared["policies"]) == ["made", "ppo/amplitude", "lookahead", "efe", "prbs", "uniform"]
+    assert list(compared["policies"]) == ["made/untrained", "made", "ppo/amplitude", "shield", "efe", "prbs", "uniform"]
 
     arguments = ["--policies", "made", "prbs", "--options", '{"horizon": 32}', "--systems", 4]
     status, _, messages = script("evaluate.py", *arguments)

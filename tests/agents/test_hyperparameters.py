@@ -9,6 +9,7 @@ from agents.training import ALGORITHMS, PPOSettings, SACSettings, TrainConfig
 from agents.training.hyperparameters import FILES, read_settings, settings_of, track_of, write_settings
 from duffing_env import TRACKS
 from estimator import Channel, Rig
+from estimator.lanes import LANES
 
 SHORT = "duffing_env/Short-v0"
 
@@ -30,13 +31,15 @@ def test_every_file_is_sound_for_every_track(algo, env_id):
 
 
 def test_ppo_is_as_its_class_says_where_its_file_is_silent():
-    assert read_settings("ppo", "duffing_env/WienerHammerstein-v0") == PPOSettings()
-    assert (read_settings("ppo", "family").levels, read_settings("ppo", "family").hidden) == (5, (128, 128))
-    amplitude = read_settings("ppo", "duffing_env/Amplitude-v0")
-    assert read_settings("ppo", "duffing_env/Amplitude-v1") == amplitude
-    assert (amplitude.foresight, amplitude.levels, amplitude.gamma) == (True, 3, 1.0)
-    rig = read_settings("ppo", "duffing_env/Rig-v0")
-    assert (rig.foresight, rig.levels, rig.gamma) == (True, 3, 1.0)
+    amplitude, power, short = (
+        read_settings("ppo", f"duffing_env/{name}-v0") for name in ("Amplitude", "Power", "Short")
+    )
+    others = ("duffing_env/Amplitude-v1", "duffing_env/Rig-v0", "duffing_env/WienerHammerstein-v0")
+    assert [read_settings("ppo", other) for other in others] == [amplitude] * 3
+    assert (amplitude.features, amplitude.own, amplitude.levels, amplitude.gamma) == (True, True, 2, 1.0)
+    assert (amplitude.n_epochs, amplitude.activation) == (PPOSettings().n_epochs, PPOSettings().activation)
+    assert (power.levels, short.n_steps, amplitude.hidden) == (5, 48, (128, 128))
+    assert read_settings("ppo", "family").num_envs % LANES == 0
     assert TrainConfig(env="duffing_env/Amplitude-v0").hyperparameters == amplitude
 
 

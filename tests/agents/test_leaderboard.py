@@ -285,7 +285,7 @@ def test_the_chief_figures_are_a_line_for_each_policy(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     rows = [line.split() for line in lines if line.startswith((trained, "prbs"))]
-    cells = ["12.35", "±", "0.00", "87.7", "±", "0.0", "75.0", "0.0"]
+    cells = ["12.35", "±", "0.00", "87.7", "±", "0.0", "75.0", "0.0", "3.14"]
     assert rows == [[trained, *cells], ["prbs", *cells]]
 
 

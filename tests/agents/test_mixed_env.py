@@ -12,9 +12,10 @@ from agents.training.mixed_env import MixedVecEnv, draw_options
 from estimator.lanes import LANES
 
 TRACK = "duffing_env/Power-v0"
-RANGES = {"max_rms": [0.01, 0.1], "horizon": [16, 64]}
+LENGTHS = {"horizon": [16, 64]}
+RANGES = {"max_rms": [0.01, 0.1], **LENGTHS}
 DRAW = partial(draw_options, env_id=TRACK, options={}, ranges=RANGES)
-TINY = PPOSettings(num_envs=LANES, n_steps=8, batch_size=64, hidden=(4,), foresight=True)
+TINY = PPOSettings(num_envs=LANES, n_steps=8, batch_size=64, hidden=(4,))
 
 
 def config(**settings):
@@ -47,10 +48,12 @@ def test_every_group_has_its_own_options_and_draws_anew():
     envs.close()
 
 
-def test_an_episode_adds_up_to_what_it_gained():
-    """What is still to come is a difference of potentials: it adds the same to every episode of a group."""
-    envs = MixedVecEnv(LANES, 5, DRAW, scale=2.0, own=True)
-    to_come = envs.reset()[:, envs.foresight.to_come]
+@table("track", [TRACK, "duffing_env/Amplitude-v0"])
+def test_an_episode_adds_up_to_what_it_gained(track):
+    """What is still to come adds its potential, where the energy has no limit, once to every episode of a group."""
+    envs = MixedVecEnv(LANES, 5, partial(draw_options, env_id=track, options={}, ranges=LENGTHS), scale=2.0, own=True)
+    envs.reset()
+    to_come = (track != TRACK) * envs._groups[0].shown.to_come
     total = np.zeros(LANES)
     for _ in range(envs._groups[0].envs.horizon):
         _, rewards, dones, infos = envs.step(np.zeros((LANES, 1)))
@@ -88,10 +91,10 @@ def test_a_run_says_what_it_varied_and_goes_on(tmp_path):
         ({"vary": {"max_rms": [0.1, float("nan")]}}, r"vary\['max_rms'\]"),
         ({"vary": [16, 64]}, "vary must be a dictionary"),
         ({"options": {"horizon": 32}}, "both have horizon"),
-        ({"reward": "max_rms"}, "vary needs a track, foresight and a reward that counts information"),
+        ({"reward": "max_rms"}, "vary needs a track, features and a reward that counts information"),
         ({"env": "family"}, "vary needs a track"),
-        ({"hyperparameters": PPOSettings(num_envs=LANES, foresight=False)}, "foresight False"),
-        ({"hyperparameters": PPOSettings(num_envs=LANES + 1, foresight=True)}, f"take {2 * LANES}"),
+        ({"hyperparameters": PPOSettings(num_envs=LANES, features=False)}, "features False"),
+        ({"hyperparameters": PPOSettings(num_envs=LANES + 1)}, f"take {2 * LANES}"),
     ],
 )
 def test_what_cannot_be_varied_is_refused(settings, named):

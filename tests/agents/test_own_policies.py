@@ -380,7 +380,7 @@ def test_a_policy_plays_the_observation_that_it_learned_from(tmp_path, how):
         )
         save_policy(mine, model)
     elif how == "trained":
-        tiny = PPOSettings(num_envs=4, n_steps=8, batch_size=32, hidden=(4,))
+        tiny = PPOSettings(num_envs=4, n_steps=8, batch_size=32, hidden=(4,), features=False)
         train(TrainConfig(env="Short-v0", steps=32, hyperparameters=tiny, output=tmp_path / "mine", options=HISTORY))
     else:
         card = {"observation": "history"} if how == "card" else {"config": {"options": HISTORY}}

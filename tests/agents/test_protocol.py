@@ -164,7 +164,7 @@ def test_the_latest_entry_of_a_name_counts(monkeypatch, tmp_path, entry):
     assert found["seeds"] == 2
 
 
-@table("line", ["", "{", "[]", '{"name": "x"}', '{"name": "x", "track": "y", "score": 3}'])
+@table("line", ["{", "[]", '{"name": "x"}', '{"name": "x", "track": "y", "score": 3}'])
 def test_a_broken_board_is_told(tmp_path, entry, line):
     path = tmp_path / "board.jsonl"
     path.write_text(json.dumps(entry) + "\n" + line + "\n")
@@ -240,7 +240,7 @@ def test_two_programs_may_add_at_once(tmp_path, entry):
 def test_the_board_that_ships_is_of_what_ships():
     entries = board.read(board.SHIPPED)
     shown = {entry["name"] for entry in entries if entry["track"] == SHORT}
-    assert {"ppo/short", "lookahead", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
+    assert {"ppo/short", "shield", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
     for entry in entries:
         # What has a name without a training has learned nothing.
         assert (entry["budget"] == "none") == (entry["name"] in POLICIES), entry["name"]

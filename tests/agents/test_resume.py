@@ -18,6 +18,7 @@ from safetensors.numpy import load_file, save_file
 
 import agents
 from agents import make_policy
+from agents.policies.features import NAMES
 from agents.stopping import Stopped
 from agents.training import ALGORITHMS, TrainConfig, resume, train
 from agents.training.checkpoints import (
@@ -129,7 +130,7 @@ def test_a_kill_loses_at_most_one_checkpoint_interval(tmp_path, algo):
     assert run.folder == folder
     assert run.config == config(algo, folder)
     assert (folder / "config.json").read_bytes() == begun
-    names = ["000000256", "000000512", "000000768", "000001024"]
+    names = [f"{steps:09d}" for steps in range(256, 1025, 256)]
     assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == names
     assert [make_policy(str(folder / "checkpoints" / name)).card["steps"] for name in names] == [256, 512, 768, 1024]
     assert make_policy(str(folder)).card["steps"] == STEPS
@@ -160,7 +161,9 @@ def test_the_schedule_and_the_log_go_on(tmp_path):
     ("algo", "settings"),
     [
         *((algo, {}) for algo in ALGORITHMS),
-        ("ppo", {"hyperparameters": ALGORITHMS["ppo"](**ON_POLICY, foresight=True, levels=4, entropy_bonus=0.1)}),
+        ("ppo", {"hyperparameters": ALGORITHMS["ppo"](**ON_POLICY, levels=4, entropy_bonus=0.1)}),
+        ("ppo", {"hyperparameters": ALGORITHMS["ppo"](**ON_POLICY, features=False)}),
+        ("ppo", {"imitate": "velocity-sign", "imitations": 512}),
         ("sac", {"hyperparameters": ALGORITHMS["sac"](**OFF_POLICY | {"learning_starts": 600})}),
     ],
 )
@@ -183,6 +186,7 @@ def test_a_resumed_run_is_the_one_that_was_never_stopped(tmp_path, algo, setting
 
 def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_again(tmp_path):
     folder = stopped("ppo", tmp_path / "run", at=128)
+    assert latest_checkpoint(folder) is None
     assert not (folder / "checkpoints").exists()
     resume(folder)
     whole = train(config("ppo", tmp_path / "whole", eval_every=128))
@@ -228,7 +232,7 @@ def test_only_the_latest_checkpoint_holds_the_state(tmp_path):
     assert set(found) == {"000000512"}
     assert latest_checkpoint(folder) == folder / "checkpoints" / "000000512"
     buffer = load_file(latest_checkpoint(folder) / TENSORS)
-    assert buffer["buffer/observations"].shape == (50, 8, 22)  # of 64 samples of each, the buffer holds 50
+    assert buffer["buffer/observations"].shape == (50, 8, len(NAMES) + 22)  # of 64 samples of each, the buffer holds 50
     earlier = make_policy(str(folder / "checkpoints" / "000000256"))
     assert earlier.card["steps"] == 256
 

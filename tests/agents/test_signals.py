@@ -333,7 +333,7 @@ def test_a_path_loads_the_trained_policy(tmp_path, monkeypatch):
     assert make_policy(str(tmp_path), seed=3) == ("loaded", tmp_path, 3)
 
 
-@table("name", ["prbs", "efe", "lookahead"])
+@table("name", ["prbs", "efe", "shield"])
 def test_the_name_of_an_environment_is_none(name):
     with pytest.raises(ValueError, match="env must be an environment, but is 'duffing_env/Short-v1'; pass what gym"):
         make_policy(name, "duffing_env/Short-v1")

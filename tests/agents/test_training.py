@@ -21,6 +21,7 @@ from agents.commands.train import Config
 from agents.evaluation.batch import TESTED, make
 from agents.evaluation.leaderboard import summarise
 from agents.evaluation.rollout import evaluate
+from agents.policies.features import NAMES
 from agents.results import write_json
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.config import describe
@@ -58,7 +59,7 @@ def tiny(output=None, **settings):
 def test_the_same_seed_gives_the_same_policy_byte_by_byte(runs):
     first, again = (runs[name].folder for name in ("first", "again"))
     weights = sorted(path.relative_to(first) for path in first.rglob("policy.safetensors"))
-    assert len(weights) == 6
+    assert len(weights) == 7
     for path in weights:
         assert (first / path).read_bytes() == (again / path).read_bytes()
     returns = [[(steps, value) for steps, _, value in runs[name].curve] for name in ("first", "again")]
@@ -68,7 +69,7 @@ def test_the_same_seed_gives_the_same_policy_byte_by_byte(runs):
 def test_another_seed_gives_another_policy(runs):
     first, other = (load_file(runs[name].folder / "policy.safetensors") for name in ("first", "other"))
     assert first.keys() == other.keys()
-    for name in first:
+    for name in first.keys() - {"setting"}:  # that of the track
         assert not np.array_equal(first[name], other[name]), name
 
 
@@ -76,6 +77,7 @@ def test_the_run_folder_holds_what_it_promises(runs):
     folder = runs["first"].folder
     files = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
     checkpoints = [f"checkpoints/{steps:09d}/policy" for steps in (4096, 8192, 12288, 16384, 20480)]
+    checkpoints += ["untrained/policy"]
     assert files == sorted(
         ["config.json", "learning_curve.png", "policy.json", "policy.safetensors", "progress.csv"]
         + [f"{checkpoint}.{ending}" for checkpoint in checkpoints for ending in ("json", "safetensors")]
@@ -105,7 +107,8 @@ def test_the_card_says_what_the_policy_was_trained_on(runs):
     description = json.loads((folder / "config.json").read_text())
     card = make_policy(str(folder)).card
     assert card.pop("network")["layers"] == ["mlp_extractor.policy_net.0", "action_net"]
-    assert card == {"format": 3, "observation": "posterior", "algorithm": "ppo", "steps": 20_480, **description}
+    assert card.pop("features").keys() == {"own", "model", "degree", "lag"}
+    assert card == {"format": 4, "observation": "posterior", "algorithm": "ppo", "steps": 20_480, **description}
     assert make_policy(str(folder / "checkpoints" / "000008192")).card["steps"] == 8192
 
 
@@ -145,7 +148,8 @@ def test_reward_and_options_reach_the_environment(tmp_path, monkeypatch):
 
     monkeypatch.setattr(agents.vec_env, "DuffingVecEnv", Spy)
     run = tiny(tmp_path / "run", reward="parameter_error", options={"horizon": 8, "max_output": 3.0, "spread": 0.1})
-    (envs,) = made
+    envs, examples = made  # these show how the features vary
+    assert examples.envs.experiment.horizon == 8
     experiment = envs.envs.experiment
     assert (experiment.reward, experiment.horizon, experiment.max_output) == ("parameter_error", 8, 3.0)
     assert (experiment.spread, envs.num_envs) == (0.1, 8)
@@ -197,7 +201,7 @@ def test_hyperparameters_reach_the_algorithm(tmp_path):
     ppo = replace(TINY, n_steps=32, n_epochs=3, log_std_init=-1.25, hidden=(5, 7), learning_rate=1e-9)
     run = tiny(tmp_path / "run", steps=512, hyperparameters=ppo)
     weights = load_file(run.folder / "policy.safetensors")
-    assert weights["mlp_extractor.policy_net.0.weight"].shape == (5, 22)
+    assert weights["mlp_extractor.policy_net.0.weight"].shape == (5, len(NAMES) + 22)
     assert weights["mlp_extractor.policy_net.2.weight"].shape == (7, 5)
     assert weights["action_net.weight"].shape == (1, 7)
     np.testing.assert_allclose(weights["log_std"], -1.25, atol=1e-5)
@@ -250,12 +254,13 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("seen", ["history", "privileged"])
-def test_another_observation_than_the_posterior_has_no_foresight(tmp_path, seen):
+def test_another_observation_than_the_posterior_has_no_features(tmp_path, seen):
     with pytest.raises(
-        ValueError, match=f"observation must be 'posterior' with foresight, but is '{seen}'; add --ppo.no-foresight"
+        ValueError, match=f"observation must be 'posterior' with features, but is '{seen}'; add --ppo.no-features"
     ):
         TrainConfig(env="Short-v0", options={"observation": seen})
-    run = tiny(tmp_path / "run", env="Short-v0", options={"observation": seen})
+    settings = {"options": {"observation": seen}, "hyperparameters": replace(TINY, features=False)}
+    run = tiny(tmp_path / "run", env="Short-v0", **settings)
     assert (run.folder / "policy.json").exists()
 
 

@@ -49,9 +49,10 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
     first = scores(folder)
     assert set(first) == {0, 1}
     used = json.loads((folder / "trials" / "000" / "config.json").read_text())["config"]["hyperparameters"]
-    assert {name: value for name, value in used.items() if name not in ("foresight", "levels", "entropy_bonus")} == {
+    assert used == {
         "num_envs": 8, "batch_size": 128, "learning_rate": 1e-3, "gamma": 0.99, "hidden": [4], "n_steps": 16,
-        "n_epochs": 4, "gae_lambda": 0.95, "log_std_init": -0.5, "rule_logit": 1.0,
+        "n_epochs": 4, "gae_lambda": 0.95, "log_std_init": -0.5, "activation": "relu",
+        "features": True, "own": True, "levels": 0, "entropy_bonus": 0.0, "advantages_by_time": True,
     }  # fmt: skip
     tune(tiny(folder), 2)  # nothing is left to do
     assert scores(folder) == first
