@@ -1,4 +1,4 @@
-"""All records as people have them, of which `make test` runs one of each kind."""
+"""All records as people have them, of which `make test` runs one of each kind that must be answered."""
 
 from dataclasses import replace
 
