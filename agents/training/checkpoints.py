@@ -36,6 +36,7 @@ _HALF_WRITTEN = ".checkpoint-"
 _ENTROPY = "log_ent_coef"  # the log weight of the entropy, of an algorithm that learns it
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _ENDED = ("r", "l", "t")
+_NORMALIZER = ("normalizer.mean", "normalizer.std")
 
 
 @dataclass
@@ -119,9 +120,8 @@ def begin_with(folder: Path, model: BaseAlgorithm) -> None:
         tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(folder / WEIGHTS).items()}
     except OSError as error:
         raise ValueError(f"begin must be the folder of a policy, but {folder} has no {WEIGHTS}; name one") from error
-    envs: Any = model.get_env()
-    kept = {name: tensors.pop(name).numpy() for name in ("normalizer.mean", "normalizer.std") if name in tensors}
-    tensors.pop("setting", None)
+    for name in ("setting", *_NORMALIZER):
+        tensors.pop(name, None)
     shapes, own = ({name: tuple(t.shape) for name, t in of.items()} for of in (tensors, model.policy.state_dict()))
     for name in sorted({*shapes, *own}):
         if shapes.get(name) != own.get(name):
@@ -130,8 +130,17 @@ def begin_with(folder: Path, model: BaseAlgorithm) -> None:
                 f"{shapes.get(name, 'none')} in place of {own.get(name, 'none')}; train with its hyperparameters"
             )
     model.policy.load_state_dict(tensors)
-    if kept and hasattr(envs, "normalizer"):
-        envs.normalizer.mean, envs.normalizer.std = kept["normalizer.mean"], kept["normalizer.std"]
+    _take_normalizer(folder, model)
+
+
+def _take_normalizer(folder: Path, model: BaseAlgorithm) -> None:
+    """Let the environments of a model normalise features as those of a policy did; nothing where it has none."""
+    from safetensors.numpy import load_file
+
+    envs: Any = model.get_env()
+    tensors = load_file(folder / WEIGHTS)
+    if hasattr(envs, "normalizer") and _NORMALIZER[0] in tensors:
+        envs.normalizer.mean, envs.normalizer.std = (tensors[name].copy() for name in _NORMALIZER)
 
 
 def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
@@ -148,6 +157,7 @@ def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
     model.num_timesteps, model._n_updates = progress.steps, progress.updates
     model._episode_num = progress.episodes
     try:
+        _take_normalizer(checkpoint, model)  # which a run that was begun with a policy has from that
         tensors = {name: tensor.copy() for name, tensor in load_file(checkpoint / TENSORS).items()}
         for name in model.get_parameters():
             part = attrgetter(name)(model)

@@ -57,6 +57,16 @@ def log(folder):
     return list(csv.DictReader((folder / "progress.csv").read_text().splitlines()))
 
 
+def test_a_run_that_began_with_a_policy_sees_as_it_did_after_a_stop(tmp_path):
+    first = train(config("ppo", tmp_path / "first", seed=5)).folder
+    folder = resume(stopped("ppo", tmp_path / "run", at=640, begin=first)).folder
+    whole = train(config("ppo", tmp_path / "whole", eval_every=128, begin=first)).folder
+    runs = [load_file(path / "policy.safetensors") for path in (first, folder, whole)]
+    for name in ("normalizer.mean", "normalizer.std"):
+        assert all(np.array_equal(run[name], runs[0][name]) for run in runs)
+    assert (folder / "policy.safetensors").read_bytes() == (whole / "policy.safetensors").read_bytes()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def few_systems():
     """What is evaluated on the way is no subject here: on 4 systems instead of 128."""
