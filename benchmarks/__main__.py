@@ -17,7 +17,7 @@ from benchmarks.peer_process import Peers
 from benchmarks.report import Section, print_section, print_verdicts
 from benchmarks.timing import CORES
 
-SectionName = Literal["estimators", "environments", "training", "roofline", "scaling", "startup"]
+SectionName = Literal["estimators", "environments", "training", "decisions", "roofline", "scaling", "startup"]
 _SETTINGS = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
 
 
@@ -28,7 +28,9 @@ class Config:
     All rows of a section are timed in turns, in the same run. Needs about 15 minutes and a quiet machine.
     """
 
-    sections: tuple[SectionName, ...] = ("estimators", "environments", "training", "roofline", "scaling", "startup")
+    sections: tuple[SectionName, ...] = (
+        "estimators", "environments", "training", "decisions", "roofline", "scaling", "startup",
+    )  # fmt: skip
     """Parts to run."""
     repetitions: int = 5
     """Rounds; every row is run once in each. At least 5 for results to be quoted."""

@@ -21,7 +21,7 @@ SETTLING = 0.02
 
 #: From seconds and work to the value in a unit; where more is better, and where less is.
 _RATES = ("env-steps/s", "flop/s", "op/s")
-_COSTS = {"ns/env-step": 1e9, "µs/sample": 1e6, "s": 1.0, "MiB": 1.0}
+_COSTS = {"ns/env-step": 1e9, "µs/sample": 1e6, "µs/decision": 1e6, "s": 1.0, "MiB": 1.0}
 
 
 @dataclass(frozen=True)
