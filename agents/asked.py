@@ -46,6 +46,18 @@ def check_shown(env: Any, observed: npt.NDArray[Any]) -> None:
     )
 
 
+def check_entries(observed: npt.NDArray[Any], entries: int) -> None:
+    """Refuse observations (entries,) or (n, entries) of another shape."""
+    if observed.ndim not in (1, 2) or observed.shape[-1] != entries:
+        raise ValueError(f"observation must have {entries} entries, but has shape {observed.shape}")
+
+
+def check_finite(observed: npt.NDArray[Any]) -> None:
+    """Refuse observations with a number that is not finite."""
+    if not np.isfinite(observed).all():
+        raise ValueError(f"observation must be finite, but is {observed[~np.isfinite(observed)][0]} somewhere")
+
+
 def check_rows(name: str, given: int, expected: int) -> None:
     """Refuse what is for another number of environments than the observation."""
     if given != expected:

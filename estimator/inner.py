@@ -55,7 +55,7 @@ class _Pipeline(CompilerBase):
     def define_pipelines(self) -> list[Any]:
         """The one for code without Python's objects."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.passes = [(_Lowering if each is NativeLowering else each, told) for each, told in passes.passes]
+        passes.passes = [(_Lowering if each is NativeLowering else each, name) for each, name in passes.passes]
         passes.finalize()
         return [passes]
 

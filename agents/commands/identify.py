@@ -97,11 +97,11 @@ def steps(result: Result) -> list[str]:
     """Sentences: the sampling step that was taken, and where it is from."""
     even = [one.step for one in result.records if one.times is None]
     agree = "and the times agree" if all(even) else "as some records have no times" if any(even) else "without times"
-    told = [f"The sampling step is {_rate(result.rig.step)} by the rig, {agree}."] if even else []
+    sentences = [f"The sampling step is {_rate(result.rig.step)} by the rig, {agree}."] if even else []
     for one in result.records:
         if one.times is not None and one.step is not None:
-            told.append(f"By its times {one.name.partition(', from sample ')[0]} has steps of {_rate(one.step)}.")
-    return list(dict.fromkeys(told))
+            sentences.append(f"By its times {one.name.partition(', from sample ')[0]} has steps of {_rate(one.step)}.")
+    return list(dict.fromkeys(sentences))
 
 
 def _rate(step: float) -> str:

@@ -33,7 +33,7 @@ def from_record(
         sink: of the output's, likewise.
 
     Raises:
-        ValueError: where the step is neither given nor told, or the file is not as it must be.
+        ValueError: where neither the caller nor the file gives the step, or the file is not as it must be.
         FileNotFoundError: if there is no such file.
     """
     if not path.exists():
@@ -73,8 +73,8 @@ def from_record(
     for name, one, base in zip(("input", "output"), (unit, seen), bases, strict=True):
         if one and base and conversion(one, base) != 1.0:
             said.append(f"The {name} is in {one}, and is taken in {base}: results are in units of SI.")
-    told = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
-    return text_of(rig, f", from {printable(path.name)}{told}"), "\n".join(said)
+    guessed = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
+    return text_of(rig, f", from {printable(path.name)}{guessed}"), "\n".join(said)
 
 
 def _taken(step: float, source: str) -> str:

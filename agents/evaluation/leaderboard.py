@@ -255,7 +255,7 @@ def headline(evaluations: list[Evaluation]) -> Table:
 def print_headline(evaluations: list[Evaluation], title: str) -> None:
     """Print the chief figures, in 80 columns."""
     heads, rows = headline(evaluations)
-    caption = "means over systems ± half of the 95 % bootstrap interval; 90 % intervals that cover;\n"
+    caption = "means over systems ± half of the 95 % bootstrap interval; 90 % intervals that cover; "
     caption += "episodes that a limit ended early; time of a decision"
     if "efficiency" in evaluations[0].metrics:
         caption += f"\n{TERMS['efficiency']}"

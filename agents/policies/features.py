@@ -6,11 +6,10 @@ rolled out without noise, after a first input up, none or down, and then
 - *at rest*: no further input,
 - *braking*: pushes against the motion.
 
-What the network sees of that is in `NAMES`. Where the model is odd, all of it is turned upright, so that the
-motion is upwards. The *shield* is the interval of choices after which braking still keeps the
-first sensor within its limit, with a margin of some predictive standard deviations; between the three first inputs the
-peaks are taken to be linear. Where no input does, it is the one that leads beyond the limit the least. A model without
-a limit on an output has no shield.
+`NAMES` has what the network sees of the rollouts. Where the model is odd, all of it is turned upright, so that the
+motion is upwards. The *shield* is the interval of choices after which braking still keeps the first sensor within its
+limit, with a margin of some predictive standard deviations; between the three first inputs the peaks are taken to be
+linear. Where no choice does, it is the one that leads beyond the limit the least.
 
 What inputs *teach* is Σ_t φ_tᵀ W φ_t / (2 σ²), with φ the derivatives by the coefficients of what the first sensor
 shows after a sample, and σ² the variance of an output. W = (C⁻¹ + J)⁻¹ is what will be unknown at the end of the
@@ -39,8 +38,9 @@ from estimator.parameters import FloatArray
 FIRST_INPUTS = ("up", "none", "down")
 
 #: What every network sees. ``next``: what the first sensor shows after a move; ``rest`` and ``peak``: the highest that
-#: it shows at rest and braking; ``reach``: the highest while braking, with its margin; ``taught``: what two samples at
-#: rest teach, and ``braked`` what braking does.
+#: it shows at rest and braking; ``reach``: the highest while braking, with its margin. ``taught`` and ``braked``
+#: compare what three moves teach at rest and braking: ``up`` is up less down, and ``none`` is none less the better of
+#: both, in parts of the most; ``down`` is the logarithm of the most over the samples left.
 NAMES = (
     "log_std_mean", "log_std_max", "log_gamma", "log_xi", "time_left", "thrift", "reserve", "push",
     "last_input", "last_output", "now", "velocity", "log_deviation", "lowest", "highest",
@@ -51,7 +51,7 @@ NAMES = (
 #: Largest size of a feature.
 BOUND = 10.0
 
-#: Moves that a rollout looks ahead: the first input, and four. More tell no more.
+#: Moves that a rollout looks ahead, the first input's among them.
 _MOVES = 5
 
 #: Predictive standard deviations that the shield keeps from the limit: where the noises are known, and where they are
@@ -192,8 +192,7 @@ def compiled(view: View) -> Any:
 
     @inner
     def desk():
-        square = np.empty((k, k))
-        return np.empty(size), np.empty(size), square, square.copy(), square.copy()
+        return np.empty(size), np.empty(size), np.empty((k, k)), np.empty((k, k)), np.empty((k, k))
 
     @inner
     def square(A, W):

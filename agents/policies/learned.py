@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.asked import check_state, starts
+from agents.asked import check_entries, check_finite, check_state, starts
 from agents.policies.decision import Actor, decider
 from agents.policies.features import FeatureMap
 from estimator.checks import number, numbers, whole
@@ -194,15 +194,13 @@ class LearnedPolicy:
             observation = numbers("observation", observation)
         seen = np.asarray(observation, dtype=np.float32)
         size = self._seen if found is None else found.observation_size
-        if seen.shape[-1:] != (size,):
-            raise ValueError(f"observation must have {size} entries, but has shape {seen.shape}")
+        check_entries(seen, size)
         if found is not None and actor is not None and deterministic:
             rows = np.ascontiguousarray(seen.reshape(-1, size))
             actions = np.empty((len(rows), 1), dtype=np.float32)
             if decider(found.view)(rows, found.setting, found.own, actor, actions) < 0:
                 return actions.reshape(*seen.shape[:-1], 1), state
-        if not np.isfinite(seen).all():
-            raise ValueError(f"observation must be finite, but is {seen[~np.isfinite(seen)][0]} somewhere")
+        check_finite(seen)
         if found is None:
             return self._choose(seen, state, episode_start, deterministic)
         features = found(seen.reshape(-1, size))

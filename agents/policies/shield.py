@@ -1,4 +1,4 @@
-"""`shield`: the shield of the networks alone, which lets through what pushes along the velocity. Nothing is learned."""
+"""`shield`: pushes along the velocity, bounded by the networks' shield. Nothing is learned."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from agents.asked import check_entries, check_finite
 from agents.policies.features import NAMES, FeatureMap
 from estimator.checks import numbers
 
@@ -16,7 +17,7 @@ _VELOCITY = NAMES.index("velocity")
 class Shield:
     """Push along the velocity of the first sensor, as hard as the shield allows (`agents.policies.features`).
 
-    It is what a network has to add to.
+    A trained network is compared with it: both have the same shield.
 
     Args:
         env: the unwrapped environment, single or vector, whose prior, limits and noises it is to know.
@@ -41,11 +42,9 @@ class Shield:
         Raises:
             ValueError: for observations of another shape, or that are not finite.
         """
-        seen, size = numbers("observation", observation).astype(np.float32), self._map.observation_size
-        if seen.ndim not in (1, 2) or seen.shape[-1] != size:
-            raise ValueError(f"observation must have {size} entries, but has shape {seen.shape}")
-        if not np.isfinite(seen).all():
-            raise ValueError(f"observation must be finite, but is {seen[~np.isfinite(seen)][0]} somewhere")
+        seen = numbers("observation", observation).astype(np.float32)
+        check_entries(seen, self._map.observation_size)
+        check_finite(seen)
         features = self._map(np.atleast_2d(seen))
         pushes = np.where(features.values[:, _VELOCITY] >= 0.0, 1.0, -1.0)
         return features.act(pushes).reshape(*seen.shape[:-1], 1), state

@@ -89,7 +89,7 @@ class FeatureVecEnv(VecEnvWrapper):
 
     @property
     def tensors(self) -> dict[str, npt.NDArray[Any]]:
-        """What a policy's file keeps of it."""
+        """Setting and normaliser, as a policy's file holds them."""
         return {"setting": self._map.to_tensor(), **self.normalizer.to_tensors()}
 
     @property

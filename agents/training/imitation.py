@@ -59,7 +59,7 @@ def imitate(
         rewards.append(reward)
         ends.append(starts)
         if len(seen) % _ROUND == 0 or done + envs.num_envs >= samples:
-            _fit(model.policy, optimizer, np.concatenate(seen), np.concatenate(wanted), generator)
+            _fit_actor(model.policy, optimizer, np.concatenate(seen), np.concatenate(wanted), generator)
         tell(min(1.0, (done + envs.num_envs) / samples))
     returns = returns_of(np.array(rewards), np.array(ends), model.gamma)
     known = np.isfinite(returns)
@@ -92,17 +92,25 @@ def _choices(envs: FeatureVecEnv, actions: npt.NDArray[Any]) -> npt.NDArray[Any]
     return np.rint((upright + 1.0) / 2.0 * (int(envs.action_space.n) - 1)).astype(np.int64)
 
 
-def _fit(policy: Any, optimizer: Any, seen: Any, wanted: Any, generator: Any) -> None:
-    """Raise the likelihood of what is wanted."""
+def _minimise(loss_of: Callable[[Any], Any], rows: int, optimizer: Any, generator: Any) -> None:
+    """Step down a loss of batches of so many rows, given by their places."""
     import torch
 
-    seen, wanted = torch.from_numpy(seen), torch.from_numpy(wanted)
     for _ in range(_EPOCHS):
-        for batch in torch.randperm(len(seen), generator=generator).split(_BATCH):
-            loss = -policy.get_distribution(seen[batch]).log_prob(wanted[batch]).mean()
+        for batch in torch.randperm(rows, generator=generator).split(_BATCH):
+            loss = loss_of(batch)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
+
+
+def _fit_actor(policy: Any, optimizer: Any, seen: Any, wanted: Any, generator: Any) -> None:
+    """Raise the likelihood of the teacher's choices."""
+    import torch
+
+    seen, wanted = torch.from_numpy(seen), torch.from_numpy(wanted)
+    likelihood = lambda batch: policy.get_distribution(seen[batch]).log_prob(wanted[batch]).mean()  # noqa: E731
+    _minimise(lambda batch: -likelihood(batch), len(seen), optimizer, generator)
 
 
 def _fit_critic(policy: Any, optimizer: Any, seen: Any, returns: Any, generator: Any) -> None:
@@ -110,9 +118,5 @@ def _fit_critic(policy: Any, optimizer: Any, seen: Any, returns: Any, generator:
     import torch
 
     seen, returns = torch.from_numpy(seen), torch.from_numpy(returns)
-    for _ in range(_EPOCHS):
-        for batch in torch.randperm(len(seen), generator=generator).split(_BATCH):
-            loss = (policy.predict_values(seen[batch])[:, 0] - returns[batch]).square().mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
+    error = lambda batch: policy.predict_values(seen[batch])[:, 0] - returns[batch]  # noqa: E731
+    _minimise(lambda batch: error(batch).square().mean(), len(seen), optimizer, generator)

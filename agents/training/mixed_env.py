@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from agents.evaluation.batch import make
 from agents.policies.features import BOUND, FeatureMap, Features
-from agents.training.feature_env import Normalizer, has_potential
+from agents.training.feature_env import SCALE, Normalizer, has_potential
 from agents.vec_env import BatchVecEnv, rows_of, told_of
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.checks import shown
@@ -73,7 +73,6 @@ class MixedVecEnv(BatchVecEnv):
         seed: of what is drawn, of oscillators and noise.
         draw: what a group plays next.
         reward: that counts information.
-        scale: of rewards.
         levels: an action is one of so many evenly spaced choices from -1 to 1, by its number; 0: any between.
         own: whether the observation itself stands behind the features; then all that is drawn has one model.
 
@@ -88,7 +87,6 @@ class MixedVecEnv(BatchVecEnv):
         draw: Draw,
         *,
         reward: str = "information_gain",
-        scale: float,
         levels: int = 0,
         own: bool = False,
     ) -> None:
@@ -96,7 +94,6 @@ class MixedVecEnv(BatchVecEnv):
             raise ValueError(f"num_envs must be a multiple of {LANES} for drawn options, but is {num_envs}")
         self.render_mode = None
         self._rngs = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(num_envs // LANES)]
-        self._scale = scale
         self._draw, self._own = draw, own
         self._fixed = {"reward": reward, "autoreset_mode": AutoresetMode.SAME_STEP}
         self._levels = np.linspace(-1.0, 1.0, levels) if levels else None
@@ -129,7 +126,7 @@ class MixedVecEnv(BatchVecEnv):
 
     @property
     def tensors(self) -> dict[str, npt.NDArray[Any]]:
-        """What a policy's file keeps of it: what observations are relative to is of the environment that is played."""
+        """The normaliser, as a policy's file holds it; the setting is that of the environment that is played."""
         return self.normalizer.to_tensors()
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
@@ -151,7 +148,7 @@ class MixedVecEnv(BatchVecEnv):
             group.shown = group.map(observations)
             group.left -= 1
             after = np.where(ended, np.float32(0), group.shown.to_come)
-            rewards[mine] = self._scale * (gained + group.weight * (after - before))
+            rewards[mine] = SCALE * (gained + group.weight * (after - before))
             self._returns[mine] += gained
             self._lengths[mine] += 1
             dones[mine] = ended | (group.left == 0)

@@ -304,13 +304,13 @@ def _make_envs(config: TrainConfig, seed: int) -> Any:
 def _with_features(config: TrainConfig, rows: int, seed: int) -> tuple[Any, int]:
     """Environments that show features, and the samples of an episode."""
     from agents.evaluation.batch import make
-    from agents.training.feature_env import SCALE, FeatureVecEnv
+    from agents.training.feature_env import FeatureVecEnv
     from agents.training.mixed_env import MixedVecEnv, draw_options
     from agents.vec_env import DuffingVecEnv
 
     options, own = {"reward": config.reward, **config.options}, config.hyperparameters.own
     levels = getattr(config.hyperparameters, "levels", 0)
-    mixed: dict[str, Any] = {"reward": config.reward, "levels": levels, "scale": SCALE}
+    mixed: dict[str, Any] = {"reward": config.reward, "levels": levels}
     if config.env == family.FAMILY:
         return MixedVecEnv(rows, seed, family.draw_rig, **mixed), family.TYPICAL
     if config.vary:

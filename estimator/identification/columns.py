@@ -81,8 +81,8 @@ def headed(name: str, unit: str) -> str:
         >>> headed("Weg [mm]", "mm"), headed("Weg [mm]", "m"), headed("Weg", "m")
         ('Weg [mm]', 'Weg [m]', 'Weg')
     """
-    told = unit_of(name)
-    return name if told is None or unit == "1" or conversion(told, unit) == 1.0 else f"{bare(name)} [{unit}]"
+    own = unit_of(name)
+    return name if own is None or unit == "1" or conversion(own, unit) == 1.0 else f"{bare(name)} [{unit}]"
 
 
 def is_unit(word: str) -> bool:
@@ -120,10 +120,10 @@ def with_unit(path: Path, name: str, unit: str) -> str:
     Raises:
         ValueError: where the name has another.
     """
-    told, below = unit_of(name), re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", unit.strip())
-    if told and below.lower() not in (*_NONE, "none") and plain(told) != plain(below):
+    own, below = unit_of(name), re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", unit.strip())
+    if own and below.lower() not in (*_NONE, "none") and plain(own) != plain(below):
         raise ValueError(f"{path}: {name!r:.60} must have one unit, but {below!r:.40} stands below; mend one")
-    return name if told or below.lower() in (*_NONE, "none") else f"{name} [{below}]"
+    return name if own or below.lower() in (*_NONE, "none") else f"{name} [{below}]"
 
 
 def chosen(
@@ -147,7 +147,7 @@ def chosen(
         stamped: columns of dates or times of day.
 
     Raises:
-        ValueError: where they are not told, or not by one column each.
+        ValueError: where no column has them, or several have.
     """
     if not names:
         if source or sink:
@@ -186,8 +186,8 @@ def _named(path: Path, names: Sequence[str], wish: str | None, table: str) -> li
     if wish is None:
         return []
     # The name as it stands there, or without its unit; or else the file has the same in another unit than the rig.
-    told = wish.strip().lower()
-    found = [k for k, name in enumerate(names) if told in (name.strip().lower(), bare(name).lower())]
+    wished = wish.strip().lower()
+    found = [k for k, name in enumerate(names) if wished in (name.strip().lower(), bare(name).lower())]
     found = found or [k for k, name in enumerate(names) if bare(wish).lower() == bare(name).lower()]
     if len(found) != 1:
         raise ValueError(

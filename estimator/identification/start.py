@@ -168,8 +168,8 @@ def misfits(problem: Problem, delays: NDArray[np.intp]) -> FloatArray:
         force = force - basis @ (basis.T @ force)
         rest = acceleration - basis @ (basis.T @ acceleration)
         square = np.sum(force**2, axis=0)
-        told = np.divide((rest @ force) ** 2, square, out=np.zeros(len(delays)), where=square > 0)
-        least = np.minimum(least, (rest @ rest - told) / max(acceleration @ acceleration, 1e-300))
+        explained = np.divide((rest @ force) ** 2, square, out=np.zeros(len(delays)), where=square > 0)
+        least = np.minimum(least, (rest @ rest - explained) / max(acceleration @ acceleration, 1e-300))
     return least
 
 

@@ -8,6 +8,7 @@ from tables import table
 
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.family import draw_rig
+from agents.training.feature_env import SCALE
 from agents.training.mixed_env import MixedVecEnv, draw_options
 from estimator.lanes import LANES
 
@@ -33,7 +34,7 @@ def test_options_are_drawn_over_their_whole_range():
 
 
 def test_every_group_has_its_own_options_and_draws_anew():
-    envs = MixedVecEnv(4 * LANES, 3, DRAW, scale=1.0, own=True)
+    envs = MixedVecEnv(4 * LANES, 3, DRAW, own=True)
     lengths = [group.envs.horizon for group in envs._groups]
     assert len(set(lengths)) > 1
     envs.reset()
@@ -51,7 +52,7 @@ def test_every_group_has_its_own_options_and_draws_anew():
 @table("track", [TRACK, "duffing_env/Amplitude-v0"])
 def test_an_episode_adds_up_to_what_it_gained(track):
     """What is still to come adds its potential, where the energy has no limit, once to every episode of a group."""
-    envs = MixedVecEnv(LANES, 5, partial(draw_options, env_id=track, options={}, ranges=LENGTHS), scale=2.0, own=True)
+    envs = MixedVecEnv(LANES, 5, partial(draw_options, env_id=track, options={}, ranges=LENGTHS), own=True)
     envs.reset()
     to_come = (track != TRACK) * envs._groups[0].shown.to_come
     total = np.zeros(LANES)
@@ -60,14 +61,14 @@ def test_an_episode_adds_up_to_what_it_gained(track):
         total += rewards
     assert dones.all()
     gained = np.array([info["episode"]["r"] for info in infos])
-    assert total == pytest.approx(2.0 * (gained - to_come), abs=1e-3)
+    assert total == pytest.approx(SCALE * (gained - to_come), abs=2e-3)
     envs.close()
 
 
 @pytest.mark.parametrize("draw", [DRAW, draw_rig], ids=["track", "family"])
 def test_the_same_seed_gives_the_same_episodes(draw):
     def episodes(seed):
-        envs = MixedVecEnv(LANES, seed, draw, scale=1.0)
+        envs = MixedVecEnv(LANES, seed, draw)
         seen = [envs.reset(), *(envs.step(np.ones((LANES, 1)))[0] for _ in range(5))]
         envs.close()
         return np.array(seen)
