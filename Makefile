@@ -41,7 +41,7 @@ compat: $(READY)  ## what other RL libraries make of the environments, in .venv-
 	.venv-compat/bin/python -m pip install --quiet --no-deps --upgrade --target .venv-compat/newest gymnasium==1.4.0
 	.venv-compat/bin/python -m benchmarks.compat
 	.venv-compat/bin/python -m pytest tests/test_examples.py tests/agents/test_seeds.py
-	.venv-compat/bin/python -m benchmarks.cluster
+	.venv-compat/bin/python -m benchmarks.ray_node_kill
 	PYTHONPATH=.venv-compat/newest .venv-compat/bin/python -m benchmarks.compat
 
 lint: $(READY)  ## style, format and types
@@ -95,7 +95,7 @@ fuzz: $(READY)  ## bad inputs by the thousand; fails where one is not refused cl
 	$(BIN)/python -m benchmarks.fuzz --inputs $(INPUTS)
 
 soak: $(READY)  ## long runs on every track
-	$(BIN)/python -m benchmarks.soak --steps 10000000
+	$(BIN)/python -m benchmarks.soak_test --steps 10000000
 
 kills: $(READY)  ## commands killed at random moments, and started again; a quarter of an hour
 	$(BIN)/python -m benchmarks.kills

@@ -28,7 +28,7 @@ class Config:
 class Silverbox(Config):
     """Run the official protocol of the Silverbox benchmark, for every estimator of this project.
 
-    `python -m benchmarks.silverbox` puts other packages beside them.
+    `python -m benchmarks.silverbox_comparison` puts other packages beside them.
     """
 
     figures: Path = Path("runs/silverbox")

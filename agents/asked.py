@@ -24,13 +24,13 @@ def check_shown(env: Any, observed: npt.NDArray[Any]) -> None:
     """Refuse observations (n, entries) that an environment did not show last: its beliefs are not theirs.
 
     Args:
-        env: whose beliefs a policy reads; its ``shown`` is what it showed last.
+        env: whose beliefs a policy reads; its ``last_observations`` is what it showed last.
         observed: what the policy is asked about.
 
     Raises:
         ValueError: naming the first entry that differs.
     """
-    last = env.shown
+    last = env.last_observations
     if observed.shape == last.shape:
         same = observed == last
         if same.all():

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from duffing_env.contract import Fixed, checked_options
+from duffing_env.env_base import ReadOnlyOption, check_reset_options
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.extras import need
 from estimator.parameters import Parameters
@@ -99,7 +99,7 @@ class DuffingVecEnv(BatchVecEnv):
         ValueError: for an environment that was made otherwise.
     """
 
-    levels = Fixed("levels", "_n_levels")
+    levels = ReadOnlyOption("levels", "_n_levels")
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class DuffingVecEnv(BatchVecEnv):
             raise ValueError(
                 f"options must be a dict, or {self.num_envs} of them, one for each row, but are {len(self._options)}"
             )
-        chosen = [checked_options(options, "truth").get("truth") for options in self._options]
+        chosen = [check_reset_options(options, "truth").get("truth") for options in self._options]
         options = None if all(truth is None for truth in chosen) else {"truth": chosen}
         observations, infos = self.envs.reset(seed=self._seed_of_batch, options=options)
         self._seed_of_batch = None
@@ -218,7 +218,7 @@ class DuffingVecEnv(BatchVecEnv):
     @property
     def _told(self) -> tuple[str, ...]:
         """What is told of every step."""
-        return (*self._batch.single._reported, *self._batch.single._flags)
+        return (*self._batch.single_env_class._info_gains, *self._batch.single_env_class._info_flags)
 
     @property
     def _batch(self) -> DuffingVectorEnv:

@@ -14,8 +14,8 @@ from typing import Any, Literal
 from agents.cli import run_script
 from agents.results import versions, write_json
 from benchmarks.peer_process import Peers
-from benchmarks.report import Section, print_section, print_verdicts
-from benchmarks.timing import CORES
+from benchmarks.section_tables import Section, print_section, print_verdicts
+from benchmarks.timed_rounds import CORES
 
 SectionName = Literal["estimators", "environments", "training", "decisions", "roofline", "scaling", "startup"]
 _SETTINGS = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import gymnasium as gym
 
 from agents import make_policy
-from benchmarks.report import Claim, Section
-from benchmarks.timing import Row, measure
+from benchmarks.section_tables import Claim, Section
+from benchmarks.timed_rounds import Row, measure
 
 #: Track and policy, to the bars of one environment and of many [µs].
 BARS = {("Amplitude-v0", "ppo/amplitude"): (15.0, 3.0), ("Amplitude-v1", "ppo/amplitude-v1"): (30.0, 6.0)}

@@ -13,10 +13,10 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
 import duffing_env  # noqa: F401  registers the tracks
+from benchmarks.component_timing import SAMPLES, EstimatorOnly, plant_only, play
 from benchmarks.peer_process import Peers
-from benchmarks.pieces import SAMPLES, EstimatorOnly, plant_only, play
-from benchmarks.report import Claim, Section, ratio
-from benchmarks.timing import Row, later, measure, timed
+from benchmarks.section_tables import Claim, Section, ratio
+from benchmarks.timed_rounds import Row, later, measure, timed
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.lanes import LANES
 

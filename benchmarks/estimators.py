@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.peer_process import Peers
-from benchmarks.report import Claim, Section, ratio
-from benchmarks.timing import Row, measure, timed
-from duffing_env.silverbox import load_record, record_available, synthesise_multisine
+from benchmarks.section_tables import Claim, Section, ratio
+from benchmarks.timed_rounds import Row, measure, timed
+from duffing_env.plants.silverbox_record import load_record, record_available, synthesise_multisine
 from estimator import SILVERBOX_TWIN, OnlineEstimator, coefficients_of, difference, duffing, silverbox_prior
 from estimator.belief import Belief
 from estimator.models.model import Model
@@ -39,7 +39,7 @@ def samples() -> tuple[FloatArray, FloatArray, str]:
 
 
 def write_samples(path: Path) -> None:
-    """What `benchmarks.silverbox_peers` reads: the same samples, our prior, and its expected noises."""
+    """What `benchmarks.silverbox_peer_filters` reads: the same samples, our prior, and its expected noises."""
     u, y, _ = samples()
     prior = silverbox_prior()
     gamma_shape, gamma_rate, xi_shape, xi_rate = prior.noises

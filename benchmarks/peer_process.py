@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from benchmarks.timing import Row
+from benchmarks.timed_rounds import Row
 
 ROOT = Path(__file__).parents[1]
 LOCK = Path(__file__).with_name("peers.lock")

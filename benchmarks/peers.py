@@ -119,11 +119,11 @@ def samples() -> dict[str, Any]:
 def row(name: str) -> Run:
     """The row of this name, set up.
 
-    A kind of environment and a number of them; ``silverbox`` and what `benchmarks.silverbox_peers.row` takes; or
+    A kind of environment and a number of them; ``silverbox`` and what `benchmarks.silverbox_peer_filters.row` takes; or
     ``rigs`` and what `benchmarks.rigs.peer_rows.row` takes.
     """
     kind, _, rest = name.partition(" ")
-    modules = {"silverbox": ("silverbox_peers", ""), "rigs": ("peer_rows", "rigs")}
+    modules = {"silverbox": ("silverbox_peer_filters", ""), "rigs": ("peer_rows", "rigs")}
     if kind in modules:
         module, folder = modules[kind]
         sys.path.append(str(Path(__file__).parent / folder))

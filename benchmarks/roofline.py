@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.pieces import experiment_of, plants
-from benchmarks.report import Claim, Section
-from benchmarks.timing import Result, Row, measure, timed
+from benchmarks.component_timing import experiment_of, plants
+from benchmarks.section_tables import Claim, Section
+from benchmarks.timed_rounds import Result, Row, measure, timed
 from duffing_env.batch import Batch
-from duffing_env.experiment import SimulatedExperiment
-from duffing_env.kernel import RESET_NEXT_STEP, updater
-from duffing_env.layout import layout_of
-from duffing_env.sources import parts
-from duffing_env.stages import noise_drawer
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.kernel import RESET_NEXT_STEP, compile_belief_update
+from duffing_env.kernel_stages.env_codegen import generated_functions
+from duffing_env.kernel_stages.plant_stages import compile_noise_draw
+from duffing_env.storage.kernel_spec import block_layout
 from estimator.inference import mean_field
 from estimator.lanes import LANES, jit, lanewise, rows
 from estimator.straight import straight
@@ -126,15 +126,15 @@ def count(functions: dict[Any, int]) -> Counter[str]:
 def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
     """The pieces of a step: lane functions, and how often a step calls them."""
     experiment = experiment_of(factorisation)
-    kind = experiment.kind
-    code = parts(kind)
+    kind = experiment.kernel_spec
+    code = generated_functions(kind)
     if factorisation == "structured":
-        inference = {updater(kind): 1}
+        inference = {compile_belief_update(kind): 1}
     else:
-        begin, iterate, end, _ = mean_field.pieces(layout_of(kind))
-        inference = {begin: 1, iterate: experiment.setup.iterations, end: 1}
+        begin, iterate, end, _ = mean_field.pieces(block_layout(kind))
+        inference = {begin: 1, iterate: experiment.kernel_params.iterations, end: 1}
     return {
-        "noise": {noise_drawer(layout_of(kind)): 1},
+        "noise": {compile_noise_draw(block_layout(kind)): 1},
         "plant": {code.plant: 1},
         _INFERENCE[factorisation]: inference,
         "reward and end": {code.settle: 1},

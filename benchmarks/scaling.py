@@ -9,8 +9,8 @@ import gymnasium as gym
 
 from agents.evaluation.figures import new_figure, save
 from benchmarks.environments import TRACK, vector_steps
-from benchmarks.report import Claim, Section, ratio
-from benchmarks.timing import CORES, Result, Row, later, measure, timed
+from benchmarks.section_tables import Claim, Section, ratio
+from benchmarks.timed_rounds import CORES, Result, Row, later, measure, timed
 from estimator.inference import DEFAULT_ITERATIONS
 
 UNIT = "ns/env-step"

@@ -7,8 +7,8 @@ import tempfile
 from collections.abc import Callable
 
 from benchmarks.peer_process import ROOT
-from benchmarks.report import Claim, Section
-from benchmarks.timing import Row, measure
+from benchmarks.section_tables import Claim, Section
+from benchmarks.timed_rounds import Row, measure
 
 PACKAGES = ("estimator", "duffing_env", "agents", "gymnasium", "numba", "stable_baselines3")
 MANY = 16384

@@ -19,8 +19,8 @@ from agents.evaluation.rollout import evaluate
 from agents.policies.learned import CARD
 from agents.training import PPOSettings, TrainConfig
 from benchmarks.peer_process import ROOT
-from benchmarks.report import Claim, Section, ratio
-from benchmarks.timing import CORES, Row, measure
+from benchmarks.section_tables import Claim, Section, ratio
+from benchmarks.timed_rounds import CORES, Row, measure
 
 TRACK = TrainConfig.env
 EXCITATIONS = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")

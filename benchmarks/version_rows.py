@@ -1,4 +1,4 @@
-"""The rows of one version of this project. Runs as a child of `benchmarks.versions`, in that version's tree.
+"""The rows of one version of this project. Runs as a child of `benchmarks.version_comparison`, in that version's tree.
 
 It is spoken to like `benchmarks.peers`. Versions before the engine (`estimator.engine`) had other names for the update.
 """

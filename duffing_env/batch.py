@@ -11,22 +11,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from duffing_env.experiment import Experiment
-from duffing_env.hypotheses import abreast, blocks_of_members
-from duffing_env.kernel import RESET_NOW, compiled
-from duffing_env.layout import OUTCOME, layout_of, noise_rows, observation_bounds, pack, parameter_names
-from duffing_env.noise import stream_words
-from duffing_env.recycling import Recycled
+from duffing_env.experiment_config import Experiment
+from duffing_env.kernel import RESET_ONLY, compile_kernel
+from duffing_env.kernel_stages.noise_filter_bank import interleave_width, n_member_blocks
+from duffing_env.storage.array_pool import ArrayPool
+from duffing_env.storage.kernel_spec import (
+    OUTCOME_ROWS,
+    block_layout,
+    noise_std_rows,
+    observation_bounds,
+    pack_params,
+    parameter_names,
+)
+from duffing_env.storage.random_streams import new_stream_words
 from estimator.belief import Belief, record_size
 from estimator.lanes import LANES
 from estimator.parameters import FloatArray, Parameters
 
-_OUTCOME = tuple(name.lower() for name in OUTCOME)
+_OUTCOME_NAMES = tuple(name.lower() for name in OUTCOME_ROWS)
 
 #: The process whose threads have stepped: they do not live on in its children.
-_process: int | None = None
+_threaded_process: int | None = None
 
-_turn = threading.Lock()
+_threading_lock = threading.Lock()
 
 
 class Batch:
@@ -35,95 +42,105 @@ class Batch:
     Args:
         experiment: what is fixed about them.
         size: their number n; memory is laid out for a multiple of `LANES`.
-        reset_mode: `duffing_env.kernel.RESET_BY_HAND`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
+        reset_mode: `duffing_env.kernel.RESET_MANUALLY`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
         threads: threads that step the blocks; results do not depend on it.
         hold: samples that a step plays, at most: an environment stops where its episode ends.
-        limit: samples after which episodes are cut off.
+        max_samples: samples after which episodes are cut off.
 
     Attributes:
-        observations: (n, entries) float32, overwritten by every step, unless `renew` is called before.
+        observations: (n, entries) float32, overwritten by every step, unless `renew_output_arrays` is called before.
         final_observations: the same, for what was reset within the step; always overwritten.
         outcomes: (len(OUTCOME), n), as the observations.
     """
 
     def __init__(
-        self, experiment: Experiment, size: int, reset_mode: int, threads: int = 1, hold: int = 1, limit: float = np.inf
+        self,
+        experiment: Experiment,
+        size: int,
+        reset_mode: int,
+        threads: int = 1,
+        hold: int = 1,
+        max_samples: float = np.inf,
     ) -> None:
         self.experiment = experiment
         self.size = size
         self._reset_mode = reset_mode
         self._threads = threads
-        self._kind = experiment.kind
-        self._kernel = compiled(self._kind)
-        self._place = layout_of(self._kind)
-        self._setup = experiment.setup._replace(hold=hold, limit=limit, abreast=abreast(size))
-        self._packed = pack(self._setup)
-        self._prior = experiment.believed
-        model, drawn = experiment.truth_model, experiment.setup.noise_range > 1
-        self._truth = {name: f"PARAM_{name}" for name in parameter_names(model)} | (noise_rows(model) if drawn else {})
-        self._worth = np.array([worth_of(experiment, name) for name in self._truth])
-        n_rows, n_observation = max(self._place.values()) + 1, len(observation_bounds(experiment.model))
+        self._spec = experiment.kernel_spec
+        self._kernel = compile_kernel(self._spec)
+        self._row_of = block_layout(self._spec)
+        self._params = experiment.kernel_params._replace(
+            hold=hold, max_samples=max_samples, interleaved_envs=interleave_width(size)
+        )
+        self._packed_params = pack_params(self._params)
+        self._prior = experiment.prior_belief
+        model, draws_noises = experiment.truth_model, experiment.kernel_params.noise_range > 1
+        self._truth_rows = {name: f"PARAM_{name}" for name in parameter_names(model)} | (
+            noise_std_rows(model) if draws_noises else {}
+        )
+        self._truth_scales = np.array([parameter_scale(experiment, name) for name in self._truth_rows])
+        n_rows, n_observation = max(self._row_of.values()) + 1, len(observation_bounds(experiment.model))
         # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
-        self._recorded = np.stack(experiment.recorded)
+        self._replayed_record = np.stack(experiment.replayed_record)
         n_blocks = -(-size // LANES)
         padded = n_blocks * LANES
         self._blocks = np.zeros((n_blocks, n_rows, LANES))
         self._flat_blocks = self._blocks.reshape(n_blocks, -1)
-        n_members = blocks_of_members(size, len(self._setup.hypotheses))
+        n_members = n_member_blocks(size, len(self._params.hypothesis_priors))
         self._members = np.zeros((n_members, (record_size(experiment.model) + 1) * LANES))
         self._ended = np.zeros_like(self._blocks)
         self._flat_ended = self._ended.reshape(n_blocks, -1)
-        self._saved = np.zeros((threads, 2 * n_rows * LANES))
+        self._workspace = np.zeros((threads, 2 * n_rows * LANES))
         self._actions = np.zeros(padded, dtype=np.float32)
-        self._all_observations = Recycled((padded, n_observation), np.float32)
-        self._all_outcomes = Recycled((len(OUTCOME), padded), np.float64)
-        self.renew()
+        self._observation_pool = ArrayPool((padded, n_observation), np.float32)
+        self._outcome_pool = ArrayPool((len(OUTCOME_ROWS), padded), np.float64)
+        self.renew_output_arrays()
         self._final_observations = np.zeros_like(self._observations)
         self.final_observations = self._final_observations[:size]
         # Lanes beyond the last environment do the same work as the others, so that none of them runs wild.
         self._mask = np.ones(padded, dtype=np.bool_)
-        self._reset()
+        self._reset_masked()
         self._mask[size:] = False
 
     def seed(self, index: int, generator: np.random.Generator) -> None:
         """Start environment ``index``'s stream of random numbers from its ``np_random``."""
         block, lane = divmod(index, LANES)
-        first = self._place["STREAM_a"]
-        self._blocks[block, first : first + 4, lane] = stream_words(generator, self.experiment.branch)
+        first = self._row_of["STREAM_a"]
+        self._blocks[block, first : first + 4, lane] = new_stream_words(generator, self.experiment.branch)
 
     def reset(self, mask: npt.NDArray[np.bool_]) -> None:
         """Start episodes where ``mask`` (n,) is true."""
         self._mask[: self.size] = mask
-        self._reset()
+        self._reset_masked()
 
-    def _reset(self) -> None:
-        self._call(RESET_NOW)
+    def _reset_masked(self) -> None:
+        self._run_kernel(RESET_ONLY)
 
-    def checked_truth(self, truth: Any) -> FloatArray:
-        """(size, quantities) what ``reset(options={"truth": ...})`` asks for, inside, for `choose`: NaN what is drawn.
+    def parse_truth(self, truth: Any) -> FloatArray:
+        """(size, quantities) what ``reset(options={"truth": ...})`` asks for, inside, for `restart_with_truth`: NaN what is drawn.
 
         Raises:
             ValueError: for what is no such truth, naming the parameter.
         """
         if not isinstance(truth, list | tuple):
-            return self._checked(truth, "truth", self.size)
+            return self._parse_one_truth(truth, "truth", self.size)
         if len(truth) != self.size:
             raise ValueError(f"truth must be one for all environments, or {self.size} of them, but is {len(truth)}")
-        chosen = np.full((self.size, len(self._truth)), np.nan)
+        chosen = np.full((self.size, len(self._truth_rows)), np.nan)
         for row, each in enumerate(truth):
             if each is not None:
-                chosen[row] = self._checked(each, f"truth[{row}]", 1)[0]
+                chosen[row] = self._parse_one_truth(each, f"truth[{row}]", 1)[0]
         return chosen
 
-    def _checked(self, truth: Any, called: str, size: int) -> FloatArray:
+    def _parse_one_truth(self, truth: Any, label: str, size: int) -> FloatArray:
         """(size, quantities) of one truth for so many environments."""
         experiment = self.experiment
-        names, needed = list(self._truth), list(parameter_names(experiment.truth_model))
+        names, parameters = list(self._truth_rows), list(parameter_names(experiment.truth_model))
         if experiment.plant is None:
-            raise ValueError(f"{called} cannot be chosen here: no plant is simulated; leave it out")
-        if not isinstance(truth, Mapping) or set(truth) not in (set(names), set(needed)):
-            noises = f", or these and {names[len(needed) :]}" if len(names) > len(needed) else ""
-            raise ValueError(f"{called} must give the parameters {needed}{noises}, but is {truth!r:.300}")
+            raise ValueError(f"{label} cannot be chosen here: no plant is simulated; leave it out")
+        if not isinstance(truth, Mapping) or set(truth) not in (set(names), set(parameters)):
+            noises = f", or these and {names[len(parameters) :]}" if len(names) > len(parameters) else ""
+            raise ValueError(f"{label} must give the parameters {parameters}{noises}, but is {truth!r:.300}")
         chosen = np.full((size, len(names)), np.nan)
         for k, name in enumerate(names[: len(truth)]):
             value = truth[name]
@@ -131,112 +148,114 @@ class Batch:
                 chosen[:, k] = value
             except (TypeError, ValueError):
                 raise ValueError(
-                    f"{called}[{name!r}] must be a number, or {size} of them, but is {value!r:.200}"
+                    f"{label}[{name!r}] must be a number, or {size} of them, but is {value!r:.200}"
                 ) from None
             if not np.isfinite(chosen[:, k]).all():
-                raise ValueError(f"{called}[{name!r}] must be finite, but is {value!r:.200}")
-            if (name == "m" or k >= len(needed)) and not (chosen[:, k] > 0).all():
-                raise ValueError(f"{called}[{name!r}] must be positive, but is {value!r:.200}")
-        return chosen / self._worth
+                raise ValueError(f"{label}[{name!r}] must be finite, but is {value!r:.200}")
+            if (name == "m" or k >= len(parameters)) and not (chosen[:, k] > 0).all():
+                raise ValueError(f"{label}[{name!r}] must be positive, but is {value!r:.200}")
+        return chosen / self._truth_scales
 
-    def choose(self, mask: npt.NDArray[np.bool_], truth: FloatArray) -> None:
+    def restart_with_truth(self, mask: npt.NDArray[np.bool_], truth: FloatArray) -> None:
         """Begin the episodes of ``mask``, which were just reset, once more: with these systems, and the same noise.
 
         What ``truth`` has as NaN stays as it was drawn: all of a row, or its standard deviations.
         """
-        setup, n = self._setup, len(parameter_names(self.experiment.truth_model))
-        kept = [place for name, place in self._place.items() if name.startswith(("STREAM_", "JUMP_"))]
-        noises = [self._place[row] for row in noise_rows(self.experiment.truth_model).values()]
+        params, n = self._params, len(parameter_names(self.experiment.truth_model))
+        kept_rows = [place for name, place in self._row_of.items() if name.startswith(("STREAM_", "JUMP_"))]
+        noise_rows_kept = [self._row_of[row] for row in noise_std_rows(self.experiment.truth_model).values()]
         for row in np.flatnonzero(mask & np.isfinite(truth[:, 0])).tolist():
             b, lane = divmod(row, LANES)
-            drawn, stds = self._blocks[b, kept, lane], self._blocks[b, noises, lane]
+            kept_values, stds = self._blocks[b, kept_rows, lane], self._blocks[b, noise_rows_kept, lane]
             if np.isfinite(truth[row]).all() and truth.shape[1] > n:
                 stds = truth[row, n:]
-            told = setup._replace(
-                center=truth[row, :n], width=np.zeros(n), spread=0.0,
+            row_params = params._replace(
+                nominal_parameters=truth[row, :n], parameter_stds=np.zeros(n), spread=0.0,
                 process_noise=stds[0], measurement_noise=stds[1:], noise_range=1.0,
             )  # fmt: skip
             self._mask[: self.size] = np.arange(self.size) == row
-            self._call(RESET_NOW, pack(told), (b, b + 1))
-            self._blocks[b, kept, lane] = drawn
+            self._run_kernel(RESET_ONLY, pack_params(row_params), (b, b + 1))
+            self._blocks[b, kept_rows, lane] = kept_values
 
-    def renew(self, *, observations: bool = True) -> None:
+    def renew_output_arrays(self, *, observations: bool = True) -> None:
         """Keep the arrays of the last step as they are, for as long as anybody holds them: the next gets others.
 
         Args:
             observations: whether those of the observations too, and not only those of the outcomes.
         """
-        self._outcomes = self._all_outcomes.take()
+        self._outcomes = self._outcome_pool.acquire()
         self.outcomes = self._outcomes[:, : self.size]
         if observations:
-            self._observations = self._all_observations.take()
+            self._observations = self._observation_pool.acquire()
             self.observations = self._observations[: self.size]
 
     def step(self, actions: npt.ArrayLike) -> None:
         """Apply actions (n,) for a step: in parts of the largest input, clipped to [-1, 1], in float32's range."""
         self._actions[: self.size] = actions
-        self._call(self._reset_mode)
+        self._run_kernel(self._reset_mode)
 
-    def _call(self, reset_mode: int, packed: FloatArray | None = None, blocks: tuple[int, int] | None = None) -> None:
-        told = (
-            self._actions, self._packed if packed is None else packed, self._recorded, reset_mode, self._mask,
+    def _run_kernel(
+        self, reset_mode: int, packed_params: FloatArray | None = None, blocks: tuple[int, int] | None = None
+    ) -> None:
+        arguments = (
+            self._actions, self._packed_params if packed_params is None else packed_params, self._replayed_record, reset_mode, self._mask,
             self._observations, self._outcomes, self._final_observations, self._flat_ended,
         )  # fmt: skip
         if blocks is not None:
-            self._kernel.step(*blocks, self._flat_blocks, self._members, self._saved[0], *told)
-        elif self._threads > 1 and (turn := use_threads(self._threads)) is not None:
-            with turn:
-                self._kernel.step_parallel(self._flat_blocks, self._members, self._saved, *told)
+            self._kernel.step(*blocks, self._flat_blocks, self._members, self._workspace[0], *arguments)
+        elif self._threads > 1 and (thread_context := numba_thread_context(self._threads)) is not None:
+            with thread_context:
+                self._kernel.step_parallel(self._flat_blocks, self._members, self._workspace, *arguments)
         else:
-            self._kernel.step(0, len(self._blocks), self._flat_blocks, self._members, self._saved[0], *told)
+            self._kernel.step(0, len(self._blocks), self._flat_blocks, self._members, self._workspace[0], *arguments)
 
     @property
     def memory(self) -> dict[str, npt.NDArray[Any]]:
         """All that the next step goes on from, and what the last one showed: the arrays themselves."""
         return {"blocks": self._blocks, "members": self._members, "observations": self._observations}
 
-    def measure(self, u: float, y: float) -> None:
+    def set_measured_sample(self, u: float, y: float) -> None:
         """Let the next step play this input and output [V], of an experiment that replays a record of one sample."""
-        self._recorded[:, 0] = u, y
+        self._replayed_record[:, 0] = u, y
 
     def outcome(self, index: int) -> dict[str, float]:
         """What the last step left behind for one environment, by its names in lower case."""
-        return dict(zip(_OUTCOME, self._outcomes[:, index].tolist(), strict=True))
+        return dict(zip(_OUTCOME_NAMES, self._outcomes[:, index].tolist(), strict=True))
 
-    def quantity(self, name: str) -> FloatArray:
+    def row_values(self, name: str) -> FloatArray:
         """(n,) current values of a row, such as what the last step left behind; a copy."""
-        return self._blocks[:, self._place[name]].flatten()[: self.size]
+        return self._blocks[:, self._row_of[name]].flatten()[: self.size]
 
     def records(self, ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
-        """(n, size) the beliefs now, as flat records (`estimator.Belief`); a copy. ``ended`` as of `rows`."""
-        return self._columns(slice(record_size(self.experiment.model)), ended)
+        """(n, size) the beliefs now, as flat records (`estimator.Belief`); a copy. ``ended`` as of `row_matrix`."""
+        return self._gather_rows(slice(record_size(self.experiment.model)), ended)
 
-    def rows(self, names: Sequence[str], ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+    def row_matrix(self, names: Sequence[str], ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
         """(n, k) values of some rows; a copy.
 
         Args:
             names: of the k rows.
             ended: (n,) environments of which those are meant that their last episode ended with, if any.
         """
-        return self._columns([self._place[name] for name in names], ended)
+        return self._gather_rows([self._row_of[name] for name in names], ended)
 
-    def _columns(self, places: slice | list[int], ended: npt.NDArray[np.bool_] | None) -> FloatArray:
-        found = self._blocks[:, places].swapaxes(1, 2).reshape(len(self._blocks) * LANES, -1)[: self.size]
+    def _gather_rows(self, row_numbers: slice | list[int], ended: npt.NDArray[np.bool_] | None) -> FloatArray:
+        found = self._blocks[:, row_numbers].swapaxes(1, 2).reshape(len(self._blocks) * LANES, -1)[: self.size]
         if ended is not None:
-            last = self._ended[:, places].swapaxes(1, 2).reshape(len(self._blocks) * LANES, -1)[: self.size]
+            last = self._ended[:, row_numbers].swapaxes(1, 2).reshape(len(self._blocks) * LANES, -1)[: self.size]
             found = np.where(ended[:, None], last, found)
         # Of a single block that is a view, in another order, for which a kernel would be compiled once more.
         return np.array(found, order="C")
 
     def mixture(self, index: int) -> tuple[FloatArray, FloatArray]:
         """Records (m, size) and weights (m,) of the beliefs that environment ``index`` weighs: one, or its members."""
-        count = len(self._setup.hypotheses)
+        count = len(self._params.hypothesis_priors)
         if not count:
             return self.records()[index : index + 1], np.ones(1)
-        (block, lane), n = divmod(index, LANES), self._setup.abreast
-        places = block * blocks_of_members(n, count) * LANES + np.arange(count) * n + lane
+        (block, lane), n = divmod(index, LANES), self._params.interleaved_envs
+        slots = block * n_member_blocks(n, count) * LANES + np.arange(count) * n + lane
         rows = self._members.reshape(len(self._members), -1, LANES).swapaxes(1, 2)
-        members = rows[places // LANES, places % LANES]
+        members = rows[slots // LANES, slots % LANES]
         return members[:, :-1].copy(), members[:, -1].copy()
 
     def belief(self, index: int) -> Belief:
@@ -245,29 +264,33 @@ class Batch:
 
     def beliefs(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[Belief]:
         """The beliefs of some environments; ``final``: those that their last episodes ended with, if reset since."""
-        records = self._adjacent(indices, 0, record_size(self.experiment.model), final=final)
+        records = self._gather_adjacent_rows(indices, 0, record_size(self.experiment.model), final=final)
         records.flags.writeable = False
         return self._prior.with_records(records)
 
     def truth(self, ended: npt.NDArray[np.bool_] | None = None) -> Parameters:
-        """The true plants, a batch of n; where a record is replayed, the twin of its circuit. ``ended`` as of `rows`.
+        """The true plants, a batch of n; where a record is replayed, the twin of its circuit. ``ended`` as of `row_matrix`.
 
         With the standard deviations of their noises, where those are drawn.
         """
-        values = self._worth[:, None] * self.rows(list(self._truth.values()), ended).T
-        return Parameters(zip(self._truth, values, strict=True))
+        values = self._truth_scales[:, None] * self.row_matrix(list(self._truth_rows.values()), ended).T
+        return Parameters(zip(self._truth_rows, values, strict=True))
 
-    def true_of(self, index: int) -> Parameters:
+    def truth_of(self, index: int) -> Parameters:
         """The true plant of environment ``index``."""
         return self.truths(np.array([index]))[0]
 
     def truths(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[Parameters]:
         """The true plants of some environments; ``final``: those of their last episodes, if reset since."""
-        first = self._place[next(iter(self._truth.values()))]
-        rows = (self._worth * self._adjacent(indices, first, len(self._truth), final=final)).tolist()
-        return [Parameters(zip(self._truth, values, strict=True)) for values in rows]
+        first = self._row_of[next(iter(self._truth_rows.values()))]
+        rows = (
+            self._truth_scales * self._gather_adjacent_rows(indices, first, len(self._truth_rows), final=final)
+        ).tolist()
+        return [Parameters(zip(self._truth_rows, values, strict=True)) for values in rows]
 
-    def _adjacent(self, indices: npt.NDArray[np.intp], first: int, count: int, *, final: bool) -> FloatArray:
+    def _gather_adjacent_rows(
+        self, indices: npt.NDArray[np.intp], first: int, count: int, *, final: bool
+    ) -> FloatArray:
         """(k, count) adjacent rows of some environments, now or at the end of their last episodes; a copy."""
         stored = self._ended if final else self._blocks
         blocks, lanes = np.divmod(indices, LANES)
@@ -283,7 +306,7 @@ class Batch:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._kernel = compiled(self._kind)
+        self._kernel = compile_kernel(self._spec)
         self._flat_blocks = self._blocks.reshape(len(self._blocks), -1)
         self._flat_ended = self._ended.reshape(len(self._ended), -1)
         self.observations = self._observations[: self.size]
@@ -291,7 +314,7 @@ class Batch:
         self.outcomes = self._outcomes[:, : self.size]
 
 
-def worth_of(experiment: Experiment, name: str) -> float:
+def parameter_scale(experiment: Experiment, name: str) -> float:
     """What one inside is worth outside, of a parameter of the truth, or of a noise as the first sensor shows it."""
     scales, model = experiment.scales, experiment.truth_model
     if name in model.dimensions:
@@ -308,7 +331,7 @@ def spawn_seeds(seed: int | None, count: int) -> list[int]:
     return [int(child.generate_state(1, np.uint64)[0]) for child in children]
 
 
-def use_threads(number: int) -> AbstractContextManager[object] | None:
+def numba_thread_context(n_threads: int) -> AbstractContextManager[object] | None:
     """The context in which Numba may step with so many threads; None where it may not.
 
     It may not in the child of a process that has: one thread then does it all, with the same results. One of Numba's
@@ -317,9 +340,9 @@ def use_threads(number: int) -> AbstractContextManager[object] | None:
     """
     import numba
 
-    global _process
-    _process = _process or os.getpid()
-    if _process != os.getpid():
+    global _threaded_process
+    _threaded_process = _threaded_process or os.getpid()
+    if _threaded_process != os.getpid():
         return None
-    numba.set_num_threads(number)
-    return _turn if numba.threading_layer() == "workqueue" else nullcontext()
+    numba.set_num_threads(n_threads)
+    return _threading_lock if numba.threading_layer() == "workqueue" else nullcontext()

@@ -11,22 +11,29 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from duffing_env.batch import Batch
-from duffing_env.contract import Specified, action_space, checked_options, in_turn, make_experiment, observation_space
-from duffing_env.experiment import Experiment, SimulatedExperiment
-from duffing_env.kernel import RESET_BY_HAND
-from duffing_env.layout import SUMMED
-from duffing_env.own import Own
+from duffing_env.custom_functions import CustomFunctions
+from duffing_env.env_base import (
+    ExperimentEnv,
+    action_space,
+    check_reset_options,
+    make_experiment,
+    observation_space,
+    refuse_concurrent_calls,
+)
+from duffing_env.experiment_config import Experiment, SimulatedExperiment
+from duffing_env.kernel import RESET_MANUALLY
+from duffing_env.storage.kernel_spec import SUMMED_OUTCOMES
 from estimator.belief import Belief
 from estimator.checks import numbers, one_of, shown
 from estimator.parameters import Parameters
 
 if TYPE_CHECKING:
-    from duffing_env.rendering import Screen
+    from duffing_env.rendering.episode_renderer import EpisodeRenderer
 
 Observation = npt.NDArray[np.float32]
 
 
-class DuffingEnv(Specified, gym.Env[Any, Any]):
+class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     r"""Choose the input of a Duffing oscillator so that its parameters are identified.
 
     ## Description
@@ -82,7 +89,7 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     | ``simulation_error`` | s_{t-1} - s_t, s the relative error of a free run, at most 1 | [-1, 1] |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
 
-    The ranges are those of an episode's sum. `duffing_env.rewards` (the manual's page "Rewards") says what each bounds,
+    The ranges are those of an episode's sum. `duffing_env.step_rewards.reward_registry` (the manual's page "Rewards") says what each bounds,
     and how it can be fooled. What is gained is kept when an episode is terminated, unless ``terminated_return`` is set;
     with ``terminal`` it is paid in the last step, in one sum.
 
@@ -126,7 +133,7 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     |----------|---------|---------|
     | ``factorisation`` | ``structured`` | the estimator's: ``structured`` or ``mean_field`` |
     | ``iterations`` | 3 or 10 | variational iterations per sample (structured, mean field) |
-    | ``reward`` | ``information_gain`` | see above; or a function of one's own (`duffing_env.own`) |
+    | ``reward`` | ``information_gain`` | see above; or a function of one's own (`duffing_env.custom_functions`) |
     | ``observation`` | ``posterior`` | or ``history``, ``privileged``, or a function of one's own |
     | ``history`` | 16 | steps that the observation ``history`` shows |
     | ``max_input`` | 0.15 | input limit [V] |
@@ -181,26 +188,26 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}  # noqa: RUF012
-    experiment_kind: ClassVar[type[Experiment]] = SimulatedExperiment
+    experiment_class: ClassVar[type[Experiment]] = SimulatedExperiment
 
     @classmethod
-    def _kind(cls) -> type[Experiment]:
-        return cls.experiment_kind
+    def _experiment_class(cls) -> type[Experiment]:
+        return cls.experiment_class
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
         if render_mode is not None:
             one_of("render_mode", render_mode, self.metadata["render_modes"])
-        self.experiment = make_experiment(self.experiment_kind, options)
+        self.experiment = make_experiment(self.experiment_class, options)
         self.observation_space = observation_space(self.experiment)
         self.action_space = action_space()
         self.render_mode = render_mode
-        self._batch = Batch(self.experiment, 1, RESET_BY_HAND)
-        self._own = Own.of(self._batch)
-        self._sensor = next(iter(self.experiment.truth_model.outputs))
-        self._streamed: np.random.Generator | None = None
+        self._batch = Batch(self.experiment, 1, RESET_MANUALLY)
+        self._custom = CustomFunctions.for_batch(self._batch)
+        self._first_sensor = next(iter(self.experiment.truth_model.outputs))
+        self._seeded_generator: np.random.Generator | None = None
         self._running = False
-        self._turn = [None]
-        self._screen: Screen | None = None
+        self._call_token = [None]
+        self._renderer: EpisodeRenderer | None = None
 
     @property
     def belief(self) -> Belief:
@@ -214,11 +221,11 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         Raises:
             gymnasium.error.ResetNeeded: before the first reset, which draws it.
         """
-        if self._streamed is None:
+        if self._seeded_generator is None:
             raise ResetNeeded("no system is drawn yet: call reset() before you ask for the truth")
-        return self._batch.true_of(0)
+        return self._batch.truth_of(0)
 
-    @in_turn
+    @refuse_concurrent_calls
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -231,25 +238,25 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         Raises:
             ValueError: for another option, or what is no such system; nothing has changed then.
         """
-        options = checked_options(options, *self._choices)
-        chosen = self._batch.checked_truth(options["truth"]) if "truth" in options else None
-        self._rest()
+        options = check_reset_options(options, *self._reset_options)
+        chosen_truth = self._batch.parse_truth(options["truth"]) if "truth" in options else None
+        self._reset_plant()
         super().reset(seed=seed)
-        if self.np_random is not self._streamed:
-            self._streamed = self.np_random
+        if self.np_random is not self._seeded_generator:
+            self._seeded_generator = self.np_random
             self._batch.seed(0, self.np_random)
-        everywhere = np.ones(1, dtype=np.bool_)
-        self._batch.reset(everywhere)
-        if chosen is not None:
-            self._batch.choose(everywhere, chosen)
-        if self._own is not None:
-            self._own.begin(everywhere)
+        all_envs = np.ones(1, dtype=np.bool_)
+        self._batch.reset(all_envs)
+        if chosen_truth is not None:
+            self._batch.restart_with_truth(all_envs, chosen_truth)
+        if self._custom is not None:
+            self._custom.start_episodes(all_envs)
         self._running = True
         if self.render_mode is not None:
             self._start_drawing()
         return self._observation(), self._info(self._batch.outcome(0))
 
-    @in_turn
+    @refuse_concurrent_calls
     def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one input for ``hold`` samples, or until the episode ends.
 
@@ -259,84 +266,84 @@ class DuffingEnv(Specified, gym.Env[Any, Any]):
         """
         if not self._running:
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        given, own = _one_number(action), self._own
-        if own is not None:
-            own.before()
-        outcome = self._play(given)
-        if own is not None:
-            outcome["reward"] += float(own.rewards(None)[0])
-            own.observe(None)
+        clipped_action, custom = _scalar_action(action), self._custom
+        if custom is not None:
+            custom.before_step()
+        outcome = self._play_action(clipped_action)
+        if custom is not None:
+            outcome["reward"] += float(custom.step_rewards(None)[0])
+            custom.observe_step(None)
         terminated, truncated = bool(outcome["terminated"]), bool(outcome["truncated"])
         self._running = not (terminated or truncated)
         return self._observation(), outcome["reward"], terminated, truncated, self._info(outcome)
 
     def _observation(self) -> Observation:
-        seen: Observation = self._seen.observations[0].copy()
-        return seen
+        observation: Observation = self._observation_owner.observations[0].copy()
+        return observation
 
-    def _rest(self) -> None:
+    def _reset_plant(self) -> None:
         """What else has to come to rest before an episode: nothing that is simulated."""
 
     #: Options of a reset.
-    _choices: ClassVar[tuple[str, ...]] = ("truth",)
-    _reported: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
-    _flags: ClassVar[tuple[str, ...]] = ("diverged",)
+    _reset_options: ClassVar[tuple[str, ...]] = ("truth",)
+    _info_gains: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
+    _info_flags: ClassVar[tuple[str, ...]] = ("diverged",)
 
     def _info(self, outcome: dict[str, float]) -> dict[str, Any]:
-        info: dict[str, Any] = {name: outcome[name] for name in self._reported}
-        for flag in self._flags:
+        info: dict[str, Any] = {name: outcome[name] for name in self._info_gains}
+        for flag in self._info_flags:
             info[flag] = bool(outcome[flag])
         return info
 
-    def _play(self, action: float) -> dict[str, float]:
+    def _play_action(self, action: float) -> dict[str, float]:
         """Let as many samples pass as the action holds: sums of what they earned, and how the last one left it."""
         outcome = self._play_sample(action)
         for _ in range(1, self.experiment.hold):
             if outcome["terminated"] or outcome["truncated"]:
                 break
             before, outcome = outcome, self._play_sample(action)
-            for name in SUMMED:
+            for name in SUMMED_OUTCOMES:
                 outcome[name.lower()] += before[name.lower()]
         return outcome
 
     def _play_sample(self, action: float) -> dict[str, float]:
-        self._apply(action)
-        if self._screen is not None:
-            self._draw()
+        self._apply_sample(action)
+        if self._renderer is not None:
+            self._draw_sample()
         return self._batch.outcome(0)
 
-    def _apply(self, action: float) -> None:
+    def _apply_sample(self, action: float) -> None:
         """Let one sample pass; the action is in [-1, 1]."""
         self._batch.step(action)
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """Input, output and posterior so far: an RGB array (height, width, 3) in mode ``rgb_array``."""
-        if self.render_mode is None or self._screen is None:
+        if self.render_mode is None or self._renderer is None:
             gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array', and reset it")
             return None
-        return self._screen.frame() if self.render_mode == "rgb_array" else None
+        return self._renderer.frame() if self.render_mode == "rgb_array" else None
 
     def _start_drawing(self) -> None:
-        from duffing_env.rendering import Screen
+        from duffing_env.rendering.episode_renderer import EpisodeRenderer
 
-        if self._screen is None:
+        if self._renderer is None:
             limits, fps = (self.max_input, self.experiment.max_output), self.metadata["render_fps"]
-            self._screen = Screen(self.render_mode, *limits, fps, self.experiment.scales)
-        self._screen.start(self._batch.true_of(0), self.belief, self.horizon)
+            self._renderer = EpisodeRenderer(self.render_mode, *limits, fps, self.experiment.scales)
+        self._renderer.start(self._batch.truth_of(0), self.belief, self.horizon)
 
-    def _draw(self) -> None:
-        assert self._screen is not None
-        u, y = self._batch.quantity("INPUT")[0], self._batch.quantity(f"Y_{self._sensor}")[0]
-        self._screen.add(float(u), float(y), self.belief)
+    def _draw_sample(self) -> None:
+        assert self._renderer is not None
+        u, y = self._batch.row_values("INPUT")[0], self._batch.row_values(f"Y_{self._first_sensor}")[0]
+        self._renderer.add_sample(float(u), float(y), self.belief)
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._screen is not None:
-            self._screen.close()
-            self._screen = None
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
 
-def _one_number(action: npt.ArrayLike) -> float:
+def _scalar_action(action: npt.ArrayLike) -> float:
     try:
         given = action if type(action) is np.ndarray else numbers("action", action)
         item = given.item() if given.size == 1 else math.nan

@@ -15,47 +15,47 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from duffing_env.batch import Batch, spawn_seeds
-from duffing_env.continuous import ContinuousEnv
-from duffing_env.contract import (
-    Fixed,
-    Specified,
+from duffing_env.custom_functions import CustomFunctions
+from duffing_env.env import DuffingEnv
+from duffing_env.env_base import (
+    ExperimentEnv,
+    ReadOnlyOption,
     action_space,
-    checked_options,
-    in_turn,
+    check_reset_options,
     make_experiment,
     observation_space,
+    refuse_concurrent_calls,
 )
-from duffing_env.env import DuffingEnv
-from duffing_env.experiment import MOST_SAMPLES, Experiment
-from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
-from duffing_env.layout import OUTCOME
-from duffing_env.own import Own
-from duffing_env.replay import SilverboxReplayEnv
+from duffing_env.experiment_config import MAX_SAMPLES, Experiment
+from duffing_env.kernel import RESET_MANUALLY, RESET_NEXT_STEP, RESET_SAME_STEP
+from duffing_env.storage.kernel_spec import OUTCOME_ROWS
+from duffing_env.tracks.continuous_tracks import ContinuousEnv
+from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
 from estimator.belief import Belief
 from estimator.checks import MOST_SEED, numbers, shown, whole
 from estimator.parameters import FloatArray, Parameters
 
 _RESET_MODES = {
-    AutoresetMode.DISABLED: RESET_BY_HAND,
+    AutoresetMode.DISABLED: RESET_MANUALLY,
     AutoresetMode.NEXT_STEP: RESET_NEXT_STEP,
     AutoresetMode.SAME_STEP: RESET_SAME_STEP,
 }
 
 #: Name of what a step leaves to its place in a batch's outcomes; the flags are the last of them.
-_PLACES = {name.lower(): place for place, name in enumerate(OUTCOME)}
-_FIRST_FLAG = _PLACES["terminated"]
+_OUTCOME_INDEX = {name.lower(): place for place, name in enumerate(OUTCOME_ROWS)}
+_FIRST_FLAG = _OUTCOME_INDEX["terminated"]
 
 #: Rows at most, some gigabytes of them.
-MOST_ENVS = 2**20
+MAX_ENVS = 2**20
 
 #: Numbers that all observations have together: 1 GiB.
-_MOST_SHOWN = 2**28
+_MAX_OBSERVED_NUMBERS = 2**28
 
 Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 
 
-class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32], npt.NDArray[Any]]):
+class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.float32], npt.NDArray[Any]]):
     """Many `DuffingEnv` at once: the same numbers, row by row.
 
     Row i, reset with seed s, follows a single environment that is reset with ``spawn_seeds(s, num_envs)[i]``, bit for
@@ -88,19 +88,19 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
-    single: ClassVar[type[DuffingEnv]] = DuffingEnv
+    single_env_class: ClassVar[type[DuffingEnv]] = DuffingEnv
 
-    num_envs = Fixed("num_envs", "_num_envs")
-    max_episode_steps = Fixed("max_episode_steps", "_max_episode_steps")
-    autoreset_mode = Fixed("autoreset_mode", "_autoreset_mode")
-    copy = Fixed("copy", "_copy")
-    threads = Fixed("threads", "_threads")
-    render_mode = Fixed("render_mode", "_render_mode")
+    num_envs = ReadOnlyOption("num_envs", "_num_envs")
+    max_episode_steps = ReadOnlyOption("max_episode_steps", "_max_episode_steps")
+    autoreset_mode = ReadOnlyOption("autoreset_mode", "_autoreset_mode")
+    copy = ReadOnlyOption("copy", "_copy")
+    threads = ReadOnlyOption("threads", "_threads")
+    render_mode = ReadOnlyOption("render_mode", "_render_mode")
     _render_mode: ClassVar[None] = None
 
     @classmethod
-    def _kind(cls) -> type[Experiment]:
-        return cls.single.experiment_kind
+    def _experiment_class(cls) -> type[Experiment]:
+        return cls.single_env_class.experiment_class
 
     def __init__(
         self,
@@ -113,11 +113,11 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        whole("num_envs", num_envs, MOST_ENVS)
+        whole("num_envs", num_envs, MAX_ENVS)
         whole("threads", threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
         limit = None if max_episode_steps == -1 else max_episode_steps
         if limit is not None:
-            whole("max_episode_steps", limit, MOST_SAMPLES)
+            whole("max_episode_steps", limit, MAX_SAMPLES)
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, but is {render_mode!r}; render a single environment")
         try:
@@ -127,28 +127,31 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
             raise ValueError(f"autoreset_mode must be one of {modes}, but is {autoreset_mode!r}") from None
         self._num_envs, self._threads, self._max_episode_steps = int(num_envs), int(threads), limit
         self.metadata = {**type(self).metadata, "autoreset_mode": self._autoreset_mode}
-        self.experiment: Experiment = make_experiment(self.single.experiment_kind, options)
+        self.experiment: Experiment = make_experiment(self.single_env_class.experiment_class, options)
         self.single_observation_space = observation_space(self.experiment)
-        each, seen = len(self.experiment.setup.hypotheses), int(np.prod(self.single_observation_space.shape))
-        if num_envs * each > MOST_ENVS or num_envs * seen > _MOST_SHOWN:
+        n_hypotheses, n_observed = (
+            len(self.experiment.kernel_params.hypothesis_priors),
+            int(np.prod(self.single_observation_space.shape)),
+        )
+        if num_envs * n_hypotheses > MAX_ENVS or num_envs * n_observed > _MAX_OBSERVED_NUMBERS:
             raise ValueError(
-                f"num_envs must leave room for {each or 1} beliefs and {seen} observed numbers in each of {num_envs} "
-                f"environments, at most {MOST_ENVS} and {_MOST_SHOWN} in all; take fewer"
+                f"num_envs must leave room for {n_hypotheses or 1} beliefs and {n_observed} observed numbers in each of {num_envs} "
+                f"environments, at most {MAX_ENVS} and {_MAX_OBSERVED_NUMBERS} in all; take fewer"
             )
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         reset_mode = _RESET_MODES[self._autoreset_mode]
         hold = self.experiment.hold
-        cut = math.inf if limit is None else float(limit * hold)
-        self._batch = Batch(self.experiment, self.num_envs, reset_mode, self._threads, hold, cut)
-        self._own = Own.of(self._batch)
+        max_samples = math.inf if limit is None else float(limit * hold)
+        self._batch = Batch(self.experiment, self.num_envs, reset_mode, self._threads, hold, max_samples)
+        self._custom = CustomFunctions.for_batch(self._batch)
         self._copy = copy
-        self._turn = [None]
+        self._call_token = [None]
         self._seeded: Flags = np.zeros(self.num_envs, dtype=np.bool_)
         self._finished: Flags = np.ones(self.num_envs, dtype=np.bool_)
-        self._everywhere: Flags = np.ones(self.num_envs, dtype=np.bool_)
-        self._any_due = True
+        self._all_rows: Flags = np.ones(self.num_envs, dtype=np.bool_)
+        self._any_needs_reset = True
 
     @property
     def truth(self) -> Parameters:
@@ -165,7 +168,7 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         """The posterior of row ``index`` now."""
         return self._batch.belief(index)
 
-    @in_turn
+    @refuse_concurrent_calls
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
@@ -181,23 +184,25 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         Raises:
             ValueError: for another option, a mask or a truth that is not one, or another number of seeds.
         """
-        options = checked_options(options, "reset_mask", "truth")
+        options = check_reset_options(options, "reset_mask", "truth")
         mask = self._reset_mask(options)
-        chosen = self._batch.checked_truth(options["truth"]) if "truth" in options else None
+        chosen_truth = self._batch.parse_truth(options["truth"]) if "truth" in options else None
         self._seed(seed, mask)
-        self._batch.renew(observations=self._copy)
+        self._batch.renew_output_arrays(observations=self._copy)
         self._batch.reset(mask)
-        if chosen is not None:
-            self._batch.choose(mask, chosen)
+        if chosen_truth is not None:
+            self._batch.restart_with_truth(mask, chosen_truth)
         self._finished[mask] = False
-        due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
-        self._any_due = bool(due.any())
-        if self._own is not None:
-            self._own.begin(mask)
-        nothing = np.zeros((_FIRST_FLAG, self.num_envs))
-        return self._seen.observations, self._step_infos(nothing, np.zeros((4, self.num_envs), dtype=np.bool_), mask)
+        needs_reset = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
+        self._any_needs_reset = bool(needs_reset.any())
+        if self._custom is not None:
+            self._custom.start_episodes(mask)
+        no_outcomes = np.zeros((_FIRST_FLAG, self.num_envs))
+        return self._observation_owner.observations, self._step_infos(
+            no_outcomes, np.zeros((4, self.num_envs), dtype=np.bool_), mask
+        )
 
-    @in_turn
+    @refuse_concurrent_calls
     def step(
         self, actions: npt.NDArray[np.float32]
     ) -> tuple[Observations, npt.NDArray[np.float64], Flags, Flags, dict[str, Any]]:
@@ -211,35 +216,35 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
             actions = numbers("actions", actions)  # type: ignore[assignment]
         if actions.shape != (self.num_envs, 1):
             raise ValueError(f"actions must have shape {(self.num_envs, 1)}, but have {actions.shape}; one per row")
-        given = actions[:, 0]
-        if not math.isfinite(given.sum()) and not np.isfinite(given).all():
+        inputs = actions[:, 0]
+        if not math.isfinite(inputs.sum()) and not np.isfinite(inputs).all():
             row = int(np.argmin(np.isfinite(actions)))
             raise ValueError(f"actions must be finite, but row {row} is {actions[row, 0]}; pass values in [-1, 1]")
-        if given.dtype != np.float32:
-            given = np.clip(given, -1.0, 1.0)
-        if self._any_due:
-            due = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
-            rows = np.flatnonzero(due).tolist()
+        if inputs.dtype != np.float32:
+            inputs = np.clip(inputs, -1.0, 1.0)
+        if self._any_needs_reset:
+            needs_reset = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
+            rows = np.flatnonzero(needs_reset).tolist()
             raise ResetNeeded(f"rows {rows} have finished or not begun: reset them with options={{'reset_mask': mask}}")
-        self._batch.renew(observations=self._copy)
-        own = self._own
-        if own is not None:
-            own.before()
-        self._batch.step(given)
+        self._batch.renew_output_arrays(observations=self._copy)
+        custom = self._custom
+        if custom is not None:
+            custom.before_step()
+        self._batch.step(inputs)
         outcomes = self._batch.outcomes
         flags = outcomes[_FIRST_FLAG:] != 0.0
         terminated, truncated = flags[0], flags[1]
         finished = terminated | truncated
         any_finished = bool(np.count_nonzero(finished))
-        if own is not None:
+        if custom is not None:
             ended = finished if any_finished and self._autoreset_mode == AutoresetMode.SAME_STEP else None
-            outcomes[0] += own.rewards(ended)
-            own.observe(ended)
+            outcomes[0] += custom.step_rewards(ended)
+            custom.observe_step(ended)
         infos = self._infos(outcomes, flags, finished if any_finished else None)
         self._finished = finished
         if self._autoreset_mode == AutoresetMode.DISABLED:
-            self._any_due = any_finished
-        return self._seen.observations, outcomes[0], terminated, truncated, infos
+            self._any_needs_reset = any_finished
+        return self._observation_owner.observations, outcomes[0], terminated, truncated, infos
 
     @property
     def memory(self) -> dict[str, npt.NDArray[Any]]:
@@ -248,11 +253,11 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         Episodes that went on in the one of two environments with the same options go on in the other when it is reset,
         and its arrays are filled with copies of these.
         """
-        return self._batch.memory | ({} if self._own is None else self._own.memory)
+        return self._batch.memory | ({} if self._custom is None else self._custom.memory)
 
     def _reset_mask(self, options: dict[str, Any]) -> Flags:
         if "reset_mask" not in options:
-            return self._everywhere
+            return self._all_rows
         mask = options["reset_mask"]
         fits = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
         if not (fits and mask.any()):
@@ -281,42 +286,42 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
         if isinstance(seed, int | np.integer):
             super().reset(seed=int(seed))
         for row in np.flatnonzero(mask).tolist():
-            own = seeds[row]
-            if own is not None or not self._seeded[row]:
-                generator, _ = gym.utils.seeding.np_random(None if own is None else int(own))
+            row_seed = seeds[row]
+            if row_seed is not None or not self._seeded[row]:
+                generator, _ = gym.utils.seeding.np_random(None if row_seed is None else int(row_seed))
                 self._batch.seed(row, generator)
         self._seeded |= mask
 
     def _infos(self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], finished: Flags | None) -> dict[str, Any]:
         """What is told of a step, and of the rows that finished in it, if any."""
-        infos = self._step_infos(outcomes, flags, self._everywhere)
+        infos = self._step_infos(outcomes, flags, self._all_rows)
         if finished is None:
             return infos
         if self._autoreset_mode != AutoresetMode.SAME_STEP:
-            return infos | self._endings(finished)
+            return infos | self._final_beliefs_and_truths(finished)
         final_infos = self._step_infos(outcomes.copy(), flags.copy(), finished)
-        for name in (*self.single._reported, *self.single._flags):
+        for name in (*self.single_env_class._info_gains, *self.single_env_class._info_flags):
             final_infos[name][~finished] = 0
             infos[name][finished] = 0
         final_observations = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(finished):
-            final_observations[row] = self._seen.final_observations[row].copy()
+            final_observations[row] = self._observation_owner.final_observations[row].copy()
         return infos | {
             "final_obs": final_observations,
             "_final_obs": finished.copy(),
-            "final_info": final_infos | self._endings(finished),
+            "final_info": final_infos | self._final_beliefs_and_truths(finished),
             "_final_info": finished.copy(),
         }
 
     def _step_infos(self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], mask: Flags) -> dict[str, Any]:
         infos: dict[str, Any] = {}
-        for name in self.single._reported:
-            infos[name], infos[f"_{name}"] = outcomes[_PLACES[name]], mask.copy()
-        for name in self.single._flags:
-            infos[name], infos[f"_{name}"] = flags[_PLACES[name] - _FIRST_FLAG], mask.copy()
+        for name in self.single_env_class._info_gains:
+            infos[name], infos[f"_{name}"] = outcomes[_OUTCOME_INDEX[name]], mask.copy()
+        for name in self.single_env_class._info_flags:
+            infos[name], infos[f"_{name}"] = flags[_OUTCOME_INDEX[name] - _FIRST_FLAG], mask.copy()
         return infos
 
-    def _endings(self, finished: Flags) -> dict[str, Any]:
+    def _final_beliefs_and_truths(self, finished: Flags) -> dict[str, Any]:
         """What the finished rows ended with."""
         same_step = self._autoreset_mode == AutoresetMode.SAME_STEP
         beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
@@ -330,15 +335,15 @@ class DuffingVectorEnv(Specified, VectorEnv[Observations, npt.NDArray[np.float32
 class ContinuousVectorEnv(DuffingVectorEnv):
     """Many `ContinuousEnv` at once."""
 
-    single: ClassVar[type[DuffingEnv]] = ContinuousEnv
+    single_env_class: ClassVar[type[DuffingEnv]] = ContinuousEnv
 
 
 class SilverboxReplayVectorEnv(DuffingVectorEnv):
     """Many `SilverboxReplayEnv` at once; all rows replay the same record."""
 
-    single: ClassVar[type[DuffingEnv]] = SilverboxReplayEnv
+    single_env_class: ClassVar[type[DuffingEnv]] = SilverboxReplayEnv
 
     @property
     def recorded_input(self) -> FloatArray:
         """The inputs that the record can answer, in order [V]."""
-        return self.experiment.recorded[0]
+        return self.experiment.replayed_record[0]

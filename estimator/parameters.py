@@ -61,7 +61,7 @@ class Parameters(Mapping[str, Any]):
 
 
 #: The Silverbox circuit as the difference equation sees it, m [s²], c [s], a [1] and b [V⁻²] of Eq. (1)
-#: (``python -m duffing_env.twin`` identifies it).
+#: (``python -m duffing_env.plants.silverbox_twin`` identifies it).
 SILVERBOX_TWIN = Parameters(m=6.4568e-6, c=2.5717e-4, a=1.1747, b=3.7672)
 
 _GAIN_TWIN = 186_015.0  # s⁻²

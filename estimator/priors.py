@@ -170,7 +170,7 @@ def weak_prior(
     return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, scales=scales)
 
 
-#: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.twin`` identifies them).
+#: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.plants.silverbox_twin`` identifies them).
 _TWINS = {"difference": SILVERBOX_TWIN, "duffing": CONTINUOUS_TWIN}
 
 

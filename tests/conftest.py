@@ -22,7 +22,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 import pytest  # noqa: E402
 
-from duffing_env.silverbox import SilverboxRecord, load_record, record_available  # noqa: E402
+from duffing_env.plants.silverbox_record import SilverboxRecord, load_record, record_available  # noqa: E402
 
 BESIDE_THE_CHECKOUT = Path(__file__).parents[2] / "shared" / "data" / "silverbox"
 

@@ -83,7 +83,7 @@ def overwrite(env, name, value, row=0):
     """Put a value into a row of the plant's or the belief's state."""
     batch = env.unwrapped._batch
     block, lane = divmod(row, batch._blocks.shape[2])
-    batch._blocks[block, batch._place[name], lane] = value
+    batch._blocks[block, batch._row_of[name], lane] = value
 
 
 def assert_refused(cases):

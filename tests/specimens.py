@@ -1,6 +1,6 @@
 """One model and one environment of every sort. A kernel takes seconds to compile: tests use those of these.
 
-Every environment of the list is another combination of what is compiled in (`duffing_env.layout.Kind`), but for the
+Every environment of the list is another combination of what is compiled in (`duffing_env.storage.kernel_spec.KernelSpec`), but for the
 last ones, which share the first's and differ in what a kernel is told. Episodes are short, so that random actions
 end some at the limit and some at the horizon.
 """
@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from reference.plants import DRAG
 
-from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
-from duffing_env.model_env import ModelEnv, ModelVectorEnv
-from duffing_env.replay import SilverboxReplayEnv
-from duffing_env.rig_env import RigEnv, RigVectorEnv
+from duffing_env.tracks.continuous_tracks import ContinuousEnv
+from duffing_env.tracks.model_env import ModelEnv, ModelVectorEnv
+from duffing_env.tracks.rig_env import RigEnv, RigVectorEnv
+from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
 from duffing_env.vector_env import ContinuousVectorEnv, DuffingVectorEnv, SilverboxReplayVectorEnv
 from estimator import Channel, Rig
 from estimator.models.difference import difference
@@ -110,7 +110,7 @@ def around_bench(**options):
 
 def on_the_record(envs, actions):
     """The recorded inputs in parts of the largest, whatever the actions: but off the record for those beyond 1."""
-    played = np.minimum(envs._batch.quantity("ELAPSED").astype(int), envs.horizon - 1)
+    played = np.minimum(envs._batch.row_values("ELAPSED").astype(int), envs.horizon - 1)
     recorded = envs.recorded_input[played] / envs.max_input
     return (recorded + np.where(np.abs(np.ravel(actions)) > 1, 0.1, 0.0)).astype(np.float32)
 
@@ -125,7 +125,7 @@ class OnTheRecord(SilverboxReplayEnv):
 class OnTheRecordVector(SilverboxReplayVectorEnv):
     """Many of them."""
 
-    single = OnTheRecord
+    single_env_class = OnTheRecord
 
     def step(self, actions):
         return super().step(on_the_record(self, actions)[:, None])
@@ -154,40 +154,40 @@ class Environment:
 
     Attributes:
         name: for the test's name.
-        single: makes one.
+        single_env_class: makes one.
         vector: makes some; None where there is no such.
         options: of both.
         sums: whether a held action gives the sum of what its samples give.
     """
 
     name: str
-    single: Callable[..., Any]
+    single_env_class: Callable[..., Any]
     vector: Callable[..., Any] | None
     options: dict[str, Any] = field(default_factory=dict)
     sums: bool = True
 
     def make(self, **options):
-        return self.single(**self.options | options)
+        return self.single_env_class(**self.options | options)
 
     def make_vec(self, rows, **options):
         return self.vector(rows, **self.options | options)
 
     @property
     def on_record(self):
-        return self.single is OnTheRecord
+        return self.single_env_class is OnTheRecord
 
     @property
     def has_plant(self):
-        return self.single in (around_difference, around_bench)
+        return self.single_env_class in (around_difference, around_bench)
 
 
 TIGHT = {"horizon": 22, "max_output": 0.22}
 GUESSED = {"noise_hypotheses": 3, "process_noise_guess": 1.5e-3, "noise_range": 10.0}
 KNOWN = {"noise_range": 1.0, "noise_hypotheses": 1}
 
-difference_env = partial(Environment, single=DuffingEnv, vector=DuffingVectorEnv)
-continuous_env = partial(Environment, single=ContinuousEnv, vector=ContinuousVectorEnv)
-replay_env = partial(Environment, single=OnTheRecord, vector=OnTheRecordVector, sums=False)
+difference_env = partial(Environment, single_env_class=DuffingEnv, vector=DuffingVectorEnv)
+continuous_env = partial(Environment, single_env_class=ContinuousEnv, vector=ContinuousVectorEnv)
+replay_env = partial(Environment, single_env_class=OnTheRecord, vector=OnTheRecordVector, sums=False)
 
 #: Another kernel each.
 COMPILED = [

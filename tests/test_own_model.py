@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3
 import duffing_env  # noqa: F401 - registers the tracks
 from agents.policies import make_policy
 from duffing_env.batch import spawn_seeds
-from duffing_env.model_env import ModelEnv, ModelVectorEnv
+from duffing_env.tracks.model_env import ModelEnv, ModelVectorEnv
 
 OPTIONS = {
     "system": VAN_DER_POL,

@@ -14,7 +14,7 @@ from agents.loading import spec_of
 from agents.policies import TRAINED, trained_policies
 from agents.policies.learned import load_policy
 from agents.results import check_file, check_folder, say
-from duffing_env.silverbox import record_available
+from duffing_env.plants.silverbox_record import record_available
 from estimator.extras import how_to_get, is_missing, need
 from estimator.progress import progress
 

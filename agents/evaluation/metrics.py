@@ -8,8 +8,8 @@ import numpy as np
 from scipy import stats
 
 from agents.planner.plants import plant_of
-from duffing_env.layout import parameter_names
-from duffing_env.silverbox import load_record, regime_input
+from duffing_env.plants.silverbox_record import load_record, regime_input
+from duffing_env.storage.kernel_spec import parameter_names
 from estimator.free_run import free_run
 from estimator.information import fisher_information
 from estimator.models.difference import difference

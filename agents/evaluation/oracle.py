@@ -20,7 +20,7 @@ from agents.evaluation.batch import TESTED, make
 from agents.planner.ascent import Limits, climber
 from agents.planner.design import Known
 from agents.planner.plants import Plant, plant_of
-from duffing_env.experiment import SimulatedExperiment
+from duffing_env.experiment_config import SimulatedExperiment
 from estimator.engine.feeding import input_degree
 from estimator.files import write_atomically
 from estimator.information import fisher_information, variances

@@ -16,9 +16,9 @@ from agents.evaluation.entries import check_policies, check_predict, members_of,
 from agents.loading import of_ones_own
 from agents.planner.plants import plant_of
 from agents.policies import make_policy
-from duffing_env.experiment import Experiment, SimulatedExperiment
-from duffing_env.layout import observation_bounds, parameter_names
-from duffing_env.silverbox import record_available
+from duffing_env.experiment_config import Experiment, SimulatedExperiment
+from duffing_env.plants.silverbox_record import record_available
+from duffing_env.storage.kernel_spec import observation_bounds, parameter_names
 from estimator.belief import Belief
 from estimator.checks import MOST_SEED, printable, whole
 from estimator.maximum_a_posteriori import maximum_a_posteriori
@@ -273,7 +273,7 @@ def roll_out(
         "decision_time": np.full(systems, np.mean(deciding[1:] or deciding) / systems),
     }
     seen = outputs[..., 0] if sensors == 1 else outputs
-    setup = envs.experiment.setup
+    setup = envs.experiment.kernel_params
     evaluation = Evaluation(
         title_of(name), values, curve, inputs, seen, prior.scales, limits=(setup.max_input, setup.max_output)
     )
@@ -304,14 +304,16 @@ def _audit(evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment) 
     rig = Rig(experiment.step, interpolation=interpolation, delay=0 if interpolation == "linear" else -1)
     hands: dict[str, tuple[Belief, FloatArray]] = {}
     if plant == difference():
-        hands = {name: (experiment.prior_of(plant, name), u) for name in FACTORISATIONS}
+        hands = {name: (experiment.prior_for_model(plant, name), u) for name in FACTORISATIONS}
     else:
         name = "ode" if plant.is_continuous else "structured"
         # The environment's own estimator, without the hypotheses that it may weigh.
         hands[f"{name}_alone" if experiment.noise_hypotheses != 1 else name] = own_prior, u
         if set(parameter_names(plant)) == set(parameter_names(difference())):
             earlier = u if not experiment.degree else np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
-            hands |= {f"nlarx_{name}": (experiment.prior_of(difference(), name), earlier) for name in FACTORISATIONS}
+            hands |= {
+                f"nlarx_{name}": (experiment.prior_for_model(difference(), name), earlier) for name in FACTORISATIONS
+            }
     found: dict[str, dict[str, FloatArray]] = {}
     starts: list[FloatArray] = []
     for name, (prior, acting) in hands.items():

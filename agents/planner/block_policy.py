@@ -88,7 +88,7 @@ class BlockPlanner:
                 f"policy must be 'efe' here, but is 'efe-block-{block}': a design is one block anyway, and a run takes "
                 f"efe with --block {block}"
             )
-        setup = env.experiment.setup
+        setup = env.experiment.kernel_params
         if np.isfinite(setup.budget):
             raise ValueError(f"env must have no limit of energy for blocks, but has max_rms={env.experiment.max_rms!r}")
         force_of_noise(self._planner.view.model)  # refuses what cannot be simulated
@@ -129,7 +129,7 @@ class BlockPlanner:
         view, terms = planner.view, planner.terms
         seen = min(left, samples + _AFTER * terms.pace)
         rng = np.random.default_rng([planner.seed, i, left])
-        (belief,) = self._env.experiment.believed.with_records(record[None])
+        (belief,) = self._env.experiment.prior_belief.with_records(record[None])
         bound, spread = counted(self.bound(left))
         records, weights = self._env.mixture(i)
         drawn = drawn_from_records(view.model, records, weights, rng, draws_for(bound, MOST_PLANNED), spread)

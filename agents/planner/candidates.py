@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from duffing_env.noise import draw, to_unit
+from duffing_env.storage.random_streams import sfc64_next, to_uniform
 from estimator.lanes import jit
 
 #: Inputs to choose from, in parts of the largest. Of what is further off in a plan, the first five will do, then two.
@@ -116,5 +116,5 @@ def move(candidate, h, amplitude, words):
 @jit
 def uniform(words):
     """A number in (0, 1) from a stream (4,), which moves on."""
-    value, words[0], words[1], words[2], words[3] = draw(words[0], words[1], words[2], words[3])
-    return to_unit(value)
+    value, words[0], words[1], words[2], words[3] = sfc64_next(words[0], words[1], words[2], words[3])
+    return to_uniform(value)

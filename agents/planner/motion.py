@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from duffing_env.layout import observation_bounds
+from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.arrays import copy, fill
 from estimator.belief import Belief
 from estimator.engine.motion import motion
@@ -38,7 +38,7 @@ class View(NamedTuple):
         """That of an experiment of duffing_env.
 
         On a plant whose input goes linearly from one action to the next, a difference equation takes the input at the
-        begin of a sample, as the environment feeds it (`duffing_env.sources`).
+        begin of a sample, as the environment feeds it (`duffing_env.kernel_stages.env_codegen`).
         """
         model = experiment.model
         if model.is_continuous:
@@ -194,8 +194,8 @@ def limit_of(experiment: Any, sizes: FloatArray) -> float:
         experiment: of duffing_env.
         sizes: (states,) when the first sensor is at its limit.
     """
-    limit = float(experiment.setup.max_output)
-    return limit * seen(experiment.believed, float(sizes[0])) if is_of_rig(experiment) else limit
+    limit = float(experiment.kernel_params.max_output)
+    return limit * seen(experiment.prior_belief, float(sizes[0])) if is_of_rig(experiment) else limit
 
 
 #: Samples of the motion by which a system is measured, and where it turns, in parts of the limit.
@@ -330,6 +330,6 @@ def reach_of(experiment: Any, view: View, swing: Swing) -> float:
     sensor tells of a kick before the first one shows it, and on a rig, where leaving the limit may cost more than
     information.
     """
-    setup = experiment.setup
+    setup = experiment.kernel_params
     slow = view.degree or view.lag or swing.pace > 1 or np.isfinite(setup.max_slew) or np.isfinite(setup.budget)
     return 0.0 if slow or is_of_rig(experiment) or experiment.model.n_outputs > 1 else _SURE * swing.moved

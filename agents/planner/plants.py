@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from duffing_env.layout import noise_rows
+from duffing_env.storage.kernel_spec import noise_std_rows
 from estimator.belief import Belief
 from estimator.models.model import Model
 from estimator.parameters import FloatArray, Parameters
@@ -39,7 +39,7 @@ def plant_of(experiment: Any, truth: Parameters | None = None) -> Plant:
     """The plant of an experiment that simulates one; with its systems' own noises, where these are drawn."""
     model = experiment.plant
     interpolation = "linear" if experiment.degree and model.is_continuous else "zero_order"
-    prior, setup, names = experiment.prior_of(model), experiment.setup, list(noise_rows(model))
+    prior, setup, names = experiment.prior_for_model(model), experiment.kernel_params, list(noise_std_rows(model))
     process, sensors = setup.process_noise, setup.measurement_noise
     if truth is not None and names[0] in truth:
         process, *others = (np.asarray(truth[name]) / prior.scales.output for name in names)

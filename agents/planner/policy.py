@@ -162,7 +162,7 @@ class Planner:
                 f"env must show the posterior, in which the planner looks up the time left, but its observation is "
                 f"{shown(experiment.observation)}; make it with observation='posterior'"
             )
-        setup, self.view = experiment.setup, View.of(experiment)
+        setup, self.view = experiment.kernel_params, View.of(experiment)
         number("goal", goal, -float(setup.max_output), float(setup.max_output), "a goal lies within the limit")
         if goal_std is not None:
             number("goal_std", goal_std, remedy="None is no goal")
@@ -186,14 +186,14 @@ class Planner:
         self._env = env
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
-        means = experiment.believed.coefficients_mean
+        means = experiment.prior_belief.coefficients_mean
         swing = swing_of(self.view, means, setup.max_input, setup.max_output)
         self.terms = Terms(
             amplitude=setup.max_input,
             slew=setup.max_slew,
             limit=limit_of(experiment, swing.scales),
             margin=margin(env.horizon, risk) * (1 + max(self.view.degree, self.view.lag)),
-            walk=setup.walk.copy(),
+            walk=setup.walk_variances.copy(),
             scales=swing.scales,
             pace=min(swing.pace, -(-env.horizon // min(horizon, _LEAST_MOVES))),
             shaken=shaken_of(experiment, swing),

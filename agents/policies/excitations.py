@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from duffing_env.silverbox import regime_input
+from duffing_env.plants.silverbox_record import regime_input
 from estimator.checks import whole
 from estimator.models.difference import difference
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
@@ -37,7 +37,7 @@ def draw_regime(name: str) -> Draw:
     """A stretch of a regime of the Silverbox record, or of its synthesised stand-in.
 
     The stretch is contiguous and starts anywhere it fits, gaps and quiet beginning included. One
-    longer than the regime starts at its first sample and repeats it. See `duffing_env.silverbox.regime_input`.
+    longer than the regime starts at its first sample and repeats it. See `duffing_env.plants.silverbox_record.regime_input`.
     """
     return partial(_regime, name=name)
 

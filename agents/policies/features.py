@@ -395,12 +395,12 @@ class FeatureMap:
             )
         if experiment.hold != 1:
             raise ValueError(f"hold must be 1 for features, but is {experiment.hold}; train without features")
-        setup, view, prior = experiment.setup, View.of(experiment), experiment.believed
+        setup, view, prior = experiment.kernel_params, View.of(experiment), experiment.prior_belief
         center = prior.coefficients_mean
         swing = swing_of(view, center, setup.max_input, setup.max_output)
         setting = Setting(
             center=center,
-            std=1.0 / setup.inverse_std,
+            std=1.0 / setup.prior_inverse_std,
             rate=swing.taught,
             scales=swing.scales,
             max_input=float(setup.max_input),
@@ -408,8 +408,8 @@ class FeatureMap:
             limit=limit_of(experiment, swing.scales),
             samples=float(setup.horizon),
             energy=float(setup.budget),
-            process=float(np.exp(-setup.log_precisions[0])),
-            sensor=float(np.exp(-setup.log_precisions[1])),
+            process=float(np.exp(-setup.prior_log_precisions[0])),
+            sensor=float(np.exp(-setup.prior_log_precisions[1])),
             shaken=shaken_of(experiment, swing),
             pace=float(swing.pace),
             margin=MARGIN if experiment.noise_hypotheses == 1 else UNKNOWN_MARGIN,

@@ -23,7 +23,7 @@ from agents.asked import check_rows, check_state, starts
 from agents.planner.motion import places, resonances, survey
 from agents.policies.excitations import BAND
 from agents.policies.signals import Limits, limits_of
-from duffing_env.experiment import Experiment, SimulatedExperiment
+from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from estimator.checks import numbers
 from estimator.parameters import SAMPLING_STEP
 
@@ -55,8 +55,8 @@ class FeedbackPolicy:
         self._model, self._step = experiment.model, experiment.step
         self._places = places(experiment.model)
         self._limit = float(experiment.max_output)
-        self._centers = experiment.believed.coefficients_mean
-        self._stds = np.sqrt(np.diag(experiment.believed.coefficients_cov))
+        self._centers = experiment.prior_belief.coefficients_mean
+        self._stds = np.sqrt(np.diag(experiment.prior_belief.coefficients_cov))
 
     def frequency(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
         """The linear resonance that is believed, shape `(n,)` [Hz], of observations `(n, features)`."""

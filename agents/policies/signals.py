@@ -192,7 +192,7 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     draw = EXCITATIONS[name](limits.max_input)
     experiment: Any = getattr(env, "experiment", None)
     if getattr(experiment, "rig", None) is not None:
-        hold = holds(experiment.believed, samples)
+        hold = holds(experiment.prior_belief, samples)
         usual = EXCITATIONS[name](DEFAULT_MAX_INPUT)
         draw = partial(_slower, draw=usual, hold=hold, worth=limits.max_input / DEFAULT_MAX_INPUT)
     recorded = getattr(env, "recorded_input", None)

@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from duffing_env.layout import observation_bounds
-from duffing_env.rig_plant import RigPlantExperiment
+from duffing_env.storage.kernel_spec import observation_bounds
+from duffing_env.tracks.rig_plant_env import RigPlantExperiment
 from estimator.belief import Belief
 from estimator.free_run import shown_at
 from estimator.parameters import FloatArray
@@ -35,7 +35,7 @@ class Observed:
         self.experiment = RigPlantExperiment(rig=replace(rig, delay=0), prior=prior, horizon=samples)
         self.max_input, self.horizon = float(self.experiment.max_input), samples
         self.belief = prior
-        self.shown = self.observation(0.0, 0.0, 0)[None]
+        self.last_observations = self.observation(0.0, 0.0, 0)[None]
 
     @property
     def unwrapped(self) -> Observed:
@@ -55,7 +55,7 @@ class Observed:
             y: the last output; NaN, a missing one, is shown as what the model expects of the sensor.
             elapsed: samples since the run began.
         """
-        belief, prior = self.belief, self.experiment.believed
+        belief, prior = self.belief, self.experiment.prior_belief
         cov, first = belief.coefficients_cov, np.sqrt(np.diag(prior.coefficients_cov))
         stds = np.sqrt(np.diag(cov))
         pairs = list(combinations(range(len(stds)), 2))
@@ -73,5 +73,5 @@ class Observed:
         ])  # fmt: skip
         low, high = np.array(list(observation_bounds(belief.model).values())).T
         shown: npt.NDArray[np.float32] = np.clip(values, low, high).astype(np.float32)
-        self.shown = shown[None]
+        self.last_observations = shown[None]
         return shown

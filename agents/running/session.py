@@ -13,7 +13,7 @@ import numpy as np
 
 from agents.running.plant import Plant
 from agents.stopping import Stopper
-from duffing_env.rig_plant import number_of
+from duffing_env.tracks.rig_plant_env import as_number
 from estimator.checks import shown
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
@@ -190,7 +190,7 @@ class Session:
     def _number(self, name: str, *arguments: Any) -> float:
         given = self._do(name, getattr(self.plant, name), *arguments)
         try:
-            return number_of(name, given)
+            return as_number(name, given)
         except TypeError as error:
             raise Tripped("plant", str(error)) from None
 

@@ -20,7 +20,7 @@ from agents.cli import followed
 from agents.evaluation.figures import new_figure, save
 from agents.policies import make_policy
 from agents.results import check_file, show, table, versions, write_json
-from duffing_env.silverbox import Regime, SilverboxRecord, load_record
+from duffing_env.plants.silverbox_record import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
 from estimator.offline import PEMNARX

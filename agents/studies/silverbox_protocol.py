@@ -18,7 +18,7 @@ from time import perf_counter
 
 import numpy as np
 
-from duffing_env.silverbox import Regime, SilverboxRecord
+from duffing_env.plants.silverbox_record import Regime, SilverboxRecord
 from estimator import Model, OnlineEstimator, Rig, difference, duffing, published_run_prior, silverbox_prior
 from estimator.belief import Belief
 from estimator.parameters import FloatArray

@@ -32,7 +32,7 @@ from agents.studies.silverbox_protocol import (
     samples_until_close,
     simulation_error,
 )
-from duffing_env.silverbox import Regime, load_record
+from duffing_env.plants.silverbox_record import Regime, load_record
 from estimator import recorded_prior
 
 SUBMITTED = ("ODE linear", "ODE look-ahead +e", "ODE spline +e, 2 passes", "NLARX three-tap")

@@ -49,7 +49,7 @@ class TrainConfig(Subject):
     """What a training run is made from. Written to ``config.json`` of its folder."""
 
     reward: str = "information_gain"
-    """Name of the reward, such as information_gain, log_posterior or fisher (`duffing_env.rewards` has all)."""
+    """Name of the reward, such as information_gain, log_posterior or fisher (`duffing_env.rewards.reward_registry` has all)."""
     steps: int = 5_000_000
     """Samples to learn from, over all environments."""
     seed: int = 0

@@ -22,8 +22,8 @@ _LEAST_STD = 0.05
 
 def has_potential(envs: Any) -> bool:
     """Whether Ψ is what is still to come in unwrapped environments (`FeatureVecEnv`)."""
-    setup = envs.experiment.setup
-    return not setup.drifts and setup.budget == np.inf
+    setup = envs.experiment.kernel_params
+    return not setup.has_drift and setup.budget == np.inf
 
 
 class Normalizer:

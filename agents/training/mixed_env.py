@@ -57,8 +57,8 @@ class _Group:
 
     def told(self, **others: Any) -> list[dict[str, Any]]:
         """The infos of its rows at the last reset or step."""
-        single = self.envs.single
-        return rows_of(self.infos, (*single._reported, *single._flags), LANES, **others)
+        single = self.envs.single_env_class
+        return rows_of(self.infos, (*single._info_gains, *single._info_flags), LANES, **others)
 
 
 class MixedVecEnv(BatchVecEnv):

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable
 from importlib.metadata import version
 
-from benchmarks.compat.libraries import CELLS, Gymnasium, Minari, RLlib, StableBaselines3, Tianshou, TorchRL
+from benchmarks.compat.library_rows import CELLS, Gymnasium, Minari, RLlib, StableBaselines3, Tianshou, TorchRL
 
 LIBRARIES = {kind.__name__: kind for kind in (Gymnasium, TorchRL, Tianshou, StableBaselines3, RLlib, Minari)}
 

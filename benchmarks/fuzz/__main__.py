@@ -28,7 +28,7 @@ AREAS = {
     "constructors": 0.32,
     "files": 0.2,
     "options": 0.05,
-    "worlds": 0.1,
+    "environments": 0.1,
     "policies": 0.06,
     "commands": 0.02,
 }
@@ -74,11 +74,11 @@ def main(config: Config) -> None:
 
 def inside(area: str, inputs: int, seed: int, path: Path | None) -> None:
     """Try an area's inputs in this process."""
-    from benchmarks.fuzz.judge import Judge
+    from benchmarks.fuzz.call_verdicts import Judge
 
     warnings.simplefilter("ignore")
     began = time.perf_counter()
-    judge, calls = Judge(), importlib.import_module(f"benchmarks.fuzz.{area}").calls()
+    judge, calls = Judge(), importlib.import_module(f"benchmarks.fuzz.fuzz_{area}").calls()
     settings = hypothesis.settings(
         max_examples=inputs, database=None, deadline=None, phases=[hypothesis.Phase.generate],
         suppress_health_check=list(hypothesis.HealthCheck),

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from agents.cli import run_script
-from benchmarks.kills.cases import CASES, Case
-from benchmarks.kills.processes import started
-from benchmarks.kills.whole import half_written
+from benchmarks.kills.file_integrity import half_written
+from benchmarks.kills.killable_process import started
+from benchmarks.kills.killed_commands import CASES, Case
 
 _NEAR = 0.05  # s
 _PATIENCE = 300.0  # s

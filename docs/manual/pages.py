@@ -19,12 +19,13 @@ from mkdocs.structure.files import File, Files
 from agents import POLICIES
 from agents.evaluation import board
 from agents.policies import TRAINED, trained_policies
-from duffing_env import TRACKS, rewards
+from duffing_env import TRACKS
+from duffing_env.rewards import reward_registry
 
 #: What docs/*.md point to in the repository, to the page that is made of it.
 MADE_OF = {
-    "duffing_env/tracks.py": "tracks/index.md",
-    "duffing_env/rewards.py": "rewards.md",
+    "duffing_env/tracks/track_registry.py": "tracks/index.md",
+    "duffing_env/rewards/reward_registry.py": "rewards.md",
     "agents/policies/__init__.py": "reference/policies.md",
     "agents/leaderboard.jsonl": "leaderboard.md",
 }
@@ -35,11 +36,11 @@ REFERENCE = {
     "duffing_env": [
         "duffing_env.vector_env.DuffingVectorEnv",
         "duffing_env.vector_env.SilverboxReplayVectorEnv",
-        "duffing_env.contract.Specified",
-        "duffing_env.own.Beliefs",
-        "duffing_env.rig_plant.Plant",
-        "duffing_env.silverbox.load_record",
-        "duffing_env.silverbox.regime_input",
+        "duffing_env.env_base.ExperimentEnv",
+        "duffing_env.custom_functions.Beliefs",
+        "duffing_env.tracks.rig_plant_env.Plant",
+        "duffing_env.plants.silverbox_record.load_record",
+        "duffing_env.plants.silverbox_record.regime_input",
     ],
     "agents": [
         "agents.training.TrainConfig",
@@ -71,7 +72,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages = {
         "tracks/index.md": _tracks(),
         **{_page(track): _track(track) for track in TRACKS},
-        "rewards.md": f"# Rewards\n\n{_fenced(inspect.getdoc(rewards) or '')}",
+        "rewards.md": f"# Rewards\n\n{_fenced(inspect.getdoc(reward_registry) or '')}",
         "reference/policies.md": _policies(),
         "leaderboard.md": _leaderboard(),
         **{f"reference/{name}.md": _reference(name, objects) for name, objects in REFERENCE.items()},

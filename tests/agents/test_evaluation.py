@@ -24,7 +24,7 @@ from agents.policies.learned import WEIGHTS, load_policy
 from agents.policies.saving import save_policy
 from agents.vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
-from duffing_env.silverbox import Regime
+from duffing_env.plants.silverbox_record import Regime
 from estimator import SAMPLING_STEP, OnlineEstimator, Rig, difference, silverbox_prior
 
 TRACK = "duffing_env/Amplitude-v0"
@@ -145,7 +145,7 @@ def run_single(name, options):
             observation, _, terminated, truncated, _ = env.step(action)
             beliefs.append(env.unwrapped.belief)
             inputs.append(options.get("max_input", 0.15) * float(np.clip(action[0], -1, 1)))
-            outputs.append(env.unwrapped._batch.quantity("Y_y")[0])
+            outputs.append(env.unwrapped._batch.row_values("Y_y")[0])
             done = terminated or truncated
         yield SimpleNamespace(truth=truth, beliefs=beliefs, inputs=inputs, outputs=outputs, terminated=terminated)
 

@@ -13,8 +13,8 @@ from agents.policies.excitations import EXCITATIONS, LEVELS, resonance
 from agents.policies.export import draw_signal, export_signal
 from agents.policies.feedback import FEEDBACK, TURN
 from agents.policies.signals import Limits, SignalPolicy
-from duffing_env.experiment import SimulatedExperiment
-from duffing_env.layout import observation_bounds
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.models.difference import difference
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.physical import coefficients_of
@@ -248,7 +248,7 @@ def test_feedback_pumps_equation_1_too(name):
 def test_resonance_and_amplitude_are_read_off_equation_1():
     env = gym.make("duffing_env/Amplitude-v1").unwrapped
     policy, model = make_policy("square-believed", env), env.experiment.model
-    prior = env.experiment.believed.coefficients_mean
+    prior = env.experiment.prior_belief.coefficients_mean
     row = np.zeros((1, len(observation_bounds(model))))
     expected = np.sqrt(prior[0] - prior[2] ** 2 / 4) / (2 * np.pi * SAMPLING_STEP)  # of m, c and a
     assert policy.frequency(row)[0] == pytest.approx(expected, rel=1e-9)

@@ -10,8 +10,8 @@ from tables import table
 from agents.planner.design import Known, designer
 from agents.planner.imagination import Terms, mind
 from agents.planner.pursuit import pursuit
-from duffing_env.continuous import ContinuousExperiment
-from duffing_env.experiment import SimulatedExperiment
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from estimator.belief import Belief
 from estimator.engine.imagination import LOST, imagination
 from estimator.lanes import LANES
@@ -239,7 +239,7 @@ def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
 
 def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
     model = difference()
-    belief = SimulatedExperiment().believed
+    belief = SimulatedExperiment().prior_belief
     u = np.full((40, LANES), 0.01)
     u[:, 5] = 50.0  # far beyond where the difference equation is stable
     W, found = block_after(model, 0, belief, u, terms(model))
@@ -270,7 +270,7 @@ def test_an_output_of_a_fast_swing_is_imagined_within_the_noise():
 
 def test_few_steps_are_enough_to_plan_with():
     """The nats of plans of Eq. (1) are those of sixteen exact steps within 0.06, and their differences within 0.02."""
-    belief, fine = ContinuousExperiment().believed, replace(duffing(), substeps=16)
+    belief, fine = ContinuousExperiment().prior_belief, replace(duffing(), substeps=16)
     u = np.random.default_rng(2).choice([-0.15, 0.15], (24, LANES))
     W, found = block_after(duffing(), 0, belief, u, terms(duffing()))
     found.appraise(W.reshape(-1), np.zeros((4, 4)), 1.0)

@@ -478,7 +478,7 @@ def test_an_environment_of_stable_baselines3_is_taken_as_it_is(name):
     envs = DuffingVecEnv("duffing_env/Short-v0", 2, seed=0, max_input=0.1)
     expected, _ = make_policy(name, envs.envs).predict(envs.reset(), deterministic=True)
     for held in (envs, VecCheckNan(envs), VecNormalize(envs, norm_obs=False)):
-        actions, _ = make_policy(name, held).predict(envs.envs.shown, deterministic=True)
+        actions, _ = make_policy(name, held).predict(envs.envs.last_observations, deterministic=True)
         np.testing.assert_array_equal(actions, expected)
     normalised = VecNormalize(envs)
     if name == "prbs":

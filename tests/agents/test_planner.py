@@ -23,7 +23,7 @@ from agents.planner.motion import View, reach_of, swing_of
 from agents.planner.policy import Planner
 from agents.planner.search import search
 from agents.policies import make_policy
-from duffing_env.experiment import SimulatedExperiment
+from duffing_env.experiment_config import SimulatedExperiment
 from estimator import Channel, Rig
 from estimator.belief import Belief, covariance_places
 from estimator.models.difference import difference
@@ -44,7 +44,7 @@ def roll_out(track, n, seed=0, steps=None, options=None, name="efe", **planner):
     envs = make(track, n, **(options or {}))
     policy = make_policy(name, envs, seed=seed, **planner)
     observations, _ = envs.reset(seed=0)
-    place = list(duffing_env.layout.observation_bounds(envs.experiment.model)).index
+    place = list(duffing_env.storage.kernel_spec.observation_bounds(envs.experiment.model)).index
     last = place(f"last_{next(iter(envs.experiment.model.outputs))}")
     state, start, running = None, np.ones(n, dtype=bool), np.ones(n, dtype=bool)
     inputs, outputs, early, gains = [], [], 0, np.zeros(n)
@@ -100,7 +100,8 @@ def test_wrappers_that_leave_observations_alone_are_played(name, wrap):
     # The pair of them goes on from a copy.
     copied, its = copy.deepcopy((env, policy))
     one, other = (
-        played(p, e.unwrapped.shown[0], lambda a, e=e: e.step(a)[0]) for e, p in ((env, policy), (copied, its))
+        played(p, e.unwrapped.last_observations[0], lambda a, e=e: e.step(a)[0])
+        for e, p in ((env, policy), (copied, its))
     )
     np.testing.assert_array_equal(one, other)
     # A batch of one, as Stable-Baselines3 has it.
@@ -309,7 +310,7 @@ def test_it_plays_a_plant_of_ones_own():
 
 
 def test_the_map_measures_every_state_by_its_size_at_the_limit():
-    paper = SimulatedExperiment().believed.coefficients_mean
+    paper = SimulatedExperiment().prior_belief.coefficients_mean
     np.testing.assert_array_equal(swing_of(View(difference()), paper, 0.15, 0.6).scales, [0.6, 0.6])
     # A linear oscillator of 2π / 40 rad per sample: its velocity has that much of the displacement's amplitude.
     omega = 2 * np.pi / 40
@@ -333,12 +334,12 @@ def test_plans_count_on_what_an_input_moves_within_its_sample():
     np.testing.assert_allclose(held.moved, gain * (1 - np.cos(omega)) / omega**2, rtol=1e-3)
     assert swing_of(View(difference()), [1.5, -0.2, -0.9, 0.4], 0.15, 0.6).moved == pytest.approx(0.4)
 
-    free = SimpleNamespace(setup=SimpleNamespace(max_slew=np.inf, budget=np.inf), model=duffing())
+    free = SimpleNamespace(kernel_params=SimpleNamespace(max_slew=np.inf, budget=np.inf), model=duffing())
     assert reach_of(free, View(duffing()), held) == 0.75 * held.moved
     # An input that goes linearly from the last one acts in full a sample later; rigs keep the whole margin.
-    slow = SimpleNamespace(setup=SimpleNamespace(max_slew=0.1, budget=np.inf), model=duffing())
-    weak = SimpleNamespace(setup=SimpleNamespace(max_slew=np.inf, budget=1.0), model=duffing())
-    rig = SimpleNamespace(setup=free.setup, model=duffing(), rig=Rig(SAMPLING_STEP))
+    slow = SimpleNamespace(kernel_params=SimpleNamespace(max_slew=0.1, budget=np.inf), model=duffing())
+    weak = SimpleNamespace(kernel_params=SimpleNamespace(max_slew=np.inf, budget=1.0), model=duffing())
+    rig = SimpleNamespace(kernel_params=free.kernel_params, model=duffing(), rig=Rig(SAMPLING_STEP))
     assert reach_of(free, View(duffing(), 1), held) == reach_of(free, View(difference(), 0, 1), held) == 0.0
     assert reach_of(free, View(duffing()), held._replace(pace=2)) == 0.0
     assert [reach_of(one, View(duffing()), held) for one in (slow, weak, rig)] == [0.0, 0.0, 0.0]

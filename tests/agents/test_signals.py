@@ -16,7 +16,7 @@ from agents.policies import POLICIES, make_policy
 from agents.policies.excitations import EXCITATIONS, draw_prbs, draw_recorded, draw_regime, draw_uniform
 from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_SAMPLES, SignalPolicy
-from duffing_env import silverbox
+from duffing_env.plants import silverbox_record
 from estimator import Channel, Rig
 
 GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
@@ -76,7 +76,7 @@ def test_a_policy_goes_on_from_a_copy(name, track):
 
 @pytest.fixture
 def without_record(monkeypatch):
-    monkeypatch.setattr(silverbox, "record_available", lambda: False)
+    monkeypatch.setattr(silverbox_record, "record_available", lambda: False)
 
 
 @table("name", EXCITATIONS)
@@ -260,7 +260,7 @@ def test_reference_policies_play_stretches_of_the_record(record):
 
 @table("regime", ["multisine", "arrow"])
 def test_reference_policies_work_without_the_record(without_record, regime):
-    synthesise = getattr(silverbox, f"synthesise_{regime}")
+    synthesise = getattr(silverbox_record, f"synthesise_{regime}")
     stretch = draw_regime(regime)(np.random.default_rng(4), 500)
     assert is_stretch_of(stretch, synthesise(np.random.default_rng(4)))
     policy = make_policy(f"silverbox-{regime}", seed=6)

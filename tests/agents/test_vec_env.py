@@ -181,7 +181,7 @@ def test_attributes_are_those_of_the_rows_that_are_asked_for():
     envs = DuffingVecEnv(TRACK, 4, seed=0, **OPTIONS)
     envs.reset()
     (truth,) = envs.get_attr("truth", indices=2)
-    assert truth == envs.envs._batch.true_of(2)
+    assert truth == envs.envs._batch.truth_of(2)
     assert type(truth.m) is float
     assert [belief.record.tolist() for belief in envs.get_attr("belief", [1, 3])] == envs.envs.records[[1, 3]].tolist()
     np.testing.assert_array_equal(envs.get_attr("records")[3], envs.envs.records[3])

@@ -129,7 +129,7 @@ def test_copies_of_a_vector_continue_alike_and_apart(environment):
 @pytest.mark.parametrize("environment", each(lambda environment: environment.sums))
 def test_a_held_action_is_the_same_action_at_every_sample(environment):
     held, sampled = environment.make(hold=4), environment.make()
-    names, ended, within = list(held._reported), 0, 0
+    names, ended, within = list(held._info_gains), 0, 0
     for seed in range(12):
         given, expected = held.reset(seed=seed), sampled.reset(seed=seed)
         assert same(given, expected)
@@ -297,6 +297,6 @@ def test_the_belief_of_an_episode_stays_as_it_was(environment):
 
 
 def test_every_compiled_combination_is_there_once():
-    kinds = [environment.make().experiment.kind for environment in COMPILED if not environment.on_record]
+    kinds = [environment.make().experiment.kernel_spec for environment in COMPILED if not environment.on_record]
     assert len(set(kinds)) == len(kinds)
-    assert {environment.make().experiment.kind for environment in ENVIRONMENTS[len(COMPILED) :]} == {kinds[0]}
+    assert {environment.make().experiment.kernel_spec for environment in ENVIRONMENTS[len(COMPILED) :]} == {kinds[0]}

@@ -6,7 +6,7 @@ import pytest
 from playing import random_actions
 from twin import TwinContinuousEnv, assert_env_follows_twin
 
-from duffing_env.continuous import ContinuousEnv
+from duffing_env.tracks.continuous_tracks import ContinuousEnv
 from duffing_env.vector_env import ContinuousVectorEnv
 
 TRACK = "duffing_env/Amplitude-v1"
@@ -68,7 +68,7 @@ def test_the_plant_does_not_depend_on_the_estimator():
         outputs.append([])
         for actions in random_actions(40, 4):
             envs.step(actions)
-            outputs[-1].append(envs._batch.quantity("Y_y"))
+            outputs[-1].append(envs._batch.row_values("Y_y"))
     np.testing.assert_array_equal(*outputs)
 
 
@@ -115,7 +115,7 @@ def test_a_soft_spring_that_pushes_is_a_number_if_a_bad_one():
         env.reset(seed=0)
         env.step([0.7])
         batch = env._batch
-        batch._blocks[0, batch._place["stiffness"], 0] = value
+        batch._blocks[0, batch._row_of["stiffness"], 0] = value
         before = env.belief
         observation, received, terminated, _, info = env.step([0.5])
         assert observation in env.observation_space
@@ -128,7 +128,7 @@ def test_a_soft_spring_that_pushes_is_a_number_if_a_bad_one():
 
 
 def test_an_episode_is_drawn_with_the_maps_of_its_estimator():
-    from duffing_env.rendering import _physical_moments
+    from duffing_env.rendering.episode_renderer import _physical_moments
 
     env = gym.make(TRACK, render_mode="rgb_array", horizon=5)
     env.reset(seed=0)

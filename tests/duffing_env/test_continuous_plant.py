@@ -8,19 +8,19 @@ from reference.filters import continuous_step
 from scipy.integrate import solve_ivp
 from twin import to_rates
 
-from duffing_env.continuous import ContinuousExperiment
-from duffing_env.kernel import _plant_of
-from duffing_env.layout import layout_of
-from duffing_env.sources import parts
-from duffing_env.stages import noise_drawer
+from duffing_env.kernel import _compile_plant_step
+from duffing_env.kernel_stages.env_codegen import generated_functions
+from duffing_env.kernel_stages.plant_stages import compile_noise_draw
+from duffing_env.storage.kernel_spec import block_layout
+from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP
 from estimator.lanes import LANES
 from estimator.models.duffing import duffing
 
 EXPERIMENT = ContinuousExperiment()
-KIND = EXPERIMENT.kind._replace(degree=1)  # which holds an input that does not rise
-HELD = KIND._replace(plant=duffing(noise="held"))
-PLACE = layout_of(KIND)
+KIND = EXPERIMENT.kernel_spec._replace(degree=1)  # which holds an input that does not rise
+HELD = KIND._replace(plant_model=duffing(noise="held"))
+PLACE = block_layout(KIND)
 STREAM = ("STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d")
 RATES = ("TRUE_stiffness", "TRUE_cubic", "TRUE_damping", "TRUE_gain")
 
@@ -39,9 +39,9 @@ def lanes(seed=0, **rows):
 @cache
 def compiled(kind):
     """The two functions that a sample of the plant takes."""
-    assert layout_of(kind) == PLACE
-    draw_noise = noise_drawer(PLACE)
-    return draw_noise, _plant_of(kind, parts(kind), draw_noise)
+    assert block_layout(kind) == PLACE
+    draw_noise = compile_noise_draw(PLACE)
+    return draw_noise, _compile_plant_step(kind, generated_functions(kind), draw_noise)
 
 
 def step(by_row, process_noise=0.0, measurement_noise=0.0, kind=KIND):

@@ -16,7 +16,7 @@ from rounding import U32
 from twin import to_coefficients
 
 from duffing_env.env import DuffingEnv
-from duffing_env.experiment import SimulatedExperiment
+from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.vector_env import DuffingVectorEnv
 
 TRACK = "duffing_env/Amplitude-v0"
@@ -121,7 +121,7 @@ def test_feedback_at_resonance_reaches_the_limit_and_terminates():
         assert not truncated
         assert not info["diverged"]
         assert abs(y) > 0.6
-        np.testing.assert_allclose(env.unwrapped._batch.quantity("Y_y"), y, rtol=1e-6)
+        np.testing.assert_allclose(env.unwrapped._batch.row_values("Y_y"), y, rtol=1e-6)
 
 
 def test_episodes_end_at_the_limit_or_at_the_horizon_but_never_at_both():
@@ -134,7 +134,7 @@ def test_episodes_end_at_the_limit_or_at_the_horizon_but_never_at_both():
         endings[terminated, truncated] += 1
         assert [step[2] or step[3] for step in episode[1:-1]] == [False] * (len(episode) - 2)
         assert not info["diverged"]
-        output = abs(env.unwrapped._batch.quantity("Y_y")[0])
+        output = abs(env.unwrapped._batch.row_values("Y_y")[0])
         assert (output > 0.1) == terminated
         assert truncated == (len(episode) - 1 == 12 and not terminated)
         limit_at_horizon += terminated and len(episode) - 1 == 12
@@ -255,7 +255,7 @@ def test_a_second_thread_is_refused_and_changes_nothing():
                 call()
             refused.append(call)
 
-    draw = env._draw
+    draw = env._draw_sample
 
     def slow():
         thread = threading.Thread(target=call_from_another_thread)
@@ -265,10 +265,10 @@ def test_a_second_thread_is_refused_and_changes_nothing():
 
     for each in (env, untouched):
         each.reset(seed=0)
-    env._draw = slow
+    env._draw_sample = slow
     assert same(env.step([0.5]), untouched.step([0.5]))
     assert len(refused) == 3
-    env._draw = draw
+    env._draw_sample = draw
     assert same(continue_with(env, random_actions(0, 40)), continue_with(untouched, random_actions(0, 40)))
 
 

@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
-from duffing_env.continuous import ContinuousExperiment
-from duffing_env.contract import make_experiment
-from duffing_env.experiment import SimulatedExperiment
-from duffing_env.layout import pack, unpacker
-from duffing_env.replay import ReplayExperiment
+from duffing_env.env_base import make_experiment
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.storage.kernel_spec import compile_unpacker, pack_params
+from duffing_env.tracks.continuous_tracks import ContinuousExperiment
+from duffing_env.tracks.silverbox_replay import ReplayExperiment
 from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
@@ -106,40 +106,40 @@ def test_settings_are_the_options():
         factorisation="mean_field", iterations=4, reward="free_energy", max_input=0.1, max_output=0.5, horizon=9,
         process_noise=1e-3, measurement_noise=2e-3, spread=0.2, noise_shape=3.0, plant_spread=0.1,
     )  # fmt: skip
-    kind, setup = experiment.kind, experiment.setup
-    assert (kind.belief, kind.plant, kind.factorisation) == (difference(), difference(), "mean_field")
-    assert (kind.iterations, kind.work) == (0, "free_energy")
+    kind, setup = experiment.kernel_spec, experiment.kernel_params
+    assert (kind.belief_model, kind.plant_model, kind.factorisation) == (difference(), difference(), "mean_field")
+    assert (kind.iterations, kind.reward_hooks) == (0, "free_energy")
     expected = {
-        "iterations": 4, "drifts": False, "jump": 0.0, "terminal": False, "forfeits": False,
+        "iterations": 4, "has_drift": False, "jump": 0.0, "terminal": False, "has_terminated_return": False,
         "max_input": 0.1, "max_output": 0.5, "horizon": 9.0, "process_noise": 1e-3, "spread": 0.1, "hold": 1,
-        "delay": 0, "as_published": False, "step": SAMPLING_STEP, "budget": np.inf, "max_slew": np.inf,
+        "input_delay": 0, "as_published": False, "step": SAMPLING_STEP, "budget": np.inf, "max_slew": np.inf,
     }  # fmt: skip
     assert {name: getattr(setup, name) for name in expected} == expected
     assert setup.measurement_noise.tolist() == [2e-3]
-    assert setup.width.tolist() == [0.0] * 4
-    assert setup.weights.tolist() == [0.0, 0.0, 0.0, 1.0]
-    assert setup.center.tolist() == [getattr(SILVERBOX_TWIN, name) for name in "mcab"]
-    np.testing.assert_allclose(setup.log_precisions, [-2 * np.log(1e-3), -2 * np.log(2e-3)], rtol=1e-14)
+    assert setup.parameter_stds.tolist() == [0.0] * 4
+    assert setup.reward_weights.tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert setup.nominal_parameters.tolist() == [getattr(SILVERBOX_TWIN, name) for name in "mcab"]
+    np.testing.assert_allclose(setup.prior_log_precisions, [-2 * np.log(1e-3), -2 * np.log(2e-3)], rtol=1e-14)
 
 
 def test_what_the_kernel_gets_is_the_setup():
     experiment = SimulatedExperiment(max_rms=0.03, jump=0.2, drift=0.01, terminated_return=-3.0)
-    setup = experiment.setup._replace(hold=4)
-    unpack = unpacker(experiment.kind)
-    again = unpack.py_func(pack(setup))
+    setup = experiment.kernel_params._replace(hold=4)
+    unpack = compile_unpacker(experiment.kernel_spec)
+    again = unpack.py_func(pack_params(setup))
     assert again._fields == setup._fields
     for name, value in setup._asdict().items():
         np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
-    assert type(again.hold) is type(again.delay) is int
-    assert type(again.terminal) is type(again.forfeits) is type(again.as_published) is np.bool_
+    assert type(again.hold) is type(again.input_delay) is int
+    assert type(again.terminal) is type(again.has_terminated_return) is type(again.as_published) is np.bool_
 
 
 def test_defaults_are_those_of_the_documentation():
     experiment = SimulatedExperiment()
-    kind, setup = experiment.kind, experiment.setup
-    assert (kind.factorisation, kind.iterations, kind.work) == ("structured", 3, "")
-    assert setup.weights.tolist() == [1.0, 0.0, 0.0, 0.0]
-    assert SimulatedExperiment(factorisation="mean_field").setup.iterations == 10
+    kind, setup = experiment.kernel_spec, experiment.kernel_params
+    assert (kind.factorisation, kind.iterations, kind.reward_hooks) == ("structured", 3, "")
+    assert setup.reward_weights.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert SimulatedExperiment(factorisation="mean_field").kernel_params.iterations == 10
     assert (setup.max_input, setup.max_output, setup.horizon) == (0.15, 0.6, 256)
     assert (setup.process_noise, setup.measurement_noise.tolist(), setup.spread) == (5e-4, [5e-4], 0.3)
 
@@ -149,24 +149,28 @@ def test_the_first_belief_is_the_prior(factorisation):
     options = {"spread": 0.2, "process_noise": 1e-3, "noise_shape": 5.0}
     experiment = SimulatedExperiment(factorisation=factorisation, **options)
     prior = prior_of(difference(), SILVERBOX_TWIN, **options, factorisation=factorisation)
-    assert experiment.believed == prior
-    setup = experiment.setup
+    assert experiment.prior_belief == prior
+    setup = experiment.kernel_params
     np.testing.assert_array_equal(setup.prior, prior.record)
-    np.testing.assert_allclose(setup.inverse_std, np.diag(prior.coefficients_cov) ** -0.5, rtol=1e-14)
+    np.testing.assert_allclose(setup.prior_inverse_std, np.diag(prior.coefficients_cov) ** -0.5, rtol=1e-14)
 
 
 def test_a_continuous_experiment_is_told_of_its_estimator():
     options = {"spread": 0.2, "process_noise": 1e-3, "measurement_noise": 2e-3, "noise_shape": 5.0}
     ode = ContinuousExperiment(**options)
-    assert (ode.kind.plant, ode.kind.belief, ode.kind.degree) == (duffing(), duffing(), 0)
-    assert ode.setup.center.tolist() == [getattr(CONTINUOUS_TWIN, name) for name in "mcab"]
-    assert ode.believed == prior_of(duffing(), CONTINUOUS_TWIN, **options)
+    assert (ode.kernel_spec.plant_model, ode.kernel_spec.belief_model, ode.kernel_spec.degree) == (
+        duffing(),
+        duffing(),
+        0,
+    )
+    assert ode.kernel_params.nominal_parameters.tolist() == [getattr(CONTINUOUS_TWIN, name) for name in "mcab"]
+    assert ode.prior_belief == prior_of(duffing(), CONTINUOUS_TWIN, **options)
     for factorisation in ("structured", "mean_field"):
         nlarx = ContinuousExperiment(estimator="nlarx", factorisation=factorisation, **options)
-        assert (nlarx.kind.plant, nlarx.kind.belief) == (duffing(), difference())
-        assert nlarx.kind.factorisation == factorisation
+        assert (nlarx.kernel_spec.plant_model, nlarx.kernel_spec.belief_model) == (duffing(), difference())
+        assert nlarx.kernel_spec.factorisation == factorisation
         # Oscillators are drawn about the continuous twin, and so is what the difference equation expects.
-        assert nlarx.believed == prior_of(difference(), CONTINUOUS_TWIN, **options, factorisation=factorisation)
+        assert nlarx.prior_belief == prior_of(difference(), CONTINUOUS_TWIN, **options, factorisation=factorisation)
 
 
 def test_an_unknown_estimator_is_named():
@@ -182,11 +186,11 @@ def test_mean_field_is_for_the_difference_equation():
 
 def test_a_replay_is_told_of_the_record(record):
     experiment = ReplayExperiment(input_delay=1, nonlinear=False, prior="published_run")
-    kind, setup = experiment.kind, experiment.setup
-    assert (kind.plant, kind.belief) == (None, difference("linear"))
-    assert (setup.delay, setup.spread) == (1, 0)
+    kind, setup = experiment.kernel_spec, experiment.kernel_params
+    assert (kind.plant_model, kind.belief_model) == (None, difference("linear"))
+    assert (setup.input_delay, setup.spread) == (1, 0)
     assert setup.horizon == experiment.samples == len(record.multisine.u) - 1
     assert ReplayExperiment(input_delay=0, regime="arrow").samples == len(record.arrow.u)
-    np.testing.assert_array_equal(experiment.recorded, (record.multisine.u, record.multisine.y))
-    assert experiment.believed == published_run_prior(model=difference("linear"))
-    assert ReplayExperiment(factorisation="mean_field", as_published=True).setup.as_published
+    np.testing.assert_array_equal(experiment.replayed_record, (record.multisine.u, record.multisine.y))
+    assert experiment.prior_belief == published_run_prior(model=difference("linear"))
+    assert ReplayExperiment(factorisation="mean_field", as_published=True).kernel_params.as_published

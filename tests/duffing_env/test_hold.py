@@ -8,7 +8,7 @@ import pytest
 from rounding import U32
 
 from duffing_env.env import DuffingEnv
-from duffing_env.replay import ReplayExperiment
+from duffing_env.tracks.silverbox_replay import ReplayExperiment
 from duffing_env.vector_env import DuffingVectorEnv
 
 TRACK = "duffing_env/Amplitude-v0"
@@ -35,15 +35,15 @@ def test_limits_hold_for_every_sample():
     single = DuffingEnv(hold=8, max_slew=0.02, max_rms=0.05, horizon=64)
     envs.reset(seed=0)
     single.reset(seed=0)
-    inputs, apply = [], single._apply
-    single._apply = lambda action: (apply(action), inputs.append(single._batch.quantity("INPUT")[0]))
+    inputs, apply = [], single._apply_sample
+    single._apply_sample = lambda action: (apply(action), inputs.append(single._batch.row_values("INPUT")[0]))
     for _ in range(8):
         envs.step(np.ones((3, 1), dtype=np.float32))
         single.step([1.0])
     np.testing.assert_allclose(np.diff([0.0, *inputs[:5]]), 0.02, rtol=1e-12)
     assert np.abs(np.diff(inputs)).max() <= 0.15
     assert np.sum(np.square(inputs)) <= 64 * 0.05**2 * (1 + 1e-12)
-    np.testing.assert_array_equal(envs._batch.quantity("SPENT"), single._batch.quantity("SPENT")[0])
+    np.testing.assert_array_equal(envs._batch.row_values("SPENT"), single._batch.row_values("SPENT")[0])
 
 
 def test_every_sample_is_drawn():
@@ -52,7 +52,7 @@ def test_every_sample_is_drawn():
     frames = [env.render()]
     for count in (3, 6, 8):
         env.step([0.5])
-        assert env._screen._samples == count
+        assert env._renderer._samples == count
         frames.append(env.render())
     assert not any(np.array_equal(a, b) for a, b in pairwise(frames))
 

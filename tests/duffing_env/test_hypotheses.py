@@ -10,12 +10,12 @@ from reference.structured import structured_update
 from specimens import GUESSED
 from twin import TwinContinuousEnv, TwinEnv, assert_env_follows_twin
 
-from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
-from duffing_env.experiment import SimulatedExperiment
-from duffing_env.model_env import ModelEnv
-from duffing_env.replay import ReplayExperiment
-from duffing_env.tracks import TRACKS
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.tracks.continuous_tracks import ContinuousEnv
+from duffing_env.tracks.model_env import ModelEnv
+from duffing_env.tracks.silverbox_replay import ReplayExperiment
+from duffing_env.tracks.track_registry import TRACKS
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator import OnlineEstimator, Rig
 from estimator.lanes import LANES
@@ -93,13 +93,13 @@ def test_the_belief_is_that_of_the_online_estimator(case):
     make, rig = ESTIMATED[case]
     env = make(**OPTIONS)
     env.reset(seed=0)
-    prior = env.experiment.believed
+    prior = env.experiment.prior_belief
     estimator = OnlineEstimator(prior.model, prior, rig, noise_hypotheses=3)
     close(env.belief, estimator.belief)
     u, y, rewards = np.empty((3, 256))
     for t, action in enumerate(random_actions(256)[:, 0]):
         rewards[t] = env.step(action)[1]
-        u[t], y[t] = env._batch.quantity("INPUT")[0], env._batch.quantity("Y_y")[0]
+        u[t], y[t] = env._batch.row_values("INPUT")[0], env._batch.row_values("Y_y")[0]
     energies = estimator.run(u, y)
     np.testing.assert_allclose(-rewards, energies[:, -1], rtol=1e-9, atol=1e-9)
     close(env.belief, estimator.belief)
@@ -155,20 +155,22 @@ def test_what_cannot_weigh_hypotheses_says_so():
 @pytest.mark.usefixtures("record")
 def test_a_record_is_weighed_by_the_same_hypotheses():
     replayed, simulated = ReplayExperiment(noise_hypotheses=3), SimulatedExperiment(noise_hypotheses=3)
-    assert replayed.kind == simulated.kind._replace(plant=None)
+    assert replayed.kernel_spec == simulated.kernel_spec._replace(plant_model=None)
     alone = ReplayExperiment()
-    assert not alone.kind.weighs
+    assert not alone.kernel_spec.has_noise_hypotheses
     # Nine members about the record's own prior.
-    np.testing.assert_allclose(replayed.setup.hypotheses[4, :4], alone.believed.noises, rtol=1e-12)
-    np.testing.assert_allclose(replayed.setup.prior[:-4], alone.setup.prior[:-4], rtol=1e-13)
+    np.testing.assert_allclose(replayed.kernel_params.hypothesis_priors[4, :4], alone.prior_belief.noises, rtol=1e-12)
+    np.testing.assert_allclose(replayed.kernel_params.prior[:-4], alone.kernel_params.prior[:-4], rtol=1e-13)
 
 
 def test_one_hypothesis_is_the_prior_itself():
     one, many = SimulatedExperiment(), SimulatedExperiment(noise_hypotheses=9)
-    assert not one.kind.weighs
-    assert one.setup.hypotheses.shape == (0, 5)
-    np.testing.assert_array_equal(one.setup.prior, one.believed.record)
-    assert many.setup.hypotheses.shape == (27, 5)
-    assert many.kind == SimulatedExperiment(noise_hypotheses=4).kind  # a kernel does not know how many there are
-    assert many.believed == one.believed
-    np.testing.assert_allclose(many.setup.prior[:-4], one.setup.prior[:-4], rtol=1e-13)
+    assert not one.kernel_spec.has_noise_hypotheses
+    assert one.kernel_params.hypothesis_priors.shape == (0, 5)
+    np.testing.assert_array_equal(one.kernel_params.prior, one.prior_belief.record)
+    assert many.kernel_params.hypothesis_priors.shape == (27, 5)
+    assert (
+        many.kernel_spec == SimulatedExperiment(noise_hypotheses=4).kernel_spec
+    )  # a kernel does not know how many there are
+    assert many.prior_belief == one.prior_belief
+    np.testing.assert_allclose(many.kernel_params.prior[:-4], one.kernel_params.prior[:-4], rtol=1e-13)

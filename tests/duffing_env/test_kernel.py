@@ -11,10 +11,10 @@ from twin import PARAMETERS, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.env import DuffingEnv
-from duffing_env.experiment import SimulatedExperiment
-from duffing_env.kernel import RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP
-from duffing_env.layout import observation_bounds
-from duffing_env.rewards import REWARDS
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.kernel import RESET_MANUALLY, RESET_NEXT_STEP, RESET_SAME_STEP
+from duffing_env.rewards.reward_registry import REWARDS
+from duffing_env.storage.kernel_spec import observation_bounds
 from estimator import SILVERBOX_TWIN
 from estimator.models.difference import difference
 from estimator.physical import coefficients_of
@@ -89,11 +89,11 @@ def test_the_length_of_an_observation_follows_from_the_model(model):
 @pytest.mark.parametrize("spread", [0.3, 0.9])
 def test_oscillators_are_log_uniform_about_the_twin(spread):
     size = 4000
-    batch = Batch(SimulatedExperiment(spread=spread), size, RESET_BY_HAND)
+    batch = Batch(SimulatedExperiment(spread=spread), size, RESET_MANUALLY)
     for row, seed in enumerate(spawn_seeds(0, size)):
         batch.seed(row, np.random.default_rng(seed))
     batch.reset(np.ones(size, dtype=np.bool_))
-    drawn = np.stack([batch.quantity(f"PARAM_{name}") for name in PARAMETERS])
+    drawn = np.stack([batch.row_values(f"PARAM_{name}") for name in PARAMETERS])
     low, high = np.log(1 - spread), np.log(1 + spread)
     quantiles = (np.log(drawn / CENTER[:, None]) - low) / (high - low)
     assert quantiles.min() > 0
@@ -106,19 +106,19 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
     # θ₁ = 1 + m / (m + c h) - a η cancels; the others are products. None takes more than eight operations on a side.
     sizes = np.abs(expected)
     sizes[0] = 1 - expected[2] + drawn[2] * expected[3]
-    told = np.stack([batch.quantity(f"TRUE_{name}") for name in COEFFICIENTS])
+    told = np.stack([batch.row_values(f"TRUE_{name}") for name in COEFFICIENTS])
     assert (np.abs(told - expected) <= 16 * U64 * sizes).all()
 
 
 def test_prior_has_the_moments_of_the_oscillators():
     # What makes the first belief calibrated: 4000 draws stand for the quadrature that the prior is made by.
     size = 4000
-    batch = Batch(SimulatedExperiment(), size, RESET_BY_HAND)
+    batch = Batch(SimulatedExperiment(), size, RESET_MANUALLY)
     for row, seed in enumerate(spawn_seeds(1, size)):
         batch.seed(row, np.random.default_rng(seed))
     batch.reset(np.ones(size, dtype=np.bool_))
     prior = batch.belief(0)
-    drawn = np.stack([batch.quantity(f"TRUE_{name}") for name in COEFFICIENTS], axis=1)
+    drawn = np.stack([batch.row_values(f"TRUE_{name}") for name in COEFFICIENTS], axis=1)
     whitened = np.linalg.solve(np.linalg.cholesky(prior.coefficients_cov), (drawn - prior.coefficients_mean).T)
     assert np.abs(whitened.mean(axis=1)).max() < 4 / np.sqrt(size)
     np.testing.assert_allclose(np.cov(whitened), np.eye(4), rtol=0, atol=0.1)
@@ -132,12 +132,12 @@ def test_plant_spread_is_for_the_plant_alone():
     assert not np.array_equal(DuffingEnv(spread=0.1).belief.record, env.belief.record)
 
 
-@pytest.mark.parametrize("mode", [RESET_BY_HAND, RESET_NEXT_STEP, RESET_SAME_STEP])
+@pytest.mark.parametrize("mode", [RESET_MANUALLY, RESET_NEXT_STEP, RESET_SAME_STEP])
 def test_lanes_beyond_the_last_environment_keep_within_bounds(mode):
     batch = Batch(SimulatedExperiment(horizon=50), 1, mode)
     batch.seed(0, np.random.default_rng(0))
     for _ in range(2000):
-        if mode == RESET_BY_HAND and batch.quantity("TRUNCATED")[0]:
+        if mode == RESET_MANUALLY and batch.row_values("TRUNCATED")[0]:
             batch.reset(np.ones(1, dtype=np.bool_))
         batch.step(np.zeros(1))
     assert np.isfinite(batch._observations).all()

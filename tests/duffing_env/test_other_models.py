@@ -6,7 +6,7 @@ from playing import random_actions
 from reference.filters import Plant, moved
 from specimens import COMPILED, SEEN_TWICE
 
-from duffing_env.model_env import ModelEnv, ModelExperiment
+from duffing_env.tracks.model_env import ModelEnv, ModelExperiment
 from estimator.models.pendulum import PENDULUM, STEP
 from estimator.parameters import Parameters
 from estimator.physical import coefficients_of
@@ -23,7 +23,7 @@ def test_its_observation_has_what_two_sensors_tell():
     first, _ = env.reset(seed=0)
     np.testing.assert_allclose(first[[*range(6), *range(9, 17)]], 0.0, atol=1e-6)
     observation, *_ = env.step([1.0])
-    outputs = [env._batch.quantity(f"Y_{name}")[0] / 0.7 for name in SEEN_TWICE.outputs]
+    outputs = [env._batch.row_values(f"Y_{name}")[0] / 0.7 for name in SEEN_TWICE.outputs]
     np.testing.assert_allclose(observation[15:17], outputs, rtol=1e-6)
     assert outputs[0] != outputs[1] != 0
     assert isinstance(env.truth, Parameters)
@@ -56,7 +56,7 @@ def test_it_is_played_and_believed():
     z, shown, expected = np.zeros(2), [], []
     for u in np.random.default_rng(0).choice([-0.5, 0.5], 64):
         env.step(np.array([u / 0.5], dtype=np.float32))
-        shown.append([env._batch.quantity(f"Y_{name}")[0] for name in SEEN_TWICE.outputs])
+        shown.append([env._batch.row_values(f"Y_{name}")[0] for name in SEEN_TWICE.outputs])
         z = moved(plant, z, truth, (u,))
         expected.append(z)
     assert (np.ptp(expected, axis=0) > 0.5).all()
@@ -71,7 +71,7 @@ def test_it_is_played_and_believed():
 
 def test_the_prior_of_a_range_is_as_wide_as_the_range_for_several_sensors_too():
     experiment = ModelExperiment(system="pendulum", mean=PENDULA, spread=0.2, sampling_step=STEP, sensor_noise=[0.01])
-    belief = experiment.believed
+    belief = experiment.prior_belief
     mean, cov = log_uniform_moments(PENDULUM, PENDULA, 0.2, Scales(STEP))
     np.testing.assert_array_equal(belief.coefficients_mean, mean)
     np.testing.assert_array_equal(belief.coefficients_cov, cov)
@@ -93,5 +93,5 @@ def test_a_spread_is_not_ignored_where_deviations_say_how_plants_are_drawn():
     told = {"system": "pendulum", "mean": PENDULA, "std": {"p1": 0.3, "p2": 0.1, "p3": 0.3}}
     with pytest.raises(ValueError, match=r"plant_spread must be 0 or left out where std says .* but is 0.1"):
         ModelEnv(**told, plant_spread=0.1)
-    assert not ModelExperiment(**told, plant_spread=0.0).setup.width.any()
-    assert ModelExperiment(**told).setup.width.tolist() == [0.3, 0.1, 0.3]
+    assert not ModelExperiment(**told, plant_spread=0.0).kernel_params.parameter_stds.any()
+    assert ModelExperiment(**told).kernel_params.parameter_stds.tolist() == [0.3, 0.1, 0.3]

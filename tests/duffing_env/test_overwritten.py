@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from duffing_env.overwritten import overwritten
+from duffing_env.package_overwrite import overwrite_message
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,14 +37,14 @@ def run(site, code, *before):
 
 def test_packages_of_ours_are_ours(site, monkeypatch):
     monkeypatch.syspath_prepend(site)
-    assert [overwritten(package, site) for package in ("agents", "estimator")] == [None, None]
+    assert [overwrite_message(package, site) for package in ("agents", "estimator")] == [None, None]
 
 
 @pytest.mark.parametrize("text", ["from .run import Agent  # theirs\n", None])
 def test_a_package_that_is_written_over_is_told(site, monkeypatch, text):
     write_over(site, "agents", text)
     monkeypatch.setattr(sys, "path", [str(site)])
-    told = overwritten("agents", site)
+    told = overwrite_message("agents", site)
     assert f"{site / 'agents'} is no longer duffing-env's" in told
     assert "pip install --force-reinstall --no-deps duffing-env" in told
 

@@ -7,8 +7,8 @@ import pytest
 from playing import assert_refused, random_actions, roll_out
 from specimens import all_that_is_given
 
+from duffing_env.custom_functions import Beliefs
 from duffing_env.env import DuffingEnv
-from duffing_env.own import Beliefs
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.models.difference import difference
 from estimator.physical import coefficients_of
@@ -79,7 +79,7 @@ def test_what_is_paid_for_a_held_action_is_for_all_its_samples():
     _, rewards, *_ = envs.step(actions)
     for _ in range(3):
         observations, *_ = plain.step(actions)
-    u, y = 0.15 * observations[:, 18], plain._batch.quantity("Y_y")
+    u, y = 0.15 * observations[:, 18], plain._batch.row_values("Y_y")
     after = Beliefs(difference(), plain.records)
     expected = after.mean[:, 0] + before.noises[:, 0] + u + y + plain.truth.m + plain.truth.b
     np.testing.assert_allclose(rewards, expected, rtol=1e-6)
@@ -190,7 +190,7 @@ def test_oscillators_are_drawn_about_a_mean_of_ones_own():
     moved.reset(seed=0)
     for name in PARAMETERS:
         low, high = moved.truth[name].min(), moved.truth[name].max()
-        middle = {"b": 1.0, "m": 1e-5}.get(name, usual.experiment.center[name])
+        middle = {"b": 1.0, "m": 1e-5}.get(name, usual.experiment.nominal_parameters[name])
         assert 0.7 * middle <= low < 0.72 * middle
         assert 1.28 * middle < high <= 1.3 * middle
     means, covs = Beliefs(difference(), moved.records).physical()

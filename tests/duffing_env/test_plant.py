@@ -5,15 +5,15 @@ import pytest
 from rounding import U64
 from twin import to_coefficients
 
-from duffing_env.experiment import SimulatedExperiment
-from duffing_env.layout import layout_of
-from duffing_env.sources import parts
-from duffing_env.stages import noise_drawer, play_record
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.kernel_stages.env_codegen import generated_functions
+from duffing_env.kernel_stages.plant_stages import compile_noise_draw, replay_sample
+from duffing_env.storage.kernel_spec import block_layout
 from estimator import SILVERBOX_TWIN
 from estimator.lanes import LANES
 
-KIND = SimulatedExperiment().kind
-PLACE = layout_of(KIND)
+KIND = SimulatedExperiment().kernel_spec
+PLACE = block_layout(KIND)
 STREAM = ("STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d")
 COEFFICIENTS = ("TRUE_theta1", "TRUE_theta2", "TRUE_theta3", "TRUE_eta")
 TRUE = dict(zip(COEFFICIENTS, to_coefficients(SILVERBOX_TWIN), strict=True))
@@ -23,7 +23,7 @@ def move_plant(flat, process_noise, measurement_noise):
     """A sample of the plant, with the noise that stands in the block."""
     for name, std in (("PROCESS_STD", process_noise), ("SENSOR_STD_y", measurement_noise)):
         flat[PLACE[name] * LANES : (PLACE[name] + 1) * LANES] = std
-    parts(KIND).plant(flat)
+    generated_functions(KIND).plant(flat)
 
 
 def block(**rows):
@@ -79,7 +79,7 @@ def test_noise_is_scaled_once_and_the_stream_of_a_waiting_lane_stands_still():
     words = np.random.default_rng(0).integers(1, 2**60, (4, LANES), dtype=np.uint64)
     waiting = np.arange(LANES) % 2
     flat, row = block(WAITING=waiting, **dict(zip(STREAM, words.view(np.float64), strict=True)))
-    noise_drawer(PLACE)(flat)
+    compile_noise_draw(PLACE)(flat)
     still = np.stack([row(name) for name in STREAM]).copy().view(np.uint64) == words
     np.testing.assert_array_equal(still.all(axis=0), waiting == 1)
 
@@ -87,5 +87,5 @@ def test_noise_is_scaled_once_and_the_stream_of_a_waiting_lane_stands_still():
 @pytest.mark.parametrize(("deviation", "off_record"), [(0.0, 0.0), (2e-8, 0.0), (-2e-8, 0.0), (1e-7, 1.0), (-0.1, 1.0)])
 def test_a_record_answers_the_recorded_input_only(deviation, off_record):
     # A float32 action in [-1, 1] is within 3e-8 of the number that it stands for; here it is scaled by 0.15.
-    told = play_record(0.1 + deviation, RECORDED_u=0.1, RECORDED_y=-0.3, max_input=0.15)
+    told = replay_sample(0.1 + deviation, RECORDED_u=0.1, RECORDED_y=-0.3, max_input=0.15)
     assert told == (0.1, -0.3, off_record)

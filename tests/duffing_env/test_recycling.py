@@ -4,37 +4,37 @@ import copy
 
 import numpy as np
 
-from duffing_env.recycling import Recycled
+from duffing_env.storage.array_pool import ArrayPool
 
 
 def test_what_is_held_is_not_given_out_again() -> None:
-    arrays = Recycled((3, 2), np.float32)
-    held = [arrays.take() for _ in range(2 * Recycled.MOST)]
+    arrays = ArrayPool((3, 2), np.float32)
+    held = [arrays.acquire() for _ in range(2 * ArrayPool.MAX_ARRAYS)]
     assert len({id(array) for array in held}) == len(held)
 
 
 def test_a_view_holds_its_array() -> None:
-    arrays = Recycled((3, 2), np.float64)
-    view = arrays.take()[1:, 0]
+    arrays = ArrayPool((3, 2), np.float64)
+    view = arrays.acquire()[1:, 0]
     view[:] = 7.0
-    for _ in range(2 * Recycled.MOST):
-        arrays.take()[:] = 0.0
+    for _ in range(2 * ArrayPool.MAX_ARRAYS):
+        arrays.acquire()[:] = 0.0
     np.testing.assert_array_equal(view, 7.0)
 
 
 def test_what_nobody_holds_is_given_out_again() -> None:
-    arrays = Recycled((3, 2), np.float64)
+    arrays = ArrayPool((3, 2), np.float64)
     places, held = set(), None
     for _ in range(20):
-        held = arrays.take()
+        held = arrays.acquire()
         places.add(held.ctypes.data)
     assert held is not None
     assert len(places) == 2
 
 
 def test_a_copy_gives_out_arrays_of_its_own() -> None:
-    arrays = Recycled((3, 2), np.float64)
+    arrays = ArrayPool((3, 2), np.float64)
     other = copy.deepcopy(arrays)
-    ours, theirs = arrays.take(), other.take()
+    ours, theirs = arrays.acquire(), other.acquire()
     assert not np.shares_memory(ours, theirs)
-    assert not np.shares_memory(theirs, other.take())
+    assert not np.shares_memory(theirs, other.acquire())

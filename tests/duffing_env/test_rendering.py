@@ -16,9 +16,10 @@ from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils.env_checker import check_env
 from scipy import stats
 
-from duffing_env import TRACKS, rendering
-from duffing_env.model_env import ModelExperiment
-from duffing_env.rendering import HEIGHT, SPAN, WIDTH, Screen
+from duffing_env import TRACKS
+from duffing_env.rendering import episode_renderer
+from duffing_env.rendering.episode_renderer import HEIGHT, MAX_SAMPLES_SHOWN, WIDTH, EpisodeRenderer
+from duffing_env.tracks.model_env import ModelExperiment
 from estimator.engine.rows import belief_names
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.priors import silverbox_prior
@@ -35,7 +36,7 @@ def changed(**entries):
 
 
 def started(horizon=100, truth=SILVERBOX_TWIN, belief=PRIOR):
-    screen = Screen("rgb_array", 0.15, 0.6, 30)
+    screen = EpisodeRenderer("rgb_array", 0.15, 0.6, 30)
     screen.start(truth, belief, horizon)
     return screen
 
@@ -43,14 +44,16 @@ def started(horizon=100, truth=SILVERBOX_TWIN, belief=PRIOR):
 def with_samples(count, **options):
     screen = started(**options)
     for k in range(count):
-        screen.add(0.1 * np.sin(k), 0.3 * np.cos(k), changed(eta=0.4 + 0.01 * np.sin(k), P_eta_eta=1e-3 / (k + 1)))
+        screen.add_sample(
+            0.1 * np.sin(k), 0.3 * np.cos(k), changed(eta=0.4 + 0.01 * np.sin(k), P_eta_eta=1e-3 / (k + 1))
+        )
     return screen
 
 
 def panel_of(screen, row):
     """One of the four panels of parameters, as last drawn."""
     screen.frame()
-    return screen._picture._parameters[row]
+    return screen._figure_cache._parameters[row]
 
 
 @pytest.fixture
@@ -60,7 +63,7 @@ def no_display(monkeypatch):
 
 def test_imports_are_light_and_frames_need_no_display_and_no_pyplot():
     script = """
-import sys, gymnasium, duffing_env, duffing_env.env, duffing_env.rendering
+import sys, gymnasium, duffing_env, duffing_env.env, duffing_env.rendering.episode_renderer
 heavy = {"matplotlib", "torch", "pygame"} & set(sys.modules)
 assert not heavy, heavy
 env = gymnasium.make("duffing_env/Amplitude-v0", render_mode="rgb_array")
@@ -106,7 +109,7 @@ def test_curves_and_numbers_are_those_of_the_episode():
         inputs.append(0.15 * float(action))
         gained += info["information_gain"]
         moments.append(env.belief.physical())
-    screen = env._screen
+    screen = env._renderer
     half = stats.norm.ppf(0.95) * np.sqrt([np.diag(cov) for _, cov in moments])
     mean = np.array([mean for mean, _ in moments])
     truth = np.array([env.truth.m, env.truth.c, env.truth.a, env.truth.b])
@@ -121,8 +124,8 @@ def test_curves_and_numbers_are_those_of_the_episode():
         shown = f"{mean[-1, row] / unit:.3f} ± {half[-1, row] / unit:.3f}"
         assert panel._estimate.get_text() == shown
         assert panel._true_value.get_text() == f"true {truth[row] / unit:.3f}"
-    np.testing.assert_allclose(screen._picture._signals[0]._curve.get_ydata()[1:], inputs, rtol=1e-6)
-    assert screen._picture._status.get_text() == f"sample 20 of 256, {gained:.1f} nats gained"
+    np.testing.assert_allclose(screen._figure_cache._signals[0]._curve.get_ydata()[1:], inputs, rtol=1e-6)
+    assert screen._figure_cache._status.get_text() == f"sample 20 of 256, {gained:.1f} nats gained"
 
 
 @pytest.mark.parametrize(
@@ -139,12 +142,12 @@ def test_curves_and_numbers_are_those_of_the_episode():
 )
 def test_other_models_are_drawn_with_their_own_names_units_and_truth(track, title, labels, signals):
     experiment = ModelExperiment(**TRACKS[f"duffing_env/{track}"]["kwargs"])
-    screen = Screen("rgb_array", experiment.max_input, experiment.max_output, 30, experiment.scales)
-    truth = Parameters({name: 1.1 * value + 0.01 for name, value in experiment.center.items()})
-    screen.start(truth, experiment.believed, 256)
-    screen.add(0.1, 0.2, experiment.believed)
+    screen = EpisodeRenderer("rgb_array", experiment.max_input, experiment.max_output, 30, experiment.scales)
+    truth = Parameters({name: 1.1 * value + 0.01 for name, value in experiment.nominal_parameters.items()})
+    screen.start(truth, experiment.prior_belief, 256)
+    screen.add_sample(0.1, 0.2, experiment.prior_belief)
     assert screen.frame().shape == (HEIGHT, WIDTH, 3)
-    picture, names = screen._picture, rendering.named(experiment.model)
+    picture, names = screen._figure_cache, episode_renderer.shown_parameters(experiment.model)
     heading = picture._figure.texts[0]
     assert heading.get_text() == title
     picture._status.set_text("sample 1024 of 1024, 123.4 nats gained")
@@ -165,7 +168,7 @@ def test_moments_are_those_of_each_belief():
         changed(theta2=np.nan),
         changed(P_theta1_theta1=np.inf),
     ]
-    means, stds = rendering._physical_moments(beliefs)
+    means, stds = episode_renderer._physical_moments(beliefs)
     for k, belief in enumerate(beliefs[:2]):
         mean, cov = belief.physical()
         np.testing.assert_allclose(means[:, k], mean)
@@ -177,14 +180,14 @@ def test_moments_are_those_of_each_belief():
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e300, 1e300])
 def test_numbers_without_bounds_are_drawn_within_the_axes(value):
     screen = started()
-    screen.add(0.1, value, changed(theta1=value, P_theta2_theta2=abs(value)))
-    screen.add(value, 0.1, changed(theta2=value))
-    screen.add(0.1, 0.1, changed(eta=1e-5))
+    screen.add_sample(0.1, value, changed(theta1=value, P_theta2_theta2=abs(value)))
+    screen.add_sample(value, 0.1, changed(theta2=value))
+    screen.add_sample(0.1, 0.1, changed(eta=1e-5))
     panel = panel_of(screen, 3)
     drawn = panel.mean.get_ydata()
     assert np.nanmax(np.abs(drawn)) <= 150
     assert panel._estimate.get_text() == "not known yet"
-    screen.add(0.1, 0.1, PRIOR)
+    screen.add_sample(0.1, 0.1, PRIOR)
     assert "±" in panel_of(screen, 3)._estimate.get_text()
 
 
@@ -194,10 +197,10 @@ def test_an_episode_without_a_usable_belief_is_drawn():
 
 
 def test_long_episodes_scroll():
-    screen = with_samples(SPAN + 44, horizon=1000)
+    screen = with_samples(MAX_SAMPLES_SHOWN + 44, horizon=1000)
     times = panel_of(screen, 0).mean.get_xdata()
-    np.testing.assert_allclose(times[[0, -1]], np.array([44, SPAN + 44]) * SAMPLING_STEP * 1e3)
-    low, high = screen._picture._panels[0].axes.get_xlim()
+    np.testing.assert_allclose(times[[0, -1]], np.array([44, MAX_SAMPLES_SHOWN + 44]) * SAMPLING_STEP * 1e3)
+    low, high = screen._figure_cache._panels[0].axes.get_xlim()
     assert low < times[0] < times[-1] < high
     assert high - low < 1.05 * (times[-1] - times[0])
 
@@ -205,7 +208,7 @@ def test_long_episodes_scroll():
 def test_time_axes_reach_over_short_episodes():
     screen = with_samples(1, horizon=40)
     screen.frame()
-    assert screen._picture._panels[0].axes.get_xlim()[1] == pytest.approx(40 * SAMPLING_STEP * 1e3, rel=0.02)
+    assert screen._figure_cache._panels[0].axes.get_xlim()[1] == pytest.approx(40 * SAMPLING_STEP * 1e3, rel=0.02)
 
 
 def test_frames_hold_nothing_of_earlier_frames_and_episodes():
@@ -220,7 +223,7 @@ def test_frames_hold_nothing_of_earlier_frames_and_episodes():
 def test_frames_reuse_the_figure_and_keep_no_memory():
     screen = with_samples(30)
     screen.frame()
-    figure = screen._picture._figure
+    figure = screen._figure_cache._figure
     artists = len(figure.findobj())
     screen.frame()
     tracemalloc.start()
@@ -228,21 +231,21 @@ def test_frames_reuse_the_figure_and_keep_no_memory():
         screen.frame()
     grown, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert screen._picture._figure is figure
+    assert screen._figure_cache._figure is figure
     assert len(figure.findobj()) == artists
     assert grown < HEIGHT * WIDTH * 3  # one frame
 
 
 def test_taking_note_of_a_sample_draws_nothing():
     screen = started()
-    screen.add(0.1, 0.2, PRIOR)
-    assert screen._picture is None
+    screen.add_sample(0.1, 0.2, PRIOR)
+    assert screen._figure_cache is None
 
 
 @pytest.mark.slow  # a time, which a busy machine makes longer
 def test_taking_note_of_a_sample_is_cheap():
     screen = started()
-    fastest = min(timeit.repeat(lambda: screen.add(0.1, 0.2, PRIOR), number=100, repeat=5)) / 100
+    fastest = min(timeit.repeat(lambda: screen.add_sample(0.1, 0.2, PRIOR), number=100, repeat=5)) / 100
     assert fastest < 50e-6
 
 
@@ -251,7 +254,7 @@ def test_copies_and_pickles_draw_the_same():
     frame = screen.frame()
     for copied in (copy.deepcopy(screen), pickle.loads(pickle.dumps(screen))):
         np.testing.assert_array_equal(copied.frame(), frame)
-        copied.add(0.1, 0.2, PRIOR)
+        copied.add_sample(0.1, 0.2, PRIOR)
         assert not np.array_equal(copied.frame(), frame)
     np.testing.assert_array_equal(screen.frame(), frame)
 
@@ -262,19 +265,19 @@ def test_window_shows_the_frames_at_the_rate_and_closes(no_display):
     def seen():
         return pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
 
-    screen = Screen("human", 0.15, 0.6, fps=20)
+    screen = EpisodeRenderer("human", 0.15, 0.6, fps=20)
     screen.start(SILVERBOX_TWIN, PRIOR, 100)
     empty = seen()
     np.testing.assert_array_equal(empty, started().frame())
     began = timeit.default_timer()
     for k in range(4):
-        screen.add(0.1, 0.05 * k, PRIOR)
+        screen.add_sample(0.1, 0.05 * k, PRIOR)
     assert timeit.default_timer() - began > 3 / 20
     np.testing.assert_array_equal(seen(), screen.frame())
     assert not np.array_equal(seen(), empty)
     before = seen()
     copied = copy.deepcopy(screen)
-    copied.add(0.1, 0.3, PRIOR)
+    copied.add_sample(0.1, 0.3, PRIOR)
     np.testing.assert_array_equal(seen(), before)
     screen.close()
     assert not pygame.display.get_init()
@@ -295,4 +298,4 @@ def test_environment_in_mode_human_returns_no_array(no_display):
 def test_mode_human_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(DependencyNotInstalled, match=r'pip install "duffing-env\[human\]"'):
-        Screen("human", 0.15, 0.6, 30)
+        EpisodeRenderer("human", 0.15, 0.6, 30)

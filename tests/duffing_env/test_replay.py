@@ -11,8 +11,8 @@ from rounding import U32
 from twin import ITERATIONS, Moments
 
 from agents.policies import make_policy
-from duffing_env.replay import SilverboxReplayEnv
-from duffing_env.silverbox import RecordNotFound
+from duffing_env.plants.silverbox_record import RecordNotFound
+from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
 from duffing_env.vector_env import SilverboxReplayVectorEnv
 from estimator import SILVERBOX_TWIN
 
@@ -74,7 +74,7 @@ class TestWithTheRecord:
 
         factorisation, nonlinear = options.get("factorisation", "structured"), options.get("nonlinear", True)
         iterations = options.get("iterations", ITERATIONS[factorisation])
-        first = env.experiment.believed
+        first = env.experiment.prior_belief
         kept = slice(None) if nonlinear else [0, 1, 2, 4, 5]  # without θ2
         mean, cov = np.zeros(6), np.zeros((6, 6))
         mean[kept] = first.mean

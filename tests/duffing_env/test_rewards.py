@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import multivariate_normal
 from twin import to_coefficients, to_parameters
 
-from duffing_env.experiment import SimulatedExperiment
-from duffing_env.layout import layout_of
-from duffing_env.rewards import REWARDS, check_reward
-from duffing_env.sources import parts
-from duffing_env.stages import pay
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.kernel_stages.env_codegen import generated_functions
+from duffing_env.kernel_stages.plant_stages import pay_reward
+from duffing_env.rewards.reward_registry import REWARDS, check_reward
+from duffing_env.storage.kernel_spec import block_layout
 from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.belief import Belief
 from estimator.engine.rows import belief_names
@@ -30,7 +30,7 @@ WORKED = ("free_energy", "fisher", "expected_free_energy", "simulation_error")  
 @cache
 def payer(kind):
     """`pay` in a block of a kind."""
-    return lanewise(layout_of(kind), "REWARD EARNED", uniform="terminal forfeits terminated_return")(pay)
+    return lanewise(block_layout(kind), "REWARD EARNED", uniform="terminal has_terminated_return terminated_return")(pay_reward)
 
 
 class Lanes:
@@ -39,12 +39,12 @@ class Lanes:
     def __init__(self, nonlinear=True, reward="information_gain"):
         self.model = difference("paper" if nonlinear else "linear")
         # A linear belief is that of a replayed record, whose truth has the model's own parameters.
-        self.kind = SimulatedExperiment(reward=reward).kind._replace(belief=self.model)
+        self.kernel_spec = SimulatedExperiment(reward=reward).kernel_spec._replace(belief_model=self.model)
         if not nonlinear:
-            self.kind = self.kind._replace(plant=None)
+            self.kernel_spec = self.kernel_spec._replace(plant_model=None)
         self.reward = reward
         self.active, self.nonlinear = ACTIVE[nonlinear], nonlinear
-        self.place, self.code = layout_of(self.kind), parts(self.kind)
+        self.place, self.code = block_layout(self.kernel_spec), generated_functions(self.kernel_spec)
         self.rows = np.zeros((max(self.place.values()) + 1, LANES))
         self.prior = silverbox_prior(self.model)
         self.rows[: len(self.prior.record)] = self.prior.record[:, None]
@@ -78,7 +78,7 @@ class Lanes:
         self.code.settle(self.rows.reshape(-1), SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
         forfeits = terminated_return is not None
         if terminal or forfeits:
-            payer(self.kind)(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)
+            payer(self.kernel_spec)(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)
 
     @property
     def belief(self):

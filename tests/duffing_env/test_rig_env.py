@@ -9,7 +9,7 @@ from playing import assert_refused
 from specimens import RIG, Bench
 
 from agents import make_policy
-from duffing_env.rig_env import RigExperiment
+from duffing_env.tracks.rig_env import RigExperiment
 from estimator import OnlineEstimator, Rig
 from estimator.physical import coefficients_of
 

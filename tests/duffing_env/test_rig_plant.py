@@ -14,8 +14,8 @@ from specimens import VOLTS, Difference, around
 
 from agents import make_policy
 from duffing_env.env import DuffingEnv
-from duffing_env.rewards import REWARDS
-from duffing_env.rig_env import RigEnv
+from duffing_env.rewards.reward_registry import REWARDS
+from duffing_env.tracks.rig_env import RigEnv
 from estimator import Channel, OnlineEstimator, Rig
 from estimator.belief import Belief
 from estimator.models.difference import difference
@@ -47,7 +47,7 @@ def test_a_plant_that_gives_the_simulated_outputs_gives_the_same_episode_to_the_
     given, outputs, played = [simulated.reset(seed=3)], [], random_actions(256)[:, 0]
     for action in played:
         given.append(simulated.step(action))
-        outputs.append(simulated._batch.quantity("Y_y")[0])
+        outputs.append(simulated._batch.row_values("Y_y")[0])
         if given[-1][2]:
             break
     assert given[-1][2]

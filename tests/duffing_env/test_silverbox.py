@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
-from duffing_env import silverbox
-from duffing_env.silverbox import (
+from duffing_env.plants import silverbox_record
+from duffing_env.plants.silverbox_record import (
     RecordDamaged,
     RecordNotFound,
     load_record,
@@ -37,7 +37,7 @@ def bare_home(tmp_path, monkeypatch):
 @pytest.fixture(scope="session")
 def record_folder(record):
     """The folder of the real files, found before any test changes the environment."""
-    return silverbox._find(None).parent
+    return silverbox_record._find_record_file(None).parent
 
 
 def junk(folder: Path, name: str = "SNLS80mV.csv") -> Path:

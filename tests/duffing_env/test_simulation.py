@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 from twin import PARAMETERS, TwinContinuousEnv, TwinEnv, multisine
 
-from duffing_env.simulation import TEST_INPUT
+from duffing_env.rewards.simulation_error_reward import TEST_INPUT
 from estimator import CONTINUOUS_TWIN, SILVERBOX_TWIN, Parameters
 
 SPREAD = 0.3
@@ -52,6 +52,6 @@ def test_it_falls_with_what_is_learned_and_sums_to_at_most_one():
     sums = np.cumsum(told, axis=0)
     assert np.abs(sums).max() <= 1
     assert (np.diff(sums[[0, 15, 63, 255]].mean(axis=1)) > 0).all()
-    errors = envs._batch.quantity("MISFIT")
+    errors = envs._batch.row_values("MISFIT")
     assert sums[-1].mean() > 0.7
     assert ((errors >= 0) & (errors <= 1)).all()

@@ -2,14 +2,14 @@
 
 import pytest
 
-from duffing_env.twin import identify_continuous_twin, identify_twin
+from duffing_env.plants.silverbox_twin import identify_continuous_twin, identify_difference_twin
 from estimator import CONTINUOUS_TWIN, SILVERBOX_TWIN
 
 PARAMETERS = ("m", "c", "a", "b")
 
 
 def test_the_twin_is_identified_from_the_record(record):
-    twin, residual = identify_twin(record)
+    twin, residual = identify_difference_twin(record)
     for name in PARAMETERS:
         assert getattr(twin, name) == pytest.approx(getattr(SILVERBOX_TWIN, name), rel=5e-5)
     assert residual == pytest.approx(2.292e-3, rel=1e-3)

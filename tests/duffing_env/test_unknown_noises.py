@@ -7,12 +7,12 @@ from specimens import COMPILED
 from twin import PARAMETERS, TwinContinuousEnv, TwinEnv, assert_env_follows_twin
 
 from duffing_env.batch import Batch, spawn_seeds
-from duffing_env.continuous import ContinuousEnv
 from duffing_env.env import DuffingEnv
-from duffing_env.experiment import SimulatedExperiment
-from duffing_env.kernel import RESET_BY_HAND
-from duffing_env.model_env import ModelExperiment
-from duffing_env.tracks import TRACKS
+from duffing_env.experiment_config import SimulatedExperiment
+from duffing_env.kernel import RESET_MANUALLY
+from duffing_env.tracks.continuous_tracks import ContinuousEnv
+from duffing_env.tracks.model_env import ModelExperiment
+from duffing_env.tracks.track_registry import TRACKS
 from duffing_env.vector_env import DuffingVectorEnv
 
 UNKNOWN = {"noise_range": 10.0, "process_noise_guess": 2e-4, "measurement_noise_guess": 1e-3, "horizon": 40}
@@ -21,7 +21,7 @@ ENVS = {"difference": (DuffingEnv, TwinEnv), "continuous": (ContinuousEnv, TwinC
 
 def begun(size, **options):
     """A batch at the start of its episodes."""
-    batch = Batch(SimulatedExperiment(**options), size, RESET_BY_HAND)
+    batch = Batch(SimulatedExperiment(**options), size, RESET_MANUALLY)
     for row, seed in enumerate(spawn_seeds(0, size)):
         batch.seed(row, np.random.default_rng(seed))
     batch.reset(np.ones(size, dtype=np.bool_))
@@ -64,12 +64,12 @@ def test_they_change_nothing_else_of_the_plant_and_are_what_it_has():
     for name in PARAMETERS:
         np.testing.assert_array_equal(loud.truth()[name], plain.truth()[name])
     assert list(plain.truth()) == list(PARAMETERS)
-    np.testing.assert_array_equal(plain.quantity("PROCESS_STD"), 5e-4)
+    np.testing.assert_array_equal(plain.row_values("PROCESS_STD"), 5e-4)
     loud.step(np.zeros(100))  # from rest: the noise is all that moves it
-    x, truth = loud.quantity("X_x1"), loud.truth()
-    np.testing.assert_allclose(x, truth.process_noise * loud.quantity("NOISE_w"), rtol=1e-14)
-    shown = truth.measurement_noise * loud.quantity("NOISE_v")
-    np.testing.assert_allclose(loud.quantity("Y_y") - x, shown, rtol=0, atol=1e-17)
+    x, truth = loud.row_values("X_x1"), loud.truth()
+    np.testing.assert_allclose(x, truth.process_noise * loud.row_values("NOISE_w"), rtol=1e-14)
+    shown = truth.measurement_noise * loud.row_values("NOISE_v")
+    np.testing.assert_allclose(loud.row_values("Y_y") - x, shown, rtol=0, atol=1e-17)
 
 
 def test_the_truth_tells_them_at_the_end_of_an_episode():
@@ -103,13 +103,13 @@ def test_every_sensor_has_a_noise_of_its_own():
 def test_the_prior_is_centred_at_the_guess():
     experiment = SimulatedExperiment(process_noise_guess=2e-4, measurement_noise_guess=3e-3, noise_shape=4.0)
     known = SimulatedExperiment(process_noise=2e-4, measurement_noise=3e-3, noise_shape=4.0)
-    assert experiment.believed == known.believed
-    assert experiment.setup.process_noise == 5e-4
-    assert experiment.setup.measurement_noise.tolist() == [5e-4]
+    assert experiment.prior_belief == known.prior_belief
+    assert experiment.kernel_params.process_noise == 5e-4
+    assert experiment.kernel_params.measurement_noise.tolist() == [5e-4]
 
 
 def test_the_guess_of_further_sensors_is_as_far_off_as_that_of_the_first():
     told = TRACKS["duffing_env/Pendulum-v0"]["kwargs"]
-    belief = ModelExperiment(**told, sensor_noise=(4e-6,), measurement_noise_guess=3e-6).believed
+    belief = ModelExperiment(**told, sensor_noise=(4e-6,), measurement_noise_guess=3e-6).prior_belief
     stds = np.sqrt(belief.noises[1::2] / belief.noises[::2])
     np.testing.assert_allclose(stds, [told["process_noise"], 3e-6, 12e-6], rtol=1e-12)

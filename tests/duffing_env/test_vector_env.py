@@ -18,7 +18,7 @@ from playing import BY_HAND, MODES, assert_refused, assert_same, random_actions,
 
 from duffing_env.batch import spawn_seeds
 from duffing_env.env import DuffingEnv
-from duffing_env.noise import BRANCHES
+from duffing_env.storage.random_streams import SEED_BRANCHES
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 
@@ -399,7 +399,7 @@ def test_final_infos_as_a_list():
 
 def test_the_same_seed_gives_other_experiments_in_each_branch():
     actions = random_actions(20, 6)
-    plain, told = DuffingVectorEnv(6), {branch: DuffingVectorEnv(6, branch=branch) for branch in BRANCHES}
+    plain, told = DuffingVectorEnv(6), {branch: DuffingVectorEnv(6, branch=branch) for branch in SEED_BRANCHES}
     reference, found = roll_out(plain, actions), {branch: roll_out(envs, actions) for branch, envs in told.items()}
     assert_same(reference, found["train"])
     masses = np.concatenate([envs.truth.m for envs in told.values()])

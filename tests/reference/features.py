@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from agents.policies.features import BOUND, Setting
-from duffing_env.layout import observation_bounds
+from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.models.difference import difference
 
 COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")

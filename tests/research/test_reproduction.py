@@ -13,7 +13,7 @@ import pytest
 
 from agents.studies import kouw2020 as module
 from agents.studies.kouw2020 import PUBLISHED, SETTINGS, prediction_mse, reproduce, simulation_mse
-from duffing_env.silverbox import CSV_NAME
+from duffing_env.plants.silverbox_record import CSV_NAME
 from estimator.offline import PEMNARX
 
 ROOT = Path(__file__).parents[2]

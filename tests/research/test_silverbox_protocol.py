@@ -14,7 +14,7 @@ import pytest
 from agents.studies import silverbox_protocol as module
 from agents.studies import silverbox_results as reporting
 from agents.studies.silverbox_protocol import GIVEN, SETTINGS, TESTS, Outcome
-from duffing_env.silverbox import Regime, SilverboxRecord, synthesise_multisine
+from duffing_env.plants.silverbox_record import Regime, SilverboxRecord, synthesise_multisine
 
 ROOT = Path(__file__).parents[2]
 MANUAL = ROOT / "docs" / "silverbox.md"

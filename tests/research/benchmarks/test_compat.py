@@ -6,7 +6,7 @@ import gymnasium as gym
 import pytest
 
 from benchmarks.compat.__main__ import LIBRARIES, cell, main
-from benchmarks.compat.libraries import CELLS
+from benchmarks.compat.library_rows import CELLS
 
 INSTALLED = ("Gymnasium", "StableBaselines3")
 

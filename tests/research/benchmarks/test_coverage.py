@@ -11,9 +11,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import binom, chi2
 
-from benchmarks import coverage
-from benchmarks.coverage import HYPOTHESES, LEVEL, WIDE_NOISES, Case, Config, evaluate, tables, wilson
-from benchmarks.systems import MAX_INPUT, ODE, POPULATIONS, draw, make_prior, simulate
+from benchmarks import interval_coverage
+from benchmarks.interval_coverage import HYPOTHESES, LEVEL, WIDE_NOISES, Case, Config, evaluate, tables, wilson
+from benchmarks.random_systems import MAX_INPUT, ODE, POPULATIONS, draw, make_prior, simulate
 from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, coefficients_of, difference, duffing, recorded_prior
 from estimator.belief import Belief
 from estimator.models.difference import Term
@@ -196,10 +196,10 @@ def test_simulated_oscillators_obey_the_equation():
 
 
 def test_the_command_writes_its_tables(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(coverage, "NOISES", (SAME, (1e-4, 3e-4)))
-    monkeypatch.setattr(coverage, "LENGTHS", (64,))
+    monkeypatch.setattr(interval_coverage, "NOISES", (SAME, (1e-4, 3e-4)))
+    monkeypatch.setattr(interval_coverage, "LENGTHS", (64,))
     path = tmp_path / "coverage.json"
-    coverage.main(Config(systems=3, only=("structured", "ensemble", "ode", "track"), json=path))
+    interval_coverage.main(Config(systems=3, only=("structured", "ensemble", "ode", "track"), json=path))
     written = json.loads(path.read_text(encoding="utf-8"))
     assert list(written) == [name for name in tables() if name.startswith(("structured", "ensemble", "ode", "track"))]
     assert [len(rows) for rows in written.values()] == [2, 2, 2] + [2] * 6 + [1] * 2 + [2] * 2
@@ -211,7 +211,7 @@ def test_the_command_writes_its_tables(tmp_path, capsys, monkeypatch):
     printed = capsys.readouterr().out
     assert "| 0.0005  | 0.0005  |" in printed
     assert "std of log" in printed
-    coverage.main(Config(systems=3, only=("wide, prior of 10 %, noise prior centred at 0.3",)))
+    interval_coverage.main(Config(systems=3, only=("wide, prior of 10 %, noise prior centred at 0.3",)))
     printed = capsys.readouterr().out
     assert "| first_order  | 64 | 3    |" in printed
     assert "| sigma_points | 64 | 3    |" in printed

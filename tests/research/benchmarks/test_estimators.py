@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import estimators, silverbox_peers
-from duffing_env.silverbox import SilverboxRecord
+from benchmarks import estimators, silverbox_peer_filters
+from duffing_env.plants.silverbox_record import SilverboxRecord
 from estimator import SILVERBOX_TWIN, OnlineEstimator, coefficients_of, difference
 
 
@@ -30,7 +30,7 @@ def test_peers_get_the_equation_and_the_inputs_that_act_on_each_output(tmp_path:
     u, y, _ = estimators.samples()
     with np.load(tmp_path / "samples.npz") as given:
         np.testing.assert_array_equal(given["y"], y)
-        model, taps = silverbox_peers.model(dict(given), "paper"), silverbox_peers.taps_of(given["u"])
+        model, taps = silverbox_peer_filters.model(dict(given), "paper"), silverbox_peer_filters.taps_of(given["u"])
     coefficients = coefficients_of(difference(), SILVERBOX_TWIN)
     moved = model.move([y[8], y[7], *coefficients], taps[9])
     assert moved == pytest.approx((coefficients @ [y[8], y[8] ** 3, y[7], u[8]], y[8]))

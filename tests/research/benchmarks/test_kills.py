@@ -7,7 +7,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from benchmarks.kills.__main__ import Config, main
-from benchmarks.kills.whole import READERS, half_written
+from benchmarks.kills.file_integrity import READERS, half_written
 
 
 def test_half_of_any_file_is_noticed(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import peer_process
 from benchmarks.peer_process import NotAvailable, Peers
-from benchmarks.timing import measure
+from benchmarks.timed_rounds import measure
 
 
 @pytest.fixture

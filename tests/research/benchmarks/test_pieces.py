@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from benchmarks.component_timing import NOISE, SAMPLES, EstimatorOnly, experiment_of, play
 from benchmarks.environments import TRACK, vector_steps
-from benchmarks.pieces import NOISE, SAMPLES, EstimatorOnly, experiment_of, play
 from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, coefficients_of, difference
 from estimator.lanes import LANES
 
@@ -18,7 +18,7 @@ def test_the_estimator_alone_is_the_estimator(factorisation: str, iterations: in
         alone.step(t)
     row, experiment = LANES + 5, experiment_of(factorisation)
     rig = Rig.silverbox("linear")
-    reference = OnlineEstimator(experiment.model, experiment.believed, rig, factorisation=factorisation)
+    reference = OnlineEstimator(experiment.model, experiment.prior_belief, rig, factorisation=factorisation)
     reference.run(data.inputs[:, row], data.outputs[:, row])
     np.testing.assert_allclose(alone.records()[row], reference.belief.record, rtol=1e-9, atol=1e-15)
 

@@ -2,8 +2,8 @@ import math
 
 import pytest
 
-from benchmarks.report import Claim, Section, print_section, print_verdicts, ratio
-from benchmarks.timing import Result
+from benchmarks.section_tables import Claim, Section, print_section, print_verdicts, ratio
+from benchmarks.timed_rounds import Result
 
 FAST, SLOW = Result("fast", "env-steps/s", (9e6, 1e7, 1.1e7)), Result("slow", "env-steps/s", (1e6, 1.2e6, 9e5))
 MISSING = Result("missing", "env-steps/s", reason="ImportError: No module named 'envpool'")

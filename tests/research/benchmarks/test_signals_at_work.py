@@ -14,9 +14,9 @@ import pytest
 from agents.running.clock import JumpingClock
 from agents.running.run import Plan, run
 from agents.running.simulated import SimulatedPlant
-from benchmarks.kills.cases import RIG, SMALL, Ship
-from benchmarks.kills.processes import started
-from benchmarks.kills.whole import half_written
+from benchmarks.kills.file_integrity import half_written
+from benchmarks.kills.killable_process import started
+from benchmarks.kills.killed_commands import RIG, SMALL, Ship
 from estimator import Rig
 
 SHORT = "duffing_env/Short-v0"

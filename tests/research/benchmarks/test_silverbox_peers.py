@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from agents.studies.silverbox_protocol import LENGTHS, SETTINGS, TESTS, TRAINING_SAMPLES, Outcome, Sections, evaluate
-from benchmarks import peer_process, silverbox, silverbox_peers
+from benchmarks import peer_process, silverbox_comparison, silverbox_peer_filters
 from benchmarks.peer_process import NotAvailable, Peers
-from benchmarks.silverbox import MODELS, OFFLINE, PEERS, Contender
-from benchmarks.timing import Result
-from duffing_env.silverbox import Regime
+from benchmarks.silverbox_comparison import MODELS, OFFLINE, PEERS, Contender
+from benchmarks.timed_rounds import Result
+from duffing_env.plants.silverbox_record import Regime
 from estimator import OnlineEstimator
 from estimator.belief import Belief
 
 
 def time(*values: float) -> Result:
-    return Result("row", silverbox.UNIT, values)
+    return Result("row", silverbox_comparison.UNIT, values)
 
 
 # --- The models that they get --------------------------------------------------------------------------------------
@@ -26,11 +26,11 @@ def time(*values: float) -> Result:
 
 def test_their_ode_moves_as_ours() -> None:
     rng = np.random.default_rng(0)
-    prior = silverbox.prior_of("ode")
+    prior = silverbox_comparison.prior_of("ode")
     parameters = np.array([0.49, 0.069, 0.5, 1.96, -1e-3, 3e-3, 0.01])
     z, v, last, now = 0.1 * rng.standard_normal(4)
     mean, cov = np.empty(9), np.zeros((9, 9))
-    mean[silverbox._MOTION] = [z, v, *parameters]
+    mean[silverbox_comparison._MOTION] = [z, v, *parameters]
     cov[:2, :2] = 1e-30 * np.eye(2)
     known = Belief.of(prior.model, mean, cov, (1.0, 1e-30), (1.0, 1.0))
     ours = OnlineEstimator(prior.model, known, SETTINGS["ODE linear"].rig)
@@ -38,7 +38,7 @@ def test_their_ode_moves_as_ours() -> None:
     ours.run([last], [np.nan], missing=True)
     begin = ours.belief.state_mean
     ours.run([now], [np.nan], missing=True)
-    moved = silverbox_peers.flow(prior.model.substeps)([*begin, *parameters], (now, last, 0.0))
+    moved = silverbox_peer_filters.flow(prior.model.substeps)([*begin, *parameters], (now, last, 0.0))
     np.testing.assert_allclose(moved, ours.belief.state_mean, rtol=0, atol=1e-15)
 
 
@@ -68,10 +68,10 @@ def outcomes() -> dict[str, Outcome]:
 
 @pytest.fixture(scope="module")
 def given(sections: Sections, outcomes: dict[str, Outcome]) -> dict[str, np.ndarray]:
-    return {name: np.asarray(value) for name, value in silverbox.given(sections, outcomes).items()}
+    return {name: np.asarray(value) for name, value in silverbox_comparison.given(sections, outcomes).items()}
 
 
-def extended_kalman_filter(model: silverbox_peers.Model, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+def extended_kalman_filter(model: silverbox_peer_filters.Model, u: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Textbook, with Jacobians by central differences: what dynamax computes, but that it moves first, as ours does."""
     mean, cov = model.mean.copy(), model.cov.copy()
     steps = 1e-6 * np.eye(len(mean))
@@ -79,7 +79,7 @@ def extended_kalman_filter(model: silverbox_peers.Model, u: np.ndarray, y: np.nd
     def transition(state: np.ndarray, taps: np.ndarray) -> np.ndarray:
         return np.concatenate([model.move(state, taps), state[2:]])
 
-    for taps, output in zip(silverbox_peers.taps_of(u), y, strict=True):
+    for taps, output in zip(silverbox_peer_filters.taps_of(u), y, strict=True):
         slopes = [(transition(mean + step, taps) - transition(mean - step, taps)) / 2e-6 for step in steps]
         mean, cov = transition(mean, taps), np.array(slopes).T @ cov @ np.array(slopes) + model.process_cov
         readout = np.array([model.read(row, taps) for row in np.eye(len(mean))])
@@ -99,15 +99,15 @@ def test_with_noises_that_are_known_theirs_is_our_filter(
 ) -> None:
     u, y = sections.training.u[:300], sections.training.y[:300]
     told = {**given, f"{name}_process_variance": process_noise**2}
-    theirs = extended_kalman_filter(silverbox_peers.model(told, name), u, y)
-    prior = silverbox.prior_of(name)
+    theirs = extended_kalman_filter(silverbox_peer_filters.model(told, name), u, y)
+    prior = silverbox_comparison.prior_of(name)
     certain = 1e15
     noises = (certain, certain * max(process_noise, 1e-15) ** 2), (certain, certain * 3e-4**2)
     setting = SETTINGS[MODELS[name]]
     ours = OnlineEstimator(setting.model, Belief.of(prior.model, prior.mean, prior.cov, *noises), setting.rig)
     ours.run(u, y)
     mean, std = ours.belief.mean, np.sqrt(np.diag(ours.belief.cov))
-    places = silverbox._MOTION if name == "ode" else list(range(len(mean)))
+    places = silverbox_comparison._MOTION if name == "ode" else list(range(len(mean)))
     np.testing.assert_allclose((theirs - mean[places]) / std[places], 0.0, atol=tolerance)
 
 
@@ -123,19 +123,19 @@ def test_a_peer_that_answers_our_means_gets_our_errors(
     monkeypatch.setattr("agents.studies.silverbox_protocol.LENGTHS", lengths)
     monkeypatch.setattr("agents.studies.silverbox_protocol.TRAINING_SAMPLES", 3000)
     monkeypatch.setattr("agents.studies.silverbox_protocol.TIMINGS", 1)
-    monkeypatch.setattr(silverbox, "LENGTHS", lengths)
-    monkeypatch.setattr(silverbox, "TRAINING_SAMPLES", 3000)
+    monkeypatch.setattr(silverbox_comparison, "LENGTHS", lengths)
+    monkeypatch.setattr(silverbox_comparison, "TRAINING_SAMPLES", 3000)
     outcome = evaluate(SETTINGS[ours], sections)
     means = []
     for belief in outcome.beliefs.values():
         if name == "ode":
-            means.append(belief.mean[silverbox._MOTION])
+            means.append(belief.mean[silverbox_comparison._MOTION])
         else:
             means.append(np.concatenate([[9.0, 9.0], belief.coefficients_mean]))
     forecasts = [[y, 1e-8] for y in sections.multisine.y]
     forecasts[:500] = [[y + 1.0, 1e-8] for y in sections.multisine.y[:500]]
     answer = {"means": [mean.tolist() for mean in means], "forecasts": forecasts}
-    contender = silverbox.judge(name, answer, time(1.0), sections, {ours: outcome})
+    contender = silverbox_comparison.judge(name, answer, time(1.0), sections, {ours: outcome})
     assert contender.coverage == 0.75
     tolerance = 1e-6
     for test in TESTS:
@@ -146,7 +146,7 @@ def test_a_peer_that_answers_our_means_gets_our_errors(
 
 def test_means_that_are_not_finite_have_no_errors(sections: Sections, outcomes: dict[str, Outcome]) -> None:
     answer = {"means": [[np.nan] * 9] * len(LENGTHS), "forecasts": None}
-    contender = silverbox.judge("three-tap", answer, time(1.0), sections, outcomes)
+    contender = silverbox_comparison.judge("three-tap", answer, time(1.0), sections, outcomes)
     assert all(np.isnan(error) for error in [*contender.errors.values(), contender.coverage])
     assert contender.to_dict()["samples_until_1_mV"] is None
 
@@ -170,7 +170,7 @@ def test_least_squares_rows_get_the_same_regressors(given: dict, monkeypatch: py
     for t in range(2, 400):
         y[t] = truth @ [y[t - 1], y[t - 1] ** 3, y[t - 2], u[t], u[t - 1], u[t - 2], 1.0]
     noiseless |= {"u": u[:400], "y": y}
-    means, forecasts = silverbox_peers.padasip_rls(noiseless, "three-tap")(400, (400,))
+    means, forecasts = silverbox_peer_filters.padasip_rls(noiseless, "three-tap")(400, (400,))
     np.testing.assert_allclose(means[0][2:], truth, atol=1e-8)
     assert forecasts is None
 
@@ -180,7 +180,7 @@ def test_speed_counts_at_equal_or_better_errors() -> None:
     for error, no_worse in ((4.0e-4, True), (3.99e-4, False), (5e-4, True)):
         theirs = Contender(time(20.0, 9.0, 30.0), dict.fromkeys(TESTS, error))
         contenders = {"ODE linear": ours, "dynamax EKF, ODE linear": theirs}
-        assert silverbox.faster(contenders, "dynamax EKF, ODE linear") == (10.0, no_worse)
+        assert silverbox_comparison.faster(contenders, "dynamax EKF, ODE linear") == (10.0, no_worse)
 
 
 # --- Peers that are missing ----------------------------------------------------------------------------------------
@@ -190,9 +190,9 @@ def test_missing_peers_are_rows_that_say_so(
     sections: Sections, outcomes: dict[str, Outcome], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(peer_process, "ensure_environment", lambda: Path(sys.executable))
-    monkeypatch.setattr(silverbox, "REPETITIONS", 1)
-    monkeypatch.setattr("benchmarks.timing.LONG_ENOUGH", 0.0)
-    found = silverbox.compare(sections, outcomes)
+    monkeypatch.setattr(silverbox_comparison, "REPETITIONS", 1)
+    monkeypatch.setattr("benchmarks.timed_rounds.LONG_ENOUGH", 0.0)
+    found = silverbox_comparison.compare(sections, outcomes)
     printed = " ".join(capsys.readouterr().out.split())
     for title in (*PEERS, OFFLINE):
         package = title.split()[0].replace("dynamax", "jax")  # its row imports jax first
@@ -208,6 +208,6 @@ def test_missing_peers_are_rows_that_say_so(
 
 def test_without_peers_the_table_says_so(sections: Sections, outcomes: dict[str, Outcome], tmp_path: Path) -> None:
     with Peers(tmp_path / "given.npz", wanted=False) as peers:
-        assert silverbox._offline(peers, sections).reason == "--no-peers"
+        assert silverbox_comparison._offline(peers, sections).reason == "--no-peers"
         with pytest.raises(NotAvailable, match="--no-peers"):
             peers.ask("silverbox dynamax ode time", 1)

@@ -3,8 +3,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from benchmarks import timing
-from benchmarks.timing import Result, Row, measure, timed
+from benchmarks import timed_rounds
+from benchmarks.timed_rounds import Result, Row, measure, timed
 
 
 def sleeping(seconds: float, calls: list[str], name: str) -> Row:
@@ -77,7 +77,7 @@ def test_bad_requests_are_refused() -> None:
 
 def test_timed_measures_the_work_only(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0, perf_counter=lambda: clock.now)
-    monkeypatch.setattr(timing, "time", clock)
+    monkeypatch.setattr(timed_rounds, "time", clock)
 
     def action(count: int) -> float:
         clock.now += 0.5

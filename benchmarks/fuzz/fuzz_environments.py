@@ -1,0 +1,72 @@
+"""Environments: `step` and `reset` with anything, single and vector."""
+
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from hypothesis import strategies as st
+
+import duffing_env  # noqa: F401  registers the tracks
+from benchmarks.fuzz.bad_values import anything
+from benchmarks.fuzz.call_verdicts import Call
+
+#: Single and vector environments to play in.
+MADE: dict[str, tuple[str, dict[str, Any], int]] = {
+    "Amplitude-v0": ("duffing_env/Amplitude-v0", {"horizon": 20}, 0),
+    "Power-v0, held": ("duffing_env/Power-v0", {"horizon": 20, "hold": 3}, 0),
+    "mean field": ("duffing_env/Amplitude-v0", {"horizon": 20, "factorisation": "mean_field"}, 0),
+    "40 of Amplitude-v0": ("duffing_env/Amplitude-v0", {"horizon": 9}, 40),
+    "3 by hand": ("duffing_env/Amplitude-v0", {"horizon": 9, "autoreset_mode": "Disabled"}, 3),
+}
+
+
+def made(name: str) -> Any:
+    """The environment, in the middle of an episode."""
+    track, options, rows = MADE[name]
+    if rows:
+        env: Any = gym.make_vec(track, num_envs=rows, vectorization_mode="vector_entry_point", **options)
+    else:
+        env = gym.make(track, disable_env_checker=True, **options).unwrapped
+    env.reset(seed=0)
+    env.step(np.full((rows, 1) if rows else (1,), 0.5, dtype=np.float32))
+    return env
+
+
+def unsound(env: Any, told: Any) -> str:
+    """What is wrong with what `reset` or `step` gave, or nothing."""
+    observation = told[0]
+    if not env.observation_space.contains(observation):
+        return "observation out of bounds"
+    if len(told) == 5 and not np.isfinite(told[1]).all():
+        return "reward is not finite"
+    return ""
+
+
+def calls() -> st.SearchStrategy[Call]:
+    """Calls of an environment's methods."""
+    pool = {name: pickle.dumps(made(name)) for name in MADE}
+
+    @st.composite
+    def call(draw: st.DrawFn) -> Call:
+        name = draw(st.sampled_from(list(MADE)))
+        env, rows = pickle.loads(pool[name]), MADE[name][2]
+        if draw(st.booleans()):
+            shape = (rows, 1) if rows else (1,)
+            value = draw(anything)
+            if draw(st.booleans()):
+                actions = np.full(shape, draw(st.floats(-1e6, 1e6)))
+                if draw(st.booleans()):
+                    actions[-1] = draw(st.sampled_from([np.nan, np.inf, 1e308, -1e308, 1e-300]))
+                value = actions
+            function = lambda: env.step(value)  # noqa: E731
+            names: tuple[str, ...] = ("action", "actions", "row")
+        else:
+            seed = draw(st.one_of(anything, st.lists(st.integers(-2, 9), min_size=rows or 1, max_size=rows or 1)))
+            options = draw(st.one_of(st.none(), st.none(), anything.map(lambda value: {"reset_mask": value})))
+            function = lambda: env.reset(seed=seed, options=options)  # noqa: E731
+            names = ("seed", "Seed", "reset_mask", "options")
+        what = f"{name}: {'step' if names[0] == 'action' else 'reset'}"
+        return Call(what, function, names, lambda: env, lambda told: unsound(env, told))
+
+    return call()

@@ -1,0 +1,143 @@
+"""Files of every kind: cut, with bits turned over, with other arrays or entries, or of another kind altogether."""
+
+import io
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from agents.commands.rig_file import text_of
+from agents.evaluation import board
+from agents.policies.learned import CARD, WEIGHTS, load_policy
+from agents.training.checkpoints import STATE, Progress, load_progress
+from agents.training.config import TrainConfig, describe, read_config
+from agents.training.hyperparameters import FILES, read_settings
+from benchmarks.fuzz.bad_values import another_array, changed, damaged
+from benchmarks.fuzz.call_verdicts import Call
+from benchmarks.fuzz.fuzz_estimators import RIG, begun, sound, suppress_overflow
+from estimator import OnlineEstimator, Rig, load_estimator, save_estimator
+from estimator.identification.records import read
+
+_RECORD = b"time [s],force [N],displacement [m]\n" + b"".join(
+    f"{k * 1e-3:.3f},{k % 7 - 3},{1e-3 * (k % 5)}\n".encode() for k in range(60)
+)
+
+
+def _go_on(path: Path) -> str:
+    """Load an estimator, let it learn, and judge it."""
+    estimator: OnlineEstimator = load_estimator(path)
+    scale = estimator.scales
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((2, 25))
+    with suppress_overflow():
+        estimator.run(0.1 * scale.input * u, 0.01 * scale.output * y)
+    return sound(estimator)
+
+
+def _act(folder: Path) -> str:
+    """Load a policy, and let it act; it is finite, and within bounds."""
+    policy = load_policy(folder)
+    try:
+        actions, _ = policy.predict(np.zeros((2, 22), dtype=np.float32), deterministic=True)
+    except ValueError as error:  # a network that is sound, for other observations
+        if "observation must have" in str(error):
+            return ""
+        raise
+    fine = actions.shape == (2, 1) and np.isfinite(actions).all() and np.abs(actions).max() <= 1
+    return "" if fine else f"actions {actions!r}"
+
+
+def _archive(arrays: dict[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def calls() -> st.SearchStrategy[Call]:
+    """Calls that read a file."""
+    from safetensors.numpy import load_file, save
+
+    place = Path(tempfile.mkdtemp(prefix="fuzz-"))
+    shipped = Path(str(__import__("agents").__file__)).parent / "policies" / "trained" / "ppo" / "short"
+    card, tensors = json.loads((shipped / CARD).read_text()), load_file(shipped / WEIGHTS)
+    kinds = ("paper", "look-ahead", "ensemble", "rig")
+    estimators = {}
+    for name in kinds:
+        save_estimator(begun(name), place / "estimator.npz")
+        with np.load(place / "estimator.npz") as archive:
+            estimators[name] = ((place / "estimator.npz").read_bytes(), {key: archive[key] for key in archive.files})
+    matlab = io.BytesIO()
+    __import__("scipy.io").io.savemat(matlab, {"u": np.arange(60.0), "y": np.sin(np.arange(60.0))})
+    entries = board.SHIPPED.read_text().splitlines()[:2]
+    config = json.dumps(describe(TrainConfig()), default=str)
+    progress = json.dumps(vars(Progress(steps=5, curve=[(1, 0.5, None)])))
+    fields = ("config", *TrainConfig.__dataclass_fields__, "hyperparameter")
+    #: Kind to the file's name, its content, what reads it, words of clear messages, and JSON to change in places.
+    others: dict[str, tuple[str, bytes, Callable[[Path], Any], tuple[str, ...], str]] = {
+        "rig": ("file", text_of(RIG, "").encode(), Rig.from_file, (), ""),
+        "csv": ("record.csv", _RECORD, lambda path: read(path, RIG), (), ""),
+        "mat": ("record.mat", matlab.getvalue(), lambda path: read(path, RIG), (), ""),
+        "run": ("config.json", config.encode(), lambda path: read_config(path.parent), fields, config),
+        "checkpoint": (STATE, progress.encode(), lambda path: load_progress(path.parent), ("checkpoint",), progress),
+        "settings": (
+            "file", (FILES / "ppo.toml").read_bytes(), lambda path: read_settings("ppo", "duffing_env/Short-v0", path),
+            ("settings", "hyperparameter"), "",
+        ),
+        "board": (
+            "file", "\n".join(entries).encode(), lambda path: board.tables(board.read(path)), ("board",), entries[0],
+        ),
+    }  # fmt: skip
+    counter = iter(range(10**9))
+
+    @st.composite
+    def call(draw: st.DrawFn) -> Call:
+        kind = draw(st.sampled_from(["estimator"] * 3 + ["policy", *others]))
+        number = next(counter) % 4
+        if kind == "mat" and draw(st.integers(0, 9)):  # a process each
+            kind = "csv"
+        folder = place / f"{kind}{number}"
+        folder.mkdir(exist_ok=True)
+        name, whole, reads, words, held = others.get(kind, ("file", b"", None, (), ""))
+        path = folder / name
+        names: tuple[str, ...] = ("path", "rig", "record", "policy", str(path))
+        if kind == "estimator":
+            known, arrays = estimators[draw(st.sampled_from(kinds))]
+            way = draw(st.integers(0, 2))
+            if way == 0:
+                content = draw(damaged(known))
+            elif way == 1:
+                key = draw(st.sampled_from(sorted(arrays)))
+                content = _archive({**arrays, key: draw(another_array(arrays[key]))})
+            else:
+                described = draw(changed(json.loads(arrays["description"].tobytes())))
+                text = np.frombuffer(json.dumps(described).encode(), dtype=np.uint8)
+                content = _archive({**arrays, "description": text})
+            path.write_bytes(content)
+            return Call("load_estimator", lambda: _go_on(path), names, sound=str)
+        if kind == "policy":
+            way = draw(st.integers(0, 3))
+            weights, described = dict(tensors), card
+            if way == 0:
+                key = draw(st.sampled_from(sorted(weights)))
+                other = draw(another_array(weights[key]))
+                if np.asarray(other).dtype.str[1:] in ("f4", "f8", "i8", "b1"):
+                    weights[key] = np.ascontiguousarray(other, dtype=np.asarray(other).dtype.newbyteorder("="))
+            elif way == 1:
+                described = draw(
+                    changed({name: card[name] for name in ("format", "network", "features") if name in card})
+                )
+            (folder / WEIGHTS).write_bytes(draw(damaged(save(weights))) if way == 2 else save(weights))
+            (folder / CARD).write_bytes(
+                draw(damaged(json.dumps(card).encode())) if way == 3 else json.dumps(described).encode()
+            )
+            return Call("load_policy", lambda: _act(folder), names, sound=str)
+        described = draw(changed(json.loads(held))) if held else None
+        is_damaged = draw(st.booleans()) if held else True
+        path.write_bytes(draw(damaged(whole)) if is_damaged else json.dumps(described).encode())
+        return Call(f"read a {kind}", lambda: reads(path), (*names, *words))
+
+    return call()

@@ -1,0 +1,67 @@
+"""This version beside an older one: ``python -m benchmarks.version_comparison --commit REV``.
+
+Each version runs from a tree of its own in a process of its own, and both are timed in turns.
+"""
+
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from agents.cli import run_script
+from benchmarks.__main__ import describe_machine
+from benchmarks.peer_process import ROOT, Child
+from benchmarks.section_tables import Claim, Section, print_section, ratio
+from benchmarks.timed_rounds import measure
+
+#: What the rows are called, their unit, and how much of the old version's speed is to be reached.
+ROWS = {
+    "inference Eq. (2)": ("env-steps/s", 1.0),
+    "inference Eq. (1)": ("env-steps/s", 0.95),
+    "steps Eq. (2)": ("env-steps/s", 1.3),
+    "steps Eq. (1)": ("env-steps/s", None),
+    "steps Eq. (1), noises unknown": ("env-steps/s", None),
+    "samples Eq. (2)": ("µs/sample", None),
+    "samples Eq. (1)": ("µs/sample", None),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Time inference of 1,024 systems, steps of as many environments with 2 threads, and one estimator's samples."""
+
+    commit: str = "f55658e"
+    """The older version; the default is the last whose kernels were written by hand."""
+    repetitions: int = 9
+    """Rounds; every row is run once in each."""
+
+
+def main(config: Config) -> None:
+    """Unpack the old version, time both, print."""
+    with tempfile.TemporaryDirectory() as folder:
+        archive = subprocess.run(["git", "archive", config.commit], cwd=ROOT, capture_output=True, check=True).stdout
+        subprocess.run(["tar", "-x", "-C", folder], input=archive, check=True)
+        command = [sys.executable, "-P", Path(__file__).with_name("version_rows.py")]
+        trees = {"old": Path(folder), "new": ROOT}
+        children = {age: Child(command, tree, {"PYTHONPATH": str(tree)}) for age, tree in trees.items()}
+        machine = describe_machine()
+        print(f"{machine['processor']}, {machine['cores']} cores. Load before: {machine['load_before']}")
+        print(f"Old is {config.commit}. Median [minimum, maximum] of {config.repetitions} repetitions, in turns.")
+        with children["old"], children["new"]:
+            rows = [
+                child.row(name, f"{name}, {age}", unit)
+                for name, (unit, _) in ROWS.items()
+                for age, child in children.items()
+            ]
+            results = measure(rows, config.repetitions)
+    claims = []
+    for name, (unit, bar) in ROWS.items():
+        old, new = results[f"{name}, old"], results[f"{name}, new"]
+        faster = ratio(old, new) if unit == "µs/sample" else ratio(new, old)
+        claims.append(Claim(f"{name}: new over old", faster, bar))
+    print_section(Section("Versions", list(results.values()), claims))
+
+
+if __name__ == "__main__":
+    run_script(main, Config, __doc__ or "")

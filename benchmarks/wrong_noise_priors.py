@@ -1,0 +1,166 @@
+"""Noises that nobody knows: what wrong priors of them cost, in coverage and in nats.
+
+``python -m benchmarks.wrong_noise_priors`` prints tables of docs/coverage.md. The priors of both noises are centred at multiples of
+the truth. Systems, noises and inputs are the same in every row, and in that of an estimator that is told the noises.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.evaluation.batch import make
+from agents.policies import make_policy
+from agents.results import show, table, write_json
+from benchmarks.interval_coverage import NO_LIMIT, QUANTILE
+from benchmarks.rigs.judge import calibrated
+from estimator.ensemble import Hypotheses
+from estimator.parameters import FloatArray
+from estimator.physical import coefficients_of
+
+#: Track to the policies that are played on it, which know no more of the noises than the track says.
+PLAYED = {
+    "duffing_env/Amplitude-v1": ("prbs", "ppo/amplitude-v1"),
+    "duffing_env/Amplitude-v0": ("prbs", "ppo/amplitude"),
+}
+NOISE, SAMPLES = 5e-4, 256  # V
+
+#: What an estimator is told of noises that are known, and what one is that a rig brings (`estimator.OnlineEstimator`).
+KNOWN: dict[str, Any] = {"noise_hypotheses": 1, "noise_shape": 1e6}
+HYPOTHESES = (7, 7)
+
+#: Nats that wrong priors may cost.
+ASKED = 0.3
+
+
+@dataclass(frozen=True)
+class Config:
+    """Coverage where the priors of the noises are wrong, and what is lost against known noises."""
+
+    systems: int = 200
+    """Oscillators of each cell."""
+    hypotheses: tuple[int, ...] = HYPOTHESES
+    """Of the estimator: one number, or two (`noise_hypotheses`)."""
+    factors: tuple[float, ...] = (0.1, 1 / 3, 1.0, 3.0, 10.0)
+    """Where the priors are centred, in parts of the truth: in all combinations, but both at the truth."""
+    tracks: tuple[str, ...] = tuple(PLAYED)
+    """Of Eq. (1) and of Eq. (2)."""
+    seed: int = 0
+    """Of all draws."""
+    json: Path | None = None
+    """File for the results."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one pair of priors made of the systems.
+
+    Attributes:
+        center: of the priors of process and measurement noise, in parts of the truth.
+        inside: (systems, coefficients) whether the 90 % interval holds the truth.
+        density: (systems,) logarithm of the posterior density at the truth [nats].
+    """
+
+    center: tuple[float, float]
+    inside: FloatArray
+    density: FloatArray
+
+
+def inputs_of(policy: str, track: str, systems: int, seed: int) -> FloatArray:
+    """(samples, systems, 1) actions of a policy on the track as it is, but for the noises' true values."""
+    envs = make(track, systems, {"noise_range": 1.0, "horizon": SAMPLES})
+    player = make_policy(policy, envs, seed=seed)
+    observations, _ = envs.reset(seed=seed)
+    state, begins, actions = None, np.ones(systems, dtype=np.bool_), []
+    for _ in range(SAMPLES):
+        action, state = player.predict(observations, state, begins, deterministic=True)
+        actions.append(np.array(action))
+        observations, _, terminated, truncated, _ = envs.step(actions[-1])
+        begins = terminated | truncated
+    return np.array(actions)
+
+
+def identified(track: str, center: tuple[float, float], actions: FloatArray, seed: int, told: dict[str, Any]) -> Cell:
+    """Play the inputs again to an estimator whose priors are centred so."""
+    systems = actions.shape[1]
+    guesses = dict(zip(("process_noise_guess", "measurement_noise_guess"), np.multiply(center, NOISE), strict=True))
+    options = {"process_noise": NOISE, "measurement_noise": NOISE, "noise_range": 1.0, "max_output": NO_LIMIT}
+    envs = make(track, systems, {"horizon": SAMPLES, **options, **guesses, **told})
+    envs.reset(seed=seed)
+    for action in actions:
+        envs.step(action)
+    beliefs = [envs.belief(row) for row in range(systems)]
+    model = envs.experiment.model
+    physical = {name: np.asarray(getattr(envs.truth, name)) for name in model.physical}
+    truth = coefficients_of(model, physical, beliefs[0].scales)
+    std = np.sqrt([np.diag(belief.coefficients_cov) for belief in beliefs])
+    away = (truth - [belief.coefficients_mean for belief in beliefs]) / std
+    densities = [belief.log_prob(true) for belief, true in zip(beliefs, truth, strict=True)]
+    return Cell(center, np.abs(away) <= QUANTILE, np.array(densities))
+
+
+def rows(cells: list[Cell], known: Cell) -> list[list[str]]:
+    """Of a table: the priors, coverage of each coefficient and of all, what is lost, and its standard error."""
+    found = []
+    for cell in cells:
+        lost = known.density - cell.density
+        shares = [f"{share:.2f}" for share in cell.inside.mean(axis=0)]
+        error = lost.std(ddof=1) / np.sqrt(len(lost))
+        center = [f"{factor:.2g}" for factor in cell.center]
+        found.append([*center, *shares, f"{cell.inside.mean():.3f}", f"{lost.mean():.2f} ± {1.96 * error:.2f}"])
+    return found
+
+
+def verdict(cells: list[Cell], known: Cell) -> dict[str, Any]:
+    """Whether the cells are calibrated, and none loses too much."""
+    hits = [int(count) for cell in cells for count in cell.inside.sum(axis=0)]
+    pooled, meets, is_calibrated = calibrated(hits, [len(known.density)] * len(hits))
+    lost = [float((known.density - cell.density).mean()) for cell in cells]
+    good = {
+        f"calibrated; pooled coverage {pooled:.3f}, {len(meets) - sum(meets)} of {len(meets)} cells outside": (
+            is_calibrated
+        ),
+        f"at most {max(lost):.2f} nats lost, {np.mean(lost):.2f} on average": max(lost) <= ASKED,
+    }
+    show(*(f"{'PASS' if passed else 'MISS'}: {text}" for text, passed in good.items()))
+    return good
+
+
+def main(config: Config) -> None:
+    """Print a table for each track and policy, and the verdict on it."""
+    from rich.progress import track as shown
+
+    numbers = config.hypotheses
+    hypotheses: Hypotheses = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+    centers = [pair for pair in product(config.factors, config.factors) if pair != (1.0, 1.0)]
+    results = {}
+    for track in config.tracks:
+        for policy in PLAYED[track]:
+            actions = inputs_of(policy, track, config.systems, config.seed)
+            known = identified(track, (1.0, 1.0), actions, config.seed, KNOWN)
+            told = {"noise_hypotheses": hypotheses}
+            cells = [
+                identified(track, center, actions, config.seed, told)
+                for center in shown(centers, description=f"{track} {policy}")
+            ]
+            names = list(make(track, 1).experiment.model.coefficients)
+            titles = ["prior of σ_w", "of σ_v", *names, "all", "lost, nats"]
+            show(f"\n{track}, {policy}, {told}", table(titles, rows(cells, known), markdown=True))
+            results[f"{track} {policy}"] = {
+                "verdict": verdict(cells, known),
+                "known": {"coverage": known.inside.mean(axis=0).tolist(), "density": known.density.tolist()},
+                "cells": [
+                    {"center": c.center, "coverage": c.inside.mean(axis=0).tolist(), "density": c.density.tolist()}
+                    for c in cells
+                ],
+            }
+    if config.json is not None:
+        write_json(config.json, results)
+
+
+if __name__ == "__main__":
+    from agents.cli import run_script
+
+    run_script(main, Config, __doc__ or "")

@@ -1,0 +1,321 @@
+"""What is fixed about an experiment: limits, noises, priors, the estimator and the reward.
+
+The fields of these classes are the keyword arguments of `gymnasium.make`; all but functions and beliefs of one's own
+are JSON-able.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from duffing_env.custom_functions import Beliefs, check_observation
+from duffing_env.rewards.reward_registry import check_reward, kernel_reward
+from duffing_env.storage.kernel_spec import KernelParams, KernelSpec, parameter_names
+from duffing_env.storage.random_streams import SEED_BRANCHES
+from estimator.belief import Belief
+from estimator.checks import LARGEST, SMALLEST, flag, number, one_of, shown, whole
+from estimator.ensemble import Hypotheses, first_weights, priors, start
+from estimator.inference import DEFAULT_ITERATIONS, MOST_ITERATIONS
+from estimator.models.difference import difference
+from estimator.models.model import Model
+from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.priors import log_uniform_moments, weak_prior
+from estimator.settings import checked_hypotheses
+from estimator.units import Scales
+
+#: More ratios of the noises, or values of each, than are worth their time.
+MAX_HYPOTHESES = 99
+
+#: Samples of an episode, or of an action, at most.
+MAX_SAMPLES = 10**9
+
+#: Smallest and largest relative half width of a range of parameters.
+SPREAD_LIMITS = 1e-6, 0.999
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What all experiments have; `duffing_env.env.DuffingEnv` says what its options are."""
+
+    factorisation: str = "structured"
+    iterations: int | None = None
+    reward: str | Callable[..., Any] = "information_gain"
+    observation: str | Callable[[Beliefs], Any] = "posterior"
+    history: int = 16
+    max_input: float = 0.15
+    max_output: float = 0.6
+    hold: int = 1
+    terminal: bool = False
+    terminated_return: float | None = None
+    noise_hypotheses: Hypotheses = 1
+    branch: str = "train"
+
+    #: Whether there is a true plant to compare with.
+    knows_truth: ClassVar[bool] = True
+    #: Whether hypotheses about the noises are moved by sigma points: from a wide belief, or where a model bends.
+    uses_cubature: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        one_of("branch", self.branch, SEED_BRANCHES)
+        one_of("factorisation", self.factorisation, DEFAULT_ITERATIONS)
+        if self.iterations is not None:
+            whole("iterations", self.iterations, MOST_ITERATIONS)
+        check_reward(self.reward)
+        if callable(self.reward) and (self.terminal or self.terminated_return is not None):
+            raise ValueError("terminal and terminated_return must be left out with a reward of one's own")
+        check_observation(self.observation, self.history)
+        for name in ("max_input", "max_output"):  # what is far beyond lets an oscillator run away, and its episode end
+            number(name, getattr(self, name), high=1e300)
+        whole("hold", self.hold, MAX_SAMPLES)
+        flag("terminal", self.terminal)
+        if self.terminated_return is not None:
+            number("terminated_return", self.terminated_return, -LARGEST, LARGEST, "None keeps what was gained")
+        hypotheses = checked_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MAX_HYPOTHESES)
+        object.__setattr__(self, "noise_hypotheses", hypotheses)
+
+    @property
+    def samples(self) -> int:
+        """Samples of an episode that no limit ends."""
+        raise NotImplementedError
+
+    @property
+    def model(self) -> Model:
+        """The model that is believed."""
+        return difference()
+
+    @property
+    def plant(self) -> Model | None:
+        """The model that is simulated; None where a record is replayed."""
+        return None
+
+    @property
+    def truth_model(self) -> Model:
+        """The model whose parameters the truth has."""
+        return self.plant or self.model
+
+    @property
+    def degree(self) -> int:
+        """Of the input over a sample of a differential equation: 0 held, 1 linear from the last input to this one."""
+        return 0
+
+    @property
+    def step(self) -> float:
+        """Sampling step [s]."""
+        return SAMPLING_STEP
+
+    @property
+    def scales(self) -> Scales:
+        """What one inside is worth outside."""
+        return Scales(self.step)
+
+    @property
+    def prior_belief(self) -> Belief:
+        """The belief that every episode starts from."""
+        raise NotImplementedError
+
+    @property
+    def nominal_parameters(self) -> dict[str, float]:
+        """The plant in the middle of the range: the Silverbox circuit's as a model of it sees it, 1 of other models."""
+        twin = CONTINUOUS_TWIN if self.truth_model.is_continuous else SILVERBOX_TWIN
+        return {name: twin.get(name, 1.0) for name in parameter_names(self.truth_model)}
+
+    @property
+    def replayed_record(self) -> tuple[FloatArray, FloatArray]:
+        """Recorded input and output; of one sample each where the plant is simulated."""
+        return np.zeros(1), np.zeros(1)
+
+    @property
+    def plant_params(self) -> dict[str, Any]:
+        """Fields of `Setup` that describe the plant."""
+        return {}
+
+    @property
+    def likeliest_log_noise_ratio(self) -> float | None:
+        """Where hypotheses about the noises are likeliest at first (`estimator.ensemble.first_weights`)."""
+        return None
+
+    @property
+    def _n_iterations(self) -> int:
+        return int(self.iterations or DEFAULT_ITERATIONS[self.factorisation])
+
+    @property
+    def kernel_spec(self) -> KernelSpec:
+        """What the kernel is compiled for."""
+        return KernelSpec(
+            self.model, self.plant, self.degree, self.factorisation,
+            self._n_iterations if self.factorisation == "structured" else 0,
+            str(self.reward) if kernel_reward(self.reward).hooks_module else "",
+            self.noise_hypotheses != 1, self.uses_cubature and self.noise_hypotheses != 1,
+        )  # fmt: skip
+
+    @property
+    def kernel_params(self) -> KernelParams:
+        """The experiment as the kernel is told of it."""
+        prior, model, names = self.prior_belief, self.model, parameter_names(self.truth_model)
+        first_record, plant_fields = prior.record, dict(self.plant_params)
+        if self.noise_hypotheses != 1:
+            members = priors(prior, self.noise_hypotheses)
+            weights = first_weights(members, self.likeliest_log_noise_ratio)
+            first_record = start(members, len(model.names), weights)
+            plant_fields["hypothesis_priors"] = np.column_stack([members[:, -4:], weights])
+        precisions = first_record[-2 - 2 * model.n_outputs :]
+        values: dict[str, Any] = {
+            "max_input": float(self.max_input),
+            "max_output": float(self.max_output),
+            "horizon": float(self.samples),
+            "iterations": self._n_iterations,
+            "step": self.step,
+            "nominal_parameters": np.array([self.nominal_parameters[name] for name in names]),
+            "parameter_stds": np.zeros(len(names)),
+            "measurement_noise": np.zeros(self.truth_model.n_outputs),
+            "walk_variances": np.zeros(model.n_coefficients),
+            "reward_weights": np.array(kernel_reward(self.reward).weights),
+            "terminal": self.terminal,
+            "has_terminated_return": self.terminated_return is not None,
+            "terminated_return": float(self.terminated_return or 0.0),
+            "prior": first_record.copy(),
+            "prior_inverse_std": 1.0 / np.sqrt(np.diag(prior.coefficients_cov)),
+            "prior_log_precisions": np.log(precisions[::2] / precisions[1::2]),
+        }
+        return KernelParams(**(values | plant_fields))
+
+
+@dataclass(frozen=True)
+class SimulatedExperiment(Experiment):
+    """An experiment on the plant ``difference``, with a new oscillator in every episode.
+
+    `duffing_env.env.DuffingEnv` says what its options are.
+    """
+
+    horizon: int = 256
+    process_noise: float = 5e-4
+    measurement_noise: float = 5e-4
+    spread: float = 0.3
+    noise_range: float = 1.0
+    process_noise_guess: float | None = None
+    measurement_noise_guess: float | None = None
+    noise_shape: float = 2.0
+    mean: Mapping[str, float] | None = None
+    prior: Belief | None = None
+    plant_spread: float | None = None
+    max_rms: float | None = None
+    max_slew: float | None = None
+    input_cost: float = 0.0
+    jump: float = 0.0
+    drift: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole("horizon", self.horizon, MAX_SAMPLES)
+        for name in ("process_noise", "measurement_noise", "noise_shape"):
+            number(name, getattr(self, name))
+        number("spread", self.spread, *SPREAD_LIMITS, "masses are positive, and none is known so well before")
+        if self.plant_spread is not None:
+            number("plant_spread", self.plant_spread, 0, SPREAD_LIMITS[1], "0 is the twin itself")
+        for name in ("max_rms", "max_slew", "process_noise_guess", "measurement_noise_guess"):
+            if getattr(self, name) is not None:
+                number(name, getattr(self, name))
+        number("noise_range", self.noise_range, 1, LARGEST, "1 draws no noises")
+        for name, limit in (("input_cost", LARGEST), ("jump", SPREAD_LIMITS[1]), ("drift", 1.0)):
+            number(name, getattr(self, name), 0, limit, "0 does without it")
+        check_nominal_parameters(self.mean, parameter_names(self.plant))
+        if self.prior is not None:
+            check_prior(self.prior, self.scales, self.model)
+        if self.drift and self.factorisation == "mean_field":
+            raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {self.drift!r}")
+
+    @property
+    def samples(self) -> int:
+        """The horizon."""
+        return self.horizon
+
+    @property
+    def plant(self) -> Model:
+        """The paper's difference equation."""
+        return difference()
+
+    @property
+    def nominal_parameters(self) -> dict[str, float]:
+        """The twin, or the means of one's own."""
+        return super().nominal_parameters | {name: float(value) for name, value in (self.mean or {}).items()}
+
+    @cached_property
+    def prior_belief(self) -> Belief:
+        """The prior of one's own, or the one that fits plants so drawn, and the noises."""
+        if self.prior is not None:
+            return self.prior.factorised(self.factorisation)
+        return self.prior_for_model(self.model, self.factorisation)
+
+    def prior_for_model(self, model: Model, factorisation: str = "structured") -> Belief:
+        """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
+        noises = *self.prior_noise_stds, self.noise_shape
+        return weak_prior(model, *self.coefficient_moments(model), *noises, scales=self.scales).factorised(
+            factorisation
+        )
+
+    def coefficient_moments(self, model: Model) -> tuple[FloatArray, FloatArray]:
+        """Mean (K,) and covariance (K, K) of the coefficients of plants so drawn."""
+        for name, value in self.nominal_parameters.items():
+            if value == 0:
+                raise ValueError(f"mean[{name!r}] must not be 0, for it is known up to a factor; give a prior as well")
+        return log_uniform_moments(model, self.nominal_parameters, self.spread, self.scales)
+
+    @property
+    def prior_noise_stds(self) -> tuple[float, float]:
+        """Standard deviations at which the priors of γ and of the first sensor's ξ are centred."""
+        process, sensor = self.process_noise_guess, self.measurement_noise_guess
+        return (
+            float(self.process_noise if process is None else process),
+            float(self.measurement_noise if sensor is None else sensor),
+        )
+
+    @property
+    def plant_params(self) -> dict[str, Any]:
+        """The noises, and the range of the plants."""
+        return {
+            "process_noise": float(self.process_noise),
+            "measurement_noise": np.full(self.plant.n_outputs, float(self.measurement_noise)),
+            "noise_range": float(self.noise_range),
+            "spread": float(self.spread if self.plant_spread is None else self.plant_spread),
+            "budget": np.inf if self.max_rms is None else self.horizon * self.max_rms * self.max_rms,
+            "max_slew": np.inf if self.max_slew is None else float(self.max_slew),
+            "sqrt_input_cost": float(np.sqrt(self.input_cost)) / self.max_input,
+            "jump": float(self.jump),
+            "has_drift": self.drift > 0,
+            "walk_variances": self.drift**2 * np.diag(self.prior_belief.coefficients_cov),
+        }
+
+
+def check_nominal_parameters(means: Mapping[str, float] | None, names: Sequence[str]) -> None:
+    """Refuse middles of the parameters' ranges that are not such, of some or all of them."""
+    if means is None:
+        return
+    if not isinstance(means, Mapping) or not set(means) <= set(names):
+        raise ValueError(f"mean must give some of the parameters {list(names)}, but is {shown(means)}")
+    for name, value in means.items():
+        number(f"mean[{name!r}]", value, SMALLEST if name == "m" else -LARGEST)
+
+
+def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None) -> None:
+    """Refuse what is not a belief, or one in other scales, or of another model where that is given."""
+    if not isinstance(prior, Belief):
+        raise ValueError(f"prior must be an estimator.Belief or None, but is {shown(prior)}")
+    if prior.scales != scales:
+        pairs = {name: (getattr(scales, name), getattr(prior.scales, name)) for name in asdict(scales)}
+        scale_words = {"input": "limit", "output": "range", "order": "time derivative that the sensor shows"}
+        differences = ", ".join(
+            f"{scale_words.get(name, name)} {found!r} in place of {required!r}"
+            for name, (required, found) in pairs.items()
+            if required != found
+        )
+        raise ValueError(
+            f"prior must have the rig's scales, limit and range, but has {differences}; identify once more with the rig as "
+            f"it is now, and save that"
+        )
+    if model is not None and prior.model != model:
+        raise ValueError(f"prior must be of the model {model.name!r}, but is of {prior.model.name!r}")

@@ -1,0 +1,118 @@
+"""Stages of a step that no model changes: scalar functions of a lane, which the kernel makes run across lanes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from duffing_env.storage.random_streams import box_muller, float_to_word, sfc64_next, to_uniform, word_to_float
+from estimator.lanes import LANES, jit, lanewise
+from estimator.rig_prior import HALF_WIDTH
+
+# A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).
+_FLOAT32_ROUNDING = 2.0**-22
+
+
+def draw_noise(STREAM_a, STREAM_b, STREAM_c, STREAM_d, WAITING):
+    """Two standard normal numbers. The stream of an environment that waits for its reset stands still."""
+    first, a, b, c, d = sfc64_next(
+        float_to_word(STREAM_a), float_to_word(STREAM_b), float_to_word(STREAM_c), float_to_word(STREAM_d)
+    )
+    second, a, b, c, d = sfc64_next(a, b, c, d)
+    w, v = box_muller(to_uniform(first), to_uniform(second))
+    live = WAITING == 0.0
+    return (
+        word_to_float(a) if live else STREAM_a, word_to_float(b) if live else STREAM_b,
+        word_to_float(c) if live else STREAM_c, word_to_float(d) if live else STREAM_d, w, v,
+    )  # fmt: skip
+
+
+def compile_noise_draw(row_of: Mapping[str, int]) -> Any:
+    """``draw_noise(W)``: two standard normal numbers in every lane, into rows ``NOISE_w`` and ``NOISE_v``."""
+    return lanewise(row_of, "STREAM_a STREAM_b STREAM_c STREAM_d NOISE_w NOISE_v")(draw_noise)
+
+
+def limit_input(ASKED, INPUT, LAST_INPUT, SPENT, budget, max_slew):
+    """The input that the generator gives when it is asked for one: near enough to the last, and paid for.
+
+    ``SPENT`` is the energy Σ u²; what is left of the budget bounds the next input, so it cannot be exceeded.
+    """
+    applied_input = min(max(ASKED, INPUT - max_slew), INPUT + max_slew)
+    max_affordable = np.sqrt(max(budget - SPENT, 0.0))
+    applied_input = min(max(applied_input, -max_affordable), max_affordable)
+    return applied_input, INPUT, LAST_INPUT, applied_input - INPUT, SPENT + applied_input * applied_input
+
+
+def replay_sample(INPUT, RECORDED_u, RECORDED_y, max_input):
+    """The recorded plant: a record answers the recorded input only."""
+    deviates = abs(INPUT - RECORDED_u) > _FLOAT32_ROUNDING * max_input
+    return RECORDED_u, RECORDED_y, 1.0 if deviates else 0.0
+
+
+def pay_reward(REWARD, EARNED, TERMINATED, TRUNCATED, terminal, has_terminated_return, terminated_return):
+    """When the reward is paid, and what an episode that is terminated returns.
+
+    ``EARNED`` is what the episode gave so far, as if it were paid sample by sample.
+    """
+    already_paid = 0.0 if terminal else EARNED
+    EARNED += REWARD
+    episode_return = EARNED if TERMINATED + TRUNCATED != 0.0 else 0.0
+    REWARD = episode_return if terminal else REWARD
+    return terminated_return - already_paid if has_terminated_return and TERMINATED != 0.0 else REWARD, EARNED
+
+
+def draw_parameter_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
+    """The sample at which the first parameter jumps, in the middle half of the episode, and its log-uniform factor."""
+    low = math.log(1.0 - jump)
+    first, a, b, c, d = sfc64_next(
+        float_to_word(STREAM_a), float_to_word(STREAM_b), float_to_word(STREAM_c), float_to_word(STREAM_d)
+    )
+    second, a, b, c, d = sfc64_next(a, b, c, d)
+    jump_sample = math.floor(horizon * (0.25 + 0.5 * to_uniform(first)))
+    factor = math.exp(low + (math.log(1.0 + jump) - low) * to_uniform(second))
+    return word_to_float(a), word_to_float(b), word_to_float(c), word_to_float(d), jump_sample, factor
+
+
+@jit
+def draw_plant_parameters(W, j, params, first_stream, first_parameter):
+    """The parameters of lane j's plant, each log-uniform about its centre, Gaussian or log-normal; then its noises.
+
+    ``first_stream`` and ``first_parameter`` say where the first word of the stream and the first parameter stand.
+    """
+    a, b = float_to_word(W[first_stream + j]), float_to_word(W[first_stream + LANES + j])
+    c, d = float_to_word(W[first_stream + 2 * LANES + j]), float_to_word(W[first_stream + 3 * LANES + j])
+    log_low = math.log(1.0 - params.spread)
+    log_width = math.log(1.0 + params.spread) - log_low
+    for p in range(len(params.nominal_parameters)):
+        first, a, b, c, d = sfc64_next(a, b, c, d)
+        if params.parameter_stds[p] != 0.0:
+            second, a, b, c, d = sfc64_next(a, b, c, d)
+            deviation, _ = box_muller(to_uniform(first), to_uniform(second))
+            value = params.nominal_parameters[p] + params.parameter_stds[p] * deviation
+            if params.parameter_stds[p] < 0.0:
+                value = params.nominal_parameters[p] * math.exp(params.parameter_stds[p] * deviation)
+            elif (
+                abs(params.nominal_parameters[p]) > HALF_WIDTH * params.parameter_stds[p]
+                and value * params.nominal_parameters[p] < 0.0
+            ):
+                value = -value  # what is believed to have one sign keeps it
+            W[first_parameter + p * LANES + j] = value
+        else:
+            W[first_parameter + p * LANES + j] = params.nominal_parameters[p] * math.exp(
+                log_low + log_width * to_uniform(first)
+            )
+    first_noise_std, log_noise_range = (
+        first_parameter + len(params.nominal_parameters) * LANES,
+        math.log(params.noise_range),
+    )
+    for k in range(1 + len(params.measurement_noise)):
+        std = params.process_noise if k == 0 else params.measurement_noise[k - 1]
+        if params.noise_range > 1.0:
+            first, a, b, c, d = sfc64_next(a, b, c, d)
+            std *= math.exp(log_noise_range * (to_uniform(first) - 0.5))
+        W[first_noise_std + k * LANES + j] = std
+    W[first_stream + j], W[first_stream + LANES + j] = word_to_float(a), word_to_float(b)
+    W[first_stream + 2 * LANES + j], W[first_stream + 3 * LANES + j] = word_to_float(c), word_to_float(d)

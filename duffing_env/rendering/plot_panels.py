@@ -1,0 +1,74 @@
+"""The panels of the picture of an environment: a signal, and a parameter, over time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from estimator.parameters import FloatArray
+
+INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
+SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"
+_TITLE: dict[str, Any] = {"fontsize": 9, "pad": 4}
+
+# A curve ends in a dot. What is "animated" Matplotlib leaves out of the background.
+_CURVE: dict[str, Any] = {"marker": "o", "markersize": 3.5, "markevery": [-1], "animated": True}
+
+
+class SignalPanel:
+    """Input or output over time, between its limits. ``animated_artists``: what a frame draws over the background."""
+
+    def __init__(self, axes: Any, name: str, limit: float, drawstyle: str) -> None:
+        self.axes = axes
+        axes.set_title(name, loc="left", color=INK, **_TITLE)
+        self._edge = 1.15 * limit
+        axes.set_ylim(-self._edge, self._edge)
+        axes.set_yticks(limit * np.array([-1, -0.5, 0, 0.5, 1]))
+        axes.yaxis.set_major_formatter("{x:.4g}")
+        for edge in (-limit, limit):
+            self.limit = axes.axhline(edge, color=GREY, linewidth=1, linestyle=(0, (1, 2)))
+        (self._curve,) = axes.plot([], color=SIGNAL, linewidth=1, drawstyle=drawstyle, **_CURVE)
+        self.animated_artists = (self._curve,)
+
+    def update(self, times: FloatArray, values: FloatArray) -> None:
+        """Show values (n,) over times (n,), in the unit of the axis."""
+        self._curve.set_data(times, np.clip(values, -self._edge, self._edge))
+
+
+class ParameterPanel:
+    """Mean and credible band of one parameter as deviations from the truth, and as numbers above."""
+
+    _EDGE = 150.0  # [%]; what is further from the truth is drawn there
+
+    def __init__(self, axes: Any, name: str, unit: float) -> None:
+        self.axes = axes
+        self._unit = unit
+        axes.set_title(name, loc="left", color=INK, **_TITLE)
+        # Linear near the truth and logarithmic away from it: a belief contracts by a factor of a hundred and more.
+        axes.set_yscale("asinh", linear_width=0.3)
+        axes.set_ylim(-1.2 * self._EDGE, 1.2 * self._EDGE)
+        axes.set_yticks([-100, -10, -1, 0, 1, 10, 100], ["−100", "−10", "−1", "", "1", "10", "100"])
+        axes.yaxis.minorticks_off()
+        self.truth = axes.axhline(0, color=TRUTH, linewidth=1, linestyle=(0, (4, 2)))
+        self.band = axes.fill_between([], [], color=POSTERIOR, alpha=0.22, linewidth=0, animated=True)
+        (self.mean,) = axes.plot([], color=POSTERIOR, linewidth=1.3, **_CURVE)
+        self._true_value = axes.annotate(
+            "", (0.6, 1.0), (0, _TITLE["pad"]), "axes fraction", "offset points", ha="center", color=TRUTH,
+            fontsize=_TITLE["fontsize"], animated=True, annotation_clip=False,
+        )  # fmt: skip
+        self._estimate = axes.set_title("", loc="right", color=POSTERIOR, animated=True, **_TITLE)
+        self.animated_artists = (self.band, self.mean, self._true_value, self._estimate)
+
+    def update(self, times: FloatArray, mean: FloatArray, half: FloatArray, true: float) -> None:
+        """Show means (n,) with half widths of their bands (n,), beside the true value."""
+        percent = 100 * np.array([mean - half - true, mean - true, mean + half - true]) / abs(true)
+        low, middle, high = np.clip(percent, -self._EDGE, self._EDGE)
+        self.mean.set_data(times, middle)
+        known = np.isfinite(low) & np.isfinite(high)
+        there, back = (times[known], low[known]), (times[known][::-1], high[known][::-1])
+        self.band.set_verts([np.hstack([there, back]).T])
+        self._true_value.set_text(f"true {true / self._unit:.3f}".replace("-", "−"))
+        in_sight = half[-1] < 10 * abs(true)
+        numbers = f"{mean[-1] / self._unit:z.3f} ± {half[-1] / self._unit:.3f}".replace("-", "−")
+        self._estimate.set_text(numbers if in_sight else "not known yet")

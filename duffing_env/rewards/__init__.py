@@ -1,0 +1,1 @@
+"""The rewards, one module each, and their registry."""

@@ -1,0 +1,104 @@
+"""The reward ``expected_free_energy``: what a sample teaches as it is expected, before its outcome is seen.
+
+The belief before the sample, with the input that is chosen, predicts the outputs. Conditioning on them shrinks the
+coefficients' covariance from C to C', whatever they turn out to be, to first order:
+
+    I = ½ log det C - ½ log det C'    [nats],
+
+which is what the expected free energy counts as epistemic: the mutual information of outputs and coefficients. The
+prediction is the structured one for every belief; of a mean-field one the covariances between its factors are zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from duffing_env.rewards.reward_registry import RewardHooks, no_hook, no_lane_hook
+from duffing_env.storage.kernel_spec import KernelSpec
+from estimator.engine.rows import carried_names
+from estimator.lanes import part
+
+
+def hook_source(spec: KernelSpec, loop: Any) -> str:
+    """``expect_sample(W)``: an imagined sample at the belief."""
+    from estimator.engine.derive import symbol
+
+    # γ counts the noise as the first sensor shows that of one sample; N is of unit strength.
+    noises = {"Q": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
+    noises |= {f"R_{y}": symbol(f"XI_RATE_{y}") / symbol(f"XI_SHAPE_{y}") for y in spec.belief_model.outputs}
+    return expected_sample_source("expect", spec, loop, noises)
+
+
+def expected_sample_source(
+    name: str,
+    spec: KernelSpec,
+    loop: Any,
+    substitutions: Mapping[str, Any],
+    first_assignments: Sequence[tuple[str, Any]] = (),
+    keeps_covariance: bool = False,
+) -> str:
+    """Source of ``name(W)``: outputs as expected; leaves ½ log det C - ½ log det C' in ``WORK`` [nats].
+
+    Args:
+        name: of the function.
+        spec: whose model is believed.
+        loop: as `duffing_env.kernel_stages.env_codegen` makes it.
+        substitutions: quantity of the model to what stands in its place: another row, or an expression.
+        first_assignments: assignments that come first.
+        keeps_covariance: whether the covariance afterwards is kept, in the rows of ``substitutions``.
+    """
+    import sympy as sp
+
+    from duffing_env.kernel_stages.env_codegen import log_det_and_density
+    from estimator.engine import algebra, derive, sensitivity
+
+    model, source, body = spec.belief_model, "", ""
+    lines, motion = derive.moved(model)
+    if model.is_continuous:
+        carried = carried_names(model)
+        start = [(f"V_{row}", value) for row, value in derive.carried_at_start(model).items()]
+        source += loop(
+            f"{name}_begin",
+            "The point that moves.",
+            derive.renamed(start, substitutions),
+            {row: f"V_{row}" for row in carried},
+        )
+        step = derive.renamed(sensitivity.motion_step(model, spec.degree), substitutions)
+        source += loop(f"{name}_move", "One Runge-Kutta step.", step, {row: f"{row}_E" for row in carried}, "T")
+        steps = model.substeps
+        body = f"    {name}_begin(W)\n    for s in range({steps}):\n        {name}_move(W, s / {steps})\n"
+    update_lines, results = algebra.expected_sample(model, motion, spec.degree)
+    log, covariances = sp.Function("log"), [row for row in results if row.startswith("P_")]
+    lines_before, det_before, _, _ = log_det_and_density(model, prefix="B")
+    entries = {row: derive.symbol(results[row]) for row in covariances}
+    lines_after, det_after, _, _ = log_det_and_density(model, covariance_entries=entries, prefix="A")
+    lines = derive.renamed(
+        [
+            *first_assignments,
+            *lines,
+            *update_lines,
+            *lines_before,
+            *lines_after,
+            ("GAINED", (log(det_before) - log(det_after)) / 2),
+        ],
+        substitutions,
+    )
+    kept_rows = (
+        {substitutions[row]: str(derive.renamed([("", entries[row])], substitutions)[0][1]) for row in covariances}
+        if keeps_covariance
+        else {}
+    )
+    source += loop(f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept_rows, "WORK": "GAINED"})
+    return source + f"@straight\ndef {name}(W):\n{body}    {name}_finish(W)\n"
+
+
+def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
+    """It expects before the belief is updated."""
+    expect_sample = generated.expect
+
+    @part(spec.name)
+    def before_update(W, params):
+        expect_sample(W)
+
+    return RewardHooks(no_lane_hook, no_hook, before_update, no_hook)

@@ -1,0 +1,52 @@
+"""The reward ``fisher``: what the outputs say of the coefficients to one who knows the truth.
+
+The covariance recursion of the structured update, linearised not at the belief but at the true plant, where it truly
+is, and with the true noises: its covariance of the coefficients is (Λ0 + F)⁻¹ with Λ0 the prior's precision and F the
+Fisher information of the outputs so far. The recursion needs no output, so no estimator can talk it into anything.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from duffing_env.rewards.expected_free_energy_reward import expected_sample_source
+from duffing_env.rewards.reward_registry import RewardHooks, no_hook
+from duffing_env.storage.kernel_spec import KernelSpec, block_layout, noise_std_rows
+from estimator.engine.rows import belief_names
+from estimator.lanes import LANES, part
+
+
+def hook_source(spec: KernelSpec, loop: Any) -> str:
+    """``update_ideal(W)``: an imagined sample at the truth."""
+    from estimator.engine.derive import symbol
+
+    model = spec.belief_model
+    truth_rows = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
+    truth_rows |= {name: f"I_{name}" for name in belief_names(model) if name.startswith("P_")}
+    names, stds = ["Q", *(f"R_{y}" for y in model.outputs)], noise_std_rows(spec.truth_model).values()
+    noises = [(name, symbol(std) ** 2) for name, std in zip(names, stds, strict=True)]
+    return expected_sample_source("ideal", spec, loop, truth_rows, noises, keeps_covariance=True)
+
+
+def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
+    """It starts from the prior, and counts a sample before the plant moves."""
+    row_of, model, update_ideal = block_layout(spec), spec.belief_model, generated.ideal
+    names = belief_names(model)
+    information_rows = tuple(
+        (names.index(name), row_of[f"I_{name}"] * LANES) for name in names if name.startswith("P_")
+    )
+    elapsed_row = row_of["ELAPSED"] * LANES
+    if model.n_outputs > 1:
+        raise ValueError(f"reward 'fisher' is for one sensor, but {model.name!r} has {model.n_outputs}")
+
+    @part(spec.name)
+    def start_information(W, j, params):
+        if W[elapsed_row + j] == 0.0:  # a truth that changes in an episode does not take back what was known
+            for index, row in information_rows:
+                W[row + j] = params.prior[index]
+
+    @part(spec.name)
+    def add_sample_information(W, params):
+        update_ideal(W)
+
+    return RewardHooks(start_information, add_sample_information, no_hook, no_hook)

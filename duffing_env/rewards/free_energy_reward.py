@@ -1,0 +1,56 @@
+"""The reward ``free_energy``: minus the free energy of the sample, which the update leaves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from duffing_env.rewards.reward_registry import RewardHooks, no_hook, no_lane_hook
+from duffing_env.storage.kernel_spec import KernelSpec, block_layout
+from estimator.arrays import copy
+from estimator.engine.free_energy import free_energies
+from estimator.inference import mean_field
+from estimator.lanes import LANES, part
+
+
+def hook_source(spec: KernelSpec, loop: Any) -> str:
+    """Nothing of its own: the update leaves what it needs."""
+    return ""
+
+
+def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
+    """It reads what the update leaves."""
+    free_energies_of, reward_row = _compile_free_energies(spec), block_layout(spec)["WORK"] * LANES
+
+    @part(spec.name)
+    def after(W, params):
+        energies = np.empty(LANES)
+        free_energies_of(W, energies)
+        for j in range(LANES):
+            W[reward_row + j] = -energies[j]
+
+    return RewardHooks(no_lane_hook, no_hook, no_hook, after)
+
+
+def _compile_free_energies(spec: KernelSpec) -> Any:
+    """``find(W, energies)``: what the last update left every lane with [nats]."""
+    row_of = block_layout(spec)
+    if spec.has_noise_hypotheses:
+        free_energy_row = row_of["FREE_ENERGY"] * LANES
+
+        @part(spec.name)
+        def mixture_free_energy(W, energies):
+            copy(energies, 0, W[free_energy_row:], LANES)
+
+        return mixture_free_energy
+    if spec.factorisation == "mean_field":
+        free_energy = mean_field.pieces(row_of).free_energy
+
+        @part(spec.name)
+        def mean_field_free_energy(W, energies):
+            for j in range(LANES):
+                energies[j] = free_energy(W, j)
+
+        return mean_field_free_energy
+    return free_energies(spec.belief_model, spec.iterations, LANES, row_of, every=False)

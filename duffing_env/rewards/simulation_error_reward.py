@@ -1,0 +1,130 @@
+"""The reward ``simulation_error``: how far the believed oscillator runs from the true one, on its own.
+
+Both are put at rest and given the same test input, without noise; what they do is compared:
+
+    misfit = min(sqrt(Σ (x_believed - x_true)² / Σ x_true²), 1).
+
+The believed one has the posterior's means for its coefficients. One that runs away, or is NaN, has a misfit of 1.
+
+The test input is a Schroeder multisine of `TEST_SAMPLES` samples: the first 20 multiples of 9.5 Hz, so up to 191 Hz as the
+Silverbox's, all of one size. Its peak is half of ``max_input``, with which oscillators of the standard tracks come to
+0.35 V at most.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from duffing_env.rewards.reward_registry import RewardHooks, no_hook
+from duffing_env.storage.kernel_spec import KernelSpec, block_layout
+from estimator.arrays import copy_lanes
+from estimator.engine.feeding import feeder
+from estimator.engine.rows import input_rows
+from estimator.lanes import LANES, part
+from estimator.parameters import FloatArray
+
+#: Length of the test input: 105 ms.
+TEST_SAMPLES = 64
+
+_N_HARMONICS, _PEAK_FRACTION = 20, 0.5
+
+
+def _schroeder_multisine() -> FloatArray:
+    """The test input (SAMPLES,), in parts of ``max_input``."""
+    harmonics = np.arange(1, _N_HARMONICS + 1)
+    phases = -np.pi * harmonics * (harmonics - 1) / _N_HARMONICS
+    times = np.arange(TEST_SAMPLES)[:, None] / TEST_SAMPLES
+    waves: FloatArray = np.cos(2 * np.pi * harmonics * times + phases).sum(axis=1)
+    return _PEAK_FRACTION * waves / np.abs(waves).max()
+
+
+TEST_INPUT = _schroeder_multisine()
+
+
+def hook_source(spec: KernelSpec, loop: Any) -> str:
+    """``step_believed`` and ``step_true``: the believed and the true plant; ``add_difference`` adds up, ``finish_misfit`` ends."""
+    import sympy as sp
+
+    from estimator.engine.derive import calculus, renamed, state_step, symbol
+
+    model = spec.belief_model
+    believed = {x: f"MODEL_{x}" for x in model.states} | {c: c for c in model.coefficients}
+    true = {x: f"TWIN_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
+    substep_arguments = ("T",) if model.is_continuous else ()
+    source_text = loop(
+        "model_move", "The believed plant moves.", *state_step(model, spec.degree, believed), *substep_arguments
+    )
+    source_text += loop("twin_move", "The true plant moves.", *state_step(model, spec.degree, true), *substep_arguments)
+    output_expression = calculus(model).outputs[0].subs(symbol("u"), 0)
+    believed_output, true_output = (renamed([("", output_expression)], names)[0][1] for names in (believed, true))
+    lines = [
+        ("E_d", symbol("DEVIATION") + (believed_output - true_output) ** 2),
+        ("E_p", symbol("POWER") + true_output**2),
+    ]
+    source_text += loop("compare", "Add up what differs.", lines, {"DEVIATION": "E_d", "POWER": "E_p"})
+    misfit = sp.sqrt(symbol("DEVIATION") / symbol("POWER"))
+    # ``reaches`` is 0 for NaN, which so counts as 1.
+    bounded_misfit = sp.Function("select")(sp.Function("reaches")(sp.S.One, symbol("RATIO")), symbol("RATIO"), sp.S.One)
+    lines = [("RATIO", misfit), ("KEPT", bounded_misfit), ("FALL", symbol("MISFIT") - symbol("KEPT"))]
+    return source_text + loop("conclude", "The misfit, and its decrease.", lines, {"WORK": "FALL", "MISFIT": "KEPT"})
+
+
+def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
+    """It compares where an episode begins, and after every update."""
+    row_of, model = block_layout(spec), spec.belief_model
+    first, last = row_of[f"MODEL_{next(iter(model.states))}"] * LANES, (row_of["POWER"] + 1) * LANES
+    rows = [row_of[row] for row in input_rows(model, spec.degree)]
+    inputs, feed_input = tuple(row * LANES for row in rows), feeder(model, spec.degree, rows, LANES)
+    reward_row, misfit_row = row_of["WORK"] * LANES, row_of["MISFIT"] * LANES
+    step_believed, step_true, add_difference, finish_misfit = (
+        generated.model_move,
+        generated.twin_move,
+        generated.compare,
+        generated.conclude,
+    )
+    substeps, is_continuous = model.substeps, model.is_continuous
+
+    @part(spec.name)
+    def run_free_simulation(W, max_input):
+        """The misfits of a block's beliefs."""
+        saved_inputs = np.empty(len(inputs) * LANES)
+        for k in range(len(inputs)):
+            copy_lanes(saved_inputs, k * LANES, W, inputs[k], LANES)
+        for i in range(first, last):
+            W[i] = 0.0
+        for t in range(TEST_SAMPLES):
+            input_now = max_input * TEST_INPUT[t]
+            input_before = max_input * TEST_INPUT[t - 1] if t > 0 else 0.0
+            input_before_last = max_input * TEST_INPUT[t - 2] if t > 1 else 0.0
+            for j in range(LANES):
+                feed_input(W, j, input_now, input_before, input_before_last)
+            if is_continuous:
+                for s in range(substeps):
+                    step_believed(W, s / substeps)
+                    step_true(W, s / substeps)
+            else:
+                step_believed(W)
+                step_true(W)
+            add_difference(W)
+        finish_misfit(W)
+        for k in range(len(inputs)):
+            copy_lanes(W, inputs[k], saved_inputs, k * LANES, LANES)
+
+    @part(spec.name)
+    def start_simulation_error(W, j, params):
+        """Of lane j alone: the other lanes keep what they had."""
+        saved_rewards, saved_misfits = np.empty(LANES), np.empty(LANES)
+        copy_lanes(saved_rewards, 0, W, reward_row, LANES)
+        copy_lanes(saved_misfits, 0, W, misfit_row, LANES)
+        run_free_simulation(W, params.max_input)
+        saved_misfits[j] = W[misfit_row + j]
+        copy_lanes(W, reward_row, saved_rewards, 0, LANES)
+        copy_lanes(W, misfit_row, saved_misfits, 0, LANES)
+
+    @part(spec.name)
+    def update_simulation_error(W, params):
+        run_free_simulation(W, params.max_input)
+
+    return RewardHooks(start_simulation_error, no_hook, no_hook, update_simulation_error)
