@@ -1,7 +1,7 @@
 """``duffing-env evaluate`` without an installation: python evaluate.py --help."""
 
 from agents.cli import run_script
-from agents.commands.evaluate import Evaluate
+from agents.commands.evaluate_command import EvaluateCommand
 
 if __name__ == "__main__":
-    run_script(Evaluate.run, Evaluate)
+    run_script(EvaluateCommand.run, EvaluateCommand)

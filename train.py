@@ -1,6 +1,6 @@
 """``duffing-env train`` without an installation: python train.py --help."""
 
-from agents.commands.train import main
+from agents.commands.train_command import main
 
 if __name__ == "__main__":
     main("train.py")

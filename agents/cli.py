@@ -21,21 +21,21 @@ from typing import Annotated, Any, TypeVar
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from agents.interruption import Interrupted, raise_on_sigterm
 from agents.loading import spec_of
-from agents.stopping import Stopped, stopped_by_sigterm
 
 
-def _parse_options(words: list[str]) -> dict[str, Any]:
+def _parse_json_options(arguments: list[str]) -> dict[str, Any]:
     """The JSON object that the first of the words holds; ValueError where it is not one."""
     try:
-        options = json.loads(words[0])
+        options = json.loads(arguments[0])
     except RecursionError:
         raise ValueError("options must be a JSON object, but are nested too deeply") from None
     if not isinstance(options, dict):
-        raise ValueError(f"options must be a JSON object, but are {words[0]}; write e.g. '{{\"spread\": 0.2}}'")
+        raise ValueError(f"options must be a JSON object, but are {arguments[0]}; write e.g. '{{\"spread\": 0.2}}'")
     for name in ("num_envs", "autoreset_mode", "max_episode_steps", "threads", "copy", "render_mode"):
         if name in options:
-            raise ValueError(f"options must not hold {name}, but are {words[0]}; the command chooses that itself")
+            raise ValueError(f"options must not hold {name}, but are {arguments[0]}; the command chooses that itself")
     return options
 
 
@@ -45,7 +45,7 @@ JsonOptions = Annotated[
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="JSON",
-        instance_from_str=_parse_options,
+        instance_from_str=_parse_json_options,
         is_instance=lambda value: isinstance(value, dict),
         str_from_instance=lambda value: [json.dumps(value)],
     ),
@@ -58,7 +58,7 @@ Task = TypeVar("Task")
 RIG_TRACK = "duffing_env/Rig-v0"
 
 
-def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
+def options_with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
     """Options of an environment, with the rig of a file, or one that ships, written out.
 
     Raises:
@@ -72,18 +72,18 @@ def with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
     return {**options, "rig": Rig.of(rig).to_dict()}
 
 
-def followed(tasks: Iterable[tuple[str, Task]]) -> Iterator[Task]:
+def iterate_with_progress(tasks: Iterable[tuple[str, Task]]) -> Iterator[Task]:
     """Tasks, one after the other; `estimator.progress.progress` names the one at hand."""
     from estimator.progress import progress
 
     tasks = list(tasks)
-    with progress() as tell:
+    with progress() as on_progress:
         for done, (name, task) in enumerate(tasks):
-            tell(done / len(tasks), name)
+            on_progress(done / len(tasks), name)
             yield task
 
 
-def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[str | Path]) -> None:
+def check_distinct_files(outputs: Mapping[str, Path | None], inputs: Iterable[str | Path]) -> None:
     """Refuse to write over what a command reads, or two things into one file.
 
     Args:
@@ -93,17 +93,17 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[str | Pat
     Raises:
         ValueError: naming the option.
     """
-    taken = {Path(path).resolve(): "it is read" for path in inputs}
+    reasons = {Path(path).resolve(): "it is read" for path in inputs}
     for name, path in outputs.items():
         if path is not None:
-            if path.resolve() in taken:
+            if path.resolve() in reasons:
                 raise ValueError(
-                    f"{name} must be a file of its own, but is {path}, and {taken[path.resolve()]}; name another"
+                    f"{name} must be a file of its own, but is {path}, and {reasons[path.resolve()]}; name another"
                 )
-            taken[path.resolve()] = f"so is {name}"
+            reasons[path.resolve()] = f"so is {name}"
 
 
-def check_new(name: str, path: Path | None, force: bool) -> None:
+def check_not_overwritten(name: str, path: Path | None, force: bool) -> None:
     """Refuse to replace a file that is there, but by force: it may be a measurement.
 
     Raises:
@@ -113,20 +113,20 @@ def check_new(name: str, path: Path | None, force: bool) -> None:
         raise ValueError(f"{name} must be a new file, but there is {path}; name another, or add --force")
 
 
-def full_id(env: Any) -> Any:
+def full_track_id(env_id: Any) -> Any:
     """The id of a track by its name, without the module that registers it; anything else as it is.
 
     Example:
-        >>> full_id("Short-v0"), full_id("duffing_env:duffing_env/Short-v0"), full_id("CartPole-v1")
+        >>> full_track_id("Short-v0"), full_track_id("duffing_env:duffing_env/Short-v0"), full_track_id("CartPole-v1")
         ('duffing_env/Short-v0', 'duffing_env/Short-v0', 'CartPole-v1')
     """
     from duffing_env import TRACKS
 
-    env = env.removeprefix("duffing_env:") if isinstance(env, str) else env
-    return f"duffing_env/{env}" if f"duffing_env/{env}" in TRACKS else env
+    env_id = env_id.removeprefix("duffing_env:") if isinstance(env_id, str) else env_id
+    return f"duffing_env/{env_id}" if f"duffing_env/{env_id}" in TRACKS else env_id
 
 
-def check_track(env_id: str) -> None:
+def check_track_id(env_id: str) -> None:
     """Refuse an environment that has no vector environment of duffing_env, on which everything here is run.
 
     Raises:
@@ -143,8 +143,8 @@ def check_track(env_id: str) -> None:
     if not isinstance(env_id, str):
         raise ValueError(f"env must be the id of a track such as duffing_env/Short-v0, but is {shown(env_id)}")
     try:
-        entry: Any = spec_of(env_id).vector_entry_point
-        entry = load_env_creator(entry) if isinstance(entry, str) else entry
+        vector_env_class: Any = spec_of(env_id).vector_entry_point
+        vector_env_class = load_env_creator(vector_env_class) if isinstance(vector_env_class, str) else vector_env_class
     except (ImportError, AttributeError) as error:
         raise ValueError(
             f"env must be the id of a track such as duffing_env/Short-v0, but is {env_id}: {error}"
@@ -154,7 +154,9 @@ def check_track(env_id: str) -> None:
         raise type(error)(
             f"env must be the id of a track such as duffing_env/Short-v0: {str(error).rstrip('.')}{remedy}"
         ) from error
-    if entry is None or (isinstance(entry, type) and not issubclass(entry, DuffingVectorEnv)):
+    if vector_env_class is None or (
+        isinstance(vector_env_class, type) and not issubclass(vector_env_class, DuffingVectorEnv)
+    ):
         raise ValueError(
             f"env must be a track, which has a vector environment of duffing_env, but is {env_id}; "
             "see the list at: python -c 'import duffing_env; print(*duffing_env.TRACKS)'"
@@ -162,7 +164,7 @@ def check_track(env_id: str) -> None:
 
 
 #: What letters become that an encoding has not; others lose their accents, or become question marks.
-_LEGIBLE = {
+_ASCII_SUBSTITUTES = {
     "²": "^2", "³": "^3", "⁴": "^4", "⁻": "^-", "·": "*", "×": "x", "±": "+/-", "−": "-", "–": "-", "—": "-",
     "…": "...",
     "→": "->", "≤": "<=", "≥": ">=", "µ": "u", "μ": "u", "γ": "gamma", "ξ": "xi", "η": "eta", "θ": "theta",
@@ -171,26 +173,26 @@ _LEGIBLE = {
 }  # fmt: skip
 
 
-def _legible(error: UnicodeError) -> tuple[str, int]:
+def _encode_error_handler(error: UnicodeError) -> tuple[str, int]:
     """What stands for letters that a stream cannot write."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     letters = error.object[error.start : error.end]
-    return "".join(_spelled(letter) for letter in letters), error.end
+    return "".join(_ascii_form(letter) for letter in letters), error.end
 
 
-def _spelled(letter: str) -> str:
-    if letter in _LEGIBLE or "\u2500" <= letter <= "\u257f":  # lines of boxes
-        return _LEGIBLE.get(letter, "+")
+def _ascii_form(letter: str) -> str:
+    if letter in _ASCII_SUBSTITUTES or "\u2500" <= letter <= "\u257f":  # lines of boxes
+        return _ASCII_SUBSTITUTES.get(letter, "+")
     plain = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
     return plain or "?"
 
 
-codecs.register_error("legible", _legible)
+codecs.register_error("legible", _encode_error_handler)
 
 
 @contextmanager
-def _as_terminals_have_it() -> Iterator[None]:
+def _terminal_output() -> Iterator[None]:
     """Print lines of 80 characters at most, and letters in any encoding."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -205,40 +207,40 @@ def _as_terminals_have_it() -> Iterator[None]:
             os.environ["COLUMNS"] = before
 
 
-def parsed(kind: Any, **options: Any) -> Any:
+def parse_arguments(settings_class: Any, **options: Any) -> Any:
     """What `tyro.cli` makes of the words; its help in lines of 80 characters, which it breaks only within boxes."""
-    said = io.StringIO()
+    captured = io.StringIO()
     try:
-        with redirect_stdout(said):
-            return tyro.cli(kind, **options)
+        with redirect_stdout(captured):
+            return tyro.cli(settings_class, **options)
     finally:
-        for line in said.getvalue().splitlines():
+        for line in captured.getvalue().splitlines():
             print("\n".join(textwrap.wrap(line, 80, break_long_words=False, break_on_hyphens=False)) or line.strip())
 
 
 @contextmanager
-def told_in_one_line(name: str) -> Iterator[None]:
+def one_line_errors(program_name: str) -> Iterator[None]:
     """End the process where the user can mend what went wrong, with one message and no traceback.
 
     The exit status is 2 for a bad value or file, or a package of an extra that is missing; 130 after Ctrl-C, and 143
     after SIGTERM.
 
     Args:
-        name: of the command, which stands before the message.
+        program_name: of the command, which stands before the message.
     """
     # At the end of the process Python looks through all that Numba and torch have built, which takes 0.1 s and more.
     atexit.register(gc.freeze)
     try:
-        with stopped_by_sigterm(), _as_terminals_have_it():
+        with raise_on_sigterm(), _terminal_output():
             yield
-    except (KeyboardInterrupt, Stopped) as stopped:
-        left = ""
-        if isinstance(stopped, Stopped) and stopped.left:
+    except (KeyboardInterrupt, Interrupted) as interruption:
+        resume_hint = ""
+        if isinstance(interruption, Interrupted) and interruption.resume_hint:
             from estimator.checks import printable
 
-            left = f"; {printable(stopped.left)}"
-        print(f"{name}: stopped{left}", file=sys.stderr)
-        sys.exit(128 + (stopped.signum if isinstance(stopped, Stopped) else SIGINT))
+            resume_hint = f"; {printable(interruption.resume_hint)}"
+        print(f"{program_name}: stopped{resume_hint}", file=sys.stderr)
+        sys.exit(128 + (interruption.signum if isinstance(interruption, Interrupted) else SIGINT))
     except Exception as error:
         from gymnasium.error import Error as GymnasiumError
 
@@ -246,16 +248,16 @@ def told_in_one_line(name: str) -> Iterator[None]:
         from estimator.extras import EXTRAS, how_to_get
 
         if isinstance(error, ModuleNotFoundError) and (package := str(error.name).split(".")[0]) in EXTRAS:
-            print(f"{name}: {how_to_get(package)}", file=sys.stderr)
+            print(f"{program_name}: {how_to_get(package)}", file=sys.stderr)
         elif isinstance(error, ValueError | OSError | GymnasiumError):
-            print(f"{name}: {printable(' '.join(str(error).splitlines()))}", file=sys.stderr)
+            print(f"{program_name}: {printable(' '.join(str(error).splitlines()))}", file=sys.stderr)
         else:
             raise
         sys.exit(2)
 
 
 def run_script(main: Callable[[Config], object], config: type[Config], description: str | None = None) -> None:
-    """Parse the command line into ``config`` and call ``main`` with it, `told_in_one_line` where that fails.
+    """Parse the command line into ``config`` and call ``main`` with it, `one_line_errors` where that fails.
 
     Args:
         main: what the script does.
@@ -263,5 +265,5 @@ def run_script(main: Callable[[Config], object], config: type[Config], descripti
         description: stands above the list of settings in the help; lines that begin with $ stay so. The docstring of
             ``config`` where it is None.
     """
-    with told_in_one_line(Path(sys.argv[0]).name):
-        main(parsed(config, description=description))
+    with one_line_errors(Path(sys.argv[0]).name):
+        main(parse_arguments(config, description=description))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.cli import run_script
-from agents.results import versions, write_json
+from agents.console_output import package_versions, write_json
 from benchmarks.peer_process import Peers
 from benchmarks.section_tables import Section, print_section, print_verdicts
 from benchmarks.timed_rounds import CORES
@@ -55,7 +55,7 @@ def main(config: Config) -> None:
         samples = Path(folder) / "samples.npz"
         with Peers(samples, config.peers) as peers:
             machine = describe_machine()
-            used = {"ours": versions("llvmlite", "stable-baselines3", "torch"), "peers": peers.versions()}
+            used = {"ours": package_versions("llvmlite", "stable-baselines3", "torch"), "peers": peers.versions()}
             print_head(machine, used, config.repetitions)
             with status:
                 on_row: Callable[[str], None] = status.update

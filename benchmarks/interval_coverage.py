@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from scipy.stats import binomtest, norm
 
-from agents.results import show, table, write_json
+from agents.console_output import format_table, print_texts_and_tables, write_json
 from benchmarks.random_systems import SPREAD, draw, make_model, make_prior, make_rig, names_of
 from duffing_env.vector_env import ContinuousVectorEnv
 from estimator import OnlineEstimator, coefficients_of, duffing
@@ -281,10 +281,12 @@ def main(config: Config) -> None:
             continue
         found = [evaluate(case, config.systems, config.seed) for case in track(cases, description=title)]
         rows = [cells(case, one) for case, one in zip(cases, found, strict=True)]
-        show(f"\n{title}", table(list(rows[0]), [list(row.values()) for row in rows], markdown=True))
+        print_texts_and_tables(
+            f"\n{title}", format_table(list(rows[0]), [list(row.values()) for row in rows], markdown=True)
+        )
         if cases[0].hypotheses > 1:
             noises = [noise_cells(case, one) for case, one in zip(cases, found, strict=True)]
-            show(table(_NOISES, noises, markdown=True))
+            print_texts_and_tables(format_table(_NOISES, noises, markdown=True))
         results[title] = [
             dataclasses.asdict(case) | dataclasses.asdict(one)
             | {"wilson": {name: wilson(hits, one.kept) for name, hits in one.hits.items()}}

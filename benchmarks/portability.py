@@ -16,7 +16,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from agents.cli import run_script
-from agents.results import show, table
+from agents.console_output import format_table, print_texts_and_tables
 from benchmarks.__main__ import cpuinfo, describe_machine
 
 ROOT = Path(__file__).parents[1]
@@ -181,7 +181,7 @@ def main(config: Config) -> None:
     if not chosen:
         raise ValueError(f"only must name a setting, but {' '.join(config.only)} is in none of their names")
     features, machine = processor_features(), describe_machine()
-    show(f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}")
+    print_texts_and_tables(f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}")
     rows, failed = [], []
     with tempfile.TemporaryDirectory() as folder:
         for setting in chosen:
@@ -192,9 +192,9 @@ def main(config: Config) -> None:
                 outcome = run(setting, config.workers, Path(folder))
             failed += [f"{setting.name}: {name}" for name in outcome.failed]
             rows.append((setting.name, f"{outcome.passed}", f"{len(outcome.failed)}", f"{outcome.seconds:.0f}"))
-            show(f"{setting.name}: {outcome.passed} passed, {len(outcome.failed)} failed")
-            show(*(f"  {name}" for name in outcome.failed))
-    show(table(("Setting", "Passed", "Failed", "Seconds"), rows))
+            print_texts_and_tables(f"{setting.name}: {outcome.passed} passed, {len(outcome.failed)} failed")
+            print_texts_and_tables(*(f"  {name}" for name in outcome.failed))
+    print_texts_and_tables(format_table(("Setting", "Passed", "Failed", "Seconds"), rows))
     if failed:
         sys.exit(1)
 

@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from signal import SIGKILL, SIGSTOP
 
-from agents.results import show, table
+from agents.console_output import format_table, print_texts_and_tables
 from estimator.extras import need
 
 ROOT = Path(__file__).parents[1]
@@ -136,7 +136,7 @@ def main() -> int:
         "lost",
         f"weights after {STEPS:,}, without Ray",
     )
-    show(table(titles, lines, markdown=True), f"A checkpoint every {INTERVAL:,} samples.")
+    print_texts_and_tables(format_table(titles, lines, markdown=True), f"A checkpoint every {INTERVAL:,} samples.")
     return wrong
 
 

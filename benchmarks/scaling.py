@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from agents.evaluation.figures import new_figure, save
+from agents.evaluation.figures import new_figure, save_png
 from benchmarks.environments import TRACK, vector_steps
 from benchmarks.section_tables import Claim, Section, ratio
 from benchmarks.timed_rounds import CORES, Result, Row, later, measure, timed
@@ -88,4 +88,4 @@ def draw(results: dict[str, Result], path: Path) -> None:
         panel.set_ylabel("ns per env-step")
         panel.grid(alpha=0.3)
         panel.legend()
-    save(figure, path)
+    save_png(figure, path)

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from agents.cli import run_script
-from agents.results import finite, show, table
+from agents.console_output import format_table, print_texts_and_tables, replace_non_finite
 from agents.studies.silverbox_protocol import (
     GIVEN,
     LENGTHS,
@@ -130,7 +130,7 @@ def compare(sections: Sections, outcomes: Mapping[str, Outcome], wanted: bool = 
         "timed_samples": TIMED,
         "versions": versions,
     }
-    return cast("dict[str, Any]", finite(compared))
+    return cast("dict[str, Any]", replace_non_finite(compared))
 
 
 def given(sections: Sections, outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
@@ -280,12 +280,12 @@ def report(
     contenders: Mapping[str, Contender], claims: Mapping[str, tuple[float, bool]], versions: Mapping[str, str]
 ) -> None:
     """Prints the table, and how much faster ours is than dynamax's filter with the same model."""
-    show("\nPeers, and ours with the same model:", as_table(contenders))
+    print_texts_and_tables("\nPeers, and ours with the same model:", as_table(contenders))
     for title, contender in contenders.items():
         if contender.reason:
-            show(f"{title}: not available: {contender.reason}")
+            print_texts_and_tables(f"{title}: not available: {contender.reason}")
     used = [name for name in ("dynamax", "jax", "filterpy", "padasip", "fastcan", "numpy") if name in versions]
-    show(
+    print_texts_and_tables(
         f"µs per sample: median [least, most] of {REPETITIONS} turns over the first {TIMED:,} samples,",
         "compiled before; fastcan: of its fit to all samples, once",
         ", ".join(f"{name} {versions[name]}" for name in used) or "no peers",
@@ -294,11 +294,11 @@ def report(
     for title, (times, no_worse) in claims.items():
         ours = MODELS[PEERS[title][1]]
         if np.isnan(times):
-            show(f"  not available: {title}")
+            print_texts_and_tables(f"  not available: {title}")
             continue
         verdict = "PASS" if times >= BAR and no_worse else "MISS"
-        show(f"  {verdict}  {ours} is {times:.1f} times as fast as {title}, at least {BAR:g},")
-        show(f"        with {_line(contenders[ours])} mV against {_line(contenders[title])} mV")
+        print_texts_and_tables(f"  {verdict}  {ours} is {times:.1f} times as fast as {title}, at least {BAR:g},")
+        print_texts_and_tables(f"        with {_line(contenders[ours])} mV against {_line(contenders[title])} mV")
 
 
 def _line(contender: Contender) -> str:
@@ -308,7 +308,7 @@ def _line(contender: Contender) -> str:
 def as_table(contenders: Mapping[str, Contender]) -> Any:
     """A row for each contender, in 100 characters."""
     titles = ("multisine\n[mV]", "arrow\n[mV]", "n.e.\n[mV]", "90 %\ncovers", "<1 mV\nafter", "µs per\nsample")
-    return table(("", *titles, "[least, most]"), (_row(*entry) for entry in contenders.items()))
+    return format_table(("", *titles, "[least, most]"), (_row(*entry) for entry in contenders.items()))
 
 
 def _row(title: str, contender: Contender) -> tuple[str, ...]:

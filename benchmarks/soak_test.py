@@ -22,7 +22,7 @@ import gymnasium as gym
 import numpy as np
 
 import duffing_env  # noqa: F401  registers the tracks
-from agents.cli import followed, run_script
+from agents.cli import iterate_with_progress, run_script
 from duffing_env.plants.silverbox_record import record_available
 from duffing_env.tracks.track_registry import TRACKS
 from estimator import Channel, OnlineEstimator, Rig
@@ -66,18 +66,18 @@ class Config:
 
 def main(config: Config) -> None:
     """Run, and print the table."""
-    from agents.results import show, table
+    from agents.console_output import format_table, print_texts_and_tables
 
     names = [name.split("/")[1] for name in TRACKS if record_available() or "Replay" not in name] + list(FILTERS)
     unknown = set(config.runs) - set(names)
     if unknown:
         raise ValueError(f"runs must be of {names}, but are {sorted(unknown)}")
     found = {}
-    for name in followed((name, name) for name in config.runs or names):
+    for name in iterate_with_progress((name, name) for name in config.runs or names):
         found[name] = filtered(name, config.steps) if name in FILTERS else soak(name, config.steps)
     rows = [[name, *(f"{value:,}" for value in counts.values())] for name, counts in found.items()]
     heads = ("run", "samples", "episodes", "not finite", "out of bounds", "not a covariance", "growth / kB")
-    show(table(heads, rows, markdown=True))
+    print_texts_and_tables(format_table(heads, rows, markdown=True))
     if config.json is not None:
         config.json.write_text(json.dumps(found, indent=2))
     bad = [name for name, c in found.items() if c["not finite"] + c["out of bounds"] + c["not a covariance"]]

@@ -14,8 +14,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.leaderboard import summarise
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.comparison_tables import summarise_metrics
+from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.policies.learned import CARD
 from agents.training import PPOSettings, TrainConfig
 from benchmarks.peer_process import ROOT
@@ -101,7 +101,9 @@ def _default_model(num_envs: int) -> Any:
 
 def _bars() -> dict[str, float]:
     """Upper end of each fixed excitation's interval."""
-    return {e.policy: float(summarise(e)[METRIC]["high"]) for e in evaluate(EXCITATIONS, TRACK, SYSTEMS)}
+    return {
+        e.policy: float(summarise_metrics(e)[METRIC]["high"]) for e in evaluate_policies(EXCITATIONS, TRACK, SYSTEMS)
+    }
 
 
 def _time_to_useful(seed: int, bar: float, reached: list[dict[str, float]]) -> float:
@@ -110,7 +112,7 @@ def _time_to_useful(seed: int, bar: float, reached: list[dict[str, float]]) -> f
         output = Path(folder) / "run"
         started = time.time()
         for checkpoint in _train_a_while(output, seed, Path(folder) / "cache"):
-            interval = summarise(evaluate([str(checkpoint)], TRACK, SYSTEMS)[0])[METRIC]
+            interval = summarise_metrics(evaluate_policies([str(checkpoint)], TRACK, SYSTEMS)[0])[METRIC]
             if float(interval["low"]) > bar:
                 low, high = float(interval["low"]), float(interval["high"])
                 reached.append({"samples": float(checkpoint.name), "low": low, "high": high})

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from agents.console_output import format_table, print_texts_and_tables, write_json
 from agents.evaluation.batch import make
 from agents.policies import make_policy
-from agents.results import show, table, write_json
 from benchmarks.interval_coverage import NO_LIMIT, QUANTILE
 from benchmarks.rigs.judge import calibrated
 from estimator.ensemble import Hypotheses
@@ -124,7 +124,7 @@ def verdict(cells: list[Cell], known: Cell) -> dict[str, Any]:
         ),
         f"at most {max(lost):.2f} nats lost, {np.mean(lost):.2f} on average": max(lost) <= ASKED,
     }
-    show(*(f"{'PASS' if passed else 'MISS'}: {text}" for text, passed in good.items()))
+    print_texts_and_tables(*(f"{'PASS' if passed else 'MISS'}: {text}" for text, passed in good.items()))
     return good
 
 
@@ -147,7 +147,9 @@ def main(config: Config) -> None:
             ]
             names = list(make(track, 1).experiment.model.coefficients)
             titles = ["prior of σ_w", "of σ_v", *names, "all", "lost, nats"]
-            show(f"\n{track}, {policy}, {told}", table(titles, rows(cells, known), markdown=True))
+            print_texts_and_tables(
+                f"\n{track}, {policy}, {told}", format_table(titles, rows(cells, known), markdown=True)
+            )
             results[f"{track} {policy}"] = {
                 "verdict": verdict(cells, known),
                 "known": {"coverage": known.inside.mean(axis=0).tolist(), "density": known.density.tolist()},

@@ -23,9 +23,9 @@ from torch import nn
 from torch.distributions import Normal
 
 from agents import save_policy
-from agents.cli import full_id, run_script
+from agents.cli import full_track_id, run_script
+from agents.console_output import package_versions
 from agents.policies.saving import check_policy_folder
-from agents.results import versions
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def main(args: Args) -> Path:
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     # Our vector environment, in CleanRL's wrappers; observations are normalised in `Observations`.
-    envs = gym.make_vec(f"duffing_env:{full_id(args.env_id)}", num_envs=args.num_envs, autoreset_mode="SameStep")
+    envs = gym.make_vec(f"duffing_env:{full_track_id(args.env_id)}", num_envs=args.num_envs, autoreset_mode="SameStep")
     episodes = RecordEpisodeStatistics(envs)
     envs = NormalizeReward(ClipAction(episodes), gamma=args.gamma)
     envs = TransformReward(envs, lambda reward: np.clip(reward, -10, 10))
@@ -195,7 +195,7 @@ def main(args: Args) -> Path:
         "steps": steps,
         "config": asdict(args) | {"output": str(folder)},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions("torch"),
+        "versions": package_versions("torch"),
     }
     save_policy(folder, agent.actor_mean, card, normalizer=(observe.rms.mean, observe.std, 10.0))
     print(folder)

@@ -16,9 +16,9 @@ from pathlib import Path
 import torch
 
 from agents import save_policy
-from agents.cli import full_id, run_script
+from agents.cli import full_track_id, run_script
+from agents.console_output import package_versions
 from agents.policies.saving import check_policy_folder
-from agents.results import versions
 
 try:
     import ray
@@ -54,7 +54,7 @@ def main(args: Args) -> Path:
     track = args.env_id.split("/")[-1].lower()
     folder = check_policy_folder("output", args.output or Path("runs") / f"rllib-ppo-{track}-{args.seed}")
     torch.set_num_threads(1)  # more than one are slower, and many times so on a busy machine
-    config = PPOConfig().environment(f"duffing_env:{full_id(args.env_id)}").debugging(seed=args.seed)
+    config = PPOConfig().environment(f"duffing_env:{full_track_id(args.env_id)}").debugging(seed=args.seed)
     config.env_runners(num_envs_per_env_runner=8)
     if (least := config.train_batch_size) > args.total_timesteps:
         raise ValueError(
@@ -72,7 +72,7 @@ def main(args: Args) -> Path:
         "steps": steps,
         "config": asdict(args) | {"output": str(folder)},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions("ray", "torch"),
+        "versions": package_versions("ray", "torch"),
     }
     # RLlib normalises no observations by default, and an action of ours, in [-1, 1], is the clipped mean.
     save_policy(folder, mean_network(algorithm.get_module()), card)

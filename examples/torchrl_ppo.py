@@ -15,9 +15,9 @@ import torch
 from torch import nn
 
 from agents import save_policy
-from agents.cli import full_id, run_script
+from agents.cli import full_track_id, run_script
+from agents.console_output import package_versions
 from agents.policies.saving import check_policy_folder
-from agents.results import versions
 
 try:
     from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
@@ -66,7 +66,7 @@ def main(args: Args) -> Path:
             f"total_timesteps must be at least a roll-out, {args.batch}, but are {args.total_timesteps}; take more"
         )
     # TorchRL resets the rows that have ended itself.
-    envs = gym.make_vec(f"duffing_env:{full_id(args.env_id)}", num_envs=args.num_envs, autoreset_mode="Disabled")
+    envs = gym.make_vec(f"duffing_env:{full_track_id(args.env_id)}", num_envs=args.num_envs, autoreset_mode="Disabled")
     env = GymWrapper(envs)
     env.set_seed(args.seed)
     features = envs.single_observation_space.shape[0]
@@ -112,7 +112,7 @@ def main(args: Args) -> Path:
         "steps": steps,
         "config": asdict(args) | {"output": str(folder)},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions("torch", "torchrl"),
+        "versions": package_versions("torch", "torchrl"),
     }
     # The most probable action of a TanhNormal, as TorchRL plays it without exploration, is the tanh of its mean.
     save_policy(folder, nn.Sequential(*mean, nn.Tanh()), card)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.commands.rig_file import from_record
+from agents.commands.rig_file_builder import rig_text_from_record
 from estimator import Result, Rig, identify
 
 Floats = NDArray[np.float64]
@@ -34,7 +34,7 @@ class Made:
     Attributes:
         files: name to content, in the order in which they are given.
         truth: m, c, a and b in SI units; in V and m for a coil.
-        init: further arguments of `agents.commands.rig_file.from_record`.
+        init: further arguments of `agents.commands.rig_file_builder.rig_text_from_record`.
         interpolation: that the user writes into the rig.
         delay: the same.
     """
@@ -99,7 +99,7 @@ def answered(made: Made, folder: Path) -> Iterator[tuple[str, Result]]:
     paths = [folder / name for name in made.files]
     for path in paths:
         path.write_bytes(made.files[path.name])
-    described, _ = from_record(paths[0], **made.init)
+    described, _ = rig_text_from_record(paths[0], **made.init)
     rig: Rig | None = replace(
         Rig.from_dict(tomllib.loads(described)), interpolation=made.interpolation, delay=made.delay
     )

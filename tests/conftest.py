@@ -41,7 +41,7 @@ def record() -> SilverboxRecord:
 @pytest.fixture
 def jumping_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let runs of this process, and their simulated plants, share a clock that jumps: none waits, and none is late."""
-    from agents.running.clock import JumpingClock
+    from agents.hardware.clock import JumpingClock
 
     clock = JumpingClock()
     for module in ("run", "simulated"):

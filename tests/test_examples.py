@@ -16,7 +16,7 @@ import pytest
 import torch
 from tables import table
 
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.policy_evaluation import evaluate_policies
 
 ROOT = Path(__file__).parents[1]
 #: Example to what it needs, the samples that it is trained on here, and what makes its roll-outs short enough.
@@ -72,7 +72,7 @@ def test_an_example_trains_a_policy_that_is_played_as_any_other(name, example, t
     assert {"duffing-env", "gymnasium", "torch"} <= card["versions"].keys()
     one, two = ((folder / "policy.safetensors").read_bytes() for folder in folders)
     assert one == two  # the same seed, the same weights
-    (found,) = evaluate([str(folders[0])], env_id="duffing_env/Short-v0", systems=4)
+    (found,) = evaluate_policies([str(folders[0])], env_id="duffing_env/Short-v0", systems=4)
     assert np.isfinite(found.metrics["information_gain"]).all()
 
 

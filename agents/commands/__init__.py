@@ -12,66 +12,77 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from agents.cli import parsed, told_in_one_line
-from agents.commands.design import Design
-from agents.commands.evaluate import Evaluate
-from agents.commands.export import Export
-from agents.commands.identify import Identify
-from agents.commands.report import Report
-from agents.commands.rig import Init, List
-from agents.commands.run import Run
+from agents.cli import one_line_errors, parse_arguments
+from agents.commands.design_command import DesignCommand
+from agents.commands.evaluate_command import EvaluateCommand
+from agents.commands.export_command import ExportCommand
+from agents.commands.identify_command import IdentifyCommand
+from agents.commands.report_command import ReportCommand
+from agents.commands.rig_command import RigInitCommand, RigListCommand
+from agents.commands.run_command import RunCommand
 
-NAME = "duffing-env"
+COMMAND_NAME = "duffing-env"
 
 
 @dataclass(frozen=True)
-class Train:
+class TrainPlaceholder:
     """Train a policy (PPO, SAC, TD3, TQC, recurrent PPO) on any track or rig."""
 
 
 #: What each command takes, by its name; commands of a group are under one.
 COMMANDS: dict[str, Any] = {
-    "identify": Identify,
-    "design": Design,
-    "run": Run,
-    "train": Train,  # its settings follow from the algorithm: `agents.commands.train`
-    "evaluate": Evaluate,
-    "export": Export,
-    "report": Report,
-    "rig": Annotated[Init, tyro.conf.subcommand("init")] | Annotated[List, tyro.conf.subcommand("list")],
+    "identify": IdentifyCommand,
+    "design": DesignCommand,
+    "run": RunCommand,
+    "train": TrainPlaceholder,  # its settings follow from the algorithm: `agents.commands.train_command`
+    "evaluate": EvaluateCommand,
+    "export": ExportCommand,
+    "report": ReportCommand,
+    "rig": Annotated[RigInitCommand, tyro.conf.subcommand("init")]
+    | Annotated[RigListCommand, tyro.conf.subcommand("list")],
 }
 
-_RIG = "Describe your rig in a file; list the rigs that ship."
+_RIG_HELP = "Describe your rig in a file; list the rigs that ship."
 
 
-def _listed() -> Any:
+def _all_subcommands() -> Any:
     """The commands, each with the first paragraph of its help: examples would be broken into several lines here."""
-    said = {name: _RIG if name == "rig" else (kind.__doc__ or "").split("\n\n")[0] for name, kind in COMMANDS.items()}
-    kinds = (Annotated[kind, tyro.conf.subcommand(name, description=said[name])] for name, kind in COMMANDS.items())
-    return Union[tuple(kinds)]  # noqa: UP007
+    descriptions = {
+        name: _RIG_HELP if name == "rig" else (command.__doc__ or "").split("\n\n")[0]
+        for name, command in COMMANDS.items()
+    }
+    subcommands = (
+        Annotated[command, tyro.conf.subcommand(name, description=descriptions[name])]
+        for name, command in COMMANDS.items()
+    )
+    return Union[tuple(subcommands)]  # noqa: UP007
 
 
-def main(words: list[str] | None = None) -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Run a command.
 
     Args:
-        words: of the command line; those of this process where they are None.
+        arguments: of the command line; those of this process where they are None.
 
     Raises:
         SystemExit: with status 2 where a value or a file is bad, 130 after Ctrl-C, 143 after SIGTERM, and 1 where a run
             ended early.
     """
-    words = sys.argv[1:] if words is None else words
-    name, *rest = words or [""]
+    arguments = sys.argv[1:] if arguments is None else arguments
+    name, *rest = arguments or [""]
     if name == "train":
-        from agents.commands.train import main as train
+        from agents.commands.train_command import main as train
 
-        return train(f"{NAME} train", rest)
-    with told_in_one_line(NAME):
+        return train(f"{COMMAND_NAME} train", rest)
+    with one_line_errors(COMMAND_NAME):
         config = (tyro.conf.FlagCreatePairsOff,)
         if name in COMMANDS:
-            about = _RIG if name == "rig" else None
-            parsed(COMMANDS[name], prog=f"{NAME} {name}", description=about, args=rest, config=config).run()
+            description = _RIG_HELP if name == "rig" else None
+            parse_arguments(
+                COMMANDS[name], prog=f"{COMMAND_NAME} {name}", description=description, args=rest, config=config
+            ).run()
         else:
-            about = "Identify an oscillator; choose the input that tells most. Each command has its own --help."
-            parsed(_listed(), prog=NAME, description=about, args=words, config=config)
+            description = "Identify an oscillator; choose the input that tells most. Each command has its own --help."
+            parse_arguments(
+                _all_subcommands(), prog=COMMAND_NAME, description=description, args=arguments, config=config
+            )

@@ -38,11 +38,11 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from agents.cli import JsonOptions, followed, run_script
+from agents.cli import JsonOptions, iterate_with_progress, run_script
+from agents.console_output import print_texts_and_tables
 from agents.evaluation.mixture import Moments, Multipliers, mix
 from agents.evaluation.oracle import Oracle, Systems
 from agents.evaluation.state_grid import StateGrid
-from agents.results import show
 from estimator.free_run import free_run
 from estimator.models.difference import difference
 from estimator.parameters import FloatArray
@@ -254,12 +254,14 @@ def main(config: Config) -> None:
     systems = Systems.of(config.env, config.systems, config.options)
     oracle = Oracle.of(Systems.of(config.env, max(config.systems, Oracle.stored(systems)), config.options))
     count = min(config.systems, len(oracle.values))
-    for row in followed((f"system {row + 1} of {count}", row) for row in range(count)):
+    for row in iterate_with_progress((f"system {row + 1} of {count}", row) for row in range(count)):
         oracle.bounds[row] = Certificate(oracle.systems, row).find(oracle.inputs[row : row + 1])
         oracle.save()
     share = np.exp((oracle.values - oracle.bounds)[:count] / 2.0)
     seconds = time.perf_counter() - began
-    show(f"{count} systems in {seconds:.0f} s: certified share {share.mean():.3f}, least {share.min():.3f}")
+    print_texts_and_tables(
+        f"{count} systems in {seconds:.0f} s: certified share {share.mean():.3f}, least {share.min():.3f}"
+    )
 
 
 if __name__ == "__main__":

@@ -19,20 +19,20 @@ from estimator.units import labelled
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from agents.evaluation.rollout import Evaluation
-    from agents.running.experiment import Designed
+    from agents.evaluation.policy_evaluation import Evaluation
+    from agents.hardware.next_experiment import ExperimentDesign
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
-_STROKES = ("-", "--", ":")
+_LINE_STYLES = ("-", "--", ":")
 
 #: A limit is drawn where a signal comes as near as this part of it: one that is far away would hide the signal.
-_NEAR = 0.5
+_SHOW_LIMIT_FROM = 0.5
 
 #: Of fewer points each is marked.
-_FEW = 20
+_MARK_POINTS_BELOW = 20
 
 
-def save(figure: Figure, path: Path) -> None:
+def save_png(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, in one piece."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
@@ -47,7 +47,7 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure((width, height), layout="constrained", dpi=120)
 
 
-def figure_of_learning(
+def plot_learning_curve(
     curve: list[tuple[int, float, float]], reward: str, held_out: Sequence[tuple[int, float]] = ()
 ) -> Figure:
     """Mean return of the last episodes over the samples that were trained on, with wall time above.
@@ -67,7 +67,7 @@ def figure_of_learning(
         panel.grid(alpha=0.3)
         panel.set_xlim(0, max(samples[-1] / 1e6, 1e-6))
     steps, seconds, returns = np.array(curve, dtype=float).reshape(-1, 3).T
-    axes.plot(steps / 1e6, returns, color=_COLOURS[0], marker="." if len(steps) < _FEW else None)
+    axes.plot(steps / 1e6, returns, color=_COLOURS[0], marker="." if len(steps) < _MARK_POINTS_BELOW else None)
     axes.set(xlabel="samples / 10⁶", ylabel=f"mean return: {reward.replace('_', ' ')}")
     axes.grid(alpha=0.3)
     if len(steps) > 1:
@@ -84,28 +84,28 @@ def figure_of_learning(
     return figure
 
 
-def figure_of_contraction(evaluations: list[Evaluation], title: str = "") -> Figure:
+def plot_posterior_contraction(evaluations: list[Evaluation], title: str = "") -> Figure:
     """Gain of log posterior of the truth over the samples: median over systems, band from 25 to 75 %."""
     figure = new_figure(7.5, 4.5 + 0.22 * math.ceil(len(evaluations) / 3))
     axes = figure.add_subplot()
     lowest = 0.0  # an over-confident posterior may lose
-    looks = product(_STROKES, _COLOURS)
-    for evaluation, (stroke, colour) in zip(evaluations, cycle(looks), strict=False):
-        low, median, high = np.percentile(evaluation.curve, [25, 50, 75], axis=1)
+    line_looks = product(_LINE_STYLES, _COLOURS)
+    for evaluation, (line_style, colour) in zip(evaluations, cycle(line_looks), strict=False):
+        low, median, high = np.percentile(evaluation.gain_curve, [25, 50, 75], axis=1)
         lowest = min(lowest, low.min())
         samples = np.arange(len(median))
         axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
-        axes.plot(samples, median, stroke, color=colour, label=plain(evaluation.title))
+        axes.plot(samples, median, line_style, color=colour, label=plain(evaluation.title))
     axes.set(xlabel="samples", ylabel="log posterior gain of the truth / nat", title=title)
     axes.set(xlim=(0, None), ylim=(lowest, None))
     axes.grid(alpha=0.3)
     # Within the axes it would cover curves.
-    what = "medians, and bands from 25 to 75 % of the systems"
-    figure.legend(loc="outside lower center", ncols=min(3, len(evaluations)), title=what, title_fontsize=9)
+    legend_title = "medians, and bands from 25 to 75 % of the systems"
+    figure.legend(loc="outside lower center", ncols=min(3, len(evaluations)), title=legend_title, title_fontsize=9)
     return figure
 
 
-def figure_of_inputs(evaluations: list[Evaluation]) -> Figure:
+def plot_inputs_and_outputs(evaluations: list[Evaluation]) -> Figure:
     """Input and output of the first system in time; of the inputs' spectrum the root of the mean power over systems.
 
     Of several sensors the first is shown. Dashed lines are limits that are come near to.
@@ -113,31 +113,31 @@ def figure_of_inputs(evaluations: list[Evaluation]) -> Figure:
     figure = new_figure(12, 1.6 * len(evaluations) + 0.8)
     grid = figure.subplots(len(evaluations), 3, sharex="col", sharey="col", squeeze=False)
     scales = evaluations[0].scales
-    unit, small, factor = scales.input_unit, scales.input_unit, scales.input
+    unit, spectrum_unit, factor = scales.input_unit, scales.input_unit, scales.input
     if unit == "V":
-        small, factor = "mV", 1e3 * factor
+        spectrum_unit, factor = "mV", 1e3 * factor
     for row, evaluation, colour in zip(grid, evaluations, cycle(_COLOURS), strict=False):
         time = 1e3 * scales.step * np.arange(len(evaluation.inputs))
         inputs = np.nan_to_num(evaluation.inputs)  # an episode that ended is silent
         spectrum = factor * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         frequencies = np.fft.rfftfreq(len(inputs), scales.step)
-        shown = evaluation.outputs[:, 0].reshape(len(time), -1)[:, 0]
+        first_sensor = evaluation.outputs[:, 0].reshape(len(time), -1)[:, 0]
         lines = (
             (labelled("u", unit), time, scales.input * evaluation.inputs[:, 0]),
-            (labelled("y", scales.output_unit), time, scales.output * shown),
-            (labelled("|U|", small), frequencies, spectrum),
+            (labelled("y", scales.output_unit), time, scales.output * first_sensor),
+            (labelled("|U|", spectrum_unit), frequencies, spectrum),
         )
         for axes, (label, x, y) in zip(row, lines, strict=True):
             axes.plot(x, y, color=colour, linewidth=0.8, drawstyle="steps-post" if axes is row[0] else "default")
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
         row[0].set_title(plain(evaluation.title), loc="left", fontsize=9)
-    for panels, worth, limit in zip(grid.T, (scales.input, scales.output), evaluations[0].limits, strict=False):
+    for panels, scale, limit in zip(grid.T, (scales.input, scales.output), evaluations[0].limits, strict=False):
         values = np.concatenate([axes.lines[0].get_ydata() for axes in panels])
-        if np.nanmax(np.abs(values), initial=0.0) > _NEAR * worth * limit:
+        if np.nanmax(np.abs(values), initial=0.0) > _SHOW_LIMIT_FROM * scale * limit:
             for axes in panels:
-                ends = axes.lines[0].get_xdata()[[0, -1]]
-                axes.hlines(worth * limit * np.array([-1, 1]), *ends, "black", "--", linewidth=0.8, zorder=1)
+                time_ends = axes.lines[0].get_xdata()[[0, -1]]
+                axes.hlines(scale * limit * np.array([-1, 1]), *time_ends, "black", "--", linewidth=0.8, zorder=1)
     for axes in grid[0, :2]:
         axes.set_title("system 0", loc="right", fontsize=9, color=_COLOURS[6])
     grid[0, 2].set_title("all systems", loc="right", fontsize=9, color=_COLOURS[6])
@@ -146,7 +146,7 @@ def figure_of_inputs(evaluations: list[Evaluation]) -> Figure:
     return figure
 
 
-def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
+def plot_error_against_information(evaluations: list[Evaluation]) -> Figure | None:
     """Mean relative error of the parameters against the information in the outputs, system by system."""
     if not all("fisher_gain" in evaluation.metrics for evaluation in evaluations):
         return None
@@ -164,18 +164,18 @@ def figure_of_information(evaluations: list[Evaluation]) -> Figure | None:
     return figure
 
 
-def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
+def plot_calibration(evaluations: list[Evaluation]) -> Figure:
     """Share of intervals that hold the truth against their nominal level: a panel for each estimator."""
-    from agents.evaluation.metrics import LEVELS
+    from agents.evaluation.metrics import CREDIBLE_LEVELS
 
-    found = [evaluation.estimators or {"": evaluation.metrics} for evaluation in evaluations]
+    metrics_by_estimator = [evaluation.estimator_metrics or {"": evaluation.metrics} for evaluation in evaluations]
     figure = new_figure(9, 3.6)
-    panels = figure.subplots(1, len(found[0]), sharex=True, sharey=True, squeeze=False)[0]
-    nominal = [100 * level for level in LEVELS.values()]
-    for axes, estimator in zip(panels, found[0], strict=True):
+    panels = figure.subplots(1, len(metrics_by_estimator[0]), sharex=True, sharey=True, squeeze=False)[0]
+    nominal = [100 * level for level in CREDIBLE_LEVELS.values()]
+    for axes, estimator in zip(panels, metrics_by_estimator[0], strict=True):
         axes.plot([0, 100], [0, 100], color="#888888", linewidth=1)
-        for evaluation, values, colour in zip(evaluations, found, cycle(_COLOURS), strict=False):
-            covered = [100 * float(np.mean(values[estimator][name])) for name in LEVELS]
+        for evaluation, values, colour in zip(evaluations, metrics_by_estimator, cycle(_COLOURS), strict=False):
+            covered = [100 * float(np.mean(values[estimator][name])) for name in CREDIBLE_LEVELS]
             axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=plain(evaluation.title))
         axes.set_title(estimator.replace("_", " "), fontsize=9)
         axes.set_xlabel("nominal level / %")
@@ -185,20 +185,22 @@ def figure_of_calibration(evaluations: list[Evaluation]) -> Figure:
     return figure
 
 
-def figure_of_experiment(designed: Designed) -> Figure:
+def plot_experiment_design(experiment_design: ExperimentDesign) -> Figure:
     """The signal of an experiment to come, and what the sensor is expected to show, both with their limits."""
-    figure, rig = new_figure(9, 5), designed.rig
+    figure, rig = new_figure(9, 5), experiment_design.rig
     above, below = figure.subplots(2, 1, sharex=True)
-    time = rig.step * np.arange(len(designed.u))
-    low, median, high = designed.shown
-    above.plot(time, designed.u, color=_COLOURS[0], linewidth=1.0, zorder=3, drawstyle="steps-post")
-    above.set(ylabel=f"input / {rig.input.unit}", title=f"{len(designed.u)} samples by {designed.policy}")
+    time = rig.step * np.arange(len(experiment_design.u))
+    low, median, high = experiment_design.shown
+    above.plot(time, experiment_design.u, color=_COLOURS[0], linewidth=1.0, zorder=3, drawstyle="steps-post")
+    above.set(
+        ylabel=f"input / {rig.input.unit}", title=f"{len(experiment_design.u)} samples by {experiment_design.policy}"
+    )
     below.fill_between(time, low, high, color=_COLOURS[1], alpha=0.3, linewidth=0, label="expected, 90 %")
     below.plot(time, median, color=_COLOURS[1], linewidth=0.8, label="expected, median")
     below.set(xlabel="time / s", ylabel=f"output / {rig.output.unit}")
     for axes, limit in ((above, rig.input.limit), (below, rig.output.range)):
-        both = limit * np.array([-1.0, 1.0])
-        axes.hlines(both, *time[[0, -1]], color="black", linestyle="--", linewidth=0.8, zorder=1, label="limits")
+        lower_upper = limit * np.array([-1.0, 1.0])
+        axes.hlines(lower_upper, *time[[0, -1]], color="black", linestyle="--", linewidth=0.8, zorder=1, label="limits")
         axes.grid(alpha=0.3)
     figure.legend(*below.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure

@@ -19,15 +19,15 @@ from estimator.physical import coefficients_of, to_physical
 from estimator.units import Scales
 
 #: Nominal levels of the intervals whose coverage is reported, by their metric.
-LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}
+CREDIBLE_LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}
 
 _TWIN_ARROW_SAMPLES = 8_192
 
 #: Lengths of the stretches of the Silverbox regime that inputs are compared with.
-_LENGTHS = np.unique(np.round(2 ** np.arange(4, 15.6, 0.5)).astype(int))
+_SEGMENT_LENGTHS = np.unique(np.round(2 ** np.arange(4, 15.6, 0.5)).astype(int))
 
 
-def estimate_metrics(
+def posterior_metrics(
     means: FloatArray, covs: FloatArray, truth: Any, model: Model, scales: Scales
 ) -> dict[str, FloatArray]:
     """Posteriors of coefficients beside the truth.
@@ -41,21 +41,28 @@ def estimate_metrics(
 
     Returns:
         Relative errors ``error_<parameter>``; the share of the coefficients that their intervals hold, at each of
-        `LEVELS`; ``nees``, the normalised estimation error squared dᵀ C⁻¹ d per coefficient, whose mean is 1 where the
+        `CREDIBLE_LEVELS`; ``nees``, the normalised estimation error squared dᵀ C⁻¹ d per coefficient, whose mean is 1 where the
         posterior is calibrated.
     """
-    true = {name: truth[name] for name in parameter_names(model)}
-    errors = np.abs(to_physical(model, means, scales) / np.stack(list(true.values()), axis=-1) - 1)
-    free = np.flatnonzero(np.diagonal(covs, axis1=1, axis2=2).all(axis=0))  # without those that are known, as θ2 = 0
-    deviations, covs = (means - coefficients_of(model, true, scales))[:, free], covs[:, free][:, :, free]
+    true_parameters = {name: truth[name] for name in parameter_names(model)}
+    errors = np.abs(to_physical(model, means, scales) / np.stack(list(true_parameters.values()), axis=-1) - 1)
+    free_coefficients = np.flatnonzero(
+        np.diagonal(covs, axis1=1, axis2=2).all(axis=0)
+    )  # without those that are known, as θ2 = 0
+    deviations, covs = (
+        (means - coefficients_of(model, true_parameters, scales))[:, free_coefficients],
+        covs[:, free_coefficients][:, :, free_coefficients],
+    )
     stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
-    units = covs / (stds[:, :, None] * stds[:, None, :])  # better conditioned than the covariances themselves
+    correlations = covs / (stds[:, :, None] * stds[:, None, :])  # better conditioned than the covariances themselves
     scaled = deviations / stds
-    nees = np.einsum("ni,ni->n", scaled, np.linalg.solve(units, scaled[:, :, None])[:, :, 0]) / len(free)
+    nees = np.einsum("ni,ni->n", scaled, np.linalg.solve(correlations, scaled[:, :, None])[:, :, 0]) / len(
+        free_coefficients
+    )
     return {
-        **{f"error_{name}": errors[:, i] for i, name in enumerate(true)},
+        **{f"error_{name}": errors[:, i] for i, name in enumerate(true_parameters)},
         **{
-            name: (np.abs(scaled) <= stats.norm.ppf(0.5 + level / 2)).mean(axis=1) for name, level in LEVELS.items()
+            name: (np.abs(scaled) <= stats.norm.ppf(0.5 + level / 2)).mean(axis=1) for name, level in CREDIBLE_LEVELS.items()
         },
         "nees": nees,
     }  # fmt: skip
@@ -69,7 +76,9 @@ def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
     return {"input_power": power, "input_peak": peak, "crest_factor": crest}
 
 
-def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatArray | None = None) -> FloatArray:
+def fisher_information_gain(
+    inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatArray | None = None
+) -> FloatArray:
     """(n,) ½ log det(Λ0 + F) - ½ log det Λ0 [nats] of inputs (T, n): what an efficient estimator gains from them.
 
     F is the Fisher information at the true coefficients of the plant's equation, along the outputs (T, n) or
@@ -87,7 +96,7 @@ def information(inputs: FloatArray, truth: Any, experiment: Any, outputs: FloatA
     return 0.5 * (np.linalg.slogdet(prior + F * np.outer(std, std))[1] - np.linalg.slogdet(prior)[1])
 
 
-def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> dict[str, FloatArray]:
+def d_efficiency_metrics(evaluation: Any, env_id: str, options: dict[str, Any]) -> dict[str, FloatArray]:
     """D-efficiency of the systems that the track's stored `Oracle` has, and what is certain of those with a bound.
 
     The latter, ``certified``, is at least so much of what is possible. Without an oracle there is neither.
@@ -99,12 +108,12 @@ def efficiency(evaluation: Any, env_id: str, options: dict[str, Any]) -> dict[st
     except FileNotFoundError:
         return {}
     n = len(oracle.values)
-    best, least = oracle.efficiency(evaluation.inputs.T[:n], np.swapaxes(evaluation.outputs, 0, 1)[:n])
-    certain = least[np.isfinite(least)]
-    return {"efficiency": best} | ({"certified": certain} if len(certain) else {})
+    efficiencies, lower_bounds = oracle.efficiency(evaluation.inputs.T[:n], np.swapaxes(evaluation.outputs, 0, 1)[:n])
+    certified = lower_bounds[np.isfinite(lower_bounds)]
+    return {"efficiency": efficiencies} | ({"certified": certified} if len(certified) else {})
 
 
-def regime_information(truth: Any, experiment: Any, seed: int, scale: float = 1.0) -> FloatArray:
+def silverbox_segment_information(truth: Any, experiment: Any, seed: int, scale: float = 1.0) -> FloatArray:
     """(lengths, n) what stretches of the Silverbox multisine regime, times ``scale``, tell of each system [nats].
 
     They start anywhere in the regime and go on at its start where it ends, so that every part of it counts alike: rare
@@ -113,12 +122,12 @@ def regime_information(truth: Any, experiment: Any, seed: int, scale: float = 1.
     rng = np.random.default_rng(seed)
     regime = regime_input("multisine", rng)
     starts = rng.integers(len(regime), size=np.size(truth.m))
-    inputs = scale * np.take(regime, np.arange(_LENGTHS[-1])[:, None] + starts, mode="wrap")
-    return np.array([information(inputs[:length], truth, experiment) for length in _LENGTHS])
+    inputs = scale * np.take(regime, np.arange(_SEGMENT_LENGTHS[-1])[:, None] + starts, mode="wrap")
+    return np.array([fisher_information_gain(inputs[:length], truth, experiment) for length in _SEGMENT_LENGTHS])
 
 
-def regimes(truth: Any, experiment: Any, seed: int) -> dict[str, FloatArray]:
-    """`regime_information` by metric: of the regime as recorded, and scaled up to the limit of the input.
+def silverbox_information_by_metric(truth: Any, experiment: Any, seed: int) -> dict[str, FloatArray]:
+    """`silverbox_segment_information` by metric: of the regime as recorded, and scaled up to the limit of the input.
 
     Where the input's power is limited, there is no regime at the limit: it would have more than the budget.
     """
@@ -126,22 +135,22 @@ def regimes(truth: Any, experiment: Any, seed: int) -> dict[str, FloatArray]:
     if experiment.max_rms is None:
         peak = np.abs(regime_input("multisine", np.random.default_rng(seed))).max()
         scales["full_peak_equivalent"] = float(experiment.max_input / peak)
-    return {name: regime_information(truth, experiment, seed, scale) for name, scale in scales.items()}
+    return {name: silverbox_segment_information(truth, experiment, seed, scale) for name, scale in scales.items()}
 
 
-def equivalents(gains: FloatArray, told: FloatArray) -> FloatArray:
-    """(n,) samples of a regime that tell as much as ``gains`` (n,) of `information`, with ``told`` of it (lengths, n).
+def equivalent_segment_lengths(gains: FloatArray, segment_information: FloatArray) -> FloatArray:
+    """(n,) samples of a regime that tell as much as ``gains`` (n,) of `fisher_information_gain`, with ``segment_information`` of it (lengths, n).
 
     Interpolated between powers of √2; inf where even the longest stretch, 46,341 samples, tells less.
     """
-    found = np.empty(len(gains))
+    lengths = np.empty(len(gains))
     for i, gain in enumerate(gains):
-        curve = np.maximum.accumulate(told[:, i])
-        found[i] = np.exp(np.interp(gain, curve, np.log(_LENGTHS))) if gain <= curve[-1] else np.inf
-    return found
+        curve = np.maximum.accumulate(segment_information[:, i])
+        lengths[i] = np.exp(np.interp(gain, curve, np.log(_SEGMENT_LENGTHS))) if gain <= curve[-1] else np.inf
+    return lengths
 
 
-def simulation_errors(means: FloatArray, truth: Any) -> FloatArray:
+def twin_simulation_rmse(means: FloatArray, truth: Any) -> FloatArray:
     """(n,) RMSE [V] of free runs of Eq. (2) with estimated coefficients beside the true ones, for the arrow input."""
     u = regime_input("arrow", np.random.default_rng(0))[-_TWIN_ARROW_SAMPLES:][1:-1]
     true = coefficients_of(difference(), truth)
@@ -150,14 +159,14 @@ def simulation_errors(means: FloatArray, truth: Any) -> FloatArray:
     return np.array([_rmse(np.append(at_rest, believed), np.append(at_rest, exact)) for believed, exact in runs])
 
 
-def arrow_errors(means: FloatArray) -> FloatArray:
+def arrow_simulation_rmse(means: FloatArray) -> FloatArray:
     """(n,) RMSE [V] of free runs over the real arrow record; inf where a run diverges."""
     arrow = load_record().arrow
     start = arrow.y[1::-1]
     return np.array([_rmse(free_run(difference(), mean, arrow.u[1:-1], start), arrow.y[2:]) for mean in means])
 
 
-def _rmse(simulated: FloatArray, output: FloatArray) -> float:
+def _rmse(simulated: FloatArray, measured: FloatArray) -> float:
     with np.errstate(invalid="ignore", over="ignore"):
-        error = float(np.sqrt(np.mean((simulated - output) ** 2)))
+        error = float(np.sqrt(np.mean((simulated - measured) ** 2)))
     return error if np.isfinite(error) else np.inf

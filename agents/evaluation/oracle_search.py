@@ -11,7 +11,7 @@ times as many, until three that began anew have come to the highest summit.
 With `--check` nothing is stored: a search from fresh starts, twice as long, says for each system what it gains over
 what is stored, and by how much its best three starts differ.
 
-System i is row i of a batch that is reset with seed 0 in the branch ``test``, as `agents.evaluation.rollout.evaluate`
+System i is row i of a batch that is reset with seed 0 in the branch ``test``, as `agents.evaluation.policy_evaluation.evaluate_policies`
 does it by default; it does not depend on the number of systems.
 """
 
@@ -24,7 +24,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agents.cli import JsonOptions, followed, run_script
+from agents.cli import JsonOptions, iterate_with_progress, run_script
+from agents.console_output import print_texts_and_tables
 from agents.evaluation.oracle import LEVELS, Oracle, Systems, as_stored
 from agents.planner import search as planning
 from agents.planner.ascent import Limits, climber
@@ -32,7 +33,6 @@ from agents.planner.imagination import Terms
 from agents.planner.motion import View, swing_of
 from agents.planner.polish import polish
 from agents.planner.pursuit import pursuit
-from agents.results import show
 from estimator.belief import Belief
 from estimator.checks import MOST_SEED, whole
 from estimator.extras import need
@@ -146,7 +146,7 @@ def begun(systems: Systems) -> Oracle:
 def check(oracle: Oracle, first: int, tries: int, seed: int) -> Iterator[str]:
     """What searches from fresh starts, twice as long, gain over what is stored: a line for each system, and for all."""
     none, found = np.empty((0, oracle.systems.samples)), []
-    for row in followed((f"system {row}", row) for row in range(first, len(oracle.values))):
+    for row in iterate_with_progress((f"system {row}", row) for row in range(first, len(oracle.values))):
         rng = np.random.default_rng([seed, row, 1])  # not [seed, row, 0], which is the same as [seed, row]
         _, value, apart = search(oracle.systems, row, none, rng, 2 * tries)
         gained = max(value - oracle.values[row], 0.0)
@@ -193,13 +193,13 @@ def main(config: Config) -> None:
     began = time.perf_counter()
     if config.check:
         for line in check(Oracle.of(systems), config.first, config.tries, config.seed):
-            show(line)
+            print_texts_and_tables(line)
             sys.stdout.flush()  # at once: a check that is cut short leaves what it found
-        show(f"{time.perf_counter() - began:.0f} s")
+        print_texts_and_tables(f"{time.perf_counter() - began:.0f} s")
         return
     count = max(config.systems, Oracle.stored(systems))
     oracle = begun(Systems.of(config.env, count, config.options))
-    for row in followed((f"system {row}", row) for row in range(config.first, config.systems)):
+    for row in iterate_with_progress((f"system {row}", row) for row in range(config.first, config.systems)):
         starts = oracle.inputs[row : row + 1] if np.isfinite(oracle.values[row]) else oracle.inputs[:0]
         rng = np.random.default_rng([config.seed, row])
         found, value, _ = search(oracle.systems, row, starts, rng, config.tries)
@@ -209,8 +209,10 @@ def main(config: Config) -> None:
             path = oracle.first(int(np.isfinite(oracle.values).sum())).save()
     gained = oracle.values - 0.5 * np.linalg.slogdet(oracle.systems.precision)[1]
     seconds = time.perf_counter() - began
-    show(f"{config.systems - config.first} systems in {seconds:.0f} s; mean gain of {count}: {gained.mean():.3f} nats")
-    show(f"stored in {path}")
+    print_texts_and_tables(
+        f"{config.systems - config.first} systems in {seconds:.0f} s; mean gain of {count}: {gained.mean():.3f} nats"
+    )
+    print_texts_and_tables(f"stored in {path}")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from agents.console_output import check_output_folder
 from agents.policies.features import BOUND
 from agents.policies.learned import (
     ACTIVATIONS,
@@ -27,7 +28,6 @@ from agents.policies.learned import (
     observation_of,
 )
 from agents.policies.own import check_wrappers, environments_of
-from agents.results import check_folder
 from estimator.checks import mapping, number, numbers, shown, whole
 from estimator.files import file_name, write_atomically, writing
 
@@ -86,7 +86,7 @@ def check_policy_folder(name: str, folder: str | Path) -> Path:
         NotADirectoryError: where it is a file.
     """
     place = file_name(name, folder)
-    check_folder(name, place)
+    check_output_folder(name, place)
     if (place / CONFIG).exists():
         raise ValueError(f"{name} must be a folder for a policy, but {place} holds a run; remove it or name another")
     return place

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from agents.cli import check_track, full_id, run_script
+from agents.cli import check_track_id, full_track_id, run_script
 from estimator.extras import need
 
 
@@ -31,8 +31,8 @@ class Config:
     """Seed of everything."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "env", full_id(self.env))
-        check_track(self.env)
+        object.__setattr__(self, "env", full_track_id(self.env))
+        check_track_id(self.env)
 
     @property
     def folder(self) -> Path:
@@ -48,8 +48,8 @@ def main(config: Config) -> None:
     from sb3_contrib import TQC
     from stable_baselines3 import PPO, SAC
 
+    from agents.console_output import package_versions
     from agents.policies.saving import check_policy_folder, save_policy
-    from agents.results import versions
 
     check_policy_folder("folder", config.folder)
     torch.set_num_threads(1)
@@ -60,7 +60,7 @@ def main(config: Config) -> None:
         "steps": model.num_timesteps,
         "config": asdict(config),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions("stable-baselines3", "sb3-contrib", "torch"),
+        "versions": package_versions("stable-baselines3", "sb3-contrib", "torch"),
     }
     save_policy(config.folder, model, card)
     print(config.folder)

@@ -16,12 +16,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from agents.cli import check_track, followed, full_id, run_script
+from agents.cli import check_track_id, full_track_id, iterate_with_progress, run_script
+from agents.console_output import print_texts_and_tables
 from agents.evaluation.batch import make
-from agents.evaluation.comparison import usual_policies
+from agents.evaluation.comparison import default_policies
 from agents.loading import of_ones_own
 from agents.policies import make_policy, trained_policies
-from agents.results import show
 from estimator.checks import one_of, whole
 from estimator.extras import need
 
@@ -48,8 +48,8 @@ class Config:
     """Seed of systems, noise and policy."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "env", full_id(self.env))
-        check_track(self.env)
+        object.__setattr__(self, "env", full_track_id(self.env))
+        check_track_id(self.env)
         one_of("grade", self.grade, (*POLICIES, "expert"))
         whole("episodes", self.episodes, _MOST)
         whole("seed", self.seed, 2**32 - 1, 0)
@@ -59,7 +59,7 @@ class Config:
         """The name of the policy; ValueError for an expert of a track that none ships for."""
         if self.grade != "expert":
             return POLICIES[self.grade]
-        shipped = [name for name in usual_policies(self.env, {}) if name in trained_policies()]
+        shipped = [name for name in default_policies(self.env, {}) if name in trained_policies()]
         if not shipped:
             raise ValueError(f"grade must not be expert on {self.env}, for which no policy ships; take planner")
         return shipped[0]
@@ -79,7 +79,7 @@ def collect(config: Config) -> list[dict[str, Any]]:
     episodes: list[dict[str, Any]] = []
     seeds = np.random.SeedSequence(config.seed).generate_state(-(-config.episodes // envs.num_envs))
     batches = [(f"batch {number} of {len(seeds)}", int(seed)) for number, seed in enumerate(seeds, start=1)]
-    for seed in followed(batches):
+    for seed in iterate_with_progress(batches):
         with of_ones_own(name, "policy"):
             episodes += _play(envs, policy, seed)
     envs.close()
@@ -143,7 +143,7 @@ def main(config: Config) -> None:
         )
     gained = [float(np.sum(buffer.rewards)) for buffer in buffers]
     counts = f"{dataset.total_episodes} episodes, {dataset.total_steps} samples"
-    show(f"{config.name}: {counts}, return {np.mean(gained):.2f}")
+    print_texts_and_tables(f"{config.name}: {counts}, return {np.mean(gained):.2f}")
 
 
 if __name__ == "__main__":

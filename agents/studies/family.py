@@ -2,7 +2,7 @@
 
     python -m agents.studies.family --policies ppo/universal shield prbs prbs-4 uniform silverbox-multisine
 
-plays every policy on the same oscillators, one of each rig that is drawn (`agents.training.family`), in the branch
+plays every policy on the same oscillators, one of each rig that is drawn (`agents.training.environments.oscillator_family`), in the branch
 ``test`` of the seeds. D-efficiency is exp(2 (I - I_efe) / K), with I the information gained about the K coefficients
 and I_efe that of the planner on the same oscillator with the same noise.
 """
@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from agents.cli import RIG_TRACK, followed, run_script
+from agents.cli import RIG_TRACK, iterate_with_progress, run_script
+from agents.console_output import format_table, print_texts_and_tables, write_json
 from agents.evaluation.batch import TESTED, make
-from agents.evaluation.entries import check_policies
+from agents.evaluation.policy_groups import check_policies_can_play
 from agents.loading import of_ones_own
 from agents.policies import make_policy
-from agents.results import show, table, write_json
-from agents.training.family import Member, draw_member
+from agents.training.environments.oscillator_family import FamilyMember, draw_oscillator
 
 PLANNER = "efe"
 
@@ -48,12 +48,12 @@ class Config:
             raise ValueError(f"policies must be some and systems at least 2, but are {self.policies}, {self.systems}")
 
 
-def unseen(count: int, seed: int = 0) -> list[Member]:
+def unseen(count: int, seed: int = 0) -> list[FamilyMember]:
     """Rigs of the family that no training draws."""
-    return [draw_member(np.random.default_rng((seed, _BRANCH, i))) for i in range(count)]
+    return [draw_oscillator(np.random.default_rng((seed, _BRANCH, i))) for i in range(count)]
 
 
-def play(member: Member, policy: str, seed: int) -> tuple[float, float, float]:
+def play(member: FamilyMember, policy: str, seed: int) -> tuple[float, float, float]:
     """An episode: the information gained, 1 where a limit ended it, and the share of 90 % intervals with the truth."""
     envs = make(RIG_TRACK, 1, member.options | TESTED)
     chosen = make_policy(policy, envs, seed=seed)
@@ -75,9 +75,9 @@ def play(member: Member, policy: str, seed: int) -> tuple[float, float, float]:
     return gained, float(terminated[0]), float(covered)
 
 
-def classes(members: Sequence[Member]) -> Iterator[tuple[str, npt.NDArray[np.bool_]]]:
+def classes(members: Sequence[FamilyMember]) -> Iterator[tuple[str, npt.NDArray[np.bool_]]]:
     """Name of a class of oscillators, and which of them are in it."""
-    kinds = np.array([member.kind for member in members])
+    kinds = np.array([member.stiffness for member in members])
     yield "all", np.ones(len(members), dtype=np.bool_)
     for kind in dict.fromkeys(kinds):
         yield str(kind), kinds == kind
@@ -99,10 +99,12 @@ def main(config: Config) -> None:
     """Play, and print the table."""
     members = unseen(config.systems, config.seed)
     names = (PLANNER, *config.policies)
-    check_policies(names, RIG_TRACK, members[0].options, config.seed)
+    check_policies_can_play(names, RIG_TRACK, members[0].options, config.seed)
     gains, ended, covered = np.empty((3, len(names), len(members)))
-    tasks = [(f"{name}, {member.kind}", (p, i)) for p, name in enumerate(names) for i, member in enumerate(members)]
-    for p, i in followed(tasks):
+    tasks = [
+        (f"{name}, {member.stiffness}", (p, i)) for p, name in enumerate(names) for i, member in enumerate(members)
+    ]
+    for p, i in iterate_with_progress(tasks):
         gains[p, i], ended[p, i], covered[p, i] = play(members[i], names[p], config.seed + i)
     groups = [(name, mask) for name, mask in classes(members) if mask.any()]
     n_coefficients = 6
@@ -119,7 +121,7 @@ def main(config: Config) -> None:
         told = {"gains": gains.tolist(), "ended": ended.tolist(), "covered": covered.tolist()}
         write_json(config.output / "family.json", {"policies": names, **told})
     heading = "D-efficiency beside efe: median / 10 % quantile"
-    show(heading, table(("oscillators", "number", *names), rows, markdown=True, labels=2))
+    print_texts_and_tables(heading, format_table(("oscillators", "number", *names), rows, markdown=True, n_labels=2))
 
 
 if __name__ == "__main__":

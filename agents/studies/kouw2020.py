@@ -16,10 +16,16 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from agents.cli import followed
-from agents.evaluation.figures import new_figure, save
+from agents.cli import iterate_with_progress
+from agents.console_output import (
+    check_output_file,
+    format_table,
+    package_versions,
+    print_texts_and_tables,
+    write_json,
+)
+from agents.evaluation.figures import new_figure, save_png
 from agents.policies import make_policy
-from agents.results import check_file, show, table, versions, write_json
 from duffing_env.plants.silverbox_record import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
@@ -119,7 +125,7 @@ def reproduce(
         OSError: A result cannot be written; found out before the work begins, where it can be.
     """
     record = load_record(data)
-    check_file("json", json)
+    check_output_file("json", json)
     figures.mkdir(parents=True, exist_ok=True)
 
     runs = run_all(record, data)
@@ -127,7 +133,7 @@ def reproduce(
     if json is not None:
         write_json(json, results)
     for measure in MEASURES:
-        save(draw(runs["as_published"], record.arrow, measure), figures / f"{measure}_error.png")
+        save_png(draw(runs["as_published"], record.arrow, measure), figures / f"{measure}_error.png")
 
     report(results)
     return results
@@ -138,7 +144,7 @@ def run_all(record: SilverboxRecord, data: Path | None) -> dict[str, dict[str, R
     compile_kernels(record, data)
     runs: dict[str, dict[str, Run]] = {name: {} for name in SETTINGS}
     tasks = [(f"{name}, {model}", (name, model)) for name, setting in SETTINGS.items() for model in setting.models]
-    for name, model in followed(tasks):
+    for name, model in iterate_with_progress(tasks):
         runs[name][model] = run(SETTINGS[name], model, record, data)
     return runs
 
@@ -270,7 +276,7 @@ def summarise(runs: dict[str, dict[str, Run]], record: SilverboxRecord) -> dict[
         "settings": {name: asdict(setting) for name, setting in SETTINGS.items()},
         "seconds": {name: {model: run.seconds for model, run in models.items()} for name, models in runs.items()},
         "samples": {"training": len(record.multisine.u), "validation": len(record.arrow.u)},
-        "versions": versions("matplotlib"),
+        "versions": package_versions("matplotlib"),
     }
     return {"published": PUBLISHED, **errors, "meta": meta}
 
@@ -288,8 +294,8 @@ def report(results: dict[str, Any]) -> None:
                 ratio = mse / PUBLISHED[model][f"{measure}_mse"]
                 cells += [f"{mse:.4e}", f"{ratio:.4f}", f"{1e3 * np.sqrt(mse):.3f}"]
             rows.append(cells)
-    show(
-        table(titles, rows, labels=2),
+    print_texts_and_tables(
+        format_table(titles, rows, n_labels=2),
         "\nratio: to the published error of the same model",
         *(f"{name + ':':20} {setting.summary}" for name, setting in SETTINGS.items()),
         *(

@@ -22,11 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.cli import run_script
+from agents.console_output import format_table, print_texts_and_tables
 from agents.evaluation.batch import TESTED, make
-from agents.evaluation.leaderboard import METRICS, in_line
+from agents.evaluation.comparison_tables import METRIC_COLUMNS, center_and_interval_text
 from agents.loading import of_ones_own
 from agents.policies import make_policy
-from agents.results import show, table
 from estimator.parameters import FloatArray
 
 TRACK = "duffing_env/Pendulum-v1"
@@ -72,14 +72,14 @@ def gains(policy: str, systems: int, seed: int = 0) -> tuple[FloatArray, int]:
 
 def main(config: Config) -> None:
     """Play, and print the table."""
-    rows, metric = [], METRICS["information_gain"]
+    rows, metric = [], METRIC_COLUMNS["information_gain"]
     for name in config.policies:
         found, early = gains(name, config.systems, config.seed)
-        then, last = in_line(metric, found[SAMPLE - 1]), in_line(metric, found[-1])
+        then, last = center_and_interval_text(metric, found[SAMPLE - 1]), center_and_interval_text(metric, found[-1])
         rows.append([name, then, f"{found[SAMPLE - 1].std():.2f}", last, str(early)])
     rows += [[f"published: {name}", f"{mean:.2f}", f"{std:.2f}", "", ""] for name, (mean, std) in PUBLISHED.items()]
     titles = "policy", f"gain of {SAMPLE} samples / nat", "std over systems", "gain of 50 / nat", "ended early"
-    show(table(titles, rows, markdown=True))
+    print_texts_and_tables(format_table(titles, rows, markdown=True))
 
 
 if __name__ == "__main__":

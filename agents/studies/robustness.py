@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from agents.cli import followed, run_script
+from agents.cli import iterate_with_progress, run_script
+from agents.console_output import format_table, print_texts_and_tables, write_json
 from agents.evaluation.batch import TESTED
-from agents.evaluation.leaderboard import METRICS, in_line
-from agents.evaluation.metrics import information
-from agents.evaluation.rollout import roll_out
-from agents.results import show, table, write_json
+from agents.evaluation.comparison_tables import METRIC_COLUMNS, center_and_interval_text
+from agents.evaluation.metrics import fisher_information_gain
+from agents.evaluation.policy_evaluation import run_episodes
 
 #: What is compared: a title, the track without its version, the options.
 CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (
@@ -68,9 +68,9 @@ def judge(track: str, options: dict[str, Any], policies: tuple[str, ...], system
     """
     best = None
     for policy in (PLANNER, *policies):
-        played, _, truth, experiment = roll_out(policy, track, systems, 0, TESTED | options)
+        played, _, truth, experiment = run_episodes(policy, track, systems, 0, TESTED | options)
         assert experiment.plant is not None
-        told = information(played.inputs, truth, experiment, played.outputs)
+        told = fisher_information_gain(played.inputs, truth, experiment, played.outputs)
         best = told if best is None else best
         efficiency = np.exp(2.0 * (told - best) / experiment.plant.n_coefficients)
         yield {
@@ -85,15 +85,15 @@ def main(config: Config) -> None:
     """Play, and print the table."""
     rows, results = [], []
     metrics = {
-        "efficiency": replace(METRICS["efficiency"], digits=3, scale=1.0),
-        "fisher_gain": METRICS["fisher_gain"],
+        "efficiency": replace(METRIC_COLUMNS["efficiency"], digits=3, scale=1.0),
+        "fisher_gain": METRIC_COLUMNS["fisher_gain"],
     }
     tasks = [(version, *CASES[case - 1]) for version in config.versions for case in config.cases]
-    for task in followed((f"{task[2]}-v{task[0]}, {task[1]}", task) for task in tasks):
+    for task in iterate_with_progress((f"{task[2]}-v{task[0]}, {task[1]}", task) for task in tasks):
         version, title, name, options = task
         track, policies = f"{name}-v{version}", (own(name, version), UNIVERSAL)
         for found in judge(f"duffing_env/{track}", options, policies, config.systems):
-            cells = [in_line(metrics[key], found[key]) for key in metrics]
+            cells = [center_and_interval_text(metrics[key], found[key]) for key in metrics]
             early = f"{int(found['ended_early'].sum())} of {config.systems}"
             rows.append([track, title, found["policy"], *cells, early])
             plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in found.items()}
@@ -101,7 +101,7 @@ def main(config: Config) -> None:
     heads = ("track", "options", "policy", "D-efficiency beside efe", "Fisher information / nat", "ended early")
     if config.output is not None:
         write_json(config.output, results)
-    show(table(heads, rows, markdown=True, labels=3))
+    print_texts_and_tables(format_table(heads, rows, markdown=True, n_labels=3))
 
 
 if __name__ == "__main__":

@@ -21,12 +21,12 @@ import numpy as np
 
 from agents import policies
 from agents.cli import run_script
-from agents.evaluation.leaderboard import print_table, summarise
-from agents.evaluation.rollout import evaluate, pooled
+from agents.console_output import print_texts_and_tables, write_json
+from agents.evaluation.comparison_tables import print_comparison_table, summarise_metrics
+from agents.evaluation.policy_evaluation import evaluate_policies, pool_seeds
 from agents.policies.learned import CARD, WEIGHTS
-from agents.results import show, write_json
 from agents.studies.family import play, unseen
-from agents.training.family import FAMILY
+from agents.training.environments.oscillator_family import FAMILY
 from estimator.files import write_atomically
 
 
@@ -62,11 +62,11 @@ def ship(config: Config) -> Path:
     if env == FAMILY:
         scores, by = _on_the_family(config), "information_gain"
     else:
-        evaluations = evaluate([str(run) for run in config.runs], env, config.systems, options=options)
-        together = pooled(config.name, evaluations)
-        scores = summarise(together)
+        evaluations = evaluate_policies([str(run) for run in config.runs], env, config.systems, options=options)
+        together = pool_seeds(config.name, evaluations)
+        scores = summarise_metrics(together)
         by = "efficiency" if "efficiency" in scores else "information_gain"
-        print_table([together], f"{env}, {config.systems} systems")
+        print_comparison_table([together], f"{env}, {config.systems} systems")
     chosen = median_index(scores[by].get("seeds", [0.0]))  # of one seed there are no seeds' own
     card = cards[chosen] | {
         "track": env,
@@ -81,7 +81,7 @@ def ship(config: Config) -> Path:
         },
     }
     put(folder, config.runs[chosen], card)
-    show(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
+    print_texts_and_tables(f"{folder}: seed {seeds[chosen]} of {seeds}, the median by {by.replace('_', ' ')}")
     return folder
 
 

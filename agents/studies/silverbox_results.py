@@ -12,9 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from agents.cli import followed
-from agents.evaluation.figures import save
-from agents.results import check_file, finite, show, table, versions, write_json
+from agents.cli import iterate_with_progress
+from agents.console_output import (
+    check_output_file,
+    format_table,
+    package_versions,
+    print_texts_and_tables,
+    replace_non_finite,
+    write_json,
+)
+from agents.evaluation.figures import save_png
 from agents.studies.silverbox_figures import figures_of
 from agents.studies.silverbox_protocol import (
     GIVEN,
@@ -72,12 +79,14 @@ def run_protocol(
         OSError: A result cannot be written.
     """
     sections = cut(load_record(data))
-    check_file("json", json)
+    check_output_file("json", json)
     figures.mkdir(parents=True, exist_ok=True)
-    outcomes = {name: evaluate(SETTINGS[name], sections) for name in followed((name, name) for name in SETTINGS)}
+    outcomes = {
+        name: evaluate(SETTINGS[name], sections) for name in iterate_with_progress((name, name) for name in SETTINGS)
+    }
     results = summarise(outcomes)
     for name, figure in figures_of(outcomes).items():
-        save(figure, figures / f"silverbox_{name}.png")
+        save_png(figure, figures / f"silverbox_{name}.png")
     if json is not None:
         write_json(json, results)
     report(outcomes)
@@ -111,8 +120,8 @@ def summarise(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
         }
         for name, outcome in outcomes.items()
     }
-    meta = {"samples": {"training": TRAINING_SAMPLES, "given": GIVEN}, "versions": versions()}
-    return {"rows": finite(rows), "meta": meta}
+    meta = {"samples": {"training": TRAINING_SAMPLES, "given": GIVEN}, "versions": package_versions()}
+    return {"rows": replace_non_finite(rows), "meta": meta}
 
 
 def submission(errors: Any) -> str:
@@ -122,7 +131,7 @@ def submission(errors: Any) -> str:
 
 def report(outcomes: Mapping[str, Outcome]) -> None:
     """Prints the table, and the submission lines."""
-    show(
+    print_texts_and_tables(
         as_table(outcomes),
         "d = 0: without feedthrough; +e: with cubic damping; n.e.: without extrapolation;",
         "1-step and coverage: of the multisine test",
@@ -134,7 +143,7 @@ def report(outcomes: Mapping[str, Outcome]) -> None:
 def as_table(outcomes: Mapping[str, Outcome]) -> Any:
     """A row for each setting."""
     columns = ("multisine\n[mV]", "arrow\n[mV]", "n.e.\n[mV]", "1-step\n[mV]", "90 %\ncovers", "<1 mV\nafter")
-    return table(
+    return format_table(
         ("", *columns, "µs per\nsample", "free energy\n[nats]"),
         (
             (
@@ -173,7 +182,7 @@ def select(data: Path | None = None) -> dict[str, dict[str, tuple[float, float]]
         for name, setting in SETTINGS.items()
         if "feedthrough" in setting.model.coefficients and setting.passes == 1
     }
-    for name, setting in followed((name, (name, setting)) for name, setting in settings.items()):
+    for name, setting in iterate_with_progress((name, (name, setting)) for name, setting in settings.items()):
         scores[name] = {}
         for label, candidate in _candidates(setting):
             estimator, _, _ = identify(candidate, first, split)
@@ -181,7 +190,7 @@ def select(data: Path | None = None) -> dict[str, dict[str, tuple[float, float]]
     rows = (
         (name, *(f"{1e3 * error:.4f}\n{covers:.3f}" for error, covers in row.values())) for name, row in scores.items()
     )
-    show(table(("simulation [mV]\n90 % covers", *next(iter(scores.values()))), rows))
+    print_texts_and_tables(format_table(("simulation [mV]\n90 % covers", *next(iter(scores.values()))), rows))
     return scores
 
 

@@ -9,24 +9,24 @@ from agents.training.algorithms import (
     TD3Settings,
     TQCSettings,
 )
-from agents.training.config import Subject, TrainConfig
-from agents.training.runs import Run, resume, train
-from agents.training.seeds import train_seeds
-from agents.training.tuning import tune
+from agents.training.hyperparameter_search import tune_hyperparameters
+from agents.training.seed_runs import train_seeds
+from agents.training.training_config import TrainConfig, TrainingSubject
+from agents.training.training_run import TrainingRun, resume, train
 
 __all__ = [
     "ALGORITHMS",
     "AlgorithmSettings",
     "PPOSettings",
     "RecurrentPPOSettings",
-    "Run",
     "SACSettings",
-    "Subject",
     "TD3Settings",
     "TQCSettings",
     "TrainConfig",
+    "TrainingRun",
+    "TrainingSubject",
     "resume",
     "train",
     "train_seeds",
-    "tune",
+    "tune_hyperparameters",
 ]

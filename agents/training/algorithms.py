@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 # Hyperparameters by what they may be; whole numbers that are not named here are at least 1.
-_FROM_ZERO = ("learning_starts", "exploration_noise", "dropped_quantiles", "levels", "entropy_bonus")
+_NON_NEGATIVE = ("learning_starts", "exploration_noise", "dropped_quantiles", "levels", "entropy_bonus")
 _POSITIVE = ("learning_rate", "entropy_weight")
-_SHARES = ("gamma", "gae_lambda", "tau")
+_FRACTIONS = ("gamma", "gae_lambda", "tau")
 
 
-def _searched(default: Any, low: Any, high: Any, **how: Any) -> Any:
+def _with_search_range(default: Any, low: Any, high: Any, **sampling: Any) -> Any:
     """A hyperparameter that a search varies: its default, its range, and how Optuna is to draw from that."""
-    return field(default=default, metadata={"low": low, "high": high, **how})
+    return field(default=default, metadata={"low": low, "high": high, **sampling})
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class AlgorithmSettings(ABC):
     """Environments that are stepped together."""
     batch_size: int = 8192
     """Samples of a gradient step."""
-    learning_rate: float = _searched(1e-3, 2e-4, 5e-3, log=True)
+    learning_rate: float = _with_search_range(1e-3, 2e-4, 5e-3, log=True)
     """Step size at the start; it falls linearly to 0."""
-    gamma: float = _searched(0.99, 0.95, 1.0)
+    gamma: float = _with_search_range(0.99, 0.95, 1.0)
     """Discount factor."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
@@ -51,14 +51,14 @@ class AlgorithmSettings(ABC):
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values |= {f"hidden[{i}]": units for i, units in enumerate(values.pop("hidden"))}
         for name, value in values.items():
-            least = 0 if name in _FROM_ZERO else 1
-            if (type(value) is int or name in _FROM_ZERO) and value < least:
+            least = 0 if name in _NON_NEGATIVE else 1
+            if (type(value) is int or name in _NON_NEGATIVE) and value < least:
                 raise ValueError(f"{name} must be at least {least}, but is {value}")
             if type(value) is float and not math.isfinite(value):
                 raise ValueError(f"{name} must be finite, but is {value}; give a number")
             if name in _POSITIVE and value <= 0:
                 raise ValueError(f"{name} must be positive, but is {value}")
-            if name in _SHARES and not 0 <= value <= 1:
+            if name in _FRACTIONS and not 0 <= value <= 1:
                 raise ValueError(f"{name} must be in [0, 1], but is {value}")
 
     @property
@@ -76,22 +76,22 @@ class AlgorithmSettings(ABC):
         """A model with these hyperparameters."""
 
     @classmethod
-    def suggest(cls, trial: Any) -> dict[str, Any]:
+    def sample_hyperparameters(cls, trial: Any) -> dict[str, Any]:
         """Hyperparameters that Optuna's ``trial`` chooses from the search space of this algorithm."""
-        varied = [f for f in fields(cls) if f.metadata]
+        searched_fields = [f for f in fields(cls) if f.metadata]
         suggest = {int: trial.suggest_int, float: trial.suggest_float}
-        return {f.name: suggest[type(f.default)](f.name, **f.metadata) for f in varied}
+        return {f.name: suggest[type(f.default)](f.name, **f.metadata) for f in searched_fields}
 
-    def _arguments(self, envs: VecEnv, seed: int, *names: str) -> dict[str, Any]:
+    def _model_arguments(self, envs: VecEnv, seed: int, *names: str) -> dict[str, Any]:
         """Arguments that every model takes, and those of the hyperparameters that are named."""
-        start = self.learning_rate
+        initial_rate = self.learning_rate
         return {name: getattr(self, name) for name in names} | {
             "env": envs,
             "batch_size": self.batch_size,
-            "learning_rate": lambda left: start * left,
+            "learning_rate": lambda progress_remaining: initial_rate * progress_remaining,
             "gamma": self.gamma,
             "stats_window_size": self.num_envs,
-            "policy_kwargs": {"net_arch": list(self.hidden), "activation_fn": _module_of(self.activation)},
+            "policy_kwargs": {"net_arch": list(self.hidden), "activation_fn": _activation_class(self.activation)},
             "seed": seed,
             "device": "cpu",
         }
@@ -101,13 +101,13 @@ class AlgorithmSettings(ABC):
 class OnPolicySettings(AlgorithmSettings):
     """Hyperparameters of algorithms that learn from the samples of the present policy only."""
 
-    n_steps: int = _searched(64, 16, 128, step=16)
+    n_steps: int = _with_search_range(64, 16, 128, step=16)
     """Samples that each environment collects between two updates."""
-    n_epochs: int = _searched(4, 2, 10)
+    n_epochs: int = _with_search_range(4, 2, 10)
     """Passes over the collected samples in an update."""
-    gae_lambda: float = _searched(0.95, 0.85, 1.0)
+    gae_lambda: float = _with_search_range(0.95, 0.85, 1.0)
     """Trade-off of bias and variance in the advantage (generalised advantage estimation)."""
-    log_std_init: float = _searched(-0.5, -1.5, 0.0)
+    log_std_init: float = _with_search_range(-0.5, -1.5, 0.0)
     """Log standard deviation of the action at the start, where it is not one of some levels."""
     entropy_bonus: float = 0.0
     """Weight of the action's entropy at the start; it falls linearly to 0."""
@@ -131,8 +131,8 @@ class OnPolicySettings(AlgorithmSettings):
         """Every update."""
         return 1
 
-    def _on_policy(self, envs: VecEnv, seed: int) -> dict[str, Any]:
-        arguments = self._arguments(envs, seed, "n_steps", "n_epochs", "gae_lambda")
+    def _on_policy_arguments(self, envs: VecEnv, seed: int) -> dict[str, Any]:
+        arguments = self._model_arguments(envs, seed, "n_steps", "n_epochs", "gae_lambda")
         if not self.levels:
             arguments["policy_kwargs"]["log_std_init"] = self.log_std_init
         return arguments
@@ -143,7 +143,7 @@ class PPOSettings(OnPolicySettings):
     """Hyperparameters of PPO; chosen for a batched environment: large batches, few epochs."""
 
     advantages_by_time: bool = True
-    """Whether advantages of features count alike at every time of an episode (`agents.training.advantages`)."""
+    """Whether advantages of features count alike at every time of an episode (`agents.training.timed_advantages`)."""
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """Stable-Baselines3's PPO."""
@@ -151,10 +151,10 @@ class PPOSettings(OnPolicySettings):
 
         buffer: dict[str, Any] = {}
         if self.features and self.advantages_by_time:
-            from agents.training.advantages import TimedRolloutBuffer
+            from agents.training.timed_advantages import TimeNormalisedRolloutBuffer
 
-            buffer["rollout_buffer_class"] = TimedRolloutBuffer
-        return PPO("MlpPolicy", **self._on_policy(envs, seed), **buffer)
+            buffer["rollout_buffer_class"] = TimeNormalisedRolloutBuffer
+        return PPO("MlpPolicy", **self._on_policy_arguments(envs, seed), **buffer)
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class RecurrentPPOSettings(OnPolicySettings):
         """sb3-contrib's RecurrentPPO."""
         from sb3_contrib import RecurrentPPO
 
-        arguments = self._on_policy(envs, seed)
+        arguments = self._on_policy_arguments(envs, seed)
         arguments["policy_kwargs"]["lstm_hidden_size"] = self.lstm_units
         return RecurrentPPO("MlpLstmPolicy", **arguments)
 
@@ -183,7 +183,7 @@ class OffPolicySettings(AlgorithmSettings):
 
     num_envs: int = 64
     """Environments that are stepped together."""
-    batch_size: int = _searched(256, 128, 1024, log=True)
+    batch_size: int = _with_search_range(256, 128, 1024, log=True)
     """Samples of a gradient step."""
     buffer_size: int = 200_000
     """Samples that are kept, over all environments."""
@@ -191,9 +191,9 @@ class OffPolicySettings(AlgorithmSettings):
     """Samples with random inputs at the start, over all environments."""
     train_freq: int = 4
     """Samples that each environment collects between two updates."""
-    gradient_steps: int = _searched(32, 8, 64, log=True)
+    gradient_steps: int = _with_search_range(32, 8, 64, log=True)
     """Gradient steps in an update."""
-    tau: float = _searched(0.005, 2e-3, 2e-2, log=True)
+    tau: float = _with_search_range(0.005, 2e-3, 2e-2, log=True)
     """How far the target networks follow in a gradient step."""
 
     @property
@@ -206,9 +206,9 @@ class OffPolicySettings(AlgorithmSettings):
         """About every time that all environments have ended an episode."""
         return self.num_envs
 
-    def _off_policy(self, envs: VecEnv, seed: int) -> dict[str, Any]:
+    def _off_policy_arguments(self, envs: VecEnv, seed: int) -> dict[str, Any]:
         names = ("buffer_size", "learning_starts", "train_freq", "gradient_steps", "tau")
-        return self._arguments(envs, seed, *names)
+        return self._model_arguments(envs, seed, *names)
 
 
 @dataclass(frozen=True)
@@ -222,14 +222,14 @@ class SACSettings(OffPolicySettings):
         """Stable-Baselines3's SAC."""
         from stable_baselines3 import SAC
 
-        return SAC("MlpPolicy", ent_coef=f"auto_{self.entropy_weight}", **self._off_policy(envs, seed))
+        return SAC("MlpPolicy", ent_coef=f"auto_{self.entropy_weight}", **self._off_policy_arguments(envs, seed))
 
 
 @dataclass(frozen=True)
 class TQCSettings(SACSettings):
     """Hyperparameters of TQC: SAC with critics of the return's distribution, without its upper end."""
 
-    dropped_quantiles: int = _searched(2, 0, 5)
+    dropped_quantiles: int = _with_search_range(2, 0, 5)
     """Upper quantiles of 25 that each critic drops, against overestimation."""
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
@@ -240,7 +240,7 @@ class TQCSettings(SACSettings):
             "MlpPolicy",
             ent_coef=f"auto_{self.entropy_weight}",
             top_quantiles_to_drop_per_net=self.dropped_quantiles,
-            **self._off_policy(envs, seed),
+            **self._off_policy_arguments(envs, seed),
         )
 
 
@@ -248,7 +248,7 @@ class TQCSettings(SACSettings):
 class TD3Settings(OffPolicySettings):
     """Hyperparameters of TD3."""
 
-    exploration_noise: float = _searched(0.2, 0.05, 0.5)
+    exploration_noise: float = _with_search_range(0.2, 0.05, 0.5)
     """Standard deviation of the noise on the action while samples are collected."""
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
@@ -258,7 +258,7 @@ class TD3Settings(OffPolicySettings):
         from stable_baselines3.common.noise import NormalActionNoise
 
         noise = NormalActionNoise(np.zeros(1), np.full(1, self.exploration_noise))
-        return TD3("MlpPolicy", action_noise=noise, **self._off_policy(envs, seed))
+        return TD3("MlpPolicy", action_noise=noise, **self._off_policy_arguments(envs, seed))
 
 
 #: Name of an algorithm to the class of its hyperparameters.
@@ -271,13 +271,13 @@ ALGORITHMS: dict[str, type[AlgorithmSettings]] = {
 }
 
 
-def _module_of(activation: str) -> Any:
+def _activation_class(activation: str) -> Any:
     """The activation as torch has it."""
     from torch import nn
 
     return {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU}[activation]
 
 
-def as_written(settings: AlgorithmSettings) -> dict[str, Any]:
+def hyperparameters_to_dict(settings: AlgorithmSettings) -> dict[str, Any]:
     """Hyperparameters as JSON and TOML hold them."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(settings).items()}

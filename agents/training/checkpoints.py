@@ -27,20 +27,20 @@ from estimator.files import whole_file, write_atomically, writing
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-Tensors = dict[str, npt.NDArray[Any]]
+TensorDict = dict[str, npt.NDArray[Any]]
 
-FOLDER = "checkpoints"
-STATE = "training.json"
-TENSORS = "training.safetensors"
-_HALF_WRITTEN = ".checkpoint-"
-_ENTROPY = "log_ent_coef"  # the log weight of the entropy, of an algorithm that learns it
-_BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_ENDED = ("r", "l", "t")
-_NORMALIZER = ("normalizer.mean", "normalizer.std")
+CHECKPOINTS_FOLDER = "checkpoints"
+STATE_FILE = "training.json"
+TENSORS_FILE = "training.safetensors"
+_PARTIAL_PREFIX = ".checkpoint-"
+_LOG_ENTROPY_WEIGHT = "log_ent_coef"  # the log weight of the entropy, of an algorithm that learns it
+_BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_EPISODE_KEYS = ("r", "l", "t")
+_NORMALIZER_TENSORS = ("normalizer.mean", "normalizer.std")
 
 
 @dataclass
-class Progress:
+class TrainingProgress:
     """How far a training is: what ``training.json`` holds.
 
     Attributes:
@@ -58,56 +58,58 @@ class Progress:
     curve: list[tuple[int, float, float | None]] = field(default_factory=list)
 
 
-def save_checkpoint(run: Path, model: BaseAlgorithm, card: dict[str, Any], progress: Progress | None) -> None:
+def save_checkpoint(
+    run_folder: Path, model: BaseAlgorithm, card: dict[str, Any], progress: TrainingProgress | None
+) -> None:
     """Write ``checkpoints/STEPS`` in one piece: under another name first, which is changed when all of it is there.
 
     Args:
-        run: the run folder.
+        run_folder: the run folder.
         model: the algorithm.
         card: of the policy, see `save_policy`.
         progress: of a training that is to go on from here; older checkpoints then lose their state. None: the policy
             alone.
     """
-    target = run / FOLDER / f"{model.num_timesteps:09d}"
+    target = run_folder / CHECKPOINTS_FOLDER / f"{model.num_timesteps:09d}"
     with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        half_written = Path(tempfile.mkdtemp(dir=run, prefix=_HALF_WRITTEN))
+        partial = Path(tempfile.mkdtemp(dir=run_folder, prefix=_PARTIAL_PREFIX))
     try:
-        half_written.chmod(0o755)
-        write_policy(half_written, model, card)
+        partial.chmod(0o755)
+        write_policy(partial, model, card)
         if progress is not None:
-            _save_state(half_written, model, progress)
+            _save_training_state(partial, model, progress)
         shutil.rmtree(target, ignore_errors=True)
-        os.replace(half_written, target)
+        os.replace(partial, target)
     finally:
-        shutil.rmtree(half_written, ignore_errors=True)
+        shutil.rmtree(partial, ignore_errors=True)
     if progress is not None:
-        drop_states(run, but=target)
+        delete_training_states(run_folder, keep=target)
 
 
-def latest_checkpoint(run: Path) -> Path | None:
+def latest_checkpoint(run_folder: Path) -> Path | None:
     """The latest checkpoint that a training can go on from; those that were never finished are removed."""
-    for half_written in run.glob(f"{_HALF_WRITTEN}*"):
-        shutil.rmtree(half_written)
-    return max((state.parent for state in run.glob(f"{FOLDER}/*/{STATE}")), default=None)
+    for partial in run_folder.glob(f"{_PARTIAL_PREFIX}*"):
+        shutil.rmtree(partial)
+    return max((state.parent for state in run_folder.glob(f"{CHECKPOINTS_FOLDER}/*/{STATE_FILE}")), default=None)
 
 
-def load_progress(checkpoint: Path) -> Progress:
+def load_progress(checkpoint: Path) -> TrainingProgress:
     """How far the training was.
 
     Raises:
         ValueError: where the file is damaged.
     """
     try:
-        found = json.loads(
-            whole_file(checkpoint / STATE, "checkpoint must be whole", 2**28).read_text(encoding="utf-8")
+        content = json.loads(
+            whole_file(checkpoint / STATE_FILE, "checkpoint must be whole", 2**28).read_text(encoding="utf-8")
         )
-        return Progress(**{**found, "curve": [tuple(point) for point in found["curve"]]})
+        return TrainingProgress(**{**content, "curve": [tuple(point) for point in content["curve"]]})
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"checkpoint must hold a sound {STATE}, but {checkpoint} does not: {error!r}") from error
+        raise ValueError(f"checkpoint must hold a sound {STATE_FILE}, but {checkpoint} does not: {error!r}") from error
 
 
-def begin_with(folder: Path, model: BaseAlgorithm) -> None:
+def load_initial_network(policy_folder: Path, model: BaseAlgorithm) -> None:
     """Give a new model the network of a trained policy.
 
     Raises:
@@ -117,33 +119,37 @@ def begin_with(folder: Path, model: BaseAlgorithm) -> None:
     from safetensors.numpy import load_file
 
     try:
-        tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(folder / WEIGHTS).items()}
+        tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(policy_folder / WEIGHTS).items()}
     except OSError as error:
-        raise ValueError(f"begin must be the folder of a policy, but {folder} has no {WEIGHTS}; name one") from error
-    for name in ("setting", *_NORMALIZER):
+        raise ValueError(
+            f"begin must be the folder of a policy, but {policy_folder} has no {WEIGHTS}; name one"
+        ) from error
+    for name in ("setting", *_NORMALIZER_TENSORS):
         tensors.pop(name, None)
-    shapes, own = ({name: tuple(t.shape) for name, t in of.items()} for of in (tensors, model.policy.state_dict()))
-    for name in sorted({*shapes, *own}):
-        if shapes.get(name) != own.get(name):
+    shapes, model_shapes = (
+        {name: tuple(t.shape) for name, t in state.items()} for state in (tensors, model.policy.state_dict())
+    )
+    for name in sorted({*shapes, *model_shapes}):
+        if shapes.get(name) != model_shapes.get(name):
             raise ValueError(
-                f"begin must be a policy with the network of the training, but {folder} has {name} of shape "
-                f"{shapes.get(name, 'none')} in place of {own.get(name, 'none')}; train with its hyperparameters"
+                f"begin must be a policy with the network of the training, but {policy_folder} has {name} of shape "
+                f"{shapes.get(name, 'none')} in place of {model_shapes.get(name, 'none')}; train with its hyperparameters"
             )
     model.policy.load_state_dict(tensors)
-    _take_normalizer(folder, model)
+    _copy_normalizer(policy_folder, model)
 
 
-def _take_normalizer(folder: Path, model: BaseAlgorithm) -> None:
+def _copy_normalizer(policy_folder: Path, model: BaseAlgorithm) -> None:
     """Let the environments of a model normalise features as those of a policy did; nothing where it has none."""
     from safetensors.numpy import load_file
 
     envs: Any = model.get_env()
-    tensors = load_file(folder / WEIGHTS)
-    if hasattr(envs, "normalizer") and _NORMALIZER[0] in tensors:
-        envs.normalizer.mean, envs.normalizer.std = (tensors[name].copy() for name in _NORMALIZER)
+    tensors = load_file(policy_folder / WEIGHTS)
+    if hasattr(envs, "normalizer") and _NORMALIZER_TENSORS[0] in tensors:
+        envs.normalizer.mean, envs.normalizer.std = (tensors[name].copy() for name in _NORMALIZER_TENSORS)
 
 
-def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
+def restore_training_state(checkpoint: Path, model: BaseAlgorithm) -> None:
     """Give a new model the weights, moments, buffer, counts and episodes that the checkpoint holds.
 
     Raises:
@@ -157,92 +163,100 @@ def restore(checkpoint: Path, model: BaseAlgorithm) -> None:
     model.num_timesteps, model._n_updates = progress.steps, progress.updates
     model._episode_num = progress.episodes
     try:
-        _take_normalizer(checkpoint, model)  # which a run that was begun with a policy has from that
-        tensors = {name: tensor.copy() for name, tensor in load_file(checkpoint / TENSORS).items()}
+        _copy_normalizer(checkpoint, model)  # which a run that was begun with a policy has from that
+        tensors = {name: tensor.copy() for name, tensor in load_file(checkpoint / TENSORS_FILE).items()}
         for name in model.get_parameters():
-            part = attrgetter(name)(model)
-            own = {key: torch.from_numpy(tensor) for key, tensor in part_of(tensors, name).items()}
-            part.load_state_dict(_moments(own, part) if isinstance(part, torch.optim.Optimizer) else own)
-        if (entropy := getattr(model, _ENTROPY, None)) is not None:
-            entropy.data.copy_(torch.from_numpy(tensors[_ENTROPY]))
+            component = attrgetter(name)(model)
+            component_tensors = {
+                key: torch.from_numpy(tensor) for key, tensor in tensors_with_prefix(tensors, name).items()
+            }
+            component.load_state_dict(
+                _optimizer_state(component_tensors, component)
+                if isinstance(component, torch.optim.Optimizer)
+                else component_tensors
+            )
+        if (entropy := getattr(model, _LOG_ENTROPY_WEIGHT, None)) is not None:
+            entropy.data.copy_(torch.from_numpy(tensors[_LOG_ENTROPY_WEIGHT]))
         if (buffer := getattr(model, "replay_buffer", None)) is not None:
-            _refill(buffer, part_of(tensors, "buffer"))
-        go_on(model, part_of(tensors, "moment"))
+            _restore_replay_buffer(buffer, tensors_with_prefix(tensors, "buffer"))
+        restore_rollout_state(model, tensors_with_prefix(tensors, "moment"))
     except (KeyError, RuntimeError, ValueError, OSError, SafetensorError) as error:
         raise ValueError(f"checkpoint must hold this algorithm's state, but {checkpoint} does not: {error}") from error
 
 
-def drop_states(run: Path, but: Path | None = None) -> None:
+def delete_training_states(run_folder: Path, keep: Path | None = None) -> None:
     """Remove the state from all checkpoints but one; their policies stay."""
-    for state in run.glob(f"{FOLDER}/*/{STATE}"):
-        if state.parent != but:
+    for state in run_folder.glob(f"{CHECKPOINTS_FOLDER}/*/{STATE_FILE}"):
+        if state.parent != keep:
             state.unlink()
-            (state.parent / TENSORS).unlink(missing_ok=True)
+            (state.parent / TENSORS_FILE).unlink(missing_ok=True)
 
 
-def _save_state(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
+def _save_training_state(folder: Path, model: BaseAlgorithm, progress: TrainingProgress) -> None:
     import torch
     from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
-    tensors: Tensors = {}
-    for name, part in model.get_parameters().items():
+    tensors: TensorDict = {}
+    for name, component in model.get_parameters().items():
         if isinstance(attrgetter(name)(model), torch.optim.Optimizer):
-            part = {f"{i}/{key}": value for i, moments in part["state"].items() for key, value in moments.items()}
-        tensors |= {f"{name}/{key}": value.detach().cpu().numpy() for key, value in part.items()}
-    if (entropy := getattr(model, _ENTROPY, None)) is not None:
-        tensors[_ENTROPY] = entropy.detach().cpu().numpy()
+            component = {
+                f"{i}/{key}": value for i, moments in component["state"].items() for key, value in moments.items()
+            }
+        tensors |= {f"{name}/{key}": value.detach().cpu().numpy() for key, value in component.items()}
+    if (entropy := getattr(model, _LOG_ENTROPY_WEIGHT, None)) is not None:
+        tensors[_LOG_ENTROPY_WEIGHT] = entropy.detach().cpu().numpy()
     if (buffer := getattr(model, "replay_buffer", None)) is not None:
-        tensors |= {f"buffer/{name}": getattr(buffer, name)[: buffer.size()] for name in _BUFFER}
+        tensors |= {f"buffer/{name}": getattr(buffer, name)[: buffer.size()] for name in _BUFFER_ARRAYS}
         tensors["buffer/position"] = np.array(buffer.pos)
-    tensors |= {f"moment/{name}": array for name, array in moment_of(model).items()}
+    tensors |= {f"moment/{name}": array for name, array in capture_rollout_state(model).items()}
     try:
-        save_file({name: np.array(tensor, order="C") for name, tensor in tensors.items()}, folder / TENSORS)
+        save_file({name: np.array(tensor, order="C") for name, tensor in tensors.items()}, folder / TENSORS_FILE)
     except SafetensorError as error:  # of a full disk
-        raise OSError(f"{folder / TENSORS} cannot be written: {error}; make room, then resume") from error
-    write_atomically(folder / STATE, json.dumps(asdict(progress)))
+        raise OSError(f"{folder / TENSORS_FILE} cannot be written: {error}; make room, then resume") from error
+    write_atomically(folder / STATE_FILE, json.dumps(asdict(progress)))
 
 
-def _moments(own: dict[str, Any], optimizer: Any) -> dict[str, Any]:
+def _optimizer_state(tensors: dict[str, Any], optimizer: Any) -> dict[str, Any]:
     """The state of an optimiser, from its tensors "PARAMETER/MOMENT"; its settings are those of the model."""
     state: dict[int, dict[str, Any]] = {}
-    for key, tensor in own.items():
+    for key, value in tensors.items():
         index, moment = key.split("/")
-        state.setdefault(int(index), {})[moment] = tensor
+        state.setdefault(int(index), {})[moment] = value
     return {"state": state, "param_groups": optimizer.state_dict()["param_groups"]}
 
 
-def _refill(buffer: Any, tensors: Tensors) -> None:
+def _restore_replay_buffer(buffer: Any, tensors: TensorDict) -> None:
     filled = len(tensors["rewards"])
-    for name in _BUFFER:
+    for name in _BUFFER_ARRAYS:
         getattr(buffer, name)[:filled] = tensors[name]
     buffer.pos = int(tensors["position"])
     buffer.full = filled == buffer.buffer_size
 
 
-def moment_of(model: BaseAlgorithm) -> Tensors:
+def capture_rollout_state(model: BaseAlgorithm) -> TensorDict:
     """The moment between an update and the next roll-out; nothing where the environments cannot be gone on with."""
     import torch
 
     envs: Any = model.get_env()
     if not hasattr(envs, "recall"):
         return {}
-    numpys = np.random.get_state(legacy=False)  # noqa: NPY002  Stable-Baselines3 draws from it
-    numpys["state"]["key"] = numpys["state"]["key"].tolist()
-    streams = {"numpy": numpys, "actions": model.action_space.np_random.bit_generator.state}
-    ended = [[episode[name] for name in _ENDED] for episode in model.ep_info_buffer or ()]
+    numpy_state = np.random.get_state(legacy=False)  # noqa: NPY002  Stable-Baselines3 draws from it
+    numpy_state["state"]["key"] = numpy_state["state"]["key"].tolist()
+    streams = {"numpy": numpy_state, "actions": model.action_space.np_random.bit_generator.state}
+    episodes = [[episode[name] for name in _EPISODE_KEYS] for episode in model.ep_info_buffer or ()]
     return {
         "streams": np.frombuffer(json.dumps(streams).encode(), np.uint8),
         "torch": torch.get_rng_state().numpy(),
         "starts": np.asarray(model._last_episode_starts),
-        "ended": np.array(ended, dtype=np.float64).reshape(-1, len(_ENDED)),
+        "ended": np.array(episodes, dtype=np.float64).reshape(-1, len(_EPISODE_KEYS)),
         "left": np.array(model._current_progress_remaining),
-        **{f"lstm/{place}": value.numpy() for place, value in enumerate(_recurrent(model))},
+        **{f"lstm/{index}": value.numpy() for index, value in enumerate(_lstm_states(model))},
         **{f"envs/{name}": array for name, array in envs.memory.items()},
     }
 
 
-def go_on(model: BaseAlgorithm, moment: Tensors) -> None:
+def restore_rollout_state(model: BaseAlgorithm, rollout_state: TensorDict) -> None:
     """Put a model with new environments into the moment that another was in.
 
     Raises:
@@ -250,29 +264,29 @@ def go_on(model: BaseAlgorithm, moment: Tensors) -> None:
     """
     import torch
 
-    if not moment:
+    if not rollout_state:
         return
     envs: Any = model.get_env()
-    model._last_obs = envs.recall(part_of(moment, "envs"))
-    model._last_episode_starts = moment["starts"]
-    model._current_progress_remaining = float(moment["left"])
-    for place, value in enumerate(_recurrent(model)):
-        value.copy_(torch.from_numpy(moment[f"lstm/{place}"]))
-    ended = [dict(zip(_ENDED, row, strict=True)) for row in moment["ended"].tolist()]
-    model.ep_info_buffer = deque(ended, maxlen=model._stats_window_size)
+    model._last_obs = envs.recall(tensors_with_prefix(rollout_state, "envs"))
+    model._last_episode_starts = rollout_state["starts"]
+    model._current_progress_remaining = float(rollout_state["left"])
+    for index, value in enumerate(_lstm_states(model)):
+        value.copy_(torch.from_numpy(rollout_state[f"lstm/{index}"]))
+    episodes = [dict(zip(_EPISODE_KEYS, row, strict=True)) for row in rollout_state["ended"].tolist()]
+    model.ep_info_buffer = deque(episodes, maxlen=model._stats_window_size)
     model.ep_success_buffer = deque(maxlen=model._stats_window_size)
-    streams = json.loads(moment["streams"].tobytes())
+    streams = json.loads(rollout_state["streams"].tobytes())
     np.random.set_state(streams["numpy"])  # noqa: NPY002
     model.action_space.np_random.bit_generator.state = streams["actions"]
-    torch.set_rng_state(torch.from_numpy(moment["torch"]))
+    torch.set_rng_state(torch.from_numpy(rollout_state["torch"]))
 
 
-def part_of(tensors: Tensors, name: str) -> Tensors:
+def tensors_with_prefix(tensors: TensorDict, prefix: str) -> TensorDict:
     """What is called "NAME/KEY", by its key."""
-    return {key.removeprefix(f"{name}/"): array for key, array in tensors.items() if key.startswith(f"{name}/")}
+    return {key.removeprefix(f"{prefix}/"): array for key, array in tensors.items() if key.startswith(f"{prefix}/")}
 
 
-def _recurrent(model: Any) -> list[Any]:
+def _lstm_states(model: Any) -> list[Any]:
     """The memories (layers, n, units) of actor and critic, of a model that has one."""
     states = getattr(model, "_last_lstm_states", None)
     return [] if states is None else [value for part in states for value in part]

@@ -9,33 +9,33 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, as_written
-from agents.training.family import FAMILY
+from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, hyperparameters_to_dict
+from agents.training.environments.oscillator_family import FAMILY
 from estimator.checks import hint, one_of, printable
 from estimator.files import whole_file, write_atomically
 
 #: Folder of the files that come with the package, ``ALGORITHM.toml``.
-FILES = Path(__file__).parents[1] / "hyperparameters"
-DEFAULT = "default"
+HYPERPARAMETER_FOLDER = Path(__file__).parents[1] / "hyperparameters"
+DEFAULT_TABLE = "default"
 
-_KINDS: dict[type, str] = {
+_TYPE_NAMES: dict[type, str] = {
     int: "a whole number", float: "a number", tuple: "a list of whole numbers", str: "a name", bool: "true or false"
 }  # fmt: skip
 
 Settings = TypeVar("Settings")
 
 
-def track_of(env_id: str) -> str:
+def track_name(env_id: str) -> str:
     """The name of a track without its module and namespace: "Amplitude-v0"."""
     return env_id.rpartition(":")[2].split("/")[-1]
 
 
-def table_of(env_id: str) -> str:
+def table_name(env_id: str) -> str:
     """The name of a track's table, which all its versions share: "Amplitude"; of what has no versions its own."""
-    return track_of(env_id).rpartition("-v")[0] or env_id
+    return track_name(env_id).rpartition("-v")[0] or env_id
 
 
-def read_settings(algo: str, env_id: str, path: Path | None = None) -> AlgorithmSettings:
+def read_hyperparameters(algo: str, env_id: str, path: Path | None = None) -> AlgorithmSettings:
     """The hyperparameters of an algorithm on a track: its defaults, the table "default", the table of the track.
 
     Args:
@@ -49,64 +49,67 @@ def read_settings(algo: str, env_id: str, path: Path | None = None) -> Algorithm
         OSError: where the file cannot be read.
     """
     one_of("algo", algo, ALGORITHMS)
-    file = FILES / f"{algo}.toml" if path is None else path
+    file = HYPERPARAMETER_FOLDER / f"{algo}.toml" if path is None else path
     try:
         tables = tomllib.loads(whole_file(file, "settings must be a TOML file", 2**20).read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"settings must be a TOML file, but {file} is not: {error}") from error
     for table, entries in tables.items():
-        _check_table(table, entries, ALGORITHMS[algo], file)
-    if path is not None and not {DEFAULT, table_of(env_id)} & set(tables):
+        _check_hyperparameter_table(table, entries, ALGORITHMS[algo], file)
+    if path is not None and not {DEFAULT_TABLE, table_name(env_id)} & set(tables):
         raise ValueError(
-            f"settings must have a table [{table_of(env_id)}] or [{DEFAULT}] for {env_id}, but {path} has "
+            f"settings must have a table [{table_name(env_id)}] or [{DEFAULT_TABLE}] for {env_id}, but {path} has "
             f"{', '.join(f'[{table}]' for table in tables) or 'none'}; name the track with --env, or add one"
         )
-    return settings_of(ALGORITHMS[algo], tables.get(DEFAULT, {}) | tables.get(table_of(env_id), {}))
+    return parse_hyperparameters(ALGORITHMS[algo], tables.get(DEFAULT_TABLE, {}) | tables.get(table_name(env_id), {}))
 
 
-def settings_of(kind: type[Settings], entries: Mapping[str, Any]) -> Settings:
+def parse_hyperparameters(settings_class: type[Settings], entries: Mapping[str, Any]) -> Settings:
     """Hyperparameters of this kind from entries as JSON and TOML hold them.
 
     Raises:
         ValueError: for an entry that is not a field, or whose value has another type.
     """
-    defaults: dict[str, Any] = {f.name: getattr(kind(), f.name) for f in fields(kind)}  # type: ignore[arg-type]
+    defaults: dict[str, Any] = {f.name: getattr(settings_class(), f.name) for f in fields(settings_class)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     for name, value in entries.items():
         if name not in defaults:
-            raise ValueError(f"{name} is no hyperparameter of {kind.__name__}{hint(name, defaults)}")
-        wanted = type(defaults[name])
-        if wanted is float and type(value) is int:
+            raise ValueError(f"{name} is no hyperparameter of {settings_class.__name__}{hint(name, defaults)}")
+        field_type = type(defaults[name])
+        if field_type is float and type(value) is int:
             value = float(value)
-        if wanted is tuple and isinstance(value, list) and all(type(units) is int for units in value):
+        if field_type is tuple and isinstance(value, list) and all(type(units) is int for units in value):
             value = tuple(value)
-        if type(value) is not wanted:
-            raise ValueError(f"{name} must be {_KINDS[wanted]}, but is {value!r}")
+        if type(value) is not field_type:
+            raise ValueError(f"{name} must be {_TYPE_NAMES[field_type]}, but is {value!r}")
         values[name] = value
-    return kind(**values)
+    return settings_class(**values)
 
 
-def write_settings(path: Path, env_id: str, settings: AlgorithmSettings, comment: str) -> None:
-    """Write a file that `read_settings` reads, with these hyperparameters for this track."""
-    lines = [f"# {printable(comment)}", f"[{table_of(env_id)}]"]
-    lines += [f"{name} = {json.dumps(value)}" for name, value in as_written(settings).items()]
+def write_hyperparameters(path: Path, env_id: str, settings: AlgorithmSettings, comment: str) -> None:
+    """Write a file that `read_hyperparameters` reads, with these hyperparameters for this track."""
+    lines = [f"# {printable(comment)}", f"[{table_name(env_id)}]"]
+    lines += [f"{name} = {json.dumps(value)}" for name, value in hyperparameters_to_dict(settings).items()]
     write_atomically(path, "\n".join(lines) + "\n")
 
 
-def _check_table(table: str, entries: Any, kind: type[AlgorithmSettings], path: Path) -> None:
+def _check_hyperparameter_table(table: str, entries: Any, settings_class: type[AlgorithmSettings], path: Path) -> None:
     """Refuse a table of no registered track, and bad entries also in the tables that are not asked for."""
     from gymnasium import registry
 
     import duffing_env  # noqa: F401  registers the tracks
 
     if not isinstance(entries, dict):
-        raise ValueError(f"settings must be in tables such as [{DEFAULT}], but {path} has {table} in none")
-    if table not in [DEFAULT, FAMILY, *map(table_of, registry)]:
-        ours = [DEFAULT, *dict.fromkeys(table_of(name) for name in registry if name.startswith("duffing_env/"))]
+        raise ValueError(f"settings must be in tables such as [{DEFAULT_TABLE}], but {path} has {table} in none")
+    if table not in [DEFAULT_TABLE, FAMILY, *map(table_name, registry)]:
+        known_tables = [
+            DEFAULT_TABLE,
+            *dict.fromkeys(table_name(name) for name in registry if name.startswith("duffing_env/")),
+        ]
         raise ValueError(
-            f"settings must have tables [{DEFAULT}] or of tracks, but {path} has [{table}]{hint(table, ours)}"
+            f"settings must have tables [{DEFAULT_TABLE}] or of tracks, but {path} has [{table}]{hint(table, known_tables)}"
         )
     try:
-        settings_of(kind, entries)
+        parse_hyperparameters(settings_class, entries)
     except ValueError as error:
         raise ValueError(f"{error}; mend [{table}] of {path}") from error

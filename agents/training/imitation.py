@@ -15,17 +15,17 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.policies import make_policy
-from agents.training.feature_env import FeatureVecEnv
+from agents.training.environments.feature_vec_env import FeatureVecEnv
 
 #: Samples between two fits, in each environment; passes over all decisions so far in a fit; decisions of a step.
-_ROUND, _EPOCHS, _BATCH = 64, 4, 1024
+_SAMPLES_BETWEEN_FITS, _EPOCHS_PER_FIT, _BATCH_SIZE = 64, 4, 1024
 
 #: Step size of the fits.
 _LEARNING_RATE = 1e-3
 
 
-def imitate(
-    model: Any, envs: FeatureVecEnv, teacher: str, samples: int, seed: int, tell: Callable[[float], None]
+def imitate_policy(
+    model: Any, envs: FeatureVecEnv, teacher: str, samples: int, seed: int, on_progress: Callable[[float], None]
 ) -> None:
     """Let the actor of a model of Stable-Baselines3's PPO choose as another policy does, and its critic know the worth.
 
@@ -35,88 +35,96 @@ def imitate(
         teacher: a policy's name, as of `agents.make_policy`.
         samples: decisions to learn from, over all environments.
         seed: of the teacher's randomness, and of the order of the decisions.
-        tell: called with the share that is done.
+        on_progress: called with the share that is done.
     """
     import torch
 
-    asked = make_policy(teacher, envs.venv.envs, seed=seed)  # type: ignore[attr-defined]
+    teacher_policy = make_policy(teacher, envs.venv.envs, seed=seed)  # type: ignore[attr-defined]
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(model.policy.parameters(), _LEARNING_RATE)
-    taught = np.arange(envs.num_envs) % 2 == 0
-    seen: list[npt.NDArray[np.float32]] = []
-    wanted: list[npt.NDArray[Any]] = []
+    is_teacher_row = np.arange(envs.num_envs) % 2 == 0
+    observations: list[npt.NDArray[np.float32]] = []
+    teacher_actions: list[npt.NDArray[Any]] = []
     rewards: list[npt.NDArray[np.float32]] = []
-    ends: list[npt.NDArray[np.bool_]] = []
-    shown, state, starts = envs.reset(), None, np.ones(envs.num_envs, dtype=np.bool_)
-    while (done := len(seen) * envs.num_envs) < samples:
-        actions, state = asked.predict(envs.observations, state, starts, deterministic=True)
-        choices = _choices(envs, actions)
-        seen.append(np.array(shown))
-        wanted.append(choices)
-        own, _ = model.policy.predict(shown, deterministic=False)
-        played = np.where(taught if choices.ndim == 1 else taught[:, None], choices, own)
-        shown, reward, starts, _ = envs.step(played)
+    episode_ends: list[npt.NDArray[np.bool_]] = []
+    observation, state, episode_starts = envs.reset(), None, np.ones(envs.num_envs, dtype=np.bool_)
+    while (done := len(observations) * envs.num_envs) < samples:
+        actions, state = teacher_policy.predict(envs.raw_observations, state, episode_starts, deterministic=True)
+        network_actions = _network_actions(envs, actions)
+        observations.append(np.array(observation))
+        teacher_actions.append(network_actions)
+        student_actions, _ = model.policy.predict(observation, deterministic=False)
+        played = np.where(
+            is_teacher_row if network_actions.ndim == 1 else is_teacher_row[:, None], network_actions, student_actions
+        )
+        observation, reward, episode_starts, _ = envs.step(played)
         rewards.append(reward)
-        ends.append(starts)
-        if len(seen) % _ROUND == 0 or done + envs.num_envs >= samples:
-            _fit_actor(model.policy, optimizer, np.concatenate(seen), np.concatenate(wanted), generator)
-        tell(min(1.0, (done + envs.num_envs) / samples))
-    returns = returns_of(np.array(rewards), np.array(ends), model.gamma)
-    known = np.isfinite(returns)
-    if known.any():
-        _fit_critic(model.policy, optimizer, np.array(seen)[known], returns[known], generator)
+        episode_ends.append(episode_starts)
+        if len(observations) % _SAMPLES_BETWEEN_FITS == 0 or done + envs.num_envs >= samples:
+            _fit_actor(
+                model.policy, optimizer, np.concatenate(observations), np.concatenate(teacher_actions), generator
+            )
+        on_progress(min(1.0, (done + envs.num_envs) / samples))
+    returns = discounted_returns(np.array(rewards), np.array(episode_ends), model.gamma)
+    is_complete = np.isfinite(returns)
+    if is_complete.any():
+        _fit_critic(model.policy, optimizer, np.array(observations)[is_complete], returns[is_complete], generator)
 
 
-def returns_of(rewards: npt.NDArray[Any], ends: npt.NDArray[np.bool_], discount: float) -> npt.NDArray[np.float32]:
+def discounted_returns(
+    rewards: npt.NDArray[Any], episode_ends: npt.NDArray[np.bool_], discount: float
+) -> npt.NDArray[np.float32]:
     """Discounted returns (T, n) from every sample to the end of its episode; NaN where that has not come.
 
     Example:
         >>> rewards, ends = np.ones((4, 1), np.float32), np.array([[False], [True], [False], [False]])
-        >>> returns_of(rewards, ends, 0.5).ravel()
+        >>> discounted_returns(rewards, ends, 0.5).ravel()
         array([1.5, 1. , nan, nan], dtype=float32)
     """
     returns = np.full(rewards.shape, np.nan, dtype=np.float32)
-    after = np.full(rewards.shape[1], np.nan, dtype=np.float32)
+    next_returns = np.full(rewards.shape[1], np.nan, dtype=np.float32)
     for t in reversed(range(len(rewards))):
-        after = returns[t] = rewards[t] + np.float32(discount) * np.where(ends[t], np.float32(0), after)
+        next_returns = returns[t] = rewards[t] + np.float32(discount) * np.where(
+            episode_ends[t], np.float32(0), next_returns
+        )
     return returns
 
 
-def _choices(envs: FeatureVecEnv, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _network_actions(envs: FeatureVecEnv, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """What the network would have to choose for these actions: upright, as its action space has it."""
-    features = envs.shown
-    pushes = np.maximum(features.pushes, 1e-6)
-    upright = np.clip(actions[:, 0] * features.signs / pushes, -1.0, 1.0)
+    features = envs.current_features
+    max_actions = np.maximum(features.pushes, 1e-6)
+    mirrored = np.clip(actions[:, 0] * features.signs / max_actions, -1.0, 1.0)
     if not isinstance(envs.action_space, gym.spaces.Discrete):
-        return upright[:, None].astype(np.float32)
-    return np.rint((upright + 1.0) / 2.0 * (int(envs.action_space.n) - 1)).astype(np.int64)
+        return mirrored[:, None].astype(np.float32)
+    return np.rint((mirrored + 1.0) / 2.0 * (int(envs.action_space.n) - 1)).astype(np.int64)
 
 
-def _minimise(loss_of: Callable[[Any], Any], rows: int, optimizer: Any, generator: Any) -> None:
+def _minimise_loss(batch_loss: Callable[[Any], Any], n_samples: int, optimizer: Any, generator: Any) -> None:
     """Step down a loss of batches of so many rows, given by their places."""
     import torch
 
-    for _ in range(_EPOCHS):
-        for batch in torch.randperm(rows, generator=generator).split(_BATCH):
-            loss = loss_of(batch)
+    for _ in range(_EPOCHS_PER_FIT):
+        for batch in torch.randperm(n_samples, generator=generator).split(_BATCH_SIZE):
+            loss = batch_loss(batch)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
 
 
-def _fit_actor(policy: Any, optimizer: Any, seen: Any, wanted: Any, generator: Any) -> None:
+def _fit_actor(policy: Any, optimizer: Any, observations: Any, teacher_actions: Any, generator: Any) -> None:
     """Raise the likelihood of the teacher's choices."""
     import torch
 
-    seen, wanted = torch.from_numpy(seen), torch.from_numpy(wanted)
-    likelihood = lambda batch: policy.get_distribution(seen[batch]).log_prob(wanted[batch]).mean()  # noqa: E731
-    _minimise(lambda batch: -likelihood(batch), len(seen), optimizer, generator)
+    observations, teacher_actions = torch.from_numpy(observations), torch.from_numpy(teacher_actions)
+    log_likelihood = lambda batch: policy.get_distribution(observations[batch]).log_prob(teacher_actions[batch]).mean()  # noqa: E731
+    _minimise_loss(lambda batch: -log_likelihood(batch), len(observations), optimizer, generator)
 
 
-def _fit_critic(policy: Any, optimizer: Any, seen: Any, returns: Any, generator: Any) -> None:
+def _fit_critic(policy: Any, optimizer: Any, observations: Any, returns: Any, generator: Any) -> None:
     """Lower the squared error of the critic."""
     import torch
 
-    seen, returns = torch.from_numpy(seen), torch.from_numpy(returns)
-    error = lambda batch: policy.predict_values(seen[batch])[:, 0] - returns[batch]  # noqa: E731
-    _minimise(lambda batch: error(batch).square().mean(), len(seen), optimizer, generator)
+    observations, returns = torch.from_numpy(observations), torch.from_numpy(returns)
+    error = lambda batch: policy.predict_values(observations[batch])[:, 0] - returns[batch]  # noqa: E731
+    _minimise_loss(lambda batch: error(batch).square().mean(), len(observations), optimizer, generator)

@@ -114,8 +114,8 @@ def _in_process(area: str, inputs: int, seed: int) -> dict[str, Any]:
 
 def show(found: dict[str, dict[str, Any]], seed: int) -> int:
     """Print the table and the faults; their number."""
-    from agents.results import show as print_all
-    from agents.results import table
+    from agents.console_output import format_table
+    from agents.console_output import print_texts_and_tables as print_all
 
     rows = []
     for area, tally in found.items():
@@ -123,7 +123,7 @@ def show(found: dict[str, dict[str, Any]], seed: int) -> int:
         rows.append([area, str(sum(counts)), *map(str, counts), f"{tally['seconds']:.0f}"])
     total = [sum(int(row[k]) for row in rows) for k in range(1, 3 + len(KINDS))]
     rows.append(["all", *map(str, total)])
-    print_all(table(("area", "inputs", *KINDS, "s"), rows, markdown=True), f"seed {seed}", width=140)
+    print_all(format_table(("area", "inputs", *KINDS, "s"), rows, markdown=True), f"seed {seed}", width=140)
     faults = sorted(
         ((n, fault, area) for area, one in found.items() for fault, n in one["faults"].items()), reverse=True
     )

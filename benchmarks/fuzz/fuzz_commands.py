@@ -9,8 +9,8 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 from agents.commands import main
-from agents.commands.rig_file import text_of
-from agents.evaluation.board import SHIPPED
+from agents.commands.rig_file_builder import text_of
+from agents.leaderboard.leaderboard_file import SHIPPED_LEADERBOARD
 from benchmarks.fuzz.call_verdicts import Call
 from benchmarks.fuzz.fuzz_estimators import RIG
 
@@ -36,7 +36,7 @@ def calls() -> st.SearchStrategy[Call]:
     os.chdir(place)
     Path("rig.toml").write_text(text_of(RIG, ""))
     Path("record.csv").write_text("u,y\n" + "1,2\n" * 60)
-    Path("board.jsonl").write_text(SHIPPED.read_text().splitlines()[0] + "\n{}\n")
+    Path("board.jsonl").write_text(SHIPPED_LEADERBOARD.read_text().splitlines()[0] + "\n{}\n")
     Path("short.csv").write_text("u,y\n1,2\n")
 
     @st.composite

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
+from agents.hardware.run_settings import RunSettings
 from agents.policies.export import draw_signal
 from agents.policies.saving import save_policy
-from agents.running.plan import Plan
 from agents.studies.datasets import Config as Dataset
-from agents.training.config import TrainConfig
+from agents.training.training_config import TrainConfig
 from benchmarks.fuzz.bad_values import anything, changed, options
 from benchmarks.fuzz.call_verdicts import Call
 from benchmarks.fuzz.fuzz_estimators import RIG
@@ -98,7 +98,7 @@ MADE: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "save_estimator": (save_estimator, {"estimator": OnlineEstimator(), "path": "estimator.npz"}),
     "save_policy": (save_policy, {"folder": "policy", "model": 3, "card": None, "normalizer": None}),
     "draw_signal": (draw_signal, {"name": "prbs", "samples": 64, "max_input": 0.15, "max_rms": None, "seed": 0}),
-    "Plan": (Plan, {name: one.default for name, one in Plan.__dataclass_fields__.items()}),
+    "Plan": (RunSettings, {name: one.default for name, one in RunSettings.__dataclass_fields__.items()}),
     "Dataset": (Dataset, {"grade": "random", "env": "duffing_env/Short-v0", "episodes": 3, "seed": 0}),
     "TrainConfig": (
         TrainConfig,

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from agents.commands.rig_file import text_of
-from agents.evaluation import board
+from agents.commands.rig_file_builder import text_of
+from agents.leaderboard import leaderboard_file
 from agents.policies.learned import CARD, WEIGHTS, load_policy
-from agents.training.checkpoints import STATE, Progress, load_progress
-from agents.training.config import TrainConfig, describe, read_config
-from agents.training.hyperparameters import FILES, read_settings
+from agents.training.checkpoints import STATE_FILE, TrainingProgress, load_progress
+from agents.training.hyperparameters import HYPERPARAMETER_FOLDER, read_hyperparameters
+from agents.training.training_config import TrainConfig, describe_run, read_config
 from benchmarks.fuzz.bad_values import another_array, changed, damaged
 from benchmarks.fuzz.call_verdicts import Call
 from benchmarks.fuzz.fuzz_estimators import RIG, begun, sound, suppress_overflow
@@ -72,9 +72,9 @@ def calls() -> st.SearchStrategy[Call]:
             estimators[name] = ((place / "estimator.npz").read_bytes(), {key: archive[key] for key in archive.files})
     matlab = io.BytesIO()
     __import__("scipy.io").io.savemat(matlab, {"u": np.arange(60.0), "y": np.sin(np.arange(60.0))})
-    entries = board.SHIPPED.read_text().splitlines()[:2]
-    config = json.dumps(describe(TrainConfig()), default=str)
-    progress = json.dumps(vars(Progress(steps=5, curve=[(1, 0.5, None)])))
+    entries = leaderboard_file.SHIPPED_LEADERBOARD.read_text().splitlines()[:2]
+    config = json.dumps(describe_run(TrainConfig()), default=str)
+    progress = json.dumps(vars(TrainingProgress(steps=5, curve=[(1, 0.5, None)])))
     fields = ("config", *TrainConfig.__dataclass_fields__, "hyperparameter")
     #: Kind to the file's name, its content, what reads it, words of clear messages, and JSON to change in places.
     others: dict[str, tuple[str, bytes, Callable[[Path], Any], tuple[str, ...], str]] = {
@@ -82,13 +82,13 @@ def calls() -> st.SearchStrategy[Call]:
         "csv": ("record.csv", _RECORD, lambda path: read(path, RIG), (), ""),
         "mat": ("record.mat", matlab.getvalue(), lambda path: read(path, RIG), (), ""),
         "run": ("config.json", config.encode(), lambda path: read_config(path.parent), fields, config),
-        "checkpoint": (STATE, progress.encode(), lambda path: load_progress(path.parent), ("checkpoint",), progress),
+        "checkpoint": (STATE_FILE, progress.encode(), lambda path: load_progress(path.parent), ("checkpoint",), progress),
         "settings": (
-            "file", (FILES / "ppo.toml").read_bytes(), lambda path: read_settings("ppo", "duffing_env/Short-v0", path),
+            "file", (HYPERPARAMETER_FOLDER / "ppo.toml").read_bytes(), lambda path: read_hyperparameters("ppo", "duffing_env/Short-v0", path),
             ("settings", "hyperparameter"), "",
         ),
         "board": (
-            "file", "\n".join(entries).encode(), lambda path: board.tables(board.read(path)), ("board",), entries[0],
+            "file", "\n".join(entries).encode(), lambda path: leaderboard_file.leaderboard_rows(leaderboard_file.read_entries(path)), ("board",), entries[0],
         ),
     }  # fmt: skip
     counter = iter(range(10**9))

@@ -48,7 +48,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Kill, and print the table."""
-    from agents.results import show, table, write_json
+    from agents.console_output import format_table, print_texts_and_tables, write_json
 
     unknown = set(config.commands) - set(CASES)
     if unknown:
@@ -74,7 +74,7 @@ def main(config: Config) -> None:
             [name, str(told["kills"]), lost, str(told["half-written"]), f"{told['resumed']} of {told['kills']}", equal]
         )
     heads = ("command", "kills", "lost at most", "half-written files", "goes on", "equal")
-    show(table(heads, rows, markdown=True))
+    print_texts_and_tables(format_table(heads, rows, markdown=True))
     for told in found.values():
         for fault in told["faults"]:
             print(fault, file=sys.stderr)

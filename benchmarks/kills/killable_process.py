@@ -11,8 +11,8 @@ from agents.cli import run_script
 
 #: The processes are forked from one that imported these.
 PRELOADED = (
-    "torch", "stable_baselines3", "optuna", "matplotlib.figure", "duffing_env", "agents.commands.train",
-    "agents.evaluation.comparison", "agents.studies.ship", "agents.running.run", "estimator.identification",
+    "torch", "stable_baselines3", "optuna", "matplotlib.figure", "duffing_env", "agents.commands.train_command",
+    "agents.evaluation.comparison", "agents.studies.ship", "agents.hardware.experiment_run", "estimator.identification",
 )  # fmt: skip
 
 

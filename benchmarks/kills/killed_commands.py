@@ -6,10 +6,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.board import SHIPPED
+from agents.hardware.simulated_plant import SimulatedPlant
+from agents.leaderboard.leaderboard_file import SHIPPED_LEADERBOARD
 from agents.policies.learned import CARD, WEIGHTS
-from agents.running.simulated import SimulatedPlant
-from agents.training.checkpoints import STATE
+from agents.training.checkpoints import STATE_FILE
 from estimator import Rig
 from estimator.extras import how_to_get, is_missing
 
@@ -102,7 +102,7 @@ class Train(Case):
         if (run / CARD).exists() or not log.exists():
             return 0.0
         steps = [int(row["time/total_timesteps"]) for row in csv.DictReader(log.read_text().splitlines())]
-        kept = [int(state.parent.name) for state in run.glob(f"checkpoints/*/{STATE}")]
+        kept = [int(state.parent.name) for state in run.glob(f"checkpoints/*/{STATE_FILE}")]
         return max(steps, default=0) - max(kept, default=0)
 
     def result(self, folder: Path) -> Any:
@@ -171,7 +171,7 @@ class Submit(Case):
     def prepare(self, folder: Path) -> None:
         """With an entry of before."""
         super().prepare(folder)
-        entry = json.loads(SHIPPED.read_text().splitlines()[0])
+        entry = json.loads(SHIPPED_LEADERBOARD.read_text().splitlines()[0])
         (folder / self._board).write_text(json.dumps(entry | {"name": "of before"}) + "\n")
 
     def start(self, folder: Path) -> list[str]:

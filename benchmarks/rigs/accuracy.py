@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from agents import results
+from agents import console_output
 from benchmarks.rigs.catalogue import BENCHES, PARAMETERS
 from benchmarks.rigs.judge import POOLED, Cell, Outcome, calibrated, identified, in_processes
 from benchmarks.rigs.records import guess, record
@@ -61,8 +61,8 @@ def show(cells: Sequence[Cell]) -> dict[str, Any]:
         "pooled coverage": pooled,
         "cells outside": int(np.size(meets) - np.sum(meets)),
     }
-    results.show(
-        results.table(titles, rows, markdown=True),
+    console_output.print_texts_and_tables(
+        console_output.format_table(titles, rows, markdown=True),
         f"{'PASS' if verdict['accurate'] else 'MISS'}: median errors at most 0.3 %, or 1.2 times the median bound\n"
         f"{'PASS' if is_calibrated else 'MISS'}: calibrated; pooled coverage {pooled:.3f} "
         f"({POOLED[0]} to {POOLED[1]}), {verdict['cells outside']} of {len(meets)} cells outside of 0.85 to 0.95",

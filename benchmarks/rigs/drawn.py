@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from agents import results
+from agents import console_output
 from benchmarks.rigs.catalogue import PARAMETERS
 from benchmarks.rigs.judge import LEVEL, in_processes, judged
 from benchmarks.rigs.simulator import KINDS, FloatArray, simulate
@@ -267,7 +267,7 @@ def show(found: dict[str, list[Answer]], first: int) -> dict[str, Any]:
             f"{one['coverage, silent']:.3f}", ", ".join(f"{100 * e:.2g}" for e in one["median errors"]),
         ))  # fmt: skip
     titles = ("", "n", "right", "refused", "warned", "silent wrong", "cover", "median errors, %")
-    results.show(results.table(titles, lines, markdown=True))
+    console_output.print_texts_and_tables(console_output.format_table(titles, lines, markdown=True))
     return kept
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from agents import results
+from agents import console_output
 from benchmarks.rigs.catalogue import PARAMETERS
 from benchmarks.rigs.judge import LEVEL, binomial_interval, in_processes, judged
 from benchmarks.rigs.loop import ASKED, SAMPLES, BenchPlant, described, held
@@ -38,7 +38,7 @@ class Trial:
 
 def trial(task: tuple[str, str, int, int]) -> Trial:
     """A record of some samples, or none; the next experiment by a policy; its answer; and both identified."""
-    from agents.running.experiment import design
+    from agents.hardware.next_experiment import design_experiment
     from estimator import identify
 
     name, policy, samples, seed = task
@@ -47,7 +47,7 @@ def trial(task: tuple[str, str, int, int]) -> Trial:
     if samples:
         first = record(bench, seed, samples)
         records, prior = [(first.u, first.y)], identify(rig, (first.u, first.y)).belief
-    found = design(rig, prior, policy, SAMPLES, ASKED, seed)
+    found = design_experiment(rig, prior, policy, SAMPLES, ASKED, seed)
     u, y = BenchPlant(bench, _AGAIN + seed).play(found.u)
     result = identify(rig, [*records, (u, y)])
     truth = np.array(bench.truth)
@@ -88,7 +88,7 @@ def show(found: dict[tuple[str, str], list[Trial]]) -> dict[str, Any]:
         ))  # fmt: skip
     titles = ("rig", "policy", "times narrower, expected", "stated / expected", "RMS error / expected",
               "coverage of 90 %", "left its range")  # fmt: skip
-    results.show(results.table(titles, rows, markdown=True))
+    console_output.print_texts_and_tables(console_output.format_table(titles, rows, markdown=True))
     every = [one for trials in found.values() for one in trials]
     ratios = np.array([one.after for one in every]) / np.array([one.expected for one in every])
     left = sum(one.left for one in every)
@@ -99,5 +99,5 @@ def show(found: dict[tuple[str, str], list[Trial]]) -> dict[str, Any]:
         "of": len(every),
         "at most, with 95 %": binomial_interval(left, len(every), 0.9)[1],
     }
-    results.show(verdict, width=170)
+    console_output.print_texts_and_tables(verdict, width=170)
     return verdict

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from agents import results
+from agents import console_output
 from benchmarks.rigs.accuracy import remarks
 from benchmarks.rigs.catalogue import A, E
 from benchmarks.rigs.judge import Outcome, identified, in_processes
@@ -96,5 +96,5 @@ def show(found: dict[tuple[str, str], list[Outcome]]) -> dict[str, Any]:
         rows.append((fault, name, right, f"{share:.2f}", verdict, remarks(outcomes)))
         written[f"{fault}, {name}"] = {"share": share, "verdict": verdict, "outcomes": [vars(o) for o in outcomes]}
     titles = ("fault", "rig", "right name", "share", "verdict", "all warnings and failures")
-    results.show(results.table(titles, rows, markdown=True))
+    console_output.print_texts_and_tables(console_output.format_table(titles, rows, markdown=True))
     return written

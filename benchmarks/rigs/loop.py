@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agents import results
+from agents import console_output
 from benchmarks.rigs.accuracy import percents
 from benchmarks.rigs.catalogue import BENCHES, PARAMETERS, Bench
 from benchmarks.rigs.judge import LEVEL, binomial_interval, calibrated, in_processes, judged
@@ -38,7 +38,7 @@ class BenchPlant:
         seed: of its noises.
     """
 
-    watches = True
+    has_watchdog = True
 
     def __init__(self, bench: Bench, seed: int) -> None:
         self._bench, self._rng = bench, generator(bench, seed, "noise")
@@ -152,12 +152,12 @@ def _samples(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float
 
 def _blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, largest: float) -> tuple[Belief, str]:
     """In blocks, as ``duffing-env run`` scales them: each has its share of what a run is allowed."""
-    from agents.running.clock import JumpingClock
-    from agents.running.run import Plan, run
+    from agents.hardware.clock import JumpingClock
+    from agents.hardware.experiment_run import RunSettings, run_experiment
 
-    plan = Plan(policy, SAMPLES, BLOCK, bound=ASKED * BLOCK / SAMPLES, seed=seed)
+    plan = RunSettings(policy, SAMPLES, BLOCK, bound=ASKED * BLOCK / SAMPLES, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
-        ran = run(rig, plant, folder, plan, clock=JumpingClock())
+        ran = run_experiment(rig, plant, folder, plan, clock=JumpingClock())
     if ran.ended not in ("complete", "range", "design"):
         raise RuntimeError(f"a run in blocks ended: {ran.message}")
     return ran.belief, ran.ended
@@ -184,9 +184,9 @@ def show(runs: dict[tuple[str, str, str], list[Run]]) -> dict[str, Any]:
         ))  # fmt: skip
     titles = ("rig", "played by", "policy", "gained, nats", "median error of m, c, a, b, %", "coverage of 90 %",
               "times narrower", "left its range", "refused")  # fmt: skip
-    results.show(results.table(titles, rows, markdown=True))
+    console_output.print_texts_and_tables(console_output.format_table(titles, rows, markdown=True))
     verdicts = {way: verdict(runs, way) for way in dict.fromkeys(way for *_, way in runs)}
-    results.show(verdicts, width=175)
+    console_output.print_texts_and_tables(verdicts, width=175)
     return verdicts
 
 

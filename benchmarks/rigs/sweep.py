@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from agents import results
+from agents import console_output
 from benchmarks.rigs.accuracy import percents, remarks
 from benchmarks.rigs.catalogue import PARAMETERS, A, Bench
 from benchmarks.rigs.judge import Cell, Outcome, calibrated, identified, in_processes
@@ -101,5 +101,5 @@ def show(cells: Sequence[Cell]) -> dict[str, Any]:
         f"within reach, denied: {sum(all_wrong)} of {len(all_wrong)}": sum(all_wrong) <= MOST_FALSE * len(all_wrong),
     }
     verdicts = (f"{'PASS' if good else 'MISS'}: {text}" for text, good in lines.items())
-    results.show(results.table(titles, rows, markdown=True), *verdicts)
+    console_output.print_texts_and_tables(console_output.format_table(titles, rows, markdown=True), *verdicts)
     return {text: bool(good) for text, good in lines.items()}

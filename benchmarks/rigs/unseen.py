@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from agents import results
+from agents import console_output
 from agents.studies.family import PLANNER, play
-from agents.training.family import Member
+from agents.training.environments.oscillator_family import FamilyMember
 from estimator.rig import Channel, Rig
 
 RIGS = {
@@ -52,7 +52,7 @@ def run(names: Sequence[str], policies: Sequence[str], seeds: int) -> dict[str, 
     """Information gained [nats] in each episode, by rig and policy; the planner's comes first."""
     gained: dict[str, dict[str, list[float]]] = {}
     for name in names:
-        member = Member(name, 0.0, 0.0, 0.0, {"rig": RIGS[name], "horizon": 256})
+        member = FamilyMember(name, 0.0, 0.0, 0.0, {"rig": RIGS[name], "horizon": 256})
         for policy in (PLANNER, *policies):
             episodes = [play(member, policy, seed)[0] for seed in range(seeds)]
             gained.setdefault(name, {})[policy] = episodes
@@ -70,8 +70,8 @@ def show(gained: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
             [name, f"{best:.2f}", *(f"{np.mean(found[p]):.2f} ({worth[name][p]:.2f})" for p in list(found)[1:])]
         )
     policies = list(next(iter(gained.values())))[1:]
-    results.show(
+    console_output.print_texts_and_tables(
         "nats, and in brackets the D-efficiency beside efe",
-        results.table(("rig", PLANNER, *policies), rows, markdown=True),
+        console_output.format_table(("rig", PLANNER, *policies), rows, markdown=True),
     )
     return worth

@@ -17,7 +17,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from agents import POLICIES
-from agents.evaluation import board
+from agents.leaderboard import leaderboard_file
 from agents.policies import TRAINED, trained_policies
 from duffing_env import TRACKS
 from duffing_env.rewards import reward_registry
@@ -53,8 +53,8 @@ REFERENCE = {
         "agents.training.TD3Settings",
         "agents.training.TQCSettings",
         "agents.training.RecurrentPPOSettings",
-        "agents.training.feature_env.FeatureVecEnv",
-        "agents.evaluation.rollout",
+        "agents.training.environments.feature_vec_env.FeatureVecEnv",
+        "agents.evaluation.policy_evaluation",
         "agents.vec_env",
     ],
 }
@@ -182,9 +182,18 @@ def _policies() -> str:
 
 
 def _leaderboard() -> str:
-    parts = ["# Leaderboard", "By the [protocol](protocol.md). `duffing-env report` prints it.", board.CAPTION]
-    for track, rows in board.tables(board.read(board.SHIPPED)).items():
-        lines = [f"| {' | '.join(row)} |" for row in (board.TITLES, ["---"] * len(board.TITLES), *rows)]
+    parts = [
+        "# Leaderboard",
+        "By the [protocol](protocol.md). `duffing-env report` prints it.",
+        leaderboard_file.LEADERBOARD_CAPTION,
+    ]
+    for track, rows in leaderboard_file.leaderboard_rows(
+        leaderboard_file.read_entries(leaderboard_file.SHIPPED_LEADERBOARD)
+    ).items():
+        lines = [
+            f"| {' | '.join(row)} |"
+            for row in (leaderboard_file.COLUMN_TITLES, ["---"] * len(leaderboard_file.COLUMN_TITLES), *rows)
+        ]
         parts += [f"## {_title(track)}", "\n".join(lines)]
     return "\n\n".join(parts)
 

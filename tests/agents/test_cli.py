@@ -13,20 +13,20 @@ import pytest
 import tyro
 from tables import table
 
-from agents.cli import JsonOptions, run_script, with_rig
+from agents.cli import JsonOptions, options_with_rig, run_script
 from agents.commands import main
 from agents.training import TrainConfig
-from agents.training.hyperparameters import track_of
+from agents.training.hyperparameters import track_name
 from estimator import Rig
 
 ROOT = Path(__file__).parents[2]
 #: Where the options of each script are declared: file and class.
 DECLARED = {
-    "train.py": [("agents/commands/train.py", "Config", ""), ("agents/training/config.py", "Subject", ""),
-                 ("agents/training/config.py", "TrainConfig", ""),
+    "train.py": [("agents/commands/train_command.py", "Config", ""), ("agents/training/training_config.py", "Subject", ""),
+                 ("agents/training/training_config.py", "TrainConfig", ""),
                  ("agents/training/algorithms.py", "AlgorithmSettings", "ppo."),
                  ("agents/training/algorithms.py", "OnPolicySettings", "ppo.")],
-    "evaluate.py": [("agents/commands/evaluate.py", "Evaluate", "")],
+    "evaluate.py": [("agents/commands/evaluate_command.py", "Evaluate", "")],
 }  # fmt: skip
 
 
@@ -134,7 +134,7 @@ def test_a_bad_value_is_one_message_and_exit_status_2(script, name, arguments, m
 
 def test_a_rig_may_be_one_that_ships(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert with_rig({"horizon": 9}, "beam") == {"horizon": 9, "rig": Rig.shipped("beam").to_dict()}
+    assert options_with_rig({"horizon": 9}, "beam") == {"horizon": 9, "rig": Rig.shipped("beam").to_dict()}
 
 
 def test_a_bad_value_shows_no_traceback(tmp_path):
@@ -241,7 +241,7 @@ def test_the_module_that_registers_a_track_may_stand_before_its_id(script, tmp_p
     told = json.loads((tmp_path / "runs" / "evaluation" / "evaluation.json").read_text())
     assert told["settings"]["env"] == env
     config = TrainConfig(env=env)
-    assert (config.env, track_of(config.env)) == (env, "OfTests-v0")
+    assert (config.env, track_name(config.env)) == (env, "OfTests-v0")
     assert TrainConfig(env="duffing_env:duffing_env/Short-v0") == TrainConfig(env="Short-v0")
     status, _, messages = script("evaluate.py", "--env", "no_such_module:mine/OfTests-v0")
     assert status == 2

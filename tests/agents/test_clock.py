@@ -7,9 +7,9 @@ import time
 import numpy as np
 import pytest
 
-from agents.running.clock import JumpingClock, RealClock
-from agents.running.run import Plan, run
-from agents.running.simulated import SimulatedPlant
+from agents.hardware.clock import JumpingClock, RealClock
+from agents.hardware.experiment_run import RunSettings, run_experiment
+from agents.hardware.simulated_plant import SimulatedPlant
 from agents.training import ALGORITHMS, TrainConfig, train
 from agents.vec_env import DuffingVecEnv
 from estimator import Channel, Rig
@@ -32,7 +32,7 @@ def set_anew(monkeypatch, request):
 
 @pytest.mark.parametrize("algo", ["ppo", "sac"])
 def test_a_training_lasts_as_long_as_it_does(set_anew, tmp_path, monkeypatch, algo):
-    monkeypatch.setattr("agents.training.heldout._SYSTEMS", 4)
+    monkeypatch.setattr("agents.training.heldout_evaluation._N_SYSTEMS", 4)
     own = {"n_steps": 16} if algo == "ppo" else {"buffer_size": 400, "learning_starts": 32}
     small = ALGORITHMS[algo](num_envs=8, batch_size=64, hidden=(4,), **own)
     began = time.perf_counter()
@@ -69,7 +69,9 @@ def test_the_clock_of_a_run_goes_forward(set_anew):
 
 def test_a_run_meets_its_ticks(set_anew, tmp_path):
     clock = JumpingClock()
-    found = run(RIG, SimulatedPlant(RIG, clock=clock), tmp_path / "run", Plan("prbs", 40), clock=clock)
+    found = run_experiment(
+        RIG, SimulatedPlant(RIG, clock=clock), tmp_path / "run", RunSettings("prbs", 40), clock=clock
+    )
     assert (found.ended, found.exit_status, found.late) == ("complete", 0, 0)
     due, seen = np.loadtxt(tmp_path / "run/samples.csv", delimiter=",", skiprows=1, usecols=(1, 7), unpack=True)
     np.testing.assert_allclose(seen, due, rtol=0, atol=1e-9)

@@ -13,13 +13,13 @@ from tables import table
 
 import agents.evaluation.comparison
 import agents.evaluation.metrics
-import agents.evaluation.rollout
+import agents.evaluation.policy_evaluation
 from agents import make_policy
-from agents.evaluation import board
 from agents.evaluation.batch import TESTED, make
-from agents.evaluation.comparison import compare, usual_policies
+from agents.evaluation.comparison import compare_policies, default_policies
 from agents.evaluation.oracle import Systems
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.policy_evaluation import evaluate_policies
+from agents.leaderboard import leaderboard_file
 from agents.policies.learned import WEIGHTS, load_policy
 from agents.policies.saving import save_policy
 from agents.vec_env import DuffingVecEnv
@@ -44,7 +44,7 @@ QUANTILES = {"coverage_50": 0.6744897501960817, "coverage": 1.6448536269514722, 
 
 @pytest.fixture
 def without_record(monkeypatch):
-    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: False)
+    monkeypatch.setattr(agents.evaluation.policy_evaluation, "record_available", lambda: False)
     monkeypatch.setattr(agents.evaluation.comparison, "record_available", lambda: False)
 
 
@@ -174,9 +174,9 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
     # Inputs and outputs are read off observations, in float32: less than ten roundings, with those of sums of squares.
     slack = 16 * rounding.U32
     name = run_folder if name == "run_folder" else name
-    (evaluation,) = evaluate([name], systems=SYSTEMS, seed=SEED, options=options)
+    (evaluation,) = evaluate_policies([name], systems=SYSTEMS, seed=SEED, options=options)
     assert evaluation.policy == name
-    assert evaluation.curve.shape == (HORIZON + 1, SYSTEMS)
+    assert evaluation.gain_curve.shape == (HORIZON + 1, SYSTEMS)
     assert evaluation.inputs.shape == evaluation.outputs.shape == (HORIZON, SYSTEMS)
     metrics = {key: values.tolist() for key, values in evaluation.metrics.items()}
     ended_early = 0
@@ -187,8 +187,8 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
         assert measured.pop("information_gain") == pytest.approx(entropy(prior) - entropy(posterior), abs=slack)
         gains = [log_density(belief, coefficients) - log_density(prior, coefficients) for belief in single.beliefs]
         assert measured.pop("log_posterior_gain") == pytest.approx(gains[-1], abs=slack)
-        np.testing.assert_allclose(evaluation.curve[: length + 1, row], gains, rtol=0, atol=slack)
-        np.testing.assert_allclose(evaluation.curve[length:, row], gains[-1], rtol=0, atol=slack)
+        np.testing.assert_allclose(evaluation.gain_curve[: length + 1, row], gains, rtol=0, atol=slack)
+        np.testing.assert_allclose(evaluation.gain_curve[length:, row], gains[-1], rtol=0, atol=slack)
         true = [single.truth.m, single.truth.c, single.truth.a, single.truth.b]
         for parameter, estimate, value in zip("mcab", estimates(posterior.coefficients_mean), true, strict=True):
             assert measured.pop(f"error_{parameter}") == pytest.approx(abs(estimate - value) / value, abs=0.01 * slack)
@@ -220,8 +220,8 @@ def test_metrics_are_those_of_single_environments(name, options, share_ended, ru
 
 
 def test_what_a_jump_of_the_truth_takes_away_is_counted(monkeypatch):
-    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: True)
-    (evaluation,) = evaluate(["prbs"], DRIFT, SYSTEMS, SEED, options={"horizon": HORIZON})
+    monkeypatch.setattr(agents.evaluation.policy_evaluation, "record_available", lambda: True)
+    (evaluation,) = evaluate_policies(["prbs"], DRIFT, SYSTEMS, SEED, options={"horizon": HORIZON})
     choose, steepest = act("prbs", {"horizon": HORIZON}), []
     for row, seed in enumerate(spawn_seeds(SEED, SYSTEMS)):
         env = gym.make(DRIFT, horizon=HORIZON, branch="test").unwrapped
@@ -233,9 +233,9 @@ def test_what_a_jump_of_the_truth_takes_away_is_counted(monkeypatch):
             ended = terminated or truncated
         assert terminated or env.truth.m != mass
         expected = np.subtract(gains, gains[0])
-        np.testing.assert_allclose(evaluation.curve[: len(gains), row], expected, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(evaluation.curve[len(gains) :, row], expected[-1], rtol=1e-6, atol=1e-6)
-        assert evaluation.metrics["log_posterior_gain"][row] == evaluation.curve[-1, row]
+        np.testing.assert_allclose(evaluation.gain_curve[: len(gains), row], expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(evaluation.gain_curve[len(gains) :, row], expected[-1], rtol=1e-6, atol=1e-6)
+        assert evaluation.metrics["log_posterior_gain"][row] == evaluation.gain_curve[-1, row]
         steepest.append(np.diff(gains).min())
     assert min(steepest) < -100  # a jump that the belief does not know of
     assert "simulation_rmse" in evaluation.metrics
@@ -243,11 +243,11 @@ def test_what_a_jump_of_the_truth_takes_away_is_counted(monkeypatch):
     assert not {"fisher_gain", "efficiency", "silverbox_equivalent", "full_peak_equivalent", "arrow_rmse"} & set(
         evaluation.metrics
     )
-    assert evaluation.estimators == {}
+    assert evaluation.estimator_metrics == {}
 
 
 def test_a_sample_of_the_regime_is_worth_one_and_one_of_a_better_policy_more(record):
-    prbs, regime = evaluate(["prbs", "silverbox-multisine"], systems=24)
+    prbs, regime = evaluate_policies(["prbs", "silverbox-multisine"], systems=24)
     found = {
         (evaluation.policy, name): np.median(evaluation.metrics[name] / (~np.isnan(evaluation.inputs)).sum(axis=0))
         for evaluation in (prbs, regime)
@@ -258,12 +258,12 @@ def test_a_sample_of_the_regime_is_worth_one_and_one_of_a_better_policy_more(rec
     # At the limit of 0.15 V instead of its own peak of some 0.12 V, the regime tells more.
     assert 1 < found["prbs", "silverbox_equivalent"] / found["prbs", "full_peak_equivalent"] < 6
     # There is none of more power than the budget.
-    (limited,) = evaluate(["uniform"], "duffing_env/Power-v0", 2)
+    (limited,) = evaluate_policies(["uniform"], "duffing_env/Power-v0", 2)
     assert "full_peak_equivalent" not in limited.metrics
 
 
 def test_all_policies_meet_the_same_systems_and_the_same_noise(without_record):
-    uniform, prbs = evaluate(["uniform", "prbs"], systems=SYSTEMS, seed=SEED, options={"horizon": HORIZON})
+    uniform, prbs = evaluate_policies(["uniform", "prbs"], systems=SYSTEMS, seed=SEED, options={"horizon": HORIZON})
     assert np.all(np.abs(uniform.inputs[0] - prbs.inputs[0]) > 1e-3)
     truths = [single.truth for single in run_single("prbs", {"horizon": 1})]
     gains = np.array([true_coefficients(truth)[3] for truth in truths])
@@ -277,9 +277,11 @@ def test_all_policies_meet_the_same_systems_and_the_same_noise(without_record):
 
 
 def test_the_same_seed_gives_the_same_and_another_does_not(without_record):
-    first, again = (evaluate(["uniform"], systems=5, seed=1, options={"horizon": HORIZON})[0] for _ in range(2))
-    (fewer,) = evaluate(["uniform"], systems=3, seed=1, options={"horizon": HORIZON})
-    (other,) = evaluate(["uniform"], systems=5, seed=2, options={"horizon": HORIZON})
+    first, again = (
+        evaluate_policies(["uniform"], systems=5, seed=1, options={"horizon": HORIZON})[0] for _ in range(2)
+    )
+    (fewer,) = evaluate_policies(["uniform"], systems=3, seed=1, options={"horizon": HORIZON})
+    (other,) = evaluate_policies(["uniform"], systems=5, seed=2, options={"horizon": HORIZON})
     for name, values in first.metrics.items():
         if name != "decision_time":
             np.testing.assert_array_equal(values, again.metrics[name])
@@ -291,24 +293,24 @@ def test_the_same_seed_gives_the_same_and_another_does_not(without_record):
 
 def test_policies_are_told_of_in_turn_and_options_left_alone(without_record):
     told, options = [], {"horizon": 5}
-    evaluations = evaluate(["prbs", "uniform", "gaussian"], systems=2, options=options, on_policy=told.append)
+    evaluations = evaluate_policies(["prbs", "uniform", "gaussian"], systems=2, options=options, on_policy=told.append)
     assert told == [evaluation.policy for evaluation in evaluations] == ["prbs", "uniform", "gaussian"]
     assert options == {"horizon": 5}
-    (alone,) = evaluate(["gaussian"], systems=2, options=options)
-    np.testing.assert_array_equal(evaluations[2].curve, alone.curve)
+    (alone,) = evaluate_policies(["gaussian"], systems=2, options=options)
+    np.testing.assert_array_equal(evaluations[2].gain_curve, alone.gain_curve)
 
 
 BY_THE_RECORD = {"silverbox_equivalent", "full_peak_equivalent", "simulation_rmse", "arrow_rmse"}
 
 
 def test_what_the_record_measures_is_left_out_without_it_and_it_is_said(without_record, tmp_path, capsys):
-    (evaluation,) = compare(["uniform"], TRACK, 2, {"horizon": 5}, tmp_path)
+    (evaluation,) = compare_policies(["uniform"], TRACK, 2, {"horizon": 5}, tmp_path)
     assert not BY_THE_RECORD & set(evaluation.metrics)
     assert "the Silverbox record is not on this machine" in " ".join(capsys.readouterr().out.split())
 
 
 def test_errors_of_free_runs_are_those_over_the_arrow_s_input(record):
-    (evaluation,) = evaluate(["uniform"], systems=SYSTEMS, seed=SEED, options={"horizon": HORIZON})
+    (evaluation,) = evaluate_policies(["uniform"], systems=SYSTEMS, seed=SEED, options={"horizon": HORIZON})
     assert set(evaluation.metrics) >= BY_THE_RECORD
     for row, single in enumerate(run_single("uniform", {"horizon": HORIZON})):
         both = single.beliefs[-1].coefficients_mean, true_coefficients(single.truth)
@@ -334,7 +336,7 @@ def free_run(coefficients, u, y):
 
 def test_the_arrow_error_is_that_of_free_runs_over_the_record(record):
     options = {"horizon": HORIZON}
-    (evaluation,) = evaluate(["prbs"], systems=SYSTEMS, seed=SEED, options=options)
+    (evaluation,) = evaluate_policies(["prbs"], systems=SYSTEMS, seed=SEED, options=options)
     u, y = record.arrow.u, record.arrow.y
     for coefficients, error in zip(identified_twins("prbs", options), evaluation.metrics["arrow_rmse"], strict=True):
         deviation = free_run(coefficients, u, y)[2:] - y[2:]
@@ -346,10 +348,10 @@ def test_the_arrow_error_is_that_of_free_runs_over_the_record(record):
 def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverges):
     rng = np.random.default_rng(0)
     arrow = Regime("arrow", scale * rng.uniform(-1, 1, 80), 0.01 * rng.normal(size=80))
-    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: True)
+    monkeypatch.setattr(agents.evaluation.policy_evaluation, "record_available", lambda: True)
     monkeypatch.setattr(agents.evaluation.metrics, "load_record", lambda: SimpleNamespace(arrow=arrow))
     options = {"horizon": HORIZON, "max_output": 2.0}
-    (evaluation,) = evaluate(["uniform"], systems=SYSTEMS, seed=SEED, options=options)
+    (evaluation,) = evaluate_policies(["uniform"], systems=SYSTEMS, seed=SEED, options=options)
     if diverges:
         assert np.all(evaluation.metrics["arrow_rmse"] == np.inf)
         return
@@ -361,8 +363,8 @@ def test_a_free_run_that_diverges_counts_as_infinite(monkeypatch, scale, diverge
 
 
 def test_others_identify_from_the_same_inputs_and_outputs(without_record):
-    (evaluation,) = evaluate(["uniform"], systems=40, seed=SEED)
-    own, others = evaluation.metrics, evaluation.estimators
+    (evaluation,) = evaluate_policies(["uniform"], systems=40, seed=SEED)
+    own, others = evaluation.metrics, evaluation.estimator_metrics
     assert list(others) == ["structured", "mean_field", "auditor"]
     for name, values in others["structured"].items():  # the environment's own, but for the float32 of its inputs
         np.testing.assert_allclose(values, own[name], rtol=1e-2, atol=1e-6)
@@ -373,7 +375,9 @@ def test_others_identify_from_the_same_inputs_and_outputs(without_record):
 
 def test_the_replay_environment_is_evaluated(record):
     limit = 0.05
-    evaluations = evaluate(["silverbox-arrow", "uniform"], REPLAY, systems=2, options=REPLAYED | {"max_output": limit})
+    evaluations = evaluate_policies(
+        ["silverbox-arrow", "uniform"], REPLAY, systems=2, options=REPLAYED | {"max_output": limit}
+    )
     on_record, off_record = evaluations
     u, y = record.arrow.u, record.arrow.y
     samples = int(np.argmax(np.abs(y[1:]) > limit)) + 1  # the episode ends when y, one sample later, is beyond
@@ -385,7 +389,7 @@ def test_the_replay_environment_is_evaluated(record):
     np.testing.assert_allclose(on_record.inputs[:samples, 0], u[:samples], rtol=0, atol=1e-8)
     assert np.isnan(on_record.inputs[samples:]).all()
     assert on_record.metrics["ended_early"].tolist() == [1, 1]
-    assert on_record.curve[-1] == pytest.approx(on_record.curve[samples])
+    assert on_record.gain_curve[-1] == pytest.approx(on_record.gain_curve[samples])
     # A record answers nothing but its own input: the episode is over, and nothing was learned.
     assert np.isfinite(off_record.inputs).sum(axis=0).tolist() == [1, 1]
     assert off_record.metrics["information_gain"].tolist() == [0, 0]
@@ -396,7 +400,7 @@ def test_the_replay_environment_is_evaluated(record):
 
 def test_the_continuous_track_is_evaluated_in_its_own_coefficients(without_record):
     options = {"horizon": HORIZON, **ODE}
-    (evaluation,) = evaluate(["uniform"], CONTINUOUS, systems=SYSTEMS, seed=SEED, options=options)
+    (evaluation,) = evaluate_policies(["uniform"], CONTINUOUS, systems=SYSTEMS, seed=SEED, options=options)
     policy, state = make_policy("uniform", gym.make(CONTINUOUS, **options), seed=SEED), None
     actions = []
     for _ in range(HORIZON):
@@ -423,17 +427,19 @@ def test_the_continuous_track_is_evaluated_in_its_own_coefficients(without_recor
         }
         assert {name: evaluation.metrics[name][row] for name in expected} == pytest.approx(expected, abs=1e-6)
         for name in expected:  # the environment's own estimator, but for the float32 of its inputs
-            assert evaluation.estimators["ode"][name][row] == pytest.approx(evaluation.metrics[name][row], abs=2e-3)
+            assert evaluation.estimator_metrics["ode"][name][row] == pytest.approx(
+                evaluation.metrics[name][row], abs=2e-3
+            )
     assert "arrow_rmse" not in evaluation.metrics
 
 
 def test_with_noises_that_are_drawn_all_is_measured_with_the_true_ones(without_record):
-    (evaluation,) = evaluate(["uniform"], CONTINUOUS, systems=60, seed=SEED)
-    assert list(evaluation.estimators) == ["ode_alone", "nlarx_structured", "nlarx_mean_field", "auditor"]
+    (evaluation,) = evaluate_policies(["uniform"], CONTINUOUS, systems=60, seed=SEED)
+    assert list(evaluation.estimator_metrics) == ["ode_alone", "nlarx_structured", "nlarx_mean_field", "auditor"]
     assert evaluation.metrics["fisher_gain"].mean() == pytest.approx(
         evaluation.metrics["information_gain"].mean(), abs=0.4
     )
-    assert 0.7 < evaluation.estimators["auditor"]["nees"].mean() < 1.3
+    assert 0.7 < evaluation.estimator_metrics["auditor"]["nees"].mean() < 1.3
     systems = Systems.of(CONTINUOUS, 2)
     assert len(np.unique(systems.variances)) == 4
     u = 0.03 * np.ones((2, systems.samples))
@@ -444,18 +450,18 @@ def test_with_noises_that_are_drawn_all_is_measured_with_the_true_ones(without_r
 
 def test_on_the_continuous_track_others_identify_too(without_record):
     by_ode, by_paper = (
-        evaluate(["uniform"], CONTINUOUS, systems=40, seed=SEED, options={"horizon": 200, **options})[0]
+        evaluate_policies(["uniform"], CONTINUOUS, systems=40, seed=SEED, options={"horizon": 200, **options})[0]
         for options in (ODE, NLARX)
     )
     for evaluation, own in ((by_ode, "ode"), (by_paper, "nlarx_structured")):
-        assert list(evaluation.estimators) == ["ode", "nlarx_structured", "nlarx_mean_field", "auditor"]
-        assert np.median(evaluation.estimators[own]["error_m"]) == pytest.approx(
+        assert list(evaluation.estimator_metrics) == ["ode", "nlarx_structured", "nlarx_mean_field", "auditor"]
+        assert np.median(evaluation.estimator_metrics[own]["error_m"]) == pytest.approx(
             np.median(evaluation.metrics["error_m"]), rel=1e-2
         )
-        errors = {name: np.median(values["error_m"]) for name, values in evaluation.estimators.items()}
+        errors = {name: np.median(values["error_m"]) for name, values in evaluation.estimator_metrics.items()}
         assert max(errors["ode"], errors["auditor"]) < 0.02 < 0.1 < errors["nlarx_structured"]  # misspecified
-        assert 0.8 < evaluation.estimators["auditor"]["coverage"].mean() < 0.98
-        assert 0.6 < evaluation.estimators["auditor"]["nees"].mean() < 1.4
+        assert 0.8 < evaluation.estimator_metrics["auditor"]["coverage"].mean() < 0.98
+        assert 0.6 < evaluation.estimator_metrics["auditor"]["nees"].mean() < 1.4
         # What an efficient estimator gains is what the well-specified one does, and no one talks it into more.
         assert evaluation.metrics["fisher_gain"].mean() == pytest.approx(
             by_ode.metrics["information_gain"].mean(), abs=0.3
@@ -467,24 +473,24 @@ def test_the_auditor_is_not_led_astray_by_a_wide_guess(without_record):
     """From the prior's mean alone, three of these fits end far from the truth, with a nees of millions."""
     guess = {"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (0.0, 1e8)}
     rig = {"step": 1e-3, "input": {"unit": "N", "limit": 10.0}, "output": {"unit": "m", "range": 0.02}, "guess": guess}
-    (found,) = evaluate(["prbs"], "duffing_env/Rig-v0", 32, options={"rig": rig, "noise_hypotheses": 3})
-    assert 0.5 < found.estimators["auditor"]["nees"].mean() < 2.0
-    assert found.estimators["auditor"]["nees"].max() < 6.0
+    (found,) = evaluate_policies(["prbs"], "duffing_env/Rig-v0", 32, options={"rig": rig, "noise_hypotheses": 3})
+    assert 0.5 < found.estimator_metrics["auditor"]["nees"].mean() < 2.0
+    assert found.estimator_metrics["auditor"]["nees"].max() < 6.0
 
 
 @pytest.mark.parametrize("track", ["Pendulum", "WienerHammerstein"])
 def test_tracks_of_other_models_are_evaluated_and_shown(track, tmp_path):
     env_id, options = f"duffing_env/{track}-v0", {"horizon": 128}
     if track == "Pendulum":
-        (evaluation,) = compare(["uniform"], env_id, 6, options, tmp_path, seed=SEED, report=True)
+        (evaluation,) = compare_policies(["uniform"], env_id, 6, options, tmp_path, seed=SEED, as_report=True)
         assert (tmp_path / "report.html").is_file()
     else:
-        (evaluation,) = evaluate(["uniform"], env_id, 6, SEED, options)
-    assert list(evaluation.estimators) == ["ode", "auditor"]
+        (evaluation,) = evaluate_policies(["uniform"], env_id, 6, SEED, options)
+    assert list(evaluation.estimator_metrics) == ["ode", "auditor"]
     for name in [name for name in evaluation.metrics if name.startswith("error_")]:
         # The environment's own estimator, but for the float32 of its inputs and outputs, which some errors amplify.
         own = np.median(evaluation.metrics[name])
-        assert np.median(evaluation.estimators["ode"][name]) == pytest.approx(own, rel=0.05), name
+        assert np.median(evaluation.estimator_metrics["ode"][name]) == pytest.approx(own, rel=0.05), name
     assert evaluation.metrics["fisher_gain"].mean() == pytest.approx(
         evaluation.metrics["information_gain"].mean(), abs=1.0
     )
@@ -498,8 +504,8 @@ def test_policies_of_several_seeds_are_one_entry(tmp_path, without_record):
     (tmp_path / "run-3").mkdir()  # a training that is not finished
     told, options = [], {"horizon": 20}
     arguments = {"systems": 3, "seed": SEED, "options": options}
-    group, alone = evaluate([f"ppo={tmp_path}/run-*", "uniform"], on_policy=told.append, **arguments)
-    each = evaluate(sorted(str(tmp_path / name) for name in names), **arguments)
+    group, alone = evaluate_policies([f"ppo={tmp_path}/run-*", "uniform"], on_policy=told.append, **arguments)
+    each = evaluate_policies(sorted(str(tmp_path / name) for name in names), **arguments)
     assert (group.policy, group.seeds, group.title, alone.title) == ("ppo", 3, "ppo (3 seeds)", "uniform")
     assert told == [*(evaluation.policy for evaluation in each), "uniform"]
     for name, values in group.metrics.items():
@@ -507,44 +513,44 @@ def test_policies_of_several_seeds_are_one_entry(tmp_path, without_record):
             np.testing.assert_array_equal(values.reshape(3, 3), [evaluation.metrics[name] for evaluation in each])
     for i, evaluation in enumerate(each):
         np.testing.assert_array_equal(group.inputs[:, 3 * i : 3 * i + 3], evaluation.inputs)
-        np.testing.assert_array_equal(group.curve[:, 3 * i : 3 * i + 3], evaluation.curve)
-        audited = evaluation.estimators["auditor"]["error_b"]
-        np.testing.assert_array_equal(group.estimators["auditor"]["error_b"][3 * i : 3 * i + 3], audited)
+        np.testing.assert_array_equal(group.gain_curve[:, 3 * i : 3 * i + 3], evaluation.gain_curve)
+        audited = evaluation.estimator_metrics["auditor"]["error_b"]
+        np.testing.assert_array_equal(group.estimator_metrics["auditor"]["error_b"][3 * i : 3 * i + 3], audited)
     with pytest.raises(ValueError, match=r"two policy folders or more match, but 'ppo=.*run-1' matches"):
-        evaluate([f"ppo={tmp_path}/run-1"], systems=2)
+        evaluate_policies([f"ppo={tmp_path}/run-1"], systems=2)
 
 
 @table("systems", [1, 0, -3])
 def test_one_system_is_too_few(systems):
     with pytest.raises(ValueError, match=f"systems must be a whole number from 2 to 100000, but is {systems}"):
-        evaluate(["uniform"], systems=systems)
+        evaluate_policies(["uniform"], systems=systems)
 
 
 def test_senseless_arguments_are_refused():
     with pytest.raises(ValueError, match=r"policies must be a list of policies, but is .prbs.; pass"):
-        evaluate("prbs")
+        evaluate_policies("prbs")
     with pytest.raises(ValueError, match="policies must name at least one"):
-        evaluate([], systems=2)
+        evaluate_policies([], systems=2)
     with pytest.raises(ValueError, match=r"policies must differ by their names, but are called .*; give each a name"):
-        evaluate(["prbs", "prbs"], systems=2)
+        evaluate_policies(["prbs", "prbs"], systems=2)
     played = []
     for name, words in (
         ("unifrom", "did you mean 'uniform'"),
         ("ppo/short", "ppo/short: env must be of the model that the"),
     ):
         with pytest.raises(ValueError, match=words):
-            evaluate(["prbs", name], "duffing_env/Pendulum-v0", systems=2, on_policy=played.append)
+            evaluate_policies(["prbs", name], "duffing_env/Pendulum-v0", systems=2, on_policy=played.append)
     assert not played, "all are made before the first one plays"
     with pytest.raises(ValueError, match="did you mean 'horizon'"):
-        evaluate(["uniform"], systems=2, options={"horizn": 3})
+        evaluate_policies(["uniform"], systems=2, options={"horizn": 3})
     with pytest.raises(gym.error.NameNotFound):
-        evaluate(["uniform"], "duffing_env/Ampltude-v0", systems=2)
+        evaluate_policies(["uniform"], "duffing_env/Ampltude-v0", systems=2)
 
 
 def test_a_file_in_place_of_the_folder_is_found_before_the_work(tmp_path):
     (tmp_path / "file").write_text("kept")
     with pytest.raises(NotADirectoryError, match=r"output must be a folder, but .*file is a file; name another place"):
-        compare(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "file" / "below")
+        compare_policies(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "file" / "below")
     assert (tmp_path / "file").read_text() == "kept"
 
 
@@ -554,7 +560,7 @@ def test_a_place_that_cannot_be_written_is_found_before_the_work(tmp_path, monke
     with pytest.raises(
         PermissionError, match=r"read-only; allow to write there, or name another place: '.*board.jsonl'"
     ):
-        board.check(tmp_path / "board.jsonl", "mine")
+        leaderboard_file.check_new_entry(tmp_path / "board.jsonl", "mine")
 
     def refuse(dir):
         raise PermissionError(13, "Permission denied")
@@ -562,26 +568,28 @@ def test_a_place_that_cannot_be_written_is_found_before_the_work(tmp_path, monke
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
     monkeypatch.setattr("agents.evaluation.comparison.evaluate", lambda *_: pytest.fail("it was measured first"))
     with pytest.raises(PermissionError, match=r"allow to write there, or name another place: '.*out'"):
-        compare(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "out")
+        compare_policies(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "out")
     with pytest.raises(PermissionError, match=r"allow to write there, or name another place: '.*'"):
-        board.check(tmp_path / "new.jsonl", "mine")
+        leaderboard_file.check_new_entry(tmp_path / "new.jsonl", "mine")
 
 
 @table("shown", [{"observation": "history"}, {"observation": "history", "history": 1}])
 def test_what_is_shown_changes_nothing_of_what_is_measured(shown):
-    usual, other = (evaluate(["uniform"], TRACK, 3, SEED, {"horizon": 12} | options)[0] for options in ({}, shown))
+    usual, other = (
+        evaluate_policies(["uniform"], TRACK, 3, SEED, {"horizon": 12} | options)[0] for options in ({}, shown)
+    )
     np.testing.assert_array_equal(other.inputs, usual.inputs)
     np.testing.assert_array_equal(other.outputs, usual.outputs)
     np.testing.assert_array_equal(other.metrics["fisher_gain"], usual.metrics["fisher_gain"])
 
 
 def test_what_is_compared_where_the_posterior_is_not_seen_are_signals():
-    assert usual_policies(TRACK, {"observation": "history"}) == ("prbs", "uniform")
-    assert usual_policies(TRACK, {"hold": 4}) == ("ppo/amplitude", "prbs", "uniform")
-    assert {"efe", "shield", "ppo/amplitude"} < set(usual_policies(TRACK, {"observation": "posterior"}))
+    assert default_policies(TRACK, {"observation": "history"}) == ("prbs", "uniform")
+    assert default_policies(TRACK, {"hold": 4}) == ("ppo/amplitude", "prbs", "uniform")
+    assert {"efe", "shield", "ppo/amplitude"} < set(default_policies(TRACK, {"observation": "posterior"}))
 
 
 def test_a_function_as_an_observation_is_not_compared_on():
     options = {"horizon": 12, "observation": lambda beliefs: beliefs.coefficients_mean}
     with pytest.raises(ValueError, match="observation must not be a function where policies are compared"):
-        evaluate(["uniform"], TRACK, 3, SEED, options)
+        evaluate_policies(["uniform"], TRACK, 3, SEED, options)

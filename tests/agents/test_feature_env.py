@@ -12,9 +12,9 @@ from agents.policies.features import BOUND, FeatureMap
 from agents.policies.learned import load_policy
 from agents.policies.saving import save_policy
 from agents.training import ALGORITHMS, PPOSettings, TrainConfig, train
-from agents.training.callbacks import Watch
-from agents.training.feature_env import SCALE, FeatureVecEnv, Normalizer
-from agents.training.imitation import imitate
+from agents.training.environments.feature_vec_env import REWARD_SCALE, FeatureNormalizer, FeatureVecEnv
+from agents.training.imitation import imitate_policy
+from agents.training.training_logs import TrainingCallback
 from agents.vec_env import DuffingVecEnv
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
@@ -27,7 +27,7 @@ def seen_through(rows=6, seed=2, env_id=AMPLITUDE, fitted=False, levels=0, in_na
 
     def envs():
         plain = DuffingVecEnv(env_id, rows, seed=seed, **options)
-        return FeatureVecEnv(plain, levels=levels, in_nats=in_nats, own=own)
+        return FeatureVecEnv(plain, levels=levels, reward_in_nats=in_nats, raw_observation=own)
 
     made = envs()
     if fitted:
@@ -41,11 +41,11 @@ def test_rewards_differ_from_the_environments_by_a_potential():
     found, rng = FeatureMap.of(plain.envs), np.random.default_rng(0)
     envs.reset()
     plain.reset()
-    start = envs.shown.to_come.copy()
+    start = envs.current_features.to_come.copy()
     returns, running, early = np.zeros(6), np.ones(6, dtype=bool), 0
     for _ in range(24):
         choices = rng.uniform(-1, 1, (6, 1)).astype(np.float32)
-        actions = envs.shown.act(choices[:, 0])
+        actions = envs.current_features.act(choices[:, 0])
         shown, rewards, dones, infos = envs.step(choices)
         observations, _, plain_dones, plain_infos = plain.step(actions)
         np.testing.assert_array_equal(dones, plain_dones)
@@ -57,7 +57,7 @@ def test_rewards_differ_from_the_environments_by_a_potential():
             np.testing.assert_array_equal(infos[row]["terminal_observation"], last)
             if running[row]:
                 gained = plain_infos[row]["episode"]["r"]
-                assert returns[row] == pytest.approx(SCALE * (gained - start[row]), abs=1e-3)
+                assert returns[row] == pytest.approx(REWARD_SCALE * (gained - start[row]), abs=1e-3)
                 early += not plain_infos[row]["TimeLimit.truncated"]
                 running[row] = False
     assert not running.any()
@@ -76,23 +76,23 @@ def test_rewards_without_a_potential_stay_as_they_are(env_id, in_nats, options):
     envs.reset()
     plain.reset()
     for _ in range(5):
-        actions = envs.shown.act([1.0, 0.0, -1.0])
+        actions = envs.current_features.act([1.0, 0.0, -1.0])
         _, rewards, _, _ = envs.step(np.array([[1.0], [0.0], [-1.0]], dtype=np.float32))
-        np.testing.assert_allclose(rewards, SCALE * plain.step(actions)[1], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(rewards, REWARD_SCALE * plain.step(actions)[1], rtol=1e-6, atol=1e-9)
 
 
 def test_what_is_seen_is_normalised_over_random_choices():
     first, second = (seen_through(rows=32, fitted=True) for _ in range(2))
     for one, two in zip(first.tensors.values(), second.tensors.values(), strict=True):
         np.testing.assert_array_equal(one, two)
-    other = Normalizer(first.observation_space.shape[0])
+    other = FeatureNormalizer(first.observation_space.shape[0])
     other.fit(seen_through(rows=32), 20, seed=1)
     assert not np.array_equal(other.mean, first.normalizer.mean)
     rng = np.random.default_rng(0)  # the same choices again
     normalised = [first.reset()]
     for _ in range(20):
         normalised.append(first.step(rng.uniform(-1, 1, (32, 1)).astype(np.float32))[0])
-        expected = (first.shown.values - first.normalizer.mean) / first.normalizer.std
+        expected = (first.current_features.values - first.normalizer.mean) / first.normalizer.std
         np.testing.assert_array_equal(normalised[-1], np.clip(expected, -BOUND, BOUND))
     least = first.normalizer.std.min()  # of what is constant
     assert least == np.float32(0.05)
@@ -141,11 +141,13 @@ def test_a_policy_acts_the_same_from_its_file(tmp_path, algo, settings):
     shown, state, own_state, starts = envs.reset(), None, None, np.ones(6, dtype=bool)
     for _ in range(30):
         choices, state = model.predict(shown, state, starts, deterministic=True)
-        expected = envs.shown.act(np.linspace(-1, 1, 3)[choices] if choices.ndim == 1 else choices[:, 0])
+        expected = envs.current_features.act(np.linspace(-1, 1, 3)[choices] if choices.ndim == 1 else choices[:, 0])
         before = own_state
-        actions, own_state = policy.predict(envs.observations, before, starts, deterministic=True)
+        actions, own_state = policy.predict(envs.raw_observations, before, starts, deterministic=True)
         np.testing.assert_allclose(actions, expected, atol=1e-5)
-        np.testing.assert_array_equal(actions, other.predict(envs.observations, before, starts, deterministic=True)[0])
+        np.testing.assert_array_equal(
+            actions, other.predict(envs.raw_observations, before, starts, deterministic=True)[0]
+        )
         shown, _, starts, _ = envs.step(choices)
     with pytest.raises(ValueError, match="observation must have 22 entries"):
         policy.predict(np.zeros((3, 58), dtype=np.float32))
@@ -175,7 +177,7 @@ def test_a_network_learns_what_another_policy_decides(levels):
         return features.act(np.linspace(-1, 1, levels)[choices] if levels else choices[:, 0])
 
     before = agreement(choose, make(AMPLITUDE, 32))
-    imitate(model, envs, "velocity-sign", 8192, 0, told.append)
+    imitate_policy(model, envs, "velocity-sign", 8192, 0, told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0
     assert before < 0.5 < 0.8 < agreement(choose, make(AMPLITUDE, 32))
@@ -213,13 +215,13 @@ def test_what_cannot_imitate_is_refused(settings, message):
 
 def test_entropy_counts_less_and_less(tmp_path, monkeypatch):
     seen = []
-    original = Watch._on_rollout_end
+    original = TrainingCallback._on_rollout_end
 
     def spy(self):
         original(self)
         seen.append(self.model.ent_coef)
 
-    monkeypatch.setattr(Watch, "_on_rollout_end", spy)
+    monkeypatch.setattr(TrainingCallback, "_on_rollout_end", spy)
     settings = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,), entropy_bonus=0.5)
     train(TrainConfig("ppo", AMPLITUDE, steps=512, output=tmp_path / "run", hyperparameters=settings))
     assert seen == [pytest.approx(0.5 * (1 - k / 4)) for k in range(4)]

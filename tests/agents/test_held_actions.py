@@ -8,7 +8,7 @@ import pytest
 from tables import table
 
 from agents.evaluation.batch import TESTED, make
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.policies import make_policy
 from estimator import SAMPLING_STEP
 
@@ -74,9 +74,9 @@ def test_the_planner_refuses_and_says_what_to_do():
 
 
 def test_every_sample_is_evaluated(monkeypatch):
-    monkeypatch.setattr("agents.evaluation.rollout.record_available", lambda: False)
+    monkeypatch.setattr("agents.evaluation.policy_evaluation.record_available", lambda: False)
     options = {"hold": HOLD, "horizon": 50, "max_output": 0.3}
-    (evaluation,) = evaluate(["uniform"], systems=6, seed=5, options=options)
+    (evaluation,) = evaluate_policies(["uniform"], systems=6, seed=5, options=options)
     envs = make(TRACK, 6, options | TESTED)
     policy, state = make_policy("uniform", envs, seed=5), None
     observations, _ = envs.reset(seed=5)
@@ -94,7 +94,7 @@ def test_every_sample_is_evaluated(monkeypatch):
     assert (samples == (~np.isnan(evaluation.outputs)).sum(axis=0)).all()
     assert 0 < evaluation.metrics["ended_early"].sum() < 6
     np.testing.assert_allclose(evaluation.metrics["log_posterior_gain"], gains, rtol=1e-9)
-    assert (evaluation.curve[-1] == evaluation.metrics["log_posterior_gain"]).all()
+    assert (evaluation.gain_curve[-1] == evaluation.metrics["log_posterior_gain"]).all()
     # The other estimators see what the environment's own saw: every sample.
     own = evaluation.metrics["error_m"]
-    np.testing.assert_allclose(evaluation.estimators["structured"]["error_m"], own, rtol=0.05, atol=2e-3)
+    np.testing.assert_allclose(evaluation.estimator_metrics["structured"]["error_m"], own, rtol=0.05, atol=2e-3)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from agents import make_policy
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.training import PPOSettings, TrainConfig, train
-from agents.training.heldout import METRICS
+from agents.training.heldout_evaluation import HELDOUT_METRICS
 
 TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,), learning_rate=0.01)
 ENV = "duffing_env/Short-v0"
@@ -37,7 +37,7 @@ def test_evaluations_are_told_and_written(run):
     made, told = run
     assert [steps for steps, _ in told] == [0, 256, 512]  # before all updates, and the first after 200 and 400 samples
     assert rows(made.folder) == [{"steps": steps, **found} for steps, found in told]
-    assert set(told[0][1]) == set(METRICS)
+    assert set(told[0][1]) == set(HELDOUT_METRICS)
     assert told[0] != told[1]
 
 
@@ -46,8 +46,8 @@ def test_they_are_the_metrics_of_evaluate(run):
     best = json.loads((made.folder / "best" / "policy.json").read_text())
     told_of = best["evaluation"]
     options = {"branch": "validation"}
-    (evaluation,) = evaluate([str(made.folder)], ENV, told_of["systems"], told_of["seed"], options)
-    for name in METRICS:
+    (evaluation,) = evaluate_policies([str(made.folder)], ENV, told_of["systems"], told_of["seed"], options)
+    for name in HELDOUT_METRICS:
         assert evaluation.metrics[name].mean() == pytest.approx(told[-1][1][name], rel=1e-12), name
 
 
@@ -56,7 +56,7 @@ def test_the_best_policy_is_kept(run):
     steps, found = max(told, key=lambda entry: entry[1]["log_posterior_gain"])
     card = make_policy(str(made.folder / "best")).card
     assert card["steps"] == steps
-    assert {name: card["evaluation"][name] for name in METRICS} == found
+    assert {name: card["evaluation"][name] for name in HELDOUT_METRICS} == found
 
 
 def test_evaluating_does_not_move_the_training(run, tmp_path):
@@ -79,7 +79,7 @@ def test_tensorboard_holds_both_logs(tmp_path):
     made = train(tiny(tmp_path / "run", eval_every=256, tensorboard=True))
     (events,) = Path(made.folder).glob("events.out.tfevents.*")
     accumulator = EventAccumulator(str(events)).Reload()
-    for name in METRICS:
+    for name in HELDOUT_METRICS:
         scalars = accumulator.Scalars(f"evaluation/{name}")
         assert [scalar.step for scalar in scalars] == [0, 256, 512]
         np.testing.assert_allclose([s.value for s in scalars], [row[name] for row in rows(made.folder)], rtol=1e-6)

@@ -6,7 +6,13 @@ import pytest
 from tables import table
 
 from agents.training import ALGORITHMS, PPOSettings, SACSettings, TrainConfig
-from agents.training.hyperparameters import FILES, read_settings, settings_of, track_of, write_settings
+from agents.training.hyperparameters import (
+    HYPERPARAMETER_FOLDER,
+    parse_hyperparameters,
+    read_hyperparameters,
+    track_name,
+    write_hyperparameters,
+)
 from duffing_env import TRACKS
 from estimator import Channel, Rig
 from estimator.lanes import LANES
@@ -21,32 +27,32 @@ def written(tmp_path, text):
 
 
 def test_there_is_one_file_for_each_algorithm():
-    assert sorted(path.stem for path in FILES.iterdir()) == sorted(ALGORITHMS)
+    assert sorted(path.stem for path in HYPERPARAMETER_FOLDER.iterdir()) == sorted(ALGORITHMS)
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 @table("env_id", TRACKS)
 def test_every_file_is_sound_for_every_track(algo, env_id):
-    assert type(read_settings(algo, env_id)) is ALGORITHMS[algo]
+    assert type(read_hyperparameters(algo, env_id)) is ALGORITHMS[algo]
 
 
 def test_ppo_is_as_its_class_says_where_its_file_is_silent():
     amplitude, power, short = (
-        read_settings("ppo", f"duffing_env/{name}-v0") for name in ("Amplitude", "Power", "Short")
+        read_hyperparameters("ppo", f"duffing_env/{name}-v0") for name in ("Amplitude", "Power", "Short")
     )
     others = ("duffing_env/Amplitude-v1", "duffing_env/Rig-v0", "duffing_env/WienerHammerstein-v0")
-    assert [read_settings("ppo", other) for other in others] == [amplitude] * 3
+    assert [read_hyperparameters("ppo", other) for other in others] == [amplitude] * 3
     assert (amplitude.features, amplitude.own, amplitude.levels, amplitude.gamma) == (True, True, 2, 1.0)
     assert (amplitude.n_epochs, amplitude.activation) == (PPOSettings().n_epochs, PPOSettings().activation)
     assert (power.levels, short.n_steps, amplitude.hidden) == (5, 48, (128, 128))
-    assert read_settings("ppo", "family").num_envs % LANES == 0
+    assert read_hyperparameters("ppo", "family").num_envs % LANES == 0
     assert TrainConfig(env="duffing_env/Amplitude-v0").hyperparameters == amplitude
 
 
 def test_a_track_goes_before_the_default(tmp_path):
     path = written(tmp_path, "[default]\ntau = 0.01\ngamma = 0.9\nhidden = [8, 4]\n[Short]\ngamma = 1\n")
-    assert read_settings("sac", SHORT, path) == SACSettings(tau=0.01, gamma=1.0, hidden=(8, 4))
-    assert read_settings("sac", "duffing_env/Power-v0", path) == SACSettings(tau=0.01, gamma=0.9, hidden=(8, 4))
+    assert read_hyperparameters("sac", SHORT, path) == SACSettings(tau=0.01, gamma=1.0, hidden=(8, 4))
+    assert read_hyperparameters("sac", "duffing_env/Power-v0", path) == SACSettings(tau=0.01, gamma=0.9, hidden=(8, 4))
     assert TrainConfig(algo="sac", env=SHORT, settings=path).hyperparameters.tau == 0.01
 
 
@@ -82,21 +88,21 @@ def test_hyperparameters_that_are_given_go_before_the_file(tmp_path):
 )
 def test_a_mistake_is_refused_by_name(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
-        read_settings("sac", SHORT, written(tmp_path, text))
+        read_hyperparameters("sac", SHORT, written(tmp_path, text))
 
 
 def test_an_unknown_algorithm_is_refused():
     with pytest.raises(ValueError, match=r"algo must be one of \['ppo', .* but is 'saac'; did you mean 'sac'\?"):
-        read_settings("saac", SHORT)
+        read_hyperparameters("saac", SHORT)
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_what_is_written_is_read(tmp_path, algo):
     settings = replace(ALGORITHMS[algo](), learning_rate=1.2345678901234567e-5, hidden=(3, 2, 1), gamma=1.0)
-    write_settings(tmp_path / "best.toml", SHORT, settings, "a comment")
-    assert read_settings(algo, SHORT, tmp_path / "best.toml") == settings
+    write_hyperparameters(tmp_path / "best.toml", SHORT, settings, "a comment")
+    assert read_hyperparameters(algo, SHORT, tmp_path / "best.toml") == settings
     with pytest.raises(ValueError, match=r"settings must have a table \[Power\] or \[default\].*has \[Short\]"):
-        read_settings(algo, "duffing_env/Power-v0", tmp_path / "best.toml")
+        read_hyperparameters(algo, "duffing_env/Power-v0", tmp_path / "best.toml")
 
 
 @pytest.mark.parametrize("kind", ALGORITHMS.values())
@@ -117,13 +123,13 @@ def test_a_search_stays_within_the_hyperparameters(kind):
     for end in (0, 1):
         found = kind.suggest(Trial(end))
         assert len(found) >= 5
-        assert settings_of(kind, found) != kind()
+        assert parse_hyperparameters(kind, found) != kind()
     assert {"learning_rate", "gamma"} < set(found) < {f.name for f in fields(kind)}
 
 
 def test_the_name_of_a_table_is_that_of_the_track():
-    assert track_of("duffing_env/Amplitude-v0") == "Amplitude-v0"
-    assert track_of("Own-v3") == "Own-v3"
+    assert track_name("duffing_env/Amplitude-v0") == "Amplitude-v0"
+    assert track_name("Own-v3") == "Own-v3"
 
 
 def test_a_rig_is_written_out_so_that_a_run_can_rebuild_itself(tmp_path):
@@ -136,6 +142,6 @@ def test_a_rig_is_written_out_so_that_a_run_can_rebuild_itself(tmp_path):
     path.unlink()
     assert (config.env, config.rig) == ("duffing_env/Rig-v0", None)
     assert config.options == {"horizon": 64, "rig": rig.to_dict()}
-    assert config.hyperparameters == read_settings("ppo", "duffing_env/Rig-v0")
+    assert config.hyperparameters == read_hyperparameters("ppo", "duffing_env/Rig-v0")
     with pytest.raises(FileNotFoundError, match="rig must be a file"):
         TrainConfig(rig=str(path))

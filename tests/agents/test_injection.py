@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 import tables
 
-from agents.cli import told_in_one_line
+from agents.cli import one_line_errors
 from agents.commands import main
-from agents.commands.identify import show as show_identified
-from agents.commands.rig_file import from_record
-from agents.evaluation import board
-from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, save
-from agents.evaluation.leaderboard import print_table
-from agents.evaluation.report import write_report
-from agents.evaluation.rollout import evaluate
-from agents.results import show, table
-from agents.running.experiment import design
+from agents.commands.identify_command import print_identification as show_identified
+from agents.commands.rig_file_builder import rig_text_from_record
+from agents.console_output import format_table, print_texts_and_tables
+from agents.evaluation.comparison_tables import print_comparison_table
+from agents.evaluation.figures import plot_inputs_and_outputs, plot_posterior_contraction, save_png
+from agents.evaluation.html_report import write_html_report
+from agents.evaluation.policy_evaluation import evaluate_policies
+from agents.hardware.next_experiment import design_experiment
+from agents.leaderboard import leaderboard_file
 from agents.training.algorithms import ALGORITHMS
-from agents.training.hyperparameters import write_settings
+from agents.training.hyperparameters import write_hyperparameters
 from estimator import Rig, identify
 from estimator.progress import _bar, progress
 
@@ -64,7 +64,7 @@ class Elements(HTMLParser):
 
 @pytest.fixture(scope="module")
 def evaluation():
-    return evaluate(["uniform"], systems=4, options={"horizon": 8})[0]
+    return evaluate_policies(["uniform"], systems=4, options={"horizon": 8})[0]
 
 
 def test_policies_in_pages_and_figures(evaluation, tmp_path):
@@ -72,10 +72,10 @@ def test_policies_in_pages_and_figures(evaluation, tmp_path):
     settings = {"env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 0, "options": {"own": SHARP}}
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of layouts that have no room
-        write_report(tmp_path / "report.html", named, settings, ["evaluate.py", *SHARP])
-        for figure in (figure_of_contraction(named), figure_of_inputs(named)):
-            save(figure, tmp_path / "figure.png")
-        (legend,) = figure_of_contraction(named).legends
+        write_html_report(tmp_path / "report.html", named, settings, ["evaluate.py", *SHARP])
+        for figure in (plot_posterior_contraction(named), plot_inputs_and_outputs(named)):
+            save_png(figure, tmp_path / "figure.png")
+        (legend,) = plot_posterior_contraction(named).legends
     assert len(legend.get_texts()) == len(SHARP)
     page = Elements((tmp_path / "report.html").read_text())
     assert not page.found & {"script", "img", "b", "onerror"}
@@ -88,8 +88,8 @@ sharp = pytest.mark.parametrize("name", SHARP, ids=lambda name: ascii(name[:24])
 @names
 def test_a_policy_in_tables(name, evaluation, capsys):
     named, other = replace(evaluation, policy=name), replace(evaluation, policy="other")
-    print_table([named, other], "title")
-    show(table(["name"], [[name]]), name)
+    print_comparison_table([named, other], "title")
+    print_texts_and_tables(format_table(["name"], [[name]]), name)
     told = capsys.readouterr().out
     assert is_tame(told)
     if len(name) < 20:
@@ -98,8 +98,8 @@ def test_a_policy_in_tables(name, evaluation, capsys):
 
 @names
 def test_a_name_on_a_board(name, tmp_path, monkeypatch, capsys):
-    (first, *_) = [json.loads(line) for line in board.SHIPPED.read_text().splitlines()][-1:]
-    board.append(tmp_path / "board.jsonl", first | {"name": name, "track": f"duffing_env/{name}"})
+    (first, *_) = [json.loads(line) for line in leaderboard_file.SHIPPED_LEADERBOARD.read_text().splitlines()][-1:]
+    leaderboard_file.append_entry(tmp_path / "board.jsonl", first | {"name": name, "track": f"duffing_env/{name}"})
     assert len((tmp_path / "board.jsonl").read_text().splitlines()) == 1
     main(["report", "--board", str(tmp_path / "board.jsonl"), "--output", str(tmp_path / "board.html")])
     assert is_tame(capsys.readouterr().out)
@@ -108,7 +108,7 @@ def test_a_name_on_a_board(name, tmp_path, monkeypatch, capsys):
 
 @names
 def test_an_error_is_one_line(name, capsys):
-    with pytest.raises(SystemExit) as ended, told_in_one_line("duffing-env"):
+    with pytest.raises(SystemExit) as ended, one_line_errors("duffing-env"):
         raise ValueError(f"rig must be a file, but is {name}")
     assert ended.value.code == 2
     told = capsys.readouterr().err
@@ -146,7 +146,7 @@ def test_a_channel(name, tmp_path):
     rig = Rig.from_dict(described)
     rig.save(tmp_path / "rig.toml")
     assert Rig.from_file(tmp_path / "rig.toml") == rig
-    design(rig, policy="prbs", samples=16).write(tmp_path / "next.csv")
+    design_experiment(rig, policy="prbs", samples=16).write(tmp_path / "next.csv")
     head, *rows = csv.reader((tmp_path / "next.csv").read_text().splitlines())
     assert head == ["time [s]", f"u [{rig.input.unit}]"]
     assert {len(row) for row in rows} == {2}
@@ -179,7 +179,7 @@ def test_a_file(name, tmp_path, capsys):
     if "/" in name or len(name) > 200:
         name = name.replace("/", ":")[:200]
     path = record(tmp_path / f"{name}.csv")
-    text, said = from_record(path)
+    text, said = rig_text_from_record(path)
     assert is_tame(said)
     assert tomllib.loads(text).keys() == {"step", "interpolation", "delay", "input", "output"}
     assert is_tame(text)
@@ -188,6 +188,6 @@ def test_a_file(name, tmp_path, capsys):
     assert not Elements((tmp_path / "page.html").read_text()).found & {"script", "img", "onerror"}
     show_identified(result)
     assert is_tame(capsys.readouterr().out)
-    write_settings(tmp_path / "best.toml", "duffing_env/Short-v0", ALGORITHMS["ppo"](), f"trial 3 of {path}")
+    write_hyperparameters(tmp_path / "best.toml", "duffing_env/Short-v0", ALGORITHMS["ppo"](), f"trial 3 of {path}")
     (found,) = tomllib.loads((tmp_path / "best.toml").read_text()).values()
     assert "learning_rate" in found

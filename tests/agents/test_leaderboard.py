@@ -10,20 +10,25 @@ import pytest
 from tables import table
 
 import agents.evaluation.figures
-import agents.evaluation.rollout
-from agents.evaluation.comparison import compare
-from agents.evaluation.figures import figure_of_contraction, figure_of_inputs, figure_of_learning, save
-from agents.evaluation.leaderboard import (
-    METRICS,
-    leaderboard,
-    print_estimators,
-    print_headline,
-    print_table,
-    summarise,
-    two_way_table,
+import agents.evaluation.policy_evaluation
+from agents.evaluation.comparison import compare_policies
+from agents.evaluation.comparison_tables import (
+    METRIC_COLUMNS,
+    comparison_table,
+    policy_by_estimator_table,
+    print_comparison_table,
+    print_estimator_table,
+    print_headline_table,
+    summarise_metrics,
     write_evaluations,
 )
-from agents.evaluation.rollout import Evaluation
+from agents.evaluation.figures import (
+    plot_inputs_and_outputs,
+    plot_learning_curve,
+    plot_posterior_contraction,
+    save_png,
+)
+from agents.evaluation.policy_evaluation import Evaluation
 from estimator import SAMPLING_STEP
 from estimator.units import VOLTS, Scales
 
@@ -58,7 +63,9 @@ def make_evaluation(policy="policy", *, samples=20, systems=30, seed=0, shift=0.
     rng = np.random.default_rng(seed)
     if not metrics:
         # In units of a hundred at most, so that no cell is wider than its column.
-        metrics = {name: rng.uniform(0, 1, systems) / max(1, metric.scale / 100) for name, metric in METRICS.items()}
+        metrics = {
+            name: rng.uniform(0, 1, systems) / max(1, metric.scale / 100) for name, metric in METRIC_COLUMNS.items()
+        }
         metrics["log_posterior_gain"] = metrics["log_posterior_gain"] + shift
     curve = np.cumsum(rng.normal(1.0, 0.3, (samples + 1, systems)), axis=0) + shift
     inputs, outputs = rng.uniform(-0.1, 0.1, (2, samples, systems))
@@ -66,8 +73,10 @@ def make_evaluation(policy="policy", *, samples=20, systems=30, seed=0, shift=0.
 
 
 def test_every_metric_of_an_evaluation_has_a_column(monkeypatch):
-    monkeypatch.setattr(agents.evaluation.rollout, "record_available", lambda: False)
-    (evaluation,) = agents.evaluation.rollout.evaluate(["uniform"], systems=2, options={"horizon": 5})
+    monkeypatch.setattr(agents.evaluation.policy_evaluation, "record_available", lambda: False)
+    (evaluation,) = agents.evaluation.policy_evaluation.evaluate_policies(
+        ["uniform"], systems=2, options={"horizon": 5}
+    )
     others = {
         "efficiency",
         "certified",
@@ -76,13 +85,13 @@ def test_every_metric_of_an_evaluation_has_a_column(monkeypatch):
         "simulation_rmse",
         "arrow_rmse",
     }
-    assert [*evaluation.metrics] == [name for name in METRICS if name not in others]
-    assert set(CONSTANTS) == set(METRICS)
+    assert [*evaluation.metrics] == [name for name in METRIC_COLUMNS if name not in others]
+    assert set(CONSTANTS) == set(METRIC_COLUMNS)
 
 
 def test_centres_are_means_and_medians():
     values = np.array([1.0, 2.0, 3.0, 10.0, 100.0])
-    summary = summarise(make_evaluation(**dict.fromkeys(METRICS, values)))
+    summary = summarise_metrics(make_evaluation(**dict.fromkeys(METRIC_COLUMNS, values)))
     medians = {"error_m", "error_c", "error_a", "error_b", "silverbox_equivalent", "simulation_rmse", "arrow_rmse"}
     medians |= {"full_peak_equivalent"}
     for name, entry in summary.items():
@@ -96,7 +105,7 @@ def test_centres_are_means_and_medians():
 
 @table("seed", range(5))
 def test_intervals_contain_the_centre(seed):
-    for name, entry in summarise(make_evaluation(seed=seed, systems=12)).items():
+    for name, entry in summarise_metrics(make_evaluation(seed=seed, systems=12)).items():
         center = entry.get("mean", entry.get("median"))
         assert entry["low"] <= center <= entry["high"], name
         assert entry["low"] < entry["high"]
@@ -107,7 +116,9 @@ def test_intervals_cover_the_mean_at_about_their_rate():
     repetitions, systems, mean = 400, 60, 2.0
     covered, widths = 0, []
     for _ in range(repetitions):
-        entry = summarise(make_evaluation(log_posterior_gain=rng.gamma(4.0, mean / 4.0, systems)))["log_posterior_gain"]
+        entry = summarise_metrics(make_evaluation(log_posterior_gain=rng.gamma(4.0, mean / 4.0, systems)))[
+            "log_posterior_gain"
+        ]
         covered += entry["low"] <= mean <= entry["high"]
         widths.append(entry["high"] - entry["low"])
     # A percentile interval of 60 values covers a little below 95 %; three standard errors are 3.3 %.
@@ -118,7 +129,7 @@ def test_intervals_cover_the_mean_at_about_their_rate():
 def test_the_interval_is_a_percentile_bootstrap_and_reproducible():
     values = np.random.default_rng(1).normal(size=50)
     evaluation = make_evaluation(coverage=values)
-    first, again, other = (summarise(evaluation, seed)["coverage"] for seed in (0, 0, 1))
+    first, again, other = (summarise_metrics(evaluation, seed)["coverage"] for seed in (0, 0, 1))
     assert first == again != other
     rng = np.random.default_rng(2)
     means = values[rng.integers(0, 50, (20_000, 50))].mean(axis=1)
@@ -127,7 +138,7 @@ def test_the_interval_is_a_percentile_bootstrap_and_reproducible():
 
 
 def test_a_constant_metric_has_an_interval_of_width_zero():
-    assert summarise(make_evaluation(ended_early=np.zeros(9), error_m=np.full(9, 0.25))) == {
+    assert summarise_metrics(make_evaluation(ended_early=np.zeros(9), error_m=np.full(9, 0.25))) == {
         "ended_early": {"mean": 0.0, "low": 0.0, "high": 0.0},
         "error_m": {"median": 0.25, "low": 0.25, "high": 0.25},
     }
@@ -140,7 +151,7 @@ def test_of_several_seeds_the_centre_is_the_interquartile_mean(capsys):
     gained = 20 + difficulty + np.arange(seeds)[:, None] + 0.1 * rng.normal(size=(seeds, systems))
     early = (rng.uniform(size=(seeds, systems)) < 0.05).astype(float)
     group = replace(make_evaluation("ppo", log_posterior_gain=gained.ravel(), ended_early=early.ravel()), seeds=seeds)
-    entry = summarise(group)["log_posterior_gain"]
+    entry = summarise_metrics(group)["log_posterior_gain"]
     assert set(entry) == {"iqm", "low", "high", "seeds", "median_of_seeds"}
     ordered = np.sort(gained.ravel())
     assert entry["iqm"] == pytest.approx(ordered[75:225].mean())
@@ -150,9 +161,9 @@ def test_of_several_seeds_the_centre_is_the_interquartile_mean(capsys):
     resampled = [np.sort(gained[:, rng.integers(0, systems, systems)].ravel())[75:225].mean() for _ in range(4000)]
     assert (entry["low"], entry["high"]) == pytest.approx(tuple(np.percentile(resampled, [2.5, 97.5])), abs=0.05)
     # An interquartile mean of rare events would be 0.
-    assert summarise(group)["ended_early"]["mean"] == pytest.approx(early.mean()) != 0
+    assert summarise_metrics(group)["ended_early"]["mean"] == pytest.approx(early.mean()) != 0
     capsys.readouterr()
-    print_table([group, make_evaluation("uniform", log_posterior_gain=np.zeros(3))], "a title")
+    print_comparison_table([group, make_evaluation("uniform", log_posterior_gain=np.zeros(3))], "a title")
     printed = capsys.readouterr().out
     assert "ppo (5 seeds)" in printed
     assert f"median seed {entry['median_of_seeds']:.2f}" in printed
@@ -161,11 +172,11 @@ def test_of_several_seeds_the_centre_is_the_interquartile_mean(capsys):
 
 def test_diverged_free_runs_make_the_interval_infinite_not_the_median():
     values = np.append(np.linspace(1.0, 2.0, 13), [np.inf] * 8)
-    entry = summarise(make_evaluation(arrow_rmse=values))["arrow_rmse"]
+    entry = summarise_metrics(make_evaluation(arrow_rmse=values))["arrow_rmse"]
     assert entry["median"] == values[10]
     assert 1.0 < entry["low"] < entry["median"]
     assert entry["high"] == np.inf
-    assert summarise(make_evaluation(arrow_rmse=np.full(4, np.inf)))["arrow_rmse"] == {
+    assert summarise_metrics(make_evaluation(arrow_rmse=np.full(4, np.inf)))["arrow_rmse"] == {
         "median": np.inf, "low": np.inf, "high": np.inf,
     }  # fmt: skip
 
@@ -177,7 +188,7 @@ def _rows(lines, border):
 def table_of(capsys, *evaluations):
     """The printed table: titles to lists of cells (centre, interval), by column; and the column heads."""
     capsys.readouterr()
-    print_table(list(evaluations), "a title")
+    print_comparison_table(list(evaluations), "a title")
     lines = capsys.readouterr().out.splitlines()
     assert any("a title" in line for line in lines)
     assert max(map(len, lines)) <= 80
@@ -205,18 +216,18 @@ def test_the_two_way_table_has_a_row_for_each_policy_and_estimator(capsys):
     names = ("error_m", "error_c", "error_a", "error_b", "coverage", "nees")
     found = {name: np.array([0.01, 0.02, 0.06]) for name in (*names, "coverage_50")}
     evaluations = [
-        replace(make_evaluation(policy), estimators={"structured": found, "mean_field": found})
+        replace(make_evaluation(policy), estimator_metrics={"structured": found, "mean_field": found})
         for policy in ("one", "two")
     ]
-    print_estimators(evaluations)
+    print_estimator_table(evaluations)
     printed = capsys.readouterr().out
     assert "what other estimators make of the same inputs and outputs" in printed
-    heads, rows = two_way_table(evaluations)
-    assert heads[2:] == [METRICS[name].title for name in names]
+    heads, rows = policy_by_estimator_table(evaluations)
+    assert heads[2:] == [METRIC_COLUMNS[name].title for name in names]
     assert all(cell in printed for row in rows for cell in row)
     assert [row[:2] for row in rows] == [[p, e] for p in ("one", "two") for e in ("structured", "mean field")]
     assert {tuple(row[2:]) for row in rows} == {("2.000", "2.00", "2.000", "2.00", "3.0", "0.03")}
-    print_estimators([make_evaluation("without")])
+    print_estimator_table([make_evaluation("without")])
     assert capsys.readouterr().out == ""
 
 
@@ -225,20 +236,20 @@ def test_a_rigs_table_and_figure_are_in_its_units():
     values = {"input_power": [90.25, 110.25], "input_peak": [19.0, 20.0], "log_posterior_gain": [1.0, 2.0]}
     told = {name: np.array(value) for name, value in values.items()}
     evaluation = replace(make_evaluation(systems=2, **told), scales=newtons)
-    _, rows = leaderboard([evaluation])
+    _, rows = comparison_table([evaluation])
     cells = {title: cell.split("\n")[0] for title, cell in rows}
     assert cells["input power / N²"] == "100.2"
     assert cells["input peak / N"] == "19.5"
-    u, y, spectrum = figure_of_inputs([evaluation]).axes
+    u, y, spectrum = plot_inputs_and_outputs([evaluation]).axes
     assert [axes.get_ylabel() for axes in (u, y, spectrum)] == ["u / N", "y / m", "|U| / N"]
     np.testing.assert_allclose(u.lines[0].get_ydata(), 20.0 * evaluation.inputs[:, 0])
     np.testing.assert_allclose(y.lines[0].get_ydata(), 0.03 * evaluation.outputs[:, 0])
     np.testing.assert_allclose(u.lines[0].get_xdata(), np.arange(20))  # ms
-    near, far, _ = figure_of_inputs([replace(evaluation, limits=(0.12, 0.6))]).axes  # signals reach 0.1
+    near, far, _ = plot_inputs_and_outputs([replace(evaluation, limits=(0.12, 0.6))]).axes  # signals reach 0.1
     (lines,) = near.collections
     np.testing.assert_allclose([segment[:, 1] for segment in lines.get_segments()], [[-2.4, -2.4], [2.4, 2.4]])
     assert not far.collections
-    in_volts = figure_of_inputs([replace(evaluation, scales=VOLTS)]).axes[2].lines[0].get_ydata()
+    in_volts = plot_inputs_and_outputs([replace(evaluation, scales=VOLTS)]).axes[2].lines[0].get_ydata()
     np.testing.assert_allclose(spectrum.lines[0].get_ydata(), 20.0 * 1e-3 * in_volts)
 
 
@@ -248,7 +259,7 @@ def test_the_best_policy_comes_first(capsys):
     head, cells = table_of(capsys, *evaluations)
     assert head == ["best", "middle", "worst"]
     centers = [float(center) for center, _ in cells["log posterior gain / nat"]]
-    by_name = {evaluation.policy: summarise(evaluation) for evaluation in evaluations}
+    by_name = {evaluation.policy: summarise_metrics(evaluation) for evaluation in evaluations}
     assert centers == pytest.approx([by_name[policy]["log_posterior_gain"]["mean"] for policy in head], abs=0.005)
     for policy, (center, interval) in zip(head, cells["error of b / %"], strict=True):
         low, high = map(float, interval.strip("[]").split(", "))
@@ -281,7 +292,7 @@ def test_ten_columns_are_not_cut(capsys):
 def test_the_chief_figures_are_a_line_for_each_policy(capsys):
     metrics = {name: np.full(3, value) for name, (value, _, _) in CONSTANTS.items()}
     trained = "runs/ppo-amplitude-v0-12"
-    print_headline([make_evaluation(trained, **metrics), make_evaluation("prbs", **metrics)], "a title")
+    print_headline_table([make_evaluation(trained, **metrics), make_evaluation("prbs", **metrics)], "a title")
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     rows = [line.split() for line in lines if line.startswith((trained, "prbs"))]
@@ -305,7 +316,7 @@ def test_json_is_valid_and_complete(tmp_path):
     assert written["settings"] == settings
     assert list(written["policies"]) == ["one", "two"]
     for evaluation in evaluations:
-        assert written["policies"][evaluation.policy] == {**summarise(evaluation), "estimators": {}}
+        assert written["policies"][evaluation.policy] == {**summarise_metrics(evaluation), "estimators": {}}
 
 
 def test_json_stays_valid_where_a_figure_is_infinite(tmp_path):
@@ -328,7 +339,9 @@ def check_picture(path, width, height, colours=1):
 
 
 def test_compare_writes_what_it_prints(tmp_path, capsys):
-    evaluations = compare(["uniform", "prbs"], "duffing_env/Amplitude-v0", 4, {"horizon": 30}, tmp_path / "out", seed=5)
+    evaluations = compare_policies(
+        ["uniform", "prbs"], "duffing_env/Amplitude-v0", 4, {"horizon": 30}, tmp_path / "out", seed=5
+    )
     printed = capsys.readouterr().out
     assert "duffing_env/Amplitude-v0, 4 systems" in printed
     folder = tmp_path / "out"
@@ -340,10 +353,12 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
     assert written["settings"] == {
         "env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 5, "options": {"horizon": 30},
     }  # fmt: skip
-    again = agents.evaluation.rollout.evaluate(["uniform", "prbs"], systems=4, seed=5, options={"horizon": 30})
+    again = agents.evaluation.policy_evaluation.evaluate_policies(
+        ["uniform", "prbs"], systems=4, seed=5, options={"horizon": 30}
+    )
     for evaluation, repeated in zip(evaluations, again, strict=True):
         timed = {"estimators": ANY, "decision_time": ANY}
-        assert written["policies"][evaluation.policy] == {**summarise(repeated), **timed}
+        assert written["policies"][evaluation.policy] == {**summarise_metrics(repeated), **timed}
     check_picture(folder / "contraction.png", 900, 566, colours=2)
     check_picture(folder / "excitations.png", 1440, 480, colours=2)
 
@@ -351,13 +366,13 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
 @table("policies", [1, 10])
 def test_contraction_shows_the_quartiles_of_every_policy(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
-    figure = figure_of_contraction(evaluations, "title")
+    figure = plot_posterior_contraction(evaluations, "title")
     (axes,), (legend,) = figure.axes, figure.legends
     assert axes.get_title() == "title"
     assert "nat" in axes.get_ylabel()
     assert [text.get_text() for text in legend.get_texts()] == [str(i) for i in range(policies)]
     for line, band, evaluation in zip(axes.lines, axes.collections, evaluations, strict=True):
-        ordered = np.sort(evaluation.curve, axis=1)
+        ordered = np.sort(evaluation.gain_curve, axis=1)
         np.testing.assert_array_equal(line.get_xdata(), np.arange(21))
         np.testing.assert_allclose(line.get_ydata(), (ordered[:, 14] + ordered[:, 15]) / 2)
         edges = band.get_paths()[0].vertices[:, 1]
@@ -366,7 +381,7 @@ def test_contraction_shows_the_quartiles_of_every_policy(policies):
 
 
 def test_contraction_shows_losses_too():
-    gains, losses = (figure_of_contraction([make_evaluation(shift=shift)]).axes[0] for shift in (0.0, -40.0))
+    gains, losses = (plot_posterior_contraction([make_evaluation(shift=shift)]).axes[0] for shift in (0.0, -40.0))
     assert gains.get_ylim()[0] == 0.0
     low, high = losses.get_ylim()
     assert low < high
@@ -376,7 +391,7 @@ def test_contraction_shows_losses_too():
 @table("policies", [1, 10])
 def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
-    panels = figure_of_inputs(evaluations).axes
+    panels = plot_inputs_and_outputs(evaluations).axes
     assert len(panels) == 3 * policies
     for row, evaluation in enumerate(evaluations):
         left, middle, right = panels[3 * row : 3 * row + 3]
@@ -396,7 +411,7 @@ def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(poli
 @table("updates", [1, 2, 30])
 def test_learning_curve_shows_returns_over_samples(updates):
     curve = [(4096 * (i + 1), 0.5 * i + 0.1, np.nan if i == 0 else float(i)) for i in range(updates)]
-    axes = figure_of_learning(curve, "information_gain").axes[0]
+    axes = plot_learning_curve(curve, "information_gain").axes[0]
     np.testing.assert_allclose(axes.lines[0].get_xdata(), 4096e-6 * np.arange(1, updates + 1))
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), [point[2] for point in curve])
     assert axes.get_ylabel() == "mean return: information gain"
@@ -404,10 +419,10 @@ def test_learning_curve_shows_returns_over_samples(updates):
 
 def test_pictures_are_written(tmp_path):
     curve = [(4096 * (i + 1), 0.5 * i + 0.1, float(i)) for i in range(9)]
-    save(figure_of_learning(curve, "information_gain"), tmp_path / "curve.png")
+    save_png(plot_learning_curve(curve, "information_gain"), tmp_path / "curve.png")
     check_picture(tmp_path / "curve.png", 840, 480)
     evaluations = [make_evaluation(str(i), seed=i, shift=3.0 * i) for i in range(4)]
-    save(figure_of_contraction(evaluations, "title"), tmp_path / "contraction.png")
+    save_png(plot_posterior_contraction(evaluations, "title"), tmp_path / "contraction.png")
     check_picture(tmp_path / "contraction.png", 900, 592, colours=4)  # two lines of names
-    save(figure_of_inputs(evaluations), tmp_path / "excitations.png")
+    save_png(plot_inputs_and_outputs(evaluations), tmp_path / "excitations.png")
     check_picture(tmp_path / "excitations.png", 1440, 864, colours=4)

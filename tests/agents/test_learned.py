@@ -16,7 +16,7 @@ from tables import table
 
 import agents
 from agents import make_policy
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.policies.learned import CARD, WEIGHTS, load_policy
 from agents.policies.saving import save_policy
 from agents.training import ALGORITHMS
@@ -446,7 +446,7 @@ def test_the_search_for_unpicklers_finds_them(source):
 @pytest.mark.parametrize("name", ["ppo/drift", "ppo/short"])  # of the others: tests/research/test_ship.py
 def test_a_policy_that_ships_does_what_its_card_says(name):
     card = make_policy(name).card
-    (evaluation,) = evaluate([name], card["config"]["env"], systems=32)
+    (evaluation,) = evaluate_policies([name], card["config"]["env"], systems=32)
     # Of several training seeds the card tells all, and which of them ships.
     place = card["seeds"].index(card["shipped"]["seed"])
     for metric, slack in (("information_gain", 0.05), ("coverage", 0.02)):

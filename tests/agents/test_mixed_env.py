@@ -7,15 +7,15 @@ import pytest
 from tables import table
 
 from agents.training import PPOSettings, TrainConfig, resume, train
-from agents.training.family import draw_rig
-from agents.training.feature_env import SCALE
-from agents.training.mixed_env import MixedVecEnv, draw_options
+from agents.training.environments.feature_vec_env import REWARD_SCALE
+from agents.training.environments.mixed_vec_env import MixedVecEnv, draw_track_options
+from agents.training.environments.oscillator_family import draw_rig_track
 from estimator.lanes import LANES
 
 TRACK = "duffing_env/Power-v0"
 LENGTHS = {"horizon": [16, 64]}
 RANGES = {"max_rms": [0.01, 0.1], **LENGTHS}
-DRAW = partial(draw_options, env_id=TRACK, options={}, ranges=RANGES)
+DRAW = partial(draw_track_options, env_id=TRACK, options={}, ranges=RANGES)
 TINY = PPOSettings(num_envs=LANES, n_steps=8, batch_size=64, hidden=(4,))
 
 
@@ -34,7 +34,7 @@ def test_options_are_drawn_over_their_whole_range():
 
 
 def test_every_group_has_its_own_options_and_draws_anew():
-    envs = MixedVecEnv(4 * LANES, 3, DRAW, own=True)
+    envs = MixedVecEnv(4 * LANES, 3, DRAW, raw_observation=True)
     lengths = [group.envs.horizon for group in envs._groups]
     assert len(set(lengths)) > 1
     envs.reset()
@@ -52,20 +52,22 @@ def test_every_group_has_its_own_options_and_draws_anew():
 @table("track", [TRACK, "duffing_env/Amplitude-v0"])
 def test_an_episode_adds_up_to_what_it_gained(track):
     """What is still to come adds its potential, where the energy has no limit, once to every episode of a group."""
-    envs = MixedVecEnv(LANES, 5, partial(draw_options, env_id=track, options={}, ranges=LENGTHS), own=True)
+    envs = MixedVecEnv(
+        LANES, 5, partial(draw_track_options, env_id=track, options={}, ranges=LENGTHS), raw_observation=True
+    )
     envs.reset()
-    to_come = (track != TRACK) * envs._groups[0].shown.to_come
+    to_come = (track != TRACK) * envs._groups[0].current_features.to_come
     total = np.zeros(LANES)
     for _ in range(envs._groups[0].envs.horizon):
         _, rewards, dones, infos = envs.step(np.zeros((LANES, 1)))
         total += rewards
     assert dones.all()
     gained = np.array([info["episode"]["r"] for info in infos])
-    assert total == pytest.approx(SCALE * (gained - to_come), abs=2e-3)
+    assert total == pytest.approx(REWARD_SCALE * (gained - to_come), abs=2e-3)
     envs.close()
 
 
-@pytest.mark.parametrize("draw", [DRAW, draw_rig], ids=["track", "family"])
+@pytest.mark.parametrize("draw", [DRAW, draw_rig_track], ids=["track", "family"])
 def test_the_same_seed_gives_the_same_episodes(draw):
     def episodes(seed):
         envs = MixedVecEnv(LANES, seed, draw)

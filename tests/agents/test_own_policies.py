@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNorm
 from tables import table
 
 from agents import make_policy, save_policy
-from agents.evaluation.protocol import fingerprint
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.policy_evaluation import evaluate_policies
+from agents.leaderboard.protocol import policy_fingerprint
 from agents.policies.learned import load_policy
 from agents.training import TrainConfig, train
 from agents.training.algorithms import PPOSettings
@@ -94,21 +94,21 @@ def test_policies_in_a_file_are_found_by_module_and_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "laboratory.py").write_text("def push(seen):\n    return seen[:, 0] * 0 + 1\n")
-    (push,) = evaluate(["laboratory:push"], **SHORT)
-    (named,) = evaluate([Push(0)], **SHORT)
+    (push,) = evaluate_policies(["laboratory:push"], **SHORT)
+    (named,) = evaluate_policies([Push(0)], **SHORT)
     assert (push.policy, named.policy) == ("laboratory:push", "Push")
     np.testing.assert_array_equal(push.inputs, named.inputs)
     with pytest.raises(ValueError, match="laboratory has no 'pull'"):
         make_policy("laboratory:pull")
     with pytest.raises(ValueError, match="policies must differ by their names"):
-        evaluate([Push(0), Push(1)], **SHORT)
+        evaluate_policies([Push(0), Push(1)], **SHORT)
 
 
 def test_a_policy_of_an_observation_by_a_function_says_what_it_needs(tmp_path):
     env = gym.make("duffing_env/Short-v0", observation=lambda beliefs: beliefs.coefficients_mean)
     save_policy(tmp_path / "mine", PPO("MlpPolicy", env, device="cpu"))
     with pytest.raises(ValueError, match=r"make it with the option observation=your function$"):
-        evaluate([str(tmp_path / "mine")], **SHORT)
+        evaluate_policies([str(tmp_path / "mine")], **SHORT)
 
 
 class Forgetful:
@@ -128,9 +128,9 @@ class Picky:
 def test_what_a_policy_refuses_is_told_with_its_name(monkeypatch):
     told = r"policy Forgetful must have predict\(observation, .*, but its predict is \(observation, state=None\)"
     with pytest.raises(ValueError, match=told):
-        evaluate([Forgetful()], **SHORT)
+        evaluate_policies([Forgetful()], **SHORT)
     with pytest.raises(ValueError, match="policy Picky does not play duffing_env/Short-v0: observation must have 35"):
-        evaluate([Picky()], **SHORT)
+        evaluate_policies([Picky()], **SHORT)
 
 
 @table(
@@ -146,7 +146,7 @@ def test_whose_actions_are_none_is_told_with_its_name(actions, told):
             return actions, state
 
     with pytest.raises(ValueError, match=f"policy Broken does not play duffing_env/Short-v0: actions {told}"):
-        evaluate([Broken(0.5)], **SHORT)
+        evaluate_policies([Broken(0.5)], **SHORT)
 
 
 def normalised_model(kind=PPO, **settings):
@@ -364,7 +364,7 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, kind):
 def test_a_network_for_other_observations_is_told_with_its_name():
     told = r"policy Sequential does not play duffing_env/Short-v0: it must take observations of shape \(4, 22\), but"
     with pytest.raises(ValueError, match=told):
-        evaluate([torch.nn.Sequential(torch.nn.Linear(10, 1))], **SHORT)
+        evaluate_policies([torch.nn.Sequential(torch.nn.Linear(10, 1))], **SHORT)
 
 
 HISTORY = {"observation": "history", "history": 10}
@@ -389,8 +389,8 @@ def test_a_policy_plays_the_observation_that_it_learned_from(tmp_path, how):
         r"mine: env must show the observation 'history', which the policy learned from, but shows 'posterior'; make it"
     )
     with pytest.raises(ValueError, match=told):
-        evaluate([mine], **SHORT)
-    (found,) = evaluate([mine], SHORT["env_id"], 4, options={"horizon": 6, **HISTORY})
+        evaluate_policies([mine], **SHORT)
+    (found,) = evaluate_policies([mine], SHORT["env_id"], 4, options={"horizon": 6, **HISTORY})
     assert np.isfinite(found.inputs).all()
 
 
@@ -399,7 +399,7 @@ def test_a_policy_of_the_posterior_does_not_play_a_history(tmp_path):
     assert make_policy(tmp_path / "mine").card["observation"] == "posterior"
     for name in (str(tmp_path / "mine"), "ppo/short"):
         with pytest.raises(ValueError, match="must show the observation 'posterior', which the policy learned from"):
-            evaluate([name], SHORT["env_id"], 4, options=HISTORY)
+            evaluate_policies([name], SHORT["env_id"], 4, options=HISTORY)
 
 
 def everything(folder):
@@ -530,10 +530,10 @@ def test_what_is_no_policy_is_refused_in_a_sentence(policy, message, tmp_path, m
     (tmp_path / "needing_of_tests.py").write_text("import no_such_package\n")
     (tmp_path / "failing_of_tests.py").write_text("def policy(seen):\n    return {}['gone']\n")
     with pytest.raises(ValueError, match=re.escape(message)):
-        evaluate([policy], **SHORT)
+        evaluate_policies([policy], **SHORT)
 
 
 def test_an_object_of_a_module_has_the_fingerprint_of_its_class(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "object_of_tests.py").write_text("class Still:\n    predict = None\npolicy = Still()\n")
-    assert fingerprint("object_of_tests:policy") == fingerprint("object_of_tests:Still") != ""
+    assert policy_fingerprint("object_of_tests:policy") == policy_fingerprint("object_of_tests:Still") != ""

@@ -10,8 +10,8 @@ import pytest
 from tables import table
 
 from agents.commands import main
-from agents.evaluation import board, protocol
 from agents.evaluation.oracle import Oracle, Systems
+from agents.leaderboard import leaderboard_file, protocol
 from agents.policies import POLICIES
 
 SHORT = "duffing_env/Short-v0"
@@ -23,7 +23,7 @@ def entry():
     """What uniform noise is worth, on few systems."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "SYSTEMS", 8)
-        return protocol.measure("uniform", SHORT, "noise")
+        return protocol.measure_policy("uniform", SHORT, "noise")
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_a_policy_of_one_s_own_reaches_the_board_with_one_command(command, tmp_p
     status, told, messages = command(*words)
     assert status == 0, messages
     assert "push is on the board runs/leaderboard.jsonl" in told
-    (entry,) = board.read(tmp_path / "runs/leaderboard.jsonl")
+    (entry,) = leaderboard_file.read_entries(tmp_path / "runs/leaderboard.jsonl")
     assert (entry["name"], entry["track"], entry["budget"], entry["seeds"]) == ("push", SHORT, "0.1M", 1)
     assert entry["policies"]["lab:push"].startswith("sha256:")
     assert 0 < entry["score"]["low"] <= entry["score"]["iqm"] <= entry["score"]["high"] < 1
@@ -67,11 +67,11 @@ def test_what_the_protocol_fixes_may_be_said(command, entry, monkeypatch):
 
 def test_the_score_is_against_the_bound_where_there_is_one(entry):
     oracle = Oracle.of(Systems.of(SHORT, 8))
-    evaluation = protocol._evaluation("uniform", SHORT, {"branch": "test"}, lambda share, at="": None)
+    evaluation = protocol._evaluate_on_track("uniform", SHORT, {"branch": "test"}, lambda share, at="": None)
     rows = np.swapaxes(evaluation.outputs, 0, 1)[:8]
     best, least = oracle.efficiency(evaluation.inputs.T[:8], rows)
     certified = np.isfinite(oracle.bounds)
-    score = protocol._score(evaluation, oracle)
+    score = protocol._efficiency_scores(evaluation, oracle)
     assert certified.any()
     np.testing.assert_array_equal(score[certified], least[certified])
     np.testing.assert_array_equal(score[~certified], best[~certified])
@@ -82,16 +82,16 @@ def test_the_score_is_against_the_bound_where_there_is_one(entry):
 
 def test_what_is_measured_twice_is_the_same(entry, monkeypatch):
     monkeypatch.setattr(protocol, "SYSTEMS", 8)
-    again = protocol.measure("uniform", SHORT, "noise")
+    again = protocol.measure_policy("uniform", SHORT, "noise")
     for part in (entry, again):
         part["metrics"].pop("decision_time", None)
     assert again == entry
 
 
-@table("track", protocol.TRACKS)
+@table("track", protocol.PROTOCOL_TRACKS)
 def test_shifted_sets_are_other_sets(track):
     usual = gym.spec(track).kwargs
-    for env_id, options in protocol.shifts_of(track).values():
+    for env_id, options in protocol.shifted_test_sets(track).values():
         assert env_id != track or any(usual.get(name) != value for name, value in options.items())
         gym.make_vec(env_id, num_envs=2, vectorization_mode="vector_entry_point", branch="test", **options)
 
@@ -109,7 +109,7 @@ def test_shifted_sets_are_other_sets(track):
     ],
 )
 def test_budgets(samples, budget):
-    assert protocol._budget(samples) == budget
+    assert protocol._budget_name(samples) == budget
 
 
 @table(
@@ -140,27 +140,27 @@ def test_what_is_no_submission_is_refused(command, words, message, tmp_path):
 
 
 def test_blanks_around_a_name_do_not_make_it_another(tmp_path, monkeypatch, entry):
-    monkeypatch.setattr(board, "SHIPPED", tmp_path / "shipped.jsonl")
-    board.append(board.SHIPPED, entry | {"name": " push "})
+    monkeypatch.setattr(leaderboard_file, "SHIPPED", tmp_path / "shipped.jsonl")
+    leaderboard_file.append_entry(leaderboard_file.SHIPPED_LEADERBOARD, entry | {"name": " push "})
     for name in ("push", "push "):
         with pytest.raises(ValueError, match="which the board that ships has; name another"):
-            board.check(tmp_path / "board.jsonl", name)
+            leaderboard_file.check_new_entry(tmp_path / "board.jsonl", name)
 
 
 @table("steps", [-5, "many", 1.5, None])
 def test_steps_of_a_card_that_are_no_number_of_samples_are_refused(tmp_path, steps):
     (tmp_path / "policy.json").write_text(json.dumps({"steps": steps}))
     with pytest.raises(ValueError, match=r"steps of .*policy.json must be a whole number from 0 to .*, but is"):
-        protocol.measure(str(tmp_path), SHORT, "mine")
+        protocol.measure_policy(str(tmp_path), SHORT, "mine")
 
 
 def test_the_latest_entry_of_a_name_counts(monkeypatch, tmp_path, entry):
     path = tmp_path / "made" / "board.jsonl"
     for seeds in (1, 2):
-        board.append(path, entry | {"seeds": seeds})
-    board.append(path, entry | {"name": "other", "protocol": 0})
-    monkeypatch.setattr(board, "digest", None)  # to read is not to compare with the oracles
-    (found,) = board.read(path)
+        leaderboard_file.append_entry(path, entry | {"seeds": seeds})
+    leaderboard_file.append_entry(path, entry | {"name": "other", "protocol": 0})
+    monkeypatch.setattr(leaderboard_file, "digest", None)  # to read is not to compare with the oracles
+    (found,) = leaderboard_file.read_entries(path)
     assert found["seeds"] == 2
 
 
@@ -169,18 +169,18 @@ def test_a_broken_board_is_told(tmp_path, entry, line):
     path = tmp_path / "board.jsonl"
     path.write_text(json.dumps(entry) + "\n" + line + "\n")
     with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:2 is not one"):
-        board.read(path)
+        leaderboard_file.read_entries(path)
     path.write_bytes(json.dumps({**entry, "reference": {}}).encode() + b"\n\xff\n")
     with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:1 is not one"):
-        board.read(path)
+        leaderboard_file.read_entries(path)
 
 
 def test_an_entry_begins_a_line(tmp_path, entry):
     path = tmp_path / "board.jsonl"
     path.write_text(json.dumps(entry))  # as some editors leave it
-    board.append(path, entry | {"name": "other"})
-    board.append(path, entry | {"name": "third"})
-    assert [found["name"] for found in board.read(path)] == ["noise", "other", "third"]
+    leaderboard_file.append_entry(path, entry | {"name": "other"})
+    leaderboard_file.append_entry(path, entry | {"name": "third"})
+    assert [found["name"] for found in leaderboard_file.read_entries(path)] == ["noise", "other", "third"]
     assert path.read_text().count("\n") == 3
 
 
@@ -190,7 +190,7 @@ def test_names_of_the_board_that_ships_are_taken(command, tmp_path):
     assert status == 2
     assert "submit must be a name of your own, but is efe, which the board that ships has; name another" in messages
     assert list(tmp_path.iterdir()) == []
-    assert board.check(board.SHIPPED, "efe") == {SHORT}
+    assert leaderboard_file.check_new_entry(leaderboard_file.SHIPPED_LEADERBOARD, "efe") == {SHORT}
 
 
 def test_a_name_that_is_submitted_twice_is_told(tmp_path, command, entry, monkeypatch):
@@ -223,7 +223,7 @@ def test_a_board_is_looked_at_before_the_measurement(command, monkeypatch, tmp_p
 
 def _append(path, entry, name):
     for k in range(50):
-        board.append(path, entry | {"name": f"{name}-{k}"})
+        leaderboard_file.append_entry(path, entry | {"name": f"{name}-{k}"})
 
 
 def test_two_programs_may_add_at_once(tmp_path, entry):
@@ -234,11 +234,11 @@ def test_two_programs_may_add_at_once(tmp_path, entry):
         writer.start()
     for writer in writers:
         writer.join()
-    assert len(board.read(path)) == 100
+    assert len(leaderboard_file.read_entries(path)) == 100
 
 
 def test_the_board_that_ships_is_of_what_ships():
-    entries = board.read(board.SHIPPED)
+    entries = leaderboard_file.read_entries(leaderboard_file.SHIPPED_LEADERBOARD)
     shown = {entry["name"] for entry in entries if entry["track"] == SHORT}
     assert {"ppo/short", "shield", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
     for entry in entries:
@@ -246,12 +246,12 @@ def test_the_board_that_ships_is_of_what_ships():
         assert (entry["budget"] == "none") == (entry["name"] in POLICIES), entry["name"]
         for policy, found in entry["policies"].items():
             if policy in protocol.trained_policies():
-                assert found == protocol.fingerprint(policy), policy
+                assert found == protocol.policy_fingerprint(policy), policy
 
 
 def test_a_score_against_another_oracle_is_marked(entry, monkeypatch):
-    ((row,),) = board.tables([entry]).values()
+    ((row,),) = leaderboard_file.leaderboard_rows([entry]).values()
     assert "*" not in row[1]
-    monkeypatch.setattr(board, "stored_oracles", set)
-    ((row,),) = board.tables([entry]).values()
+    monkeypatch.setattr(leaderboard_file, "stored_oracle_digests", set)
+    ((row,),) = leaderboard_file.leaderboard_rows([entry]).values()
     assert row[1].endswith("] *")

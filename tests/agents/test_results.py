@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from agents.cli import told_in_one_line
-from agents.results import say, show, table
+from agents.cli import one_line_errors
+from agents.console_output import format_table, print_texts_and_tables, print_wrapped
 
 WORDS = [f"column {i} of many" for i in range(30)]
 
@@ -17,7 +17,7 @@ WORDS = [f"column {i} of many" for i in range(30)]
 def test_a_table_that_is_too_wide_is_several_with_the_same_labels(capsys, monkeypatch, columns, markdown):
     monkeypatch.setenv("COLUMNS", columns)
     rows = [["first", *["a value that is long"] * 29], ["a policy with a name " * 9, *map(str, range(1000, 1029))]]
-    show(table(WORDS, rows, markdown=markdown, title="once"))
+    print_texts_and_tables(format_table(WORDS, rows, markdown=markdown, title="once"))
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= min(80, int(columns))
     told = "\n".join(lines)
@@ -30,7 +30,7 @@ def test_a_table_that_is_too_wide_is_several_with_the_same_labels(capsys, monkey
 
 def test_a_text_is_broken_between_words_and_a_path_is_not(capsys):
     path = "/" + "folder-of-a-run/" * 8
-    say("word " * 40 + path + "\n  indented")
+    print_wrapped("word " * 40 + path + "\n  indented")
     *words, whole, last = capsys.readouterr().out.splitlines()
     assert " ".join(words) == ("word " * 40).strip()
     assert max(map(len, words)) <= 80
@@ -42,8 +42,8 @@ def test_letters_that_an_encoding_lacks_are_spelled(encoding, monkeypatch):
     text = "m x'' + b x³ ± γ N s²/mm é 語 …"
     stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
     monkeypatch.setattr(sys, "stdout", stream)
-    with told_in_one_line("x"):
-        show(text, table(("", "mean"), [["c", "1 N s/mm³"]]))
+    with one_line_errors("x"):
+        print_texts_and_tables(text, format_table(("", "mean"), [["c", "1 N s/mm³"]]))
     stream.flush()
     told = stream.buffer.getvalue().decode(encoding)
     if encoding == "utf-8":

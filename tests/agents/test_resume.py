@@ -18,16 +18,16 @@ from safetensors.numpy import load_file, save_file
 
 import agents
 from agents import make_policy
+from agents.interruption import Interrupted
 from agents.policies.features import NAMES
-from agents.stopping import Stopped
 from agents.training import ALGORITHMS, TrainConfig, resume, train
 from agents.training.checkpoints import (
-    STATE,
-    TENSORS,
-    Progress,
+    STATE_FILE,
+    TENSORS_FILE,
+    TrainingProgress,
     latest_checkpoint,
     load_progress,
-    restore,
+    restore_training_state,
     save_checkpoint,
 )
 from agents.vec_env import DuffingVecEnv
@@ -71,7 +71,7 @@ def test_a_run_that_began_with_a_policy_sees_as_it_did_after_a_stop(tmp_path):
 def few_systems():
     """What is evaluated on the way is no subject here: on 4 systems instead of 128."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("agents.training.heldout._SYSTEMS", 4)
+        patch.setattr("agents.training.heldout_evaluation._N_SYSTEMS", 4)
         yield
 
 
@@ -218,8 +218,8 @@ def test_a_restored_model_learns_as_the_one_that_was_saved(tmp_path, algo):
 
     first, second = (tiny(algo).make(DuffingVecEnv(ENV, 8, seed=0), seed) for seed in (0, 1))
     first.learn(512)
-    save_checkpoint(tmp_path, first, {}, Progress(steps=512, updates=first._n_updates, episodes=3))
-    restore(latest_checkpoint(tmp_path), second)
+    save_checkpoint(tmp_path, first, {}, TrainingProgress(steps=512, updates=first._n_updates, episodes=3))
+    restore_training_state(latest_checkpoint(tmp_path), second)
     assert (second.num_timesteps, second._n_updates, second._episode_num) == (512, first._n_updates, 3)
     if "ppo" in algo:
         second.rollout_buffer = first.rollout_buffer
@@ -241,7 +241,7 @@ def test_only_the_latest_checkpoint_holds_the_state(tmp_path):
     found = {path.parent.name: path.name for path in folder.rglob("training.*")}
     assert set(found) == {"000000512"}
     assert latest_checkpoint(folder) == folder / "checkpoints" / "000000512"
-    buffer = load_file(latest_checkpoint(folder) / TENSORS)
+    buffer = load_file(latest_checkpoint(folder) / TENSORS_FILE)
     assert buffer["buffer/observations"].shape == (50, 8, len(NAMES) + 22)  # of 64 samples of each, the buffer holds 50
     earlier = make_policy(str(folder / "checkpoints" / "000000256"))
     assert earlier.card["steps"] == 256
@@ -275,17 +275,17 @@ def test_a_configuration_of_something_else_is_refused(tmp_path):
 def test_a_damaged_checkpoint_is_refused(run_of_400):
     folder = run_of_400
     checkpoint = latest_checkpoint(folder)
-    whole = (checkpoint / TENSORS).read_bytes()
+    whole = (checkpoint / TENSORS_FILE).read_bytes()
     for damage in (whole[:-10], b""):
-        (checkpoint / TENSORS).write_bytes(damage)
+        (checkpoint / TENSORS_FILE).write_bytes(damage)
         with pytest.raises(ValueError, match=r"checkpoint must hold this algorithm's state"):
             resume(folder)
-    save_file({"policy/weight": np.zeros(3)}, checkpoint / TENSORS)
+    save_file({"policy/weight": np.zeros(3)}, checkpoint / TENSORS_FILE)
     with pytest.raises(ValueError, match=r"checkpoint must hold this algorithm's state"):
         resume(folder)
-    (checkpoint / TENSORS).write_bytes(whole)
+    (checkpoint / TENSORS_FILE).write_bytes(whole)
     for damage in ("{", json.dumps({"steps": 3}), json.dumps({"curve": [], "speed": 1})):
-        (checkpoint / STATE).write_text(damage)
+        (checkpoint / STATE_FILE).write_text(damage)
         with pytest.raises(ValueError, match=r"checkpoint must hold a sound training.json"):
             resume(folder)
 
@@ -298,10 +298,10 @@ def test_after_a_signal_the_update_is_finished_and_all_is_kept(tmp_path, number,
         if steps == 384:
             os.kill(os.getpid(), number)
 
-    with pytest.raises(Stopped) as caught:
+    with pytest.raises(Interrupted) as caught:
         train(replace(config(algo, tmp_path / "run", eval_every=128), checkpoints=1), send)
     assert caught.value.signum == number
-    assert caught.value.left == f"go on with: duffing-env train --resume {tmp_path / 'run'}"
+    assert caught.value.resume_hint == f"go on with: duffing-env train --resume {tmp_path / 'run'}"
     checkpoint = latest_checkpoint(tmp_path / "run")
     assert load_progress(checkpoint).steps == 384
     assert resume(tmp_path / "run").curve[-1][0] == STEPS
@@ -309,24 +309,29 @@ def test_after_a_signal_the_update_is_finished_and_all_is_kept(tmp_path, number,
 
 @pytest.mark.parametrize(
     ("where", "left"),
-    [("_make_envs", "nothing was kept"), ("_Training._learn", "nothing was kept; begin again with: duffing-env train")],
+    [
+        ("_make_training_envs", "nothing was kept"),
+        ("_Training._learn", "nothing was kept; begin again with: duffing-env train"),
+    ],
 )
 def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, monkeypatch, where, left):
-    for number, error in ((signal.SIGINT, KeyboardInterrupt()), (signal.SIGTERM, Stopped(signal.SIGTERM))):
+    for number, error in ((signal.SIGINT, KeyboardInterrupt()), (signal.SIGTERM, Interrupted(signal.SIGTERM))):
 
         def stop(*arguments, error=error):
             raise error
 
         monkeypatch.setattr(f"agents.training.runs.{where}", stop)
         folder = tmp_path / f"run-{number}"
-        with pytest.raises(Stopped) as caught:
+        with pytest.raises(Interrupted) as caught:
             train(config("ppo", folder))
         assert caught.value.signum == number
-        assert caught.value.left == left + (f" --resume {folder}" if "begin" in left else "")
+        assert caught.value.resume_hint == left + (f" --resume {folder}" if "begin" in left else "")
 
 
 def test_a_stop_before_the_first_update_of_a_resumed_run_says_how_to_go_on(run_of_400, monkeypatch):
-    monkeypatch.setattr("agents.training.runs._Training._learn", lambda self: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(Stopped) as caught:
+    monkeypatch.setattr(
+        "agents.training.training_run._TrainingLoop._learn", lambda self: signal.raise_signal(signal.SIGINT)
+    )
+    with pytest.raises(Interrupted) as caught:
         resume(run_of_400)
-    assert caught.value.left == f"go on with: duffing-env train --resume '{run_of_400}'"
+    assert caught.value.resume_hint == f"go on with: duffing-env train --resume '{run_of_400}'"

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from tables import table
 
-from agents.commands.train import main
-from agents.training import PPOSettings, TrainConfig, train, train_seeds, tune
-from agents.training.seeds import carry_on
+from agents.commands.train_command import main
+from agents.training import PPOSettings, TrainConfig, train, train_seeds, tune_hyperparameters
+from agents.training.seed_runs import train_or_resume
 
 ENV = "duffing_env/Short-v0"
 TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
@@ -41,7 +41,9 @@ def test_each_seed_is_the_training_of_that_seed_alone(tmp_path, on_ray):
 
 def test_the_same_call_goes_on_and_another_is_refused(tmp_path, monkeypatch):
     carried = []
-    monkeypatch.setattr("agents.training.seeds.carry_on", lambda run: carried.append(run) or carry_on(run))
+    monkeypatch.setattr(
+        "agents.training.seed_runs.train_or_resume", lambda run: carried.append(run) or train_or_resume(run)
+    )
     assert len(list(train_seeds(config(tmp_path), 1))) == 1
     before = (tmp_path / "0" / "policy.json").stat().st_mtime_ns
     assert len(list(train_seeds(config(tmp_path), 2))) == 2
@@ -92,7 +94,7 @@ def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("ignore")
 def test_a_search_on_ray_has_all_its_trials(tmp_path):
     pytest.importorskip("optuna", reason="Optuna is not installed; it is the extra tune")
-    best = tune(config(tmp_path / "search"), 5, on_ray=True)
+    best = tune_hyperparameters(config(tmp_path / "search"), 5, on_ray=True)
     assert best.read_text().startswith("# ppo, trial ")
     assert len(list((tmp_path / "search" / "trials").iterdir())) == 5
 

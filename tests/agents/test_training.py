@@ -17,16 +17,16 @@ from tables import table
 
 import agents.vec_env
 from agents import make_policy
-from agents.commands.train import Config
+from agents.commands.train_command import TrainCommand
+from agents.console_output import write_json
 from agents.evaluation.batch import TESTED, make
-from agents.evaluation.leaderboard import summarise
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.comparison_tables import summarise_metrics
+from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.policies.features import NAMES
-from agents.results import write_json
 from agents.training import PPOSettings, TrainConfig, resume, train
-from agents.training.config import describe
-from agents.training.hyperparameters import settings_of
-from agents.training.runs import _make_envs
+from agents.training.hyperparameters import parse_hyperparameters
+from agents.training.training_config import describe_run
+from agents.training.training_run import _make_training_envs
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SMALL = PPOSettings(num_envs=64, n_steps=64, batch_size=1024, hidden=(16,))
@@ -92,7 +92,7 @@ def test_the_configuration_can_rebuild_the_run(runs, tmp_path):
     assert set(description) == {"config", "command", "versions"}
     settings = description["config"]
     assert settings.pop("output") == str(runs["first"].folder)
-    settings["hyperparameters"] = settings_of(PPOSettings, settings["hyperparameters"])
+    settings["hyperparameters"] = parse_hyperparameters(PPOSettings, settings["hyperparameters"])
     rebuilt = TrainConfig(**settings, output=tmp_path / "rebuilt")
     assert replace(rebuilt, output=None) == TrainConfig(steps=20_000, seed=0, torch_threads=1, hyperparameters=SMALL)
     assert description["command"][1:] == sys.argv[1:]
@@ -165,7 +165,7 @@ def test_no_training_meets_a_system_that_policies_are_compared_on():
         return envs.truth.m
 
     for seed in range(3):
-        envs = _make_envs(TrainConfig(env="duffing_env/Short-v0", seed=seed, hyperparameters=SMALL), seed)
+        envs = _make_training_envs(TrainConfig(env="duffing_env/Short-v0", seed=seed, hyperparameters=SMALL), seed)
         envs.reset()
         met = {*envs.envs.truth.m.tolist()}
         if seed == 0:
@@ -236,7 +236,7 @@ def test_a_folder_that_holds_a_run_is_refused_untouched(runs):
 def test_a_training_in_which_no_episode_ended_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("estimator.progress.EVERY", 0.0)
     settings = {"hyperparameters": TINY, "systems": 0, "reward": "information_gain"}
-    Config(steps=256, output=tmp_path / "run", options={"max_output": 10.0}, **settings).run()
+    TrainCommand(steps=256, output=tmp_path / "run", options={"max_output": 10.0}, **settings).run()
     told, said = capsys.readouterr()
     assert "left: no episode has ended" in " ".join(said.split())
     assert "No episode ended, so there is no learning curve" in told
@@ -311,8 +311,8 @@ def test_training_beats_signals_that_do_not_look(tmp_path):
     ppo = PPOSettings(num_envs=256, n_steps=32, batch_size=2048, learning_rate=3e-3, hidden=(32,))
     run = train(TrainConfig(steps=600_000, output=tmp_path / "run", torch_threads=1, hyperparameters=ppo))
     learned, uniform, multisine = (
-        summarise(evaluation)["log_posterior_gain"]
-        for evaluation in evaluate([str(run.folder), "uniform", "silverbox-multisine"], systems=128, seed=1)
+        summarise_metrics(evaluation)["log_posterior_gain"]
+        for evaluation in evaluate_policies([str(run.folder), "uniform", "silverbox-multisine"], systems=128, seed=1)
     )
     assert learned["low"] > uniform["high"] > multisine["high"]
     assert run.curve[-1][2] > uniform["mean"]
@@ -324,8 +324,8 @@ def test_sac_beats_signals_that_do_not_look(tmp_path):
     env = "duffing_env/Short-v0"
     run = train(TrainConfig(algo="sac", env=env, steps=30_000, output=tmp_path / "run"))
     learned, uniform = (
-        summarise(evaluation)["log_posterior_gain"]
-        for evaluation in evaluate([str(run.folder), "uniform"], env, systems=128, seed=1)
+        summarise_metrics(evaluation)["log_posterior_gain"]
+        for evaluation in evaluate_policies([str(run.folder), "uniform"], env, systems=128, seed=1)
     )
     assert learned["low"] > uniform["high"]
 
@@ -341,7 +341,7 @@ def test_a_folder_that_another_trains_in_is_refused_untouched(tmp_path, begin):
     assert other.stdout.readline() == "held\n"
     config = TrainConfig(steps=256, output=tmp_path / "run", torch_threads=1, hyperparameters=TINY)
     if begin is not train:
-        write_json(tmp_path / "run" / "config.json", describe(config))
+        write_json(tmp_path / "run" / "config.json", describe_run(config))
     before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     with pytest.raises(ValueError, match="must be a folder that nobody else writes to, but another process does"):
         begin(config)

@@ -7,11 +7,11 @@ import signal
 
 import pytest
 
-import agents.commands.train
-from agents.commands.train import main
-from agents.stopping import Stopped
-from agents.training import PPOSettings, TrainConfig, train, tune
-from agents.training.hyperparameters import read_settings
+import agents.commands.train_command
+from agents.commands.train_command import main
+from agents.interruption import Interrupted
+from agents.training import PPOSettings, TrainConfig, train, tune_hyperparameters
+from agents.training.hyperparameters import read_hyperparameters
 
 ENV = "duffing_env/Short-v0"
 TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=128, hidden=(4,))
@@ -21,7 +21,7 @@ TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=128, hidden=(4,))
 def few_systems():
     """Trials are scored on 8 systems instead of 128."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("agents.training.heldout._SYSTEMS", 8)
+        patch.setattr("agents.training.heldout_evaluation._N_SYSTEMS", 8)
         yield
 
 
@@ -44,7 +44,7 @@ def scores(folder):
 
 def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
     folder = tmp_path / "search"
-    best = tune(tiny(folder), 2)
+    best = tune_hyperparameters(tiny(folder), 2)
     assert best == folder / "best.toml"
     first = scores(folder)
     assert set(first) == {0, 1}
@@ -54,10 +54,10 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
         "n_epochs": 4, "gae_lambda": 0.95, "log_std_init": -0.5, "activation": "relu",
         "features": True, "own": True, "levels": 0, "entropy_bonus": 0.0, "advantages_by_time": True,
     }  # fmt: skip
-    tune(tiny(folder), 2)  # nothing is left to do
+    tune_hyperparameters(tiny(folder), 2)  # nothing is left to do
     assert scores(folder) == first
     folder = folder.rename(tmp_path / "moved")
-    tune(tiny(folder), 3)
+    tune_hyperparameters(tiny(folder), 3)
     found = scores(folder)
     assert set(found) == {0, 1, 2}
     assert {number: found[number] for number in first} == first
@@ -65,7 +65,7 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
     winner = max(found, key=found.__getitem__)
     best = folder / best.name
     assert best.read_text().startswith(f"# ppo, trial {winner} of ")
-    settings = read_settings("ppo", ENV, best)
+    settings = read_hyperparameters("ppo", ENV, best)
     again = train(tiny(tmp_path / "again", settings=best, hyperparameters=settings))
     same = folder / "trials" / f"{winner:03d}"
     assert (again.folder / "policy.safetensors").read_bytes() == (same / "policy.safetensors").read_bytes()
@@ -75,7 +75,7 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
     rows = [line.split()[0] for line in printed.splitlines() if re.match(r"\d+ +\d", line)][-3:]
     assert [int(row) for row in rows] == sorted(found, key=lambda number: -found[number])
     with pytest.raises(ValueError, match="output must be a new folder or that of the same command"):
-        tune(tiny(folder, seed=1), 4)
+        tune_hyperparameters(tiny(folder, seed=1), 4)
 
 
 @pytest.mark.parametrize("at_once", [False, True], ids=["trained", "began"])
@@ -86,16 +86,16 @@ def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch, at
         report(run.steps, {"log_posterior_gain": 1.0})
 
     folder = tmp_path / "search"
-    monkeypatch.setattr("agents.training.tuning.carry_on", stand_in)
-    monkeypatch.setattr("agents.training.tuning.score_of", lambda output: 1.0)
-    tune(tiny(folder), 1)
+    monkeypatch.setattr("agents.training.hyperparameter_search.train_or_resume", stand_in)
+    monkeypatch.setattr("agents.training.hyperparameter_search.final_score", lambda output: 1.0)
+    tune_hyperparameters(tiny(folder), 1)
     journal = folder / "study.log"
     lines = journal.read_text().splitlines()
     told = [k for k, line in enumerate(lines) if json.loads(line)["op_code"] == 5]  # a hyperparameter of a trial
     kept = lines[: told[0] + 1] if at_once else lines[:-1]  # without its last line, the trial is still running
     journal.write_text("\n".join(kept) + "\n")
-    tune(tiny(folder), 1)
-    tune(tiny(folder), 2)
+    tune_hyperparameters(tiny(folder), 1)
+    tune_hyperparameters(tiny(folder), 2)
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
     first, again, other = optuna.load_study(study_name=None, storage=storage).trials
     assert [trial.state.name for trial in (first, again, other)] == ["FAIL", "COMPLETE", "COMPLETE"]
@@ -114,25 +114,25 @@ def test_trials_below_the_median_are_given_up(tmp_path, optuna, monkeypatch):
             report(steps, {"log_posterior_gain": score})
         ended.append(run.output.name)
 
-    monkeypatch.setattr("agents.training.tuning.carry_on", fake)
-    monkeypatch.setattr("agents.training.tuning.score_of", lambda output: -float(output.name))
-    tune(tiny(tmp_path / "search", steps=1000), 8)
+    monkeypatch.setattr("agents.training.hyperparameter_search.train_or_resume", fake)
+    monkeypatch.setattr("agents.training.hyperparameter_search.final_score", lambda output: -float(output.name))
+    tune_hyperparameters(tiny(tmp_path / "search", steps=1000), 8)
     assert ended == ["000", "001", "002", "003", "004"]
 
 
 def test_optuna_is_asked_for_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr("estimator.extras.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"optuna is not installed; get it with: pip install .*\[tune\]"):
-        tune(tiny(tmp_path / "search"), 2)
+        tune_hyperparameters(tiny(tmp_path / "search"), 2)
     assert not (tmp_path / "search").exists()
 
 
 @pytest.mark.parametrize(("words", "work"), [(["--tune", "3"], "tune"), (["--seeds", "2"], "train_seeds")])
 def test_several_trainings_that_are_stopped_go_on_by_the_same_command(words, work, monkeypatch, capsys):
     def stopped(*arguments, **options):
-        raise Stopped(signal.SIGTERM, "go on with: duffing-env train --resume one of them")
+        raise Interrupted(signal.SIGTERM, "go on with: duffing-env train --resume one of them")
 
-    monkeypatch.setattr(agents.commands.train, work, stopped)
+    monkeypatch.setattr(agents.commands.train_command, work, stopped)
     with pytest.raises(SystemExit) as caught:
         main("duffing-env train", ["--env", "Short-v0", *words])
     assert caught.value.code == 128 + signal.SIGTERM
@@ -141,7 +141,7 @@ def test_several_trainings_that_are_stopped_go_on_by_the_same_command(words, wor
 
 
 def test_a_search_says_how_its_best_is_trained_with(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(agents.commands.train, "tune", lambda *arguments, **options: tmp_path / "the best.toml")
+    monkeypatch.setattr(agents.commands.train_command, "tune", lambda *arguments, **options: tmp_path / "the best.toml")
     main("duffing-env train", ["--env", "Short-v0", "--tune", "3"])
     assert " ".join(capsys.readouterr().out.split()).endswith(
         f"the same command, with --settings '{tmp_path / 'the best.toml'}' in place of --tune and --output"

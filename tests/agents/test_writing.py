@@ -18,11 +18,11 @@ from stable_baselines3 import PPO
 from agents import policies
 from agents.cli import run_script
 from agents.commands import main
-from agents.evaluation import board, protocol
+from agents.hardware.clock import JumpingClock
+from agents.hardware.experiment_run import RunSettings, run_experiment
+from agents.hardware.simulated_plant import SimulatedPlant
+from agents.leaderboard import leaderboard_file, protocol
 from agents.policies.saving import save_policy
-from agents.running.clock import JumpingClock
-from agents.running.run import Plan, run
-from agents.running.simulated import SimulatedPlant
 from agents.studies import ship
 from agents.training import TrainConfig, resume, train
 from agents.training.algorithms import ALGORITHMS
@@ -60,7 +60,7 @@ WRITERS = {
     "evaluate --policies uniform --systems 4 --output out": ["out/evaluation.json", "out/excitations.png"],
     "evaluate --policies uniform --systems 4 --report out": ["out/report.html"],
     "evaluate --protocol Short-v0 --policies uniform --submit noise --board board.jsonl": ["board.jsonl"],
-    "run bench.toml --plant agents.running.simulated:plant --policy prbs --samples 16 --out new": [],
+    "run bench.toml --plant agents.hardware.simulated_plant:plant --policy prbs --samples 16 --out new": [],
     "ship --name ppo/mine --runs run --systems 4": ["ppo/mine/policy.json", "ppo/mine/policy.safetensors"],
     "train --env duffing_env/Short-v0 --steps 64 --systems 0 --output new --ppo.num-envs 2 --ppo.n-steps 8 "
     "--ppo.batch-size 16": [],
@@ -97,7 +97,7 @@ def bench(tmp_path_factory):
     (place / "bench.toml").write_text(RIG)
     rig = Rig.from_file(place / "bench.toml")
     plant = SimulatedPlant(rig, clock=JumpingClock())
-    run(rig, plant, place / "measured", Plan("prbs", 64), clock=plant.clock)
+    run_experiment(rig, plant, place / "measured", RunSettings("prbs", 64), clock=plant.clock)
     shutil.copy(place / "measured" / "samples.csv", place / "record.csv")
     model = PPO("MlpPolicy", DuffingVecEnv(SHORT, 2), n_steps=8, batch_size=16, device="cpu")
     config = {"env": SHORT, "reward": "information_gain", "options": {}, "seed": 0, "output": "run"}
@@ -224,7 +224,7 @@ def test_a_signal_while_it_writes_is_one_line_and_leaves_everything_as_it_was(wo
         capsys.readouterr()
         with monkeypatch.context() as patch:
             patch.setattr(os, "replace", disturbed(os.replace))
-            patch.setattr(board, "append_atomically", disturbed(board.append_atomically))
+            patch.setattr(leaderboard_file, "append_atomically", disturbed(leaderboard_file.append_atomically))
             found = command(words, patch, place)
         messages = capsys.readouterr().err
         assert sent
@@ -238,7 +238,7 @@ def test_a_signal_while_it_writes_is_one_line_and_leaves_everything_as_it_was(wo
 
 @pytest.mark.parametrize("algo", ["ppo", "sac"])
 def test_a_training_goes_on_from_what_was_written_before_the_disk_was_full(tmp_path, monkeypatch, algo):
-    monkeypatch.setattr("agents.training.heldout._SYSTEMS", 4)
+    monkeypatch.setattr("agents.training.heldout_evaluation._N_SYSTEMS", 4)
     small = {"num_envs": 8, "batch_size": 16, "hidden": (4,)}
     own = (
         {"n_steps": 16}
@@ -309,7 +309,7 @@ def test_a_run_ends_with_its_input_at_zero_and_whole_rows(bench, tmp_path):
     plant = Filling(rig, clock=JumpingClock())
     try:
         with pytest.raises(OSError, match=r"File too large; make room.*samples\.csv"):
-            run(rig, plant, tmp_path / "out", Plan("prbs", 64), clock=plant.clock)
+            run_experiment(rig, plant, tmp_path / "out", RunSettings("prbs", 64), clock=plant.clock)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert told[-1] == 0.0

@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from agents.evaluation.rollout import roll_out
+from agents.evaluation.policy_evaluation import run_episodes
 
 NOISE, SYSTEMS = 5e-4, 400  # V
 TRACKS = {
@@ -18,7 +18,7 @@ TRACKS = {
 def shown(track, hypotheses, **options):
     """Coverage and mean log posterior gain [nats] of systems under a pseudo-random binary input, printed."""
     options = {"noise_hypotheses": hypotheses, **TRACKS[track], **options}
-    evaluation, *_ = roll_out("prbs", track, SYSTEMS, 1, options)
+    evaluation, *_ = run_episodes("prbs", track, SYSTEMS, 1, options)
     found = [float(evaluation.metrics[name].mean()) for name in ("coverage", "nees", "log_posterior_gain")]
     print(f"{track} {options}: coverage {found[0]:.3f}, NEES/K {found[1]:.2f}, gain {found[2]:.2f} nats")
     return found[0]

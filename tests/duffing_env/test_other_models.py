@@ -81,9 +81,9 @@ def test_the_prior_of_a_range_is_as_wide_as_the_range_for_several_sensors_too():
 @pytest.mark.slow  # a kernel of its own
 def test_hypotheses_about_a_model_that_bends_are_moved_by_sigma_points():
     """To first order, 0.80 of the intervals cover under this input, and NEES per coefficient is 2.5."""
-    from agents.evaluation.rollout import evaluate
+    from agents.evaluation.policy_evaluation import evaluate_policies
 
-    (played,) = evaluate(["prbs-4"], "duffing_env/WienerHammerstein-v0", 256, options={"noise_hypotheses": 3})
+    (played,) = evaluate_policies(["prbs-4"], "duffing_env/WienerHammerstein-v0", 256, options={"noise_hypotheses": 3})
     assert np.mean(played.metrics["coverage"]) > 0.85
     assert np.mean(played.metrics["nees"]) < 1.7
     assert np.mean(played.metrics["log_posterior_gain"]) > 18.5

@@ -30,7 +30,9 @@ WORKED = ("free_energy", "fisher", "expected_free_energy", "simulation_error")  
 @cache
 def payer(kind):
     """`pay` in a block of a kind."""
-    return lanewise(block_layout(kind), "REWARD EARNED", uniform="terminal has_terminated_return terminated_return")(pay_reward)
+    return lanewise(block_layout(kind), "REWARD EARNED", uniform="terminal has_terminated_return terminated_return")(
+        pay_reward
+    )
 
 
 class Lanes:

@@ -9,12 +9,12 @@ from stable_baselines3 import PPO
 
 from agents import make_policy, policies
 from agents.evaluation.oracle import Systems
-from agents.evaluation.rollout import evaluate
+from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.policies.learned import CARD, load_policy
 from agents.policies.saving import save_policy
 from agents.studies.family import play, unseen
 from agents.studies.ship import Config, card_of, median_index, ship
-from agents.training.family import FAMILY
+from agents.training.environments.oscillator_family import FAMILY
 from agents.vec_env import DuffingVecEnv
 
 SHORT = "duffing_env/Short-v0"
@@ -55,7 +55,7 @@ def test_the_median_seed_ships_with_the_scores_of_all(runs, shelf, capsys):
     assert (card["track"], card["reward"], card["seeds"]) == (SHORT, "information_gain", [0, 1, 2])
     assert card["command"] == ["train.py"]
     scores = card["scores"]
-    each = evaluate([str(run) for run in runs], SHORT, systems=8)
+    each = evaluate_policies([str(run) for run in runs], SHORT, systems=8)
     by = card["shipped"]["median_by"]
     assert by == ("efficiency" if Systems.of(SHORT, 1).path.exists() else "information_gain")
     for name in {by, "information_gain"}:
@@ -127,7 +127,7 @@ def test_a_policy_that_ships_does_what_its_card_says(name):
         expected = card["scores"]["information_gain"]["mean"]
         assert abs(gains.mean() - expected) < 4 * gains.std() / np.sqrt(8)
         return
-    (evaluation,) = evaluate([name], card["config"]["env"], systems=16)
+    (evaluation,) = evaluate_policies([name], card["config"]["env"], systems=16)
     # Of several training seeds the card tells all, and which of them ships.
     place = card["seeds"].index(card["shipped"]["seed"])
     for metric, slack in (("information_gain", 0.05), ("coverage", 0.02)):

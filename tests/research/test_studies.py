@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from agents.evaluation.batch import TESTED
-from agents.evaluation.metrics import information
-from agents.evaluation.rollout import roll_out
+from agents.evaluation.metrics import fisher_information_gain
+from agents.evaluation.policy_evaluation import run_episodes
 from agents.policies import make_policy
 from agents.studies import baselines, pendulum, robustness
 
 
 def test_the_pendulum_is_the_published_one_and_its_posterior_exact():
-    played, beliefs, truth, experiment = roll_out("uniform", pendulum.TRACK, 64, 0, TESTED)
+    played, beliefs, truth, experiment = run_episodes("uniform", pendulum.TRACK, 64, 0, TESTED)
     u, (ahead, w) = played.inputs.T, np.moveaxis(played.outputs, 2, 0).swapaxes(1, 2)
     h, start = 0.05, np.zeros((64, 1))
     q, velocity = (np.concatenate([start, seen], axis=1) for seen in (ahead - w, w / h))
@@ -34,7 +34,7 @@ def test_the_pendulum_is_the_published_one_and_its_posterior_exact():
         np.testing.assert_allclose(cov / np.outer(stds, stds), exact / np.outer(stds, stds), atol=0.02)
     gained = played.metrics["information_gain"]
     assert gained.mean() == pytest.approx(
-        information(played.inputs, truth, experiment, played.outputs).mean(), abs=0.01
+        fisher_information_gain(played.inputs, truth, experiment, played.outputs).mean(), abs=0.01
     )
 
 

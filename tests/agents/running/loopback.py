@@ -6,8 +6,8 @@ from collections import Counter
 
 import numpy as np
 
-from agents.running.clock import JumpingClock
-from agents.running.simulated import SimulatedPlant
+from agents.hardware.clock import JumpingClock
+from agents.hardware.simulated_plant import SimulatedPlant
 from estimator import Channel, Rig
 
 TRUTH = {"m": 1.05, "c": 1.1, "a": 145.0, "b": 9e4}

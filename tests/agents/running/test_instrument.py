@@ -14,18 +14,18 @@ import pytest
 from loopback import RIG, RIG_FILE, TABLE, TRUTH, Scpi
 from tables import table
 
-from agents.running import instrument
-from agents.running.run import Plan, run
+from agents.hardware import visa_instrument
+from agents.hardware.experiment_run import RunSettings, run_experiment
 from estimator import Rig, identify
 
 pytest.importorskip("pyvisa", reason="pip install 'duffing-env[instrument]'")
 ROOT = Path(__file__).parents[3]
 #: The run's clock jumps: that of the instrument, which is in another process, ticks with it.
 COMMAND = """
-import agents.running.run
+import agents.hardware.experiment_run
 from agents.commands import main
-from agents.running.clock import JumpingClock
-agents.running.run.RealClock = JumpingClock
+from agents.hardware.clock import JumpingClock
+agents.hardware.experiment_run.RealClock = JumpingClock
 main()
 """
 
@@ -48,16 +48,16 @@ def measured(folder):
 
 
 def play(scpi, folder, **plan):
-    plant = instrument.plant(RIG, resource=scpi.resource, **TABLE)
+    plant = visa_instrument.plant(RIG, resource=scpi.resource, **TABLE)
 
     def impatient(samples):
         """Where no answer will come, however long it is waited for."""
         if scpi.fault in ("stall", "lose") and scpi.answered == scpi.after:
             plant._link.timeout = 50
 
-    plan = Plan(**{"policy": "prbs", "samples": 40, "listen": 8, "bound": 0.01, **plan})
+    plan = RunSettings(**{"policy": "prbs", "samples": 40, "listen": 8, "bound": 0.01, **plan})
     try:
-        return run(RIG, plant, folder, plan, clock=scpi.clock, told=impatient)
+        return run_experiment(RIG, plant, folder, plan, clock=scpi.clock, on_progress=impatient)
     finally:
         plant.close()
 
@@ -134,7 +134,7 @@ def command(scpi, folder, *more):
     scpi.ticks = True
     table = "\n".join(f"{key} = {json.dumps(value)}" for key, value in {"resource": scpi.resource, **TABLE}.items())
     (folder / "rig.toml").write_text(f"{RIG_FILE}\n[instrument]\n{table}\n")
-    words = ["run", "rig.toml", "--plant", "agents.running.instrument:plant", "--out", "run", "--policy", "prbs"]
+    words = ["run", "rig.toml", "--plant", "agents.hardware.visa_instrument:plant", "--out", "run", "--policy", "prbs"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.Popen(
         [sys.executable, "-c", COMMAND, *words, "--bound", "0.01", "--samples", "2000", *more],
@@ -198,12 +198,12 @@ def test_signals_zero_the_input_and_give_parameters(scpi, tmp_path, number, stat
 
 def test_an_instrument_without_a_watchdog_is_not_armed(scpi, tmp_path):
     table = {key: value for key, value in TABLE.items() if key != "watchdog"}
-    plant = instrument.plant(RIG, resource=scpi.resource, **table)
+    plant = visa_instrument.plant(RIG, resource=scpi.resource, **table)
     with pytest.raises(ValueError, match="plant must have a watchdog"):
-        run(RIG, plant, tmp_path / "run", Plan(policy="prbs", samples=20), clock=scpi.clock)
+        run_experiment(RIG, plant, tmp_path / "run", RunSettings(policy="prbs", samples=20), clock=scpi.clock)
     assert "OUTP ON" not in scpi.lines
-    plan = Plan(policy="prbs", samples=20, no_watchdog=True)
-    assert run(RIG, plant, tmp_path / "run", plan, clock=scpi.clock).ended == "complete"
+    plan = RunSettings(policy="prbs", samples=20, no_watchdog=True)
+    assert run_experiment(RIG, plant, tmp_path / "run", plan, clock=scpi.clock).ended == "complete"
     plant.close()
 
 
@@ -225,7 +225,7 @@ def test_a_connection_that_cannot_be_made_ready_is_closed(monkeypatch):
     link = Broken()
     monkeypatch.setattr("pyvisa.ResourceManager.open_resource", lambda *_, **__: link)
     with pytest.raises(ValueError, match="cannot be opened: cable"):
-        instrument.plant(RIG, resource="TCPIP::127.0.0.1::9::SOCKET", **TABLE)
+        visa_instrument.plant(RIG, resource="TCPIP::127.0.0.1::9::SOCKET", **TABLE)
     assert link.closed == 1
 
 
@@ -233,7 +233,7 @@ def test_the_usual_timeout_is_back_after_a_block_that_failed(monkeypatch):
     link = Broken()
     monkeypatch.setattr(link, "write", lambda line: None)
     monkeypatch.setattr("pyvisa.ResourceManager.open_resource", lambda *_, **__: link)
-    plant = instrument.plant(RIG, resource="TCPIP::127.0.0.1::9::SOCKET", **TABLE)
+    plant = visa_instrument.plant(RIG, resource="TCPIP::127.0.0.1::9::SOCKET", **TABLE)
     with pytest.raises(OSError, match="cable"):
         plant.play(np.zeros(1000))
     assert link.timeout == 1000 * TABLE["timeout"], "what zeroes the input next would wait for a block's time"
@@ -256,4 +256,4 @@ def test_the_usual_timeout_is_back_after_a_block_that_failed(monkeypatch):
 )
 def test_tables_that_make_no_instrument_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        instrument.plant(RIG, **{"resource": "TCPIP::127.0.0.1::9::SOCKET", **TABLE, **change})
+        visa_instrument.plant(RIG, **{"resource": "TCPIP::127.0.0.1::9::SOCKET", **TABLE, **change})

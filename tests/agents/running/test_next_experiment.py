@@ -11,13 +11,13 @@ from loopback import RIG, RIG_FILE, TRUTH
 from tables import table
 
 from agents.commands import main
+from agents.hardware.clock import JumpingClock
+from agents.hardware.experiment_run import run_experiment
+from agents.hardware.next_experiment import design_experiment
+from agents.hardware.run_settings import RunSettings
+from agents.hardware.simulated_plant import SimulatedPlant
+from agents.hardware.simulated_plant import plant as simulated
 from agents.planner.futures import rests
-from agents.running.clock import JumpingClock
-from agents.running.experiment import design
-from agents.running.plan import Plan
-from agents.running.run import run
-from agents.running.simulated import SimulatedPlant
-from agents.running.simulated import plant as simulated
 from estimator import OnlineEstimator, identify, load_estimator, save_estimator
 from estimator.identification.beliefs import disturbance
 from estimator.identification.tables import read_table
@@ -28,15 +28,17 @@ from estimator.models.duffing import duffing
 def designed():
     """Policy to what it designs in 64 samples; the planner climbs from 4 candidates of noise, instead of 14."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("agents.running.experiment._MOST_NOISES", 4)
-        return {policy: design(RIG, policy=policy, samples=64) for policy in ("prbs", "efe", "velocity-sign")}
+        patch.setattr("agents.hardware.next_experiment._MAX_NOISE_STARTS", 4)
+        return {
+            policy: design_experiment(RIG, policy=policy, samples=64) for policy in ("prbs", "efe", "velocity-sign")
+        }
 
 
 @pytest.mark.parametrize("policy", ["prbs", "efe", "velocity-sign"])
 def test_what_is_stated_after_an_experiment_is_what_was_expected(policy, designed):
     found = designed[policy]
     assert np.abs(found.u).max() <= RIG.input.limit
-    assert found.probability < 0.05
+    assert found.exit_probability < 0.05
     plant = SimulatedPlant(RIG, TRUTH, seed=1, clock=JumpingClock())
     plant.arm(None)
     _, y = plant.play(found.u)
@@ -49,11 +51,11 @@ def test_what_is_stated_after_an_experiment_is_what_was_expected(policy, designe
     told = identify(RIG, (found.u, y)).parameters
     for name in "mcab":
         # The systems that are drawn differ by some tens of percent in what an input tells of each of their parameters.
-        assert 0.4 < told[name][1] / found.after[name] < 2.5
+        assert 0.4 < told[name][1] / found.expected_stds[name] < 2.5
 
 
 def test_the_planner_expects_more_of_its_signal(designed):
-    assert designed["efe"].gain > designed["prbs"].gain
+    assert designed["efe"].information_gain > designed["prbs"].information_gain
 
 
 @pytest.mark.parametrize("block", [None, 16])
@@ -63,8 +65,8 @@ def test_a_run_of_the_planner_is_that_of_its_seed(block, tmp_path):
     def played(name):
         clock = JumpingClock()
         plant = SimulatedPlant(RIG, TRUTH, clock=clock)
-        plan = Plan(policy="efe", samples=24, block=block)
-        assert run(RIG, plant, tmp_path / name, plan, clock=clock).ended == "complete"
+        plan = RunSettings(policy="efe", samples=24, block=block)
+        assert run_experiment(RIG, plant, tmp_path / name, plan, clock=clock).ended == "complete"
         with (tmp_path / name / "samples.csv").open() as file:
             return [{**row, "clock": ""} for row in csv.DictReader(file)]
 
@@ -122,7 +124,7 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
     assert "kg" in told
     assert "The picture is next.png" in told
     assert (tmp_path / "next.png").read_bytes().startswith(b"\x89PNG")
-    found = design(RIG, load_estimator("posterior.npz").belief, "prbs", 64)
+    found = design_experiment(RIG, load_estimator("posterior.npz").belief, "prbs", 64)
     written = np.loadtxt("next.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(written[:, 1], found.u, rtol=1e-9)
     lines = (tmp_path / "next.csv").read_text().splitlines()
@@ -173,7 +175,7 @@ def test_no_file_is_lost(tmp_path, monkeypatch, capsys, words, message):
 def test_a_column_that_the_rig_names_has_its_unit(tmp_path):
     rig = replace(RIG, input=replace(RIG.input, column="Kraft"))
     path = tmp_path / "next.csv"
-    design(rig, policy="prbs", samples=16).write(path)
+    design_experiment(rig, policy="prbs", samples=16).write(path)
     head, *rows = path.read_text().splitlines()
     assert head == "time [s],Kraft [N]"
     path.write_text("\n".join([f"{head},displacement [m]", *(f"{row},0" for row in rows)]))
@@ -196,13 +198,13 @@ def test_too_few_samples_in_a_period_are_told(tmp_path, capsys):
         told = capsys.readouterr().err
         assert ("there are 1.7 samples in a period; sample faster" in told) == (name == "slow")
     # a = 110 to 180 N/m on about 1 kg: a period of 0.5 s.
-    assert design(RIG, policy="prbs", samples=16).samples_in_period == pytest.approx(26, abs=1)
+    assert design_experiment(RIG, policy="prbs", samples=16).samples_per_period == pytest.approx(26, abs=1)
 
 
 @table("step", [1.0, 3.0])
 def test_a_step_that_is_too_long_for_the_motion_is_refused(step):
     with pytest.raises(ValueError, match=r"step must be at most 1/5 of a period, .* sample faster, 6 at least"):
-        design(replace(RIG, step=step), policy="prbs", samples=64)
+        design_experiment(replace(RIG, step=step), policy="prbs", samples=64)
 
 
 def test_what_identify_saves_outlives_a_pipe_that_closes_early(tmp_path, monkeypatch):
@@ -212,7 +214,7 @@ def test_what_identify_saves_outlives_a_pipe_that_closes_early(tmp_path, monkeyp
     def show(result):
         raise BrokenPipeError
 
-    monkeypatch.setattr("agents.commands.identify.show", show)
+    monkeypatch.setattr("agents.commands.identify_command.print_identification", show)
     with pytest.raises((BrokenPipeError, SystemExit)):
         main(["identify", "rig.toml", "record.csv", "--save", "posterior.npz"])
     mean, std, _ = load_estimator("posterior.npz").belief.parameters()["m"]
@@ -227,7 +229,7 @@ def test_a_run_goes_on_from_a_posterior(tmp_path, monkeypatch, jumping_clock):
     u, y = plant.play(np.repeat(np.random.default_rng(0).choice([-3.0, 3.0], 16), 8))
     known = identify(RIG, (u, y))
     save_estimator(OnlineEstimator(known.belief.model, known.belief, RIG), tmp_path / "posterior.npz")
-    factory = "from loopback import RIG, TRUTH\nfrom agents.running.simulated import SimulatedPlant\n"
+    factory = "from loopback import RIG, TRUTH\nfrom agents.hardware.simulated_plant import SimulatedPlant\n"
     (tmp_path / "lab.py").write_text(factory + "def plant(rig, **_):\n    return SimulatedPlant(rig, TRUTH, seed=1)\n")
     monkeypatch.syspath_prepend(tmp_path)
     arguments = ["--plant", "lab:plant", "--policy", "prbs", "--samples", "48", "--block", "24", "--out", "next"]
@@ -247,7 +249,7 @@ def test_a_run_goes_on_from_one_that_ended_in_motion(tmp_path, block):
     def played(name, samples, **more):
         clock = JumpingClock()
         plant = SimulatedPlant(RIG, TRUTH, seed=samples, clock=clock)
-        return run(RIG, plant, tmp_path / name, Plan(policy="prbs", samples=samples, **more.pop("plan", {})),
+        return run_experiment(RIG, plant, tmp_path / name, RunSettings(policy="prbs", samples=samples, **more.pop("plan", {})),
                    clock=clock, **more)  # fmt: skip
 
     first = played("first", 200)
@@ -270,8 +272,8 @@ def test_a_posterior_that_the_plant_contradicts_is_told(tmp_path, block):
     for stiffness in (TRUTH["a"], 1.1 * TRUTH["a"]):
         clock = JumpingClock()
         plant = SimulatedPlant(RIG, TRUTH | {"a": stiffness}, clock=clock)
-        plan = Plan(policy="prbs", samples=128, block=block)
-        said[stiffness] = run(RIG, plant, tmp_path / f"{stiffness}", plan, prior=known, clock=clock).message
+        plan = RunSettings(policy="prbs", samples=128, block=block)
+        said[stiffness] = run_experiment(RIG, plant, tmp_path / f"{stiffness}", plan, prior=known, clock=clock).message
     right, wrong = said.values()
     assert right == ""
     assert "what was believed before is wrong: identify" in wrong
@@ -298,4 +300,4 @@ def test_the_instrument_s_table_tells_what_is_simulated(tmp_path):
 )
 def test_experiments_that_cannot_be(given, message):
     with pytest.raises(ValueError, match=message):
-        design(**{"rig": RIG, "policy": "prbs", **given})
+        design_experiment(**{"rig": RIG, "policy": "prbs", **given})

@@ -18,15 +18,15 @@ from tables import table
 import duffing_env  # noqa: F401
 from agents import make_policy
 from agents.commands import main
+from agents.hardware.clock import JumpingClock
+from agents.hardware.env_view import EnvView
+from agents.hardware.experiment_run import RunSettings, run_experiment
+from agents.hardware.plant_interface import load_plant
+from agents.hardware.run_estimator import RunEstimator
+from agents.hardware.safety_session import SafetyStop, Session
+from agents.hardware.simulated_plant import SimulatedPlant
 from agents.planner.futures import Futures
 from agents.policies.signals import holds
-from agents.running.clock import JumpingClock
-from agents.running.follower import Follower
-from agents.running.observed import Observed
-from agents.running.plant import load_plant
-from agents.running.run import Plan, run
-from agents.running.session import Session, Tripped
-from agents.running.simulated import SimulatedPlant
 from estimator import Channel, OnlineEstimator, Rig, identify
 from estimator.free_run import free_run
 from estimator.identification.beliefs import refit
@@ -64,7 +64,9 @@ def nothing(*arguments, **details):
 
 def play(folder, plant=None, rig=RIG, **plan):
     plant = plant or Bench()
-    return run(rig, plant, folder, Plan(**{"policy": "prbs", "samples": 40, **plan}), clock=plant.clock)
+    return run_experiment(
+        rig, plant, folder, RunSettings(**{"policy": "prbs", "samples": 40, **plan}), clock=plant.clock
+    )
 
 
 def rows(folder):
@@ -126,10 +128,10 @@ def test_an_input_that_could_not_be_zeroed_is_told_loudly(method, ended, tmp_pat
     plant = Bench()
     plant.fault = lambda k, y: 0.09 if k == 20 and ended == "range" else y
     setattr(plant, method, lambda: 1 / 0)
-    plan = Plan(policy="prbs", samples=16, no_watchdog=True)
+    plan = RunSettings(policy="prbs", samples=16, no_watchdog=True)
     told = {"told": lambda samples: {}["a bug"]} if ended == "error" else {}
     with pytest.raises(KeyError) if told else nullcontext():
-        result = run(RIG, plant, tmp_path / "run", plan, clock=plant.clock, **told)
+        result = run_experiment(RIG, plant, tmp_path / "run", plan, clock=plant.clock, **told)
         assert (result.ended, result.exit_status) == (ended, 1)
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert manifest["how"] == ended
@@ -140,23 +142,23 @@ def test_an_input_that_could_not_be_zeroed_is_told_loudly(method, ended, tmp_pat
 
 def test_trips():
     plant = Bench()
-    with Session(plant, RIG, nothing, 2.0, stale=5) as session:
+    with Session(plant, RIG, nothing, 2.0, max_stale=5) as session:
         session.check(np.array([0.08, -0.08]))
-        with pytest.raises(Tripped, match="beyond its range") as tripped:
+        with pytest.raises(SafetyStop, match="beyond its range") as tripped:
             session.check(np.array([0.01, np.nan, -0.081]))
         assert tripped.value.reason == "range"
         session.check(np.full(4, np.nan))
         session.check(np.array([0.01, 0.01, 0.01, 0.01, 0.01]))
-        with pytest.raises(Tripped, match="again") as tripped:
+        with pytest.raises(SafetyStop, match="again") as tripped:
             session.check(np.array([0.01, np.nan]))
         assert tripped.value.reason == "stale"
         with (
-            pytest.raises(Tripped, match=r"^5 outputs in a row were missing$"),
-            Session(plant, RIG, nothing, 2.0, stale=5) as other,
+            pytest.raises(SafetyStop, match=r"^5 outputs in a row were missing$"),
+            Session(plant, RIG, nothing, 2.0, max_stale=5) as other,
         ):
             other.check(np.full(5, np.nan))
         plant.apply = lambda u: 4.1
-        with pytest.raises(Tripped, match=r"applied 4\.1") as tripped:
+        with pytest.raises(SafetyStop, match=r"applied 4\.1") as tripped:
             session.apply(1.0)
         assert tripped.value.reason == "input"
 
@@ -200,7 +202,7 @@ def test_a_policy_sees_what_the_environment_shows():
     env = gym.make("duffing_env/Rig-v0", rig=RIG, plant=Stepped(), horizon=40).unwrapped
     env.reset()
     estimator, plant = OnlineEstimator(rig=replace(RIG, delay=-1)), Stepped()
-    observed = Observed(RIG, estimator.belief, 40)
+    observed = EnvView(RIG, estimator.belief, 40)
     rng = np.random.default_rng(0)
     for k in range(40):
         action = np.float32(rng.uniform(-1, 1))
@@ -218,10 +220,10 @@ def test_a_policy_sees_what_the_environment_shows():
 def test_a_missing_output_is_shown_as_what_the_model_expects_of_the_sensor(kind):
     unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}[kind]
     rig = replace(RIG, output=Channel(unit, range=2.0, kind=kind))
-    follower = Follower(rig)
-    follower.take([0.0, 3.0, -2.0, 1.0], [0.01, -0.02, 0.05, 0.03])
-    observed = Observed(rig, follower.belief, 40)
-    observed.belief, u = follower.ahead(0.5), 0.5
+    follower = RunEstimator(rig)
+    follower.update([0.0, 3.0, -2.0, 1.0], [0.01, -0.02, 0.05, 0.03])
+    observed = EnvView(rig, follower.belief, 40)
+    observed.belief, u = follower.predict_ahead(0.5), 0.5
     c = dict(zip(observed.belief.names, observed.belief.coefficients_mean, strict=True))
     x, v = observed.belief.state_mean
     spring = c["gain"] * u + c["force"] - c["damping"] * v - c["stiffness"] * x - c["cubic"] * x**3
@@ -232,11 +234,11 @@ def test_a_missing_output_is_shown_as_what_the_model_expects_of_the_sensor(kind)
 
 
 def test_the_belief_ahead_is_that_of_a_sample_nobody_measured():
-    follower, reference = Follower(RIG), OnlineEstimator(rig=replace(RIG, delay=-1))
+    follower, reference = RunEstimator(RIG), OnlineEstimator(rig=replace(RIG, delay=-1))
     u, y = np.array([0.0, 1.0, -2.0]), np.array([1e-4, 2e-4, 1e-3])
-    follower.take(u, y)
+    follower.update(u, y)
     before = follower.belief
-    ahead = follower.ahead(3.0)
+    ahead = follower.predict_ahead(3.0)
     assert follower.belief == before
     reference.run(u, y)
     reference.run([3.0], [math.nan], missing=True)
@@ -245,19 +247,19 @@ def test_the_belief_ahead_is_that_of_a_sample_nobody_measured():
 
 def test_a_delay_is_looked_ahead_over():
     rig = replace(RIG, delay=2)
-    follower = Follower(rig)
-    follower.take([0.0, 1.0], [0.0, 0.0])
-    assert abs(follower.ahead(0.0).state_mean[0]) > 0, "the input of 1 N, which is on its way, has begun to act"
+    follower = RunEstimator(rig)
+    follower.update([0.0, 1.0], [0.0, 0.0])
+    assert abs(follower.predict_ahead(0.0).state_mean[0]) > 0, "the input of 1 N, which is on its way, has begun to act"
 
 
 def test_a_pause_forgets_the_phase_and_keeps_the_rest():
-    follower, plant = Follower(RIG), Bench()
+    follower, plant = RunEstimator(RIG), Bench()
     plant.arm(None)
     rng = np.random.default_rng(0)
     u, y = plant.play(np.repeat(rng.choice([-3.0, 3.0], 10), 8))
-    follower.take(np.concatenate([[0.0], u[:-1]]), y)
+    follower.update(np.concatenate([[0.0], u[:-1]]), y)
     before = follower.belief
-    follower.pause(float(u[-1]))
+    follower.start_pause(float(u[-1]))
     after = follower.belief
     np.testing.assert_allclose(after.coefficients_mean, before.coefficients_mean)
     np.testing.assert_allclose(after.coefficients_cov, before.coefficients_cov)
@@ -271,14 +273,14 @@ def two_blocks(follower, plant, seed=0):
     rng, played = np.random.default_rng(seed), []
     for size in (0.0, 3.0, 3.0):
         u, y = plant.play(size * np.repeat(rng.choice([-1.0, 1.0], 16), 8))
-        follower.take_block(u, y)
-        follower.pause(float(u[-1]))
+        follower.update_block(u, y)
+        follower.start_pause(float(u[-1]))
         played.append((u, y))
     return played
 
 
 def test_blocks_tell_the_coefficients_together_as_identify_does():
-    follower, plant = Follower(RIG), Bench()
+    follower, plant = RunEstimator(RIG), Bench()
     plant.arm(None)
     played = two_blocks(follower, plant)
     told, whole = follower.belief, identify(RIG, played).belief
@@ -291,9 +293,9 @@ def test_blocks_tell_the_coefficients_together_as_identify_does():
 
 
 def test_where_a_fit_of_all_blocks_begins_does_not_matter():
-    follower, plant = Follower(RIG), Bench()
+    follower, plant = RunEstimator(RIG), Bench()
     plant.arm(None)
-    played, prior = two_blocks(follower, plant), Follower(RIG).belief
+    played, prior = two_blocks(follower, plant), RunEstimator(RIG).belief
     first, second = (refit(RIG, played, prior, near) for near in (follower.belief, identify(RIG, played).belief))
     std = np.sqrt(np.diag(first[1]))
     np.testing.assert_allclose(first[0] / std, second[0] / std, atol=0.05)
@@ -304,10 +306,10 @@ def test_where_a_fit_of_all_blocks_begins_does_not_matter():
 
 
 def test_signals_are_as_slow_as_the_rig():
-    follower = Follower(RIG)
+    follower = RunEstimator(RIG)
     hold = holds(follower.belief, 256)
     assert hold in (2, 3), "1.9 Hz at 50 Hz are 27 samples a period; the Silverbox has 9"
-    policy = make_policy("prbs", Observed(RIG, follower.belief, 256), seed=0)
+    policy = make_policy("prbs", EnvView(RIG, follower.belief, 256), seed=0)
     actions, state = [], None
     for _ in range(hold * 6):
         action, state = policy.predict(np.zeros(1), state)
@@ -327,9 +329,9 @@ def test_signals_reach_the_rigs_limit_and_no_more(name, tmp_path):
 
 
 def listened(rig, truth, seed):
-    follower, plant = Follower(rig), SimulatedPlant(rig, truth, seed=seed, clock=JumpingClock())
+    follower, plant = RunEstimator(rig), SimulatedPlant(rig, truth, seed=seed, clock=JumpingClock())
     _, y = plant.play(np.zeros(16))
-    follower.take(np.zeros(16), y)
+    follower.update(np.zeros(16), y)
     plant.arm(None)
     return follower, plant
 
@@ -337,7 +339,7 @@ def listened(rig, truth, seed):
 def test_the_probability_of_leaving_grows_with_the_input():
     follower, _ = listened(RIG, TRUTH, 0)
     rng = np.random.default_rng(0)
-    futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
+    futures = Futures(follower.online.model, follower.draw_systems(rng), 1.0, rng)
     u = np.repeat([1.0, -1.0], 16)
     found = [futures.probability(share * u) for share in (0.0, 1.0, 5.0, 30.0)]
     assert found[0] < 0.01
@@ -351,7 +353,7 @@ def test_the_probability_of_leaving_grows_with_the_input():
 def test_the_draws_that_leave_are_those_whose_outputs_do():
     follower, _ = listened(RIG, TRUTH, 0)
     rng = np.random.default_rng(0)
-    futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
+    futures = Futures(follower.online.model, follower.draw_systems(rng), 1.0, rng)
     u = 3.0 * np.repeat([1.0, -1.0], 16)
     process, sensor = futures.disturbances(len(u))
     draws = zip(futures.coefficients, process, futures.states, strict=True)
@@ -382,7 +384,7 @@ def test_a_belief_that_cannot_be_safe_is_not_played(tmp_path):
 @pytest.mark.parametrize("policy", ["prbs", "efe"])
 def test_blocks_leave_the_range_as_rarely_as_asked(policy):
     """Of 200 systems drawn from the guess, at the first and boldest design: more than 19 for 5 % are a 1 in 1000."""
-    from agents.running.blocks import design_of
+    from agents.hardware.block_loop import block_designer
 
     rig = replace(RIG, input=replace(RIG.input, limit=40.0))
     left, promised, rng = 0, [], np.random.default_rng(5)
@@ -393,9 +395,9 @@ def test_blocks_leave_the_range_as_rarely_as_asked(policy):
         low, high = rig.guess["m"]
         truth["m"] = float(np.exp(np.log(low * high) / 2 + np.log(high / low) / 2 / HALF_WIDTH * rng.standard_normal()))
         follower, plant = listened(rig, truth, k)
-        observed = Observed(rig, follower.belief, 64)
-        futures = Futures(follower.estimator.model, follower.drawn(rng), 1.0, rng)
-        u, _, probability = design_of(make_policy(policy, observed, seed=k), observed).block(64, futures, 0.05)
+        observed = EnvView(rig, follower.belief, 64)
+        futures = Futures(follower.online.model, follower.draw_systems(rng), 1.0, rng)
+        u, _, probability = block_designer(make_policy(policy, observed, seed=k), observed).block(64, futures, 0.05)
         _, y = plant.play(40.0 * u)
         left += bool((np.abs(y) > 0.08).any())
         promised.append(probability)
@@ -518,7 +520,9 @@ def test_an_error_within_zeroes_and_is_told(options, tmp_path):
             raise KeyError("a bug")
 
     with pytest.raises(KeyError):
-        run(RIG, plant, tmp_path / "run", Plan(policy="prbs", **options), clock=plant.clock, told=broken)
+        run_experiment(
+            RIG, plant, tmp_path / "run", RunSettings(policy="prbs", **options), clock=plant.clock, on_progress=broken
+        )
     assert plant.applied == 0.0
     assert not plant._armed
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["how"] == "error"
@@ -622,8 +626,8 @@ def test_every_warning_is_told_whatever_ended_the_run(ended, tmp_path):
         if samples > 150 and ended == "SIGINT":
             signal.raise_signal(signal.SIGINT)
 
-    plan = Plan(policy="prbs", samples=160, stale=0)
-    result = run(RIG, plant, tmp_path / "run", plan, prior=believed, clock=plant.clock, told=told)
+    plan = RunSettings(policy="prbs", samples=160, stale=0)
+    result = run_experiment(RIG, plant, tmp_path / "run", plan, prior=believed, clock=plant.clock, on_progress=told)
     assert result.ended == ended
     assert "outputs came too late to be used: intervals may be too narrow" in result.message
     assert "what was believed before is wrong: identify" in result.message
@@ -718,7 +722,7 @@ def command(*words):
 
 def test_the_command(folder, capsys):
     (folder / "lab_of_tests.py").write_text(
-        "from agents.running.simulated import SimulatedPlant\n"
+        "from agents.hardware.simulated_plant import SimulatedPlant\n"
         "def plant(rig, seed=0):\n    return SimulatedPlant(rig, seed=seed)\n"
     )
     # As an editor on Windows writes it, with a mark of byte order.
@@ -735,7 +739,7 @@ def test_the_command(folder, capsys):
 
 def test_the_command_fails_where_the_input_could_not_be_zeroed(folder, capsys):
     (folder / "stuck_of_tests.py").write_text(
-        "from agents.running.simulated import SimulatedPlant\n"
+        "from agents.hardware.simulated_plant import SimulatedPlant\n"
         "class Stuck(SimulatedPlant):\n    def zero(self):\n        raise OSError('the converter does not answer')\n"
         "    def disarm(self):\n        self._armed = False\n"
         "plant = Stuck\n"
@@ -753,9 +757,9 @@ def test_the_command_fails_where_the_input_could_not_be_zeroed(folder, capsys):
     [
         ("lab", "module:name"),
         ("no_such_module:plant", "no module"),
-        ("agents.running.simulated:plan", "has no 'plan'"),
+        ("agents.hardware.simulated_plant:plan", "has no 'plan'"),
         ("builtins:repr", "plant must have"),
-        ("agents.running.instrument:plant", "must be a table of the rig file"),
+        ("agents.hardware.visa_instrument:plant", "must be a table of the rig file"),
         ("operator:neg", r"made by operator:neg\(rig, \*\*instrument\), .* but that failed: TypeError: bad operand"),
         ("builtins:divmod", r"the table \[instrument\] of the rig file, but that failed: TypeError: divmod expected 2"),
     ],

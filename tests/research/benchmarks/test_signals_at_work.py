@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.running.clock import JumpingClock
-from agents.running.run import Plan, run
-from agents.running.simulated import SimulatedPlant
+from agents.hardware.clock import JumpingClock
+from agents.hardware.experiment_run import RunSettings, run_experiment
+from agents.hardware.simulated_plant import SimulatedPlant
 from benchmarks.kills.file_integrity import half_written
 from benchmarks.kills.killable_process import started
 from benchmarks.kills.killed_commands import RIG, SMALL, Ship
@@ -34,13 +34,13 @@ COMMANDS = {
 }
 #: The clock jumps, so that no run is late.
 LAB = """
-import agents.running.run
-from agents.running.clock import JumpingClock
-from agents.running.simulated import SimulatedPlant
+import agents.hardware.experiment_run
+from agents.hardware.clock import JumpingClock
+from agents.hardware.simulated_plant import SimulatedPlant
 
 def plant(rig):
     clock = JumpingClock()
-    agents.running.run.RealClock = lambda: clock
+    agents.hardware.experiment_run.RealClock = lambda: clock
     return SimulatedPlant(rig, clock=clock)
 """
 
@@ -64,7 +64,7 @@ def bench(tmp_path_factory):
     (place / "lab.py").write_text(LAB)
     rig = Rig.from_file(place / "rig.toml")
     plant = SimulatedPlant(rig, clock=JumpingClock())
-    run(rig, plant, place / "measured", Plan("prbs", 512), clock=plant.clock)
+    run_experiment(rig, plant, place / "measured", RunSettings("prbs", 512), clock=plant.clock)
     shutil.copy(place / "measured" / "samples.csv", place / "record.csv")
     process = started(place, ["rig", "list"])  # the packages are imported
     process.join()

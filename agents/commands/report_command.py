@@ -1,0 +1,51 @@
+"""``duffing-env report``: boards as tables, and as a page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class ReportCommand:
+    """Show the leaderboard that ships, with your own entries.
+
+    $ duffing-env report
+    $ duffing-env report --board runs/leaderboard.jsonl --output board.html
+    """
+
+    board: Path | None = None
+    """File of your own entries; runs/leaderboard.jsonl where there is one."""
+    output: Path | None = None
+    """Write a page here, which opens without a network."""
+
+    def run(self) -> None:
+        """Print the tables, and write the page."""
+        from agents.cli import check_distinct_files
+        from agents.console_output import format_table, print_texts_and_tables
+        from agents.leaderboard import leaderboard_file
+
+        check_distinct_files({"output": self.output}, [self.board or leaderboard_file.OWN_LEADERBOARD])
+        own_leaderboard = (
+            self.board
+            if self.board is not None
+            else leaderboard_file.OWN_LEADERBOARD
+            if leaderboard_file.OWN_LEADERBOARD.is_file()
+            else None
+        )
+        entries = {
+            (entry["track"], entry["name"]): entry
+            for path in (leaderboard_file.SHIPPED_LEADERBOARD, own_leaderboard)
+            if path
+            for entry in leaderboard_file.read_entries(path)
+        }
+        # What is printed needs no file, and comes also where none can be written.
+        try:
+            if self.output is not None:
+                leaderboard_file.write_leaderboard_page(self.output, list(entries.values()))
+        finally:
+            for track, rows in leaderboard_file.leaderboard_rows(list(entries.values())).items():
+                print_texts_and_tables(f"\n{track}", format_table(leaderboard_file.COLUMN_TITLES, rows))
+            print_texts_and_tables(leaderboard_file.LEADERBOARD_CAPTION)
+        if self.output is not None:
+            print_texts_and_tables(f"The page is {self.output}")

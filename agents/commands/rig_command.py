@@ -1,0 +1,82 @@
+"""``duffing-env rig``: describe a rig in a file, or list those that ship."""
+
+from __future__ import annotations
+
+import shlex
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class RigInitCommand:
+    """Write a rig file. It asks, or takes what a record tells, or copies a rig that ships.
+
+    $ duffing-env rig init
+    $ duffing-env rig init rig.toml --from data.csv
+    $ duffing-env rig init rig.toml --from data.csv --step 1e-3
+    $ duffing-env rig init rig.toml --from daten.csv --input Kraft --output Weg
+    $ duffing-env rig init rig.toml --from beam
+    """
+
+    path: Annotated[Path, tyro.conf.Positional] = Path("rig.toml")
+    """The file that is written."""
+    source: Annotated[str | None, tyro.conf.arg(name="from", metavar="DATA|NAME")] = None
+    """CSV or MAT file of a record, or the name of a rig that ships."""
+    step: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    """Sampling step, for a record without a column of times, such as a MAT file."""
+    input: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Column or variable of a record that holds the input, where its name is none of the usual."""
+    output: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """The same of the output."""
+    force: bool = False
+    """Replace the file where there is one."""
+
+    def run(self) -> None:
+        """Write it."""
+        from agents.cli import check_not_overwritten
+        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record, text_of
+        from agents.console_output import print_wrapped
+        from estimator.files import write_atomically
+        from estimator.rig import SHIPPED
+
+        check_not_overwritten("path", self.path, self.force)
+        for name in ("step", "input", "output"):
+            if getattr(self, name) is not None and (self.source is None or self.source in SHIPPED):
+                raise ValueError(f"{name} goes with a record; add --from data.csv, or leave it out")
+        summary = ""
+        if self.source is None:
+            text = text_of(ask_for_rig())
+        elif self.source in SHIPPED:
+            text = SHIPPED[self.source].read_text(encoding="utf-8")
+        else:
+            text, summary = rig_text_from_record(Path(self.source), self.step, self.input, self.output)
+        write_atomically(self.path, text)
+        if summary:
+            print_wrapped(summary)
+        print_wrapped(f"Wrote {self.path}: read it, and correct what is not so.")
+        data = "data.csv" if self.source is None or self.source in SHIPPED else self.source
+        print_wrapped(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}")
+
+
+@dataclass(frozen=True)
+class RigListCommand:
+    """List the rigs that ship; each name stands for its file.
+
+    $ duffing-env rig list
+    """
+
+    def run(self) -> None:
+        """Print them."""
+        from estimator.rig import SHIPPED
+
+        width = max(map(len, SHIPPED))
+        for name, path in SHIPPED.items():
+            first = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+            description = first.split(". See")[0].rstrip(".")
+            print(
+                textwrap.fill(description, 80, initial_indent=f"{name:<{width}}  ", subsequent_indent=" " * (width + 2))
+            )

@@ -1,0 +1,82 @@
+"""``duffing-env run``: an experiment on a rig, that ends with its parameters."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from agents.hardware.run_settings import RunSettings
+
+
+@dataclass(frozen=True)
+class RunCommand:
+    """Run an experiment on a rig, and identify while it goes on.
+
+    The input is zero before and after, whatever happens. docs/running.md says what a plant is, and what can go wrong.
+
+    $ duffing-env run rig.toml --plant agents.hardware.simulated_plant:plant --out run
+    $ duffing-env run rig.toml --plant agents.hardware.visa_instrument:plant --out run
+    $ duffing-env run rig.toml --plant lab:plant --block 64 --out run
+    $ duffing-env run rig.toml run/estimator.npz --plant lab:plant --out next
+    $ duffing-env identify rig.toml run/samples.csv
+    """
+
+    rig: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RIG")]
+    """Rig file, with input.limit and output.range, and a guess where there is no posterior."""
+    plant: Annotated[str, tyro.conf.arg(metavar="MODULE:FACTORY")]
+    """What makes the plant: factory(rig, **instrument), with the table [instrument] of the rig file."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+    """New folder for the samples and the manifest."""
+    posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[POSTERIOR]")] = None
+    """What is known before: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
+    plan: Annotated[RunSettings, tyro.conf.arg(name="")] = field(default_factory=RunSettings)
+    """What to do."""
+
+    def run(self) -> None:
+        """Run, and print the parameters; the exit status is 1 after a trip, or where the input could not be zeroed."""
+        from agents.console_output import print_warning, print_wrapped
+        from agents.hardware.experiment_run import run_experiment
+        from agents.hardware.plant_interface import load_plant
+        from estimator import Rig
+        from estimator.progress import progress
+        from estimator.saving import load_estimator
+
+        rig, instrument = Rig.with_instrument(self.rig)
+        prior = None if self.posterior is None else load_estimator(self.posterior).belief
+        plant = load_plant(self.plant, rig, instrument)
+        try:
+            with progress("Running") as on_progress:
+                report_samples = lambda samples_done: on_progress(samples_done / self.plan.samples, self.plan.policy)  # noqa: E731
+                result = run_experiment(rig, plant, self.out, self.plan, prior=prior, on_progress=report_samples)
+        finally:
+            if hasattr(plant, "close"):
+                plant.close()
+        print_run_result(result)
+        if result.ended == "zero":
+            print_wrapped(f"duffing-env: complete, but {result.message}", sys.stderr)
+        elif result.exit_status:
+            print_wrapped(f"duffing-env: ended early ({result.ended}): {result.message}", sys.stderr)
+        elif result.message:
+            print_warning(result.message)
+        sys.exit(result.exit_status)
+
+
+def print_run_result(result: Any) -> None:
+    """Print the parameters with their intervals, and what was late."""
+    from agents.console_output import format_table
+    from agents.console_output import print_texts_and_tables as print_all
+
+    intervals, units = result.interval(0.9), result.units
+    rows = [
+        [name, f"{mean:.5g}", f"{intervals[name][0]:.5g} to {intervals[name][1]:.5g}", units[name]]
+        for name, (mean, _) in result.parameters.items()
+    ]
+    late = f"{result.late} ticks of the clock were missed" if result.late else "no tick of the clock was missed"
+    print_all(
+        format_table(("", "mean", "90 % interval", "unit"), rows),
+        f"{late}; the samples are {result.folder}/samples.csv",
+    )

@@ -1,0 +1,183 @@
+"""How results are printed and written: tables, JSON files, and the versions that they were made with."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from estimator.checks import printable
+from estimator.files import check_place, write_atomically
+from estimator.progress import WIDTH
+
+
+def rich_console() -> Any:
+    """Of rich, as wide as the terminal, but at most `WIDTH`."""
+    from rich.console import Console
+
+    made = Console(highlight=False, markup=False, emoji=False)
+    made.width = min(WIDTH, made.width)
+    return made
+
+
+def print_wrapped(text: str, file: TextIO | None = None) -> None:
+    """Print a text in lines of at most `WIDTH` characters; a word that is longer, such as a path, stays whole."""
+    for line in printable(text, "\n").split("\n"):
+        whole = textwrap.wrap(line, WIDTH, break_long_words=False, break_on_hyphens=False)
+        print("\n".join(whole), file=file)
+
+
+def print_warning(text: str) -> None:
+    """Print a warning on stderr."""
+    print_wrapped(f"duffing-env: warning: {text}", sys.stderr)
+
+
+def print_texts_and_tables(*parts: Any) -> None:
+    """Print texts, as `say` does, and tables (`format_table`)."""
+    for part in parts:
+        if isinstance(part, str):
+            print_wrapped(part)
+        else:
+            for k, one_table in enumerate(part):
+                if k:
+                    print()
+                rich_console().print(one_table)
+
+
+def format_table(
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    markdown: bool = False,
+    title: str = "",
+    n_labels: int = 1,
+) -> list[Any]:
+    """A table of texts for `print_texts_and_tables`: the first column to the left, the others to the right, titles broken before cells.
+
+    Where it is wider than `WIDTH`, there are several, which begin with the same columns.
+
+    Args:
+        headings: of the columns.
+        rows: their cells; a shorter row ends with empty ones.
+        markdown: whether the manual is to take the table as it is.
+        title: above the table.
+        n_labels: columns that say what a row is, and stand in each of several tables.
+    """
+    from rich.box import MARKDOWN, SIMPLE_HEAD
+    from rich.table import Table
+
+    cells = [[printable(cell, "\n") for cell in row] + [""] * (len(headings) - len(row)) for row in rows]
+
+    def make_table(columns: Sequence[int]) -> Any:
+        rich_table = Table(
+            box=MARKDOWN if markdown else SIMPLE_HEAD, show_edge=markdown, padding=(0, 1) if markdown else (0, 1, 0, 0),
+            title=title or None,
+        )  # fmt: skip
+        for column in columns:
+            below = "\n".join(cell for row in cells for cell in row[column : column + 1]).splitlines()
+            width = max([7, *map(len, below)])
+            broken = (textwrap.fill(line, width, break_long_words=False) for line in headings[column].splitlines())
+            heading = headings[column] if markdown else "\n".join(broken)
+            is_label = column < n_labels
+            rich_table.add_column(
+                heading, justify="left" if markdown or column == 0 else "right", overflow="fold",
+                max_width=_MAX_LABEL_WIDTH if is_label else None,
+            )  # fmt: skip
+        for row in cells:
+            rich_table.add_row(*(row[column] for column in columns))
+        return rich_table
+
+    return split_to_width(make_table, len(headings), n_labels)
+
+
+def split_to_width(make_table: Callable[[Sequence[int]], Any], n_columns: int, n_labels: int = 1) -> list[Any]:
+    """Tables of rich, each at most `WIDTH` wide, in place of one.
+
+    Args:
+        make_table: the table of some columns.
+        n_columns: of the whole table.
+        n_labels: the first columns, which each table has.
+    """
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    unbounded_console, max_width = Console(width=_UNBOUNDED_WIDTH, markup=False, emoji=False), rich_console().width
+    first, groups = list(range(n_labels)), [list[int]()]
+    for column in range(n_labels, n_columns):
+        candidate = make_table([*first, *groups[-1], column])
+        if groups[-1] and Measurement.get(unbounded_console, unbounded_console.options, candidate).maximum > max_width:
+            groups.append([])
+        groups[-1].append(column)
+    tables = [make_table([*first, *group]) for group in groups]
+    for later in tables[1:]:
+        later.title = None
+    for earlier in tables[:-1]:
+        earlier.caption = None
+    return tables
+
+
+#: Of what is measured, and of a label [characters].
+_UNBOUNDED_WIDTH, _MAX_LABEL_WIDTH = 10_000, 32
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a JSON file in one piece; a number that is not finite, as null.
+
+    Raises:
+        OSError: where it cannot be written.
+    """
+    write_atomically(
+        path, json.dumps(replace_non_finite(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    )
+
+
+def replace_non_finite(content: Any) -> Any:
+    """What JSON can hold: a number that is not finite becomes null."""
+    if isinstance(content, dict):
+        return {key: replace_non_finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [replace_non_finite(value) for value in content]
+    return None if isinstance(content, float) and not np.isfinite(content) else content
+
+
+def check_output_file(name: str, path: Path | None) -> None:
+    """Refuse a folder where a file is to be written, and where none can be, before the work begins.
+
+    Raises:
+        IsADirectoryError: naming the argument.
+        OSError: naming the path, where it cannot be written.
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise IsADirectoryError(f"{name} must be a file, but is the folder {path}; name a file in it")
+    check_place(path)
+
+
+def check_output_folder(name: str, path: Path) -> None:
+    """Refuse a file where a folder is to be, and where none can be written to, before the work begins.
+
+    Raises:
+        NotADirectoryError: naming the argument.
+        OSError: naming the path, where nothing can be written.
+    """
+    for place in (path, *path.parents):
+        if place.exists() and not place.is_dir():
+            raise NotADirectoryError(f"{name} must be a folder, but {place} is a file; name another place")
+    check_place(path)
+
+
+#: What the numbers of a result depend on.
+VERSIONED_PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy")
+
+
+def package_versions(*packages: str) -> dict[str, str]:
+    """Of Python, of `VERSIONED_PACKAGES`, and of these packages."""
+    return {"python": platform.python_version(), **{name: version(name) for name in (*VERSIONED_PACKAGES, *packages)}}

@@ -1,0 +1,69 @@
+"""What a run is to do: the settings of ``duffing-env run``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+#: Shortest time of silence that the watchdog is told [s].
+_MIN_WATCHDOG_TIMEOUT = 2.0
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What a run is to do.
+
+    Attributes:
+        policy: efe, the planner, or the name of a signal; without a block also that of any other policy.
+        samples: number of inputs to play, in all.
+        block: number of inputs that are chosen and played at once; where None, each input is chosen by itself, against
+            the clock.
+        bound: largest probability that a block, or a whole signal, may have of taking the output out of its range.
+        listen: number of samples without input at the start, which tell where the rig stands.
+        watchdog: seconds of silence after which the plant zeroes its input; where None, 2 s, or 20 sampling steps if
+            that is longer, and twice the length of a block besides.
+        no_watchdog: whether to run a plant that has no watchdog.
+        stale: number of outputs in a row that are missing, late, or the same number again, which end the run; 0: never.
+        seed: seed of the policy, and of the systems that are drawn from the belief.
+
+    Raises:
+        ValueError: naming the argument, the value and the remedy.
+    """
+
+    policy: str = "efe"
+    samples: int = 256
+    block: int | None = None
+    bound: float = 0.05
+    listen: int = 16
+    watchdog: float | None = None
+    no_watchdog: bool = False
+    stale: int = 32
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        # The usual plan is made for --help too, where nothing is imported that computes.
+        if any(getattr(self, field.name) is not field.default for field in fields(self)):
+            self._check()
+
+    def _check(self) -> None:
+        from agents.asked import MOST_SAMPLES
+        from estimator.checks import MOST_SEED, SMALLEST, flag, number, shown, whole
+
+        ranges = {
+            "samples": (1, MOST_SAMPLES), "listen": (1, MOST_SAMPLES), "stale": (0, MOST_SAMPLES),
+            "block": (8, MOST_SAMPLES), "seed": (0, MOST_SEED),
+        }  # fmt: skip
+        for name, (least, most) in ranges.items():
+            if name != "block" or self.block is not None:
+                whole(name, getattr(self, name), most, least)
+        if not isinstance(self.policy, str):
+            raise ValueError(f"policy must be a name, but is {shown(self.policy)}; see agents.POLICIES")
+        number("bound", self.bound, SMALLEST, 1 - SMALLEST, "0.05 is usual")
+        if self.watchdog is not None:
+            number("watchdog", self.watchdog, remedy="it is in seconds")
+        flag("no_watchdog", self.no_watchdog)
+
+    def watchdog_timeout(self, sampling_step: float) -> float | None:
+        """Seconds that the watchdog is told; None for none."""
+        if self.no_watchdog:
+            return None
+        return self.watchdog or max(_MIN_WATCHDOG_TIMEOUT, 20 * sampling_step) + 2 * (self.block or 0) * sampling_step

@@ -1,0 +1,114 @@
+"""Signals that end a run, or a command, in order: the input is zeroed, and what was measured or learned is kept."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+#: What ends a run. After a signal the command's exit status is 128 + its number.
+STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+#: A call that a signal finds the program in is left by force after so many seconds.
+_CALL_PATIENCE = 1.0
+
+
+class Interrupted(BaseException):
+    """A signal came.
+
+    Args:
+        signum: its number.
+        resume_hint: what is left of the work, and how to go on.
+    """
+
+    def __init__(self, signum: int, resume_hint: str = "") -> None:
+        super().__init__(signal.Signals(signum).name)
+        self.signum, self.resume_hint = signum, resume_hint
+
+
+class InterruptHandler:
+    """Catches signals while it is entered, in the main thread.
+
+    A signal is noticed by `check`, between two commands to the plant, so that none is cut in two. A command or a
+    policy that does not come back within ``patience`` seconds is interrupted.
+    """
+
+    def __init__(self, patience: float = _CALL_PATIENCE) -> None:
+        self._patience = patience
+        self._signum: int | None = None
+        self._old_handlers: dict[int, Any] = {}
+
+    def __enter__(self) -> InterruptHandler:
+        if threading.current_thread() is threading.main_thread():
+            self._old_handlers = {signum: signal.signal(signum, self._on_signal) for signum in STOP_SIGNALS}
+            if hasattr(signal, "setitimer"):
+                self._old_handlers[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._on_timeout)
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._cancel_timer()
+        for signum, handler in self._old_handlers.items():
+            signal.signal(signum, handler)
+
+    @property
+    def is_requested(self) -> bool:
+        """Whether a signal came."""
+        return self._signum is not None
+
+    def check(self, resume_hint: str = "") -> None:
+        """Raise `Interrupted` where a signal came; ``resume_hint`` says what is left."""
+        if self._signum is not None:
+            self._cancel_timer()
+            raise Interrupted(self._signum, resume_hint)
+
+    def ignore_signals(self) -> None:
+        """From now on no signal is noticed: the input is being zeroed."""
+        self._cancel_timer()
+        for signum in self._old_handlers:
+            signal.signal(signum, signal.SIG_IGN)
+
+    def _on_signal(self, signum: int, frame: FrameType | None) -> None:
+        self._signum = signum
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, self._patience)
+
+    def _on_timeout(self, signum: int, frame: FrameType | None) -> None:
+        if self._signum is not None:
+            raise Interrupted(self._signum)
+
+    def _cancel_timer(self) -> None:
+        if self._old_handlers and hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+@contextmanager
+def add_resume_hint(make_hint: Callable[[str], str]) -> Iterator[None]:
+    """Let a signal that ends the work within say what is left of it: ``make_hint`` makes that of what is said already."""
+    try:
+        yield
+    except (KeyboardInterrupt, Interrupted) as interruption:
+        signum, previous_hint = (
+            (interruption.signum, interruption.resume_hint)
+            if isinstance(interruption, Interrupted)
+            else (signal.SIGINT, "")
+        )
+        raise Interrupted(signum, make_hint(previous_hint)) from interruption
+
+
+@contextmanager
+def raise_on_sigterm() -> Iterator[None]:
+    """Let SIGTERM raise `Interrupted`, as Ctrl-C raises KeyboardInterrupt, in the main thread, which alone is told."""
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        raise Interrupted(signum)
+
+    is_main = threading.current_thread() is threading.main_thread()
+    old_handler = signal.signal(signal.SIGTERM, stop) if is_main else None
+    try:
+        yield
+    finally:
+        if is_main:
+            signal.signal(signal.SIGTERM, old_handler)

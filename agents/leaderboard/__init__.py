@@ -1,0 +1,1 @@
+"""The leaderboard: the protocol, its file and its tables."""

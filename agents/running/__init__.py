@@ -1,1 +1,0 @@
-"""Running experiments on a rig: sample by sample against a clock, or block by block (`agents.running.run.run`)."""

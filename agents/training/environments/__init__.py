@@ -1,0 +1,1 @@
+"""Vector environments for training: with features, mixed, and of a family of oscillators."""

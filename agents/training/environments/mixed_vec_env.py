@@ -1,0 +1,188 @@
+"""Environments of drawn options as Stable-Baselines3's `VecEnv`: groups of rows, each with options of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from time import perf_counter
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from agents.evaluation.batch import make
+from agents.policies.features import BOUND, FeatureMap, Features
+from agents.training.environments.feature_vec_env import REWARD_SCALE, FeatureNormalizer, has_shaping_potential
+from agents.vec_env import BatchVecEnv, rows_of, told_of
+from duffing_env.vector_env import DuffingVectorEnv
+from estimator.checks import shown
+from estimator.lanes import LANES
+
+#: Draws what a group plays next: the id of a track, and the options of its environments.
+DrawOptions = Callable[[np.random.Generator], tuple[str, dict[str, Any]]]
+
+
+def draw_track_options(
+    rng: np.random.Generator, env_id: str, options: dict[str, Any], ranges: Mapping[str, Sequence[float]]
+) -> tuple[str, dict[str, Any]]:
+    """A track with some of its options drawn, log-uniform: whole numbers between two of them, any between others.
+
+    Example:
+        >>> import numpy as np
+        >>> from agents.training.environments.mixed_vec_env import draw_track_options
+        >>> drawn = draw_track_options(np.random.default_rng(1), "duffing_env/Power-v0", {}, {"horizon": (128, 1024)})
+        >>> drawn
+        ('duffing_env/Power-v0', {'horizon': 371})
+    """
+    drawn = {}
+    for name, (low, high) in ranges.items():
+        value = min(float(np.exp(rng.uniform(np.log(low), np.log(high)))), high)
+        drawn[name] = round(value) if isinstance(low, int) and isinstance(high, int) else value
+    return env_id, options | drawn
+
+
+class _RowGroup:
+    """Rows with the same options, for as long as one of their episodes lasts."""
+
+    def __init__(
+        self, rng: np.random.Generator, draw: DrawOptions, options: dict[str, Any], raw_observation: bool
+    ) -> None:
+        env_id, drawn = draw(rng)
+        self.envs: DuffingVectorEnv = make(env_id, LANES, drawn | options)
+        self.feature_map = FeatureMap.of(self.envs, own=raw_observation)
+        observations, self.infos = self.envs.reset(seed=int(rng.integers(2**31)))
+        self.current_features: Features = self.feature_map(observations)
+        self.samples_left = self.envs.horizon
+        self.weight = np.float32(has_shaping_potential(self.envs))
+
+    def row_infos(self, **extra: Any) -> list[dict[str, Any]]:
+        """The infos of its rows at the last reset or step."""
+        single = self.envs.single_env_class
+        return rows_of(self.infos, (*single._info_gains, *single._info_flags), LANES, **extra)
+
+
+class MixedVecEnv(BatchVecEnv):
+    """Rows in groups of `estimator.lanes.LANES`, each group with options of its own, seen as features.
+
+    A group draws anew when an episode has gone by; the rows that began another on the way, because a limit ended
+    theirs, are cut short. As in `agents.training.environments.feature_vec_env` the increase of what is still to come is added to the
+    reward.
+
+    Args:
+        num_envs: rows, a multiple of `LANES`.
+        seed: of what is drawn, of oscillators and noise.
+        draw: what a group plays next.
+        reward: that counts information.
+        levels: an action is one of so many evenly spaced choices from -1 to 1, by its number; 0: any between.
+        raw_observation: whether the observation itself stands behind the features; then all that is drawn has one model.
+
+    Raises:
+        ValueError: for another number of rows.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        seed: int,
+        draw: DrawOptions,
+        *,
+        reward: str = "information_gain",
+        levels: int = 0,
+        raw_observation: bool = False,
+    ) -> None:
+        if num_envs % LANES:
+            raise ValueError(f"num_envs must be a multiple of {LANES} for drawn options, but is {num_envs}")
+        self.render_mode = None
+        self._rngs = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(num_envs // LANES)]
+        self._draw, self._raw_observation = draw, raw_observation
+        self._fixed_options = {"reward": reward, "autoreset_mode": AutoresetMode.SAME_STEP}
+        self._discrete_actions = np.linspace(-1.0, 1.0, levels) if levels else None
+        self._groups = [self._draw_group(rng) for rng in self._rngs]
+        first = self._groups[0].feature_map
+        self.features = first.describe() if raw_observation else {"own": False}
+        self.normalizer = FeatureNormalizer(first.size)
+        space = gym.spaces.Discrete(levels) if levels else gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        seen = gym.spaces.Box(-BOUND, BOUND, (first.size,), np.float32)
+        super().__init__(num_envs, seen, space)
+        self._choices = np.zeros(num_envs)
+        self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64)
+        self._start_time = perf_counter()
+
+    def _draw_group(self, rng: np.random.Generator) -> _RowGroup:
+        return _RowGroup(rng, self._draw, self._fixed_options, self._raw_observation)
+
+    def reset(self) -> VecEnvObs:
+        """Show what every row sees; the episodes have begun.
+
+        Raises:
+            ValueError: for options of `set_options`: they are drawn here.
+        """
+        if any(self._options):
+            raise ValueError(
+                f"options must be none where they are drawn, but are {shown(self._options)}; leave them out"
+            )
+        self.reset_infos = [info for group in self._groups for info in group.row_infos()]
+        return self.normalizer(np.concatenate([group.current_features.values for group in self._groups]))
+
+    @property
+    def tensors(self) -> dict[str, npt.NDArray[Any]]:
+        """The normaliser, as a policy's file holds it; the setting is that of the environment that is played."""
+        return self.normalizer.to_tensors()
+
+    def step_async(self, actions: npt.NDArray[Any]) -> None:
+        """Take what the network chose."""
+        self._choices = actions[:, 0] if self._discrete_actions is None else self._discrete_actions[actions]
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all groups."""
+        values = np.empty((self.num_envs, len(self.normalizer.mean)), dtype=np.float32)
+        rewards, dones = np.empty(self.num_envs, dtype=np.float32), np.empty(self.num_envs, dtype=np.bool_)
+        rows: list[dict[str, Any]] = []
+        for g, group in enumerate(self._groups):
+            group_rows = slice(g * LANES, (g + 1) * LANES)
+            potential_before = group.current_features.to_come
+            actions = group.current_features.act(self._choices[group_rows])
+            observations, group_rewards, terminated, truncated, group.infos = group.envs.step(actions)
+            ended = terminated | truncated
+            rows += group.row_infos(**{"TimeLimit.truncated": False})
+            group.current_features = group.feature_map(observations)
+            group.samples_left -= 1
+            potential = np.where(ended, np.float32(0), group.current_features.to_come)
+            rewards[group_rows] = REWARD_SCALE * (group_rewards + group.weight * (potential - potential_before))
+            self._returns[group_rows] += group_rewards
+            self._lengths[group_rows] += 1
+            dones[group_rows] = ended | (group.samples_left == 0)
+            for row in np.flatnonzero(dones[group_rows]).tolist():
+                env_row = g * LANES + row
+                rows[env_row] |= (told_of(group.infos["final_info"], row) if ended[row] else {}) | {
+                    "terminal_observation": self.normalizer(group.current_features.values[row]),
+                    "TimeLimit.truncated": bool(not ended[row]),
+                    "episode": {
+                        "r": self._returns[env_row],
+                        "l": self._lengths[env_row],
+                        "t": perf_counter() - self._start_time,
+                    },
+                }
+                self._returns[env_row], self._lengths[env_row] = 0.0, 0
+            if group.samples_left == 0:
+                group.envs.close()
+                group = self._groups[g] = self._draw_group(self._rngs[g])
+            values[group_rows] = group.current_features.values
+        return self.normalizer(values), rewards, dones, rows
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """As of `BatchVecEnv`; options of the environments are refused."""
+        if hasattr(self._groups[0].envs, attr_name):
+            setattr(self._groups[0].envs, attr_name, value)
+        super().set_attr(attr_name, value, indices)
+
+    def close(self) -> None:
+        """Close the environments."""
+        for group in self._groups:
+            group.envs.close()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Nothing: the seed is that of the constructor."""
+        return [None] * self.num_envs

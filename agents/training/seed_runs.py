@@ -1,0 +1,49 @@
+"""Several trainings of one recipe, which differ by their seeds: one after the other, or on a Ray cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from agents.policies.learned import CONFIG
+from agents.training.hyperparameters import track_name
+from agents.training.ray_tasks import run_on_ray
+from agents.training.training_config import TrainConfig, claim_run_folder, read_config
+from agents.training.training_run import train_or_resume
+from estimator.extras import need
+
+
+def train_seeds(config: TrainConfig, seeds: int, *, on_ray: bool = False) -> Iterator[Path]:
+    """Train with a seed and those after it, each into a run folder of its own; tells each that is finished.
+
+    The folders are ``OUTPUT/SEED``, where the output is runs/ALGO-TRACK if none is named. What an earlier call left
+    there is gone on with, or is finished. The weights do not depend on where a seed is trained, nor on how often it was
+    stopped.
+
+    Args:
+        config: of the first.
+        seeds: how many.
+        on_ray: whether they are tasks on a cluster, see `agents.training.ray_tasks`; all its nodes must see the folder.
+
+    Raises:
+        ModuleNotFoundError: without Ray, where it is asked for.
+        ValueError: where a folder holds another run.
+    """
+    if on_ray:
+        need("ray")
+    folder = (config.output or Path("runs") / f"{config.algo}-{track_name(config.env).lower()}").resolve()
+    runs = [folder / str(seed) for seed in range(config.seed, config.seed + seeds)]
+    begin = None if config.begin is None else config.begin.resolve()
+    for run in runs:
+        claim_run_folder(run / CONFIG, replace(config, seed=int(run.name), output=run, begin=begin))
+    if on_ray:
+        yield from (run for run, _ in run_on_ray(_train_or_resume_folder, runs))
+        return
+    for run in runs:
+        _train_or_resume_folder(run)
+        yield run
+
+
+def _train_or_resume_folder(run: Path) -> None:
+    train_or_resume(read_config(run))

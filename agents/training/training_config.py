@@ -1,0 +1,242 @@
+"""What a training run is made from: its configuration, and how the run folder tells it."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from agents.cli import RIG_TRACK, JsonOptions, check_track_id, full_track_id, options_with_rig
+from agents.console_output import package_versions, write_json
+from agents.loading import check_options, spec_of
+from agents.policies.learned import CONFIG
+from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, hyperparameters_to_dict
+from agents.training.environments.oscillator_family import FAMILY
+from agents.training.hyperparameters import parse_hyperparameters, read_hyperparameters
+from estimator.checks import is_finite, mapping, one_of, shown, whole
+from estimator.extras import need
+from estimator.files import whole_file
+from estimator.lanes import LANES
+
+#: Rewards that count information.
+INFORMATION_REWARDS = ("information_gain", "log_posterior", "fisher", "expected_free_energy")
+
+
+@dataclass(frozen=True)
+class TrainingSubject:
+    """What is trained on what; the hyperparameters follow from it, where they are not given."""
+
+    algo: Literal["ppo", "sac", "td3", "tqc", "recurrent_ppo"] = "ppo"
+    """Algorithm."""
+    env: str = "duffing_env/Amplitude-v0"
+    """Track, such as Short-v0; or family, oscillators of all kinds."""
+    rig: str | None = None
+    """Rig file, or the name of a rig that ships; the track is then Rig-v0."""
+    settings: Path | None = None
+    """File of hyperparameters, TOML; the one that comes with the package where it is not given."""
+
+    def __post_init__(self) -> None:
+        if self.rig is not None and full_track_id(self.env) not in (TrainingSubject.env, RIG_TRACK):
+            raise ValueError(f"env must be left out with rig, whose track is Rig-v0, but is {self.env}; leave one out")
+        object.__setattr__(self, "env", RIG_TRACK if self.rig is not None else full_track_id(self.env))
+
+
+@dataclass(frozen=True)
+class TrainConfig(TrainingSubject):
+    """What a training run is made from. Written to ``config.json`` of its folder."""
+
+    reward: str = "information_gain"
+    """Name of the reward, such as information_gain, log_posterior or fisher (`duffing_env.rewards.reward_registry` has all)."""
+    steps: int = 5_000_000
+    """Samples to learn from, over all environments."""
+    seed: int = 0
+    """Seed of systems, noise, weights and exploration; the same seed gives the same policy."""
+    options: JsonOptions = field(default_factory=dict)
+    """Further options of the environment, as JSON."""
+    vary: JsonOptions = field(default_factory=dict)
+    """Options that are drawn anew for every episode, as JSON: a name, and the lowest and highest value."""
+    output: Path | None = None
+    """Run folder; runs/ALGO-TRACK-SEED where it is not given, with a number where that exists."""
+    begin: Path | None = None
+    """Policy folder whose network to begin with, of the same shape; else it begins at random."""
+    imitate: str | None = None
+    """Policy whose decisions the network learns before it learns by reward, such as efe; with ppo alone."""
+    imitations: int = 200_000
+    """Of these decisions, over all environments."""
+    checkpoints: int = 5
+    """Checkpoints over the run, evenly spaced."""
+    eval_every: int = 0
+    """Samples between evaluations on systems held out from training; 0 for none."""
+    tensorboard: bool = False
+    """Whether to write the log for TensorBoard, too."""
+    torch_threads: int = 1
+    """Threads of torch; it moves the last digits. More than one gain little, and lose much on a busy machine."""
+    hyperparameters: AlgorithmSettings = field(default=None)  # type: ignore[assignment]
+    """Hyperparameters; those that the file has for the track where they are not given."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        one_of("algo", self.algo, ALGORITHMS)
+        if not isinstance(self.env, str):
+            check_track_id(self.env)
+        mapping("options", self.options)
+        check_options(self.options)
+        # A run has its rig in itself, and not the name of a file that may change.
+        object.__setattr__(self, "options", options_with_rig(self.options, self.rig))
+        object.__setattr__(self, "rig", None)
+        upper_bounds = {
+            "steps": 10**12,
+            "checkpoints": 10**4,
+            "torch_threads": 1024,
+            "imitations": 10**9,
+            "eval_every": 10**12,
+            "seed": 2**32 - 1,
+        }
+        for name, upper_bound in upper_bounds.items():
+            whole(name, getattr(self, name), upper_bound, 0 if name in ("eval_every", "seed") else 1)
+        if self.tensorboard:
+            need("tensorboard")
+        if "reward" in self.options:
+            raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
+        if "branch" in self.options:
+            raise ValueError(f"options must not hold branch, but are {self.options}; the others are to compare on")
+        if self.env != FAMILY:
+            check_track_id(self.env)
+        elif self.options or self.eval_every or self.algo != "ppo":
+            raise ValueError(
+                f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare with "
+                "python -m agents.studies.family"
+            )
+        if self.hyperparameters is None:
+            object.__setattr__(self, "hyperparameters", read_hyperparameters(self.algo, self.env, self.settings))
+        if type(self.hyperparameters) is not ALGORITHMS[self.algo]:
+            raise ValueError(
+                f"hyperparameters must be {ALGORITHMS[self.algo].__name__} for {self.algo}, "
+                f"but are {type(self.hyperparameters).__name__}"
+            )
+        if self.hyperparameters.features and self.env != FAMILY:
+            _check_observation(self)
+        if self.vary:
+            object.__setattr__(self, "vary", _checked_option_ranges(self))
+        if self.imitate is not None:
+            _check_imitation(self)
+        if (first := getattr(self.hyperparameters, "learning_starts", 0)) >= self.steps:
+            raise ValueError(
+                f"learning_starts must be below steps, but is {first} of {self.steps}: nothing would be learned; "
+                "lower it, or take more steps"
+            )
+
+    @property
+    def samples(self) -> int:
+        """Samples that are learned from: ``steps``, up to a whole number of updates."""
+        per_update = self.hyperparameters.samples_per_update
+        return -(-self.steps // per_update) * per_update
+
+
+def _check_observation(config: TrainConfig) -> None:
+    """Refuse an observation that has no features."""
+    observation = {**spec_of(config.env).kwargs, **config.options}.get("observation", "posterior")
+    if observation != "posterior":
+        raise ValueError(
+            f"observation must be 'posterior' with features, but is {shown(observation)}; "
+            f"add --{config.algo.replace('_', '-')}.no-features"
+        )
+
+
+def _check_imitation(config: TrainConfig) -> None:
+    """Refuse what cannot learn from another policy's decisions."""
+    if config.algo != "ppo" or not config.hyperparameters.features or config.env == FAMILY or config.vary:
+        raise ValueError(
+            f"imitate needs ppo with features on one track, but algo is {config.algo}, features "
+            f"{config.hyperparameters.features}, env {config.env}, vary {config.vary}; leave imitate out"
+        )
+    if config.begin is not None:
+        raise ValueError(f"imitate must be left out with begin, but is {config.imitate!r}; choose one of them")
+
+
+def _checked_option_ranges(config: TrainConfig) -> dict[str, list[float]]:
+    """What is varied, each from the lowest to the highest value."""
+    mapping("vary", config.vary)
+    if config.env == FAMILY or not config.hyperparameters.features or config.reward not in INFORMATION_REWARDS:
+        raise ValueError(
+            f"vary needs a track, features and a reward that counts information ({', '.join(INFORMATION_REWARDS)}), but env is "
+            f"{config.env}, features {config.hyperparameters.features}, reward {config.reward}; leave vary out"
+        )
+    if (num_envs := config.hyperparameters.num_envs) % LANES:
+        raise ValueError(
+            f"num_envs must be a multiple of {LANES} with vary, but is {num_envs}; take {num_envs + -num_envs % LANES}"
+        )
+    if duplicates := sorted(set(config.vary) & set(config.options)):
+        raise ValueError(f"vary must not hold what options hold, but both have {duplicates[0]}; leave it out of one")
+    for name, bounds in config.vary.items():
+        bounds = list(bounds) if isinstance(bounds, list | tuple) else [bounds]
+        if len(bounds) != 2 or not all(is_finite(end) for end in bounds) or not 0 < bounds[0] <= bounds[1]:
+            raise ValueError(
+                f"vary[{name!r}] must be two positive numbers, the lower one first, but is {shown(config.vary[name])}"
+            )
+    return {name: list(ends) for name, ends in config.vary.items()}
+
+
+def describe_run(config: TrainConfig) -> dict[str, Any]:
+    """What a run was made from: the resolved configuration, the command and the versions."""
+    resolved = asdict(config) | {"hyperparameters": hyperparameters_to_dict(config.hyperparameters)}
+    resolved = {name: str(value) if isinstance(value, Path) else value for name, value in resolved.items()}
+    return {
+        "config": resolved,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "versions": package_versions("stable-baselines3", "torch", *contrib_packages(config)),
+    }
+
+
+def claim_run_folder(config_file: Path, config: TrainConfig) -> None:
+    """Write what something in the folder of a file is made from; a folder that holds another is refused.
+
+    Where the folder lies is not looked at: it may have been moved since, and what to begin with beside it. The file
+    then tells where they are now.
+
+    Raises:
+        ValueError: for a file that says something else, naming the first setting that differs.
+    """
+    described = json.loads(json.dumps(describe_run(config)))
+    old_content = json.loads(config_file.read_text(encoding="utf-8")) if config_file.exists() else described
+    old_settings, new_settings = _comparable_settings(old_content["config"]), _comparable_settings(described["config"])
+    for name, value in new_settings.items():
+        if old_settings.get(name) != value:
+            raise ValueError(
+                f"output must be a new folder or that of the same command, but in {config_file} {name} is "
+                f"{shown(old_settings.get(name))} instead of {shown(value)}; name another folder"
+            )
+    if not config_file.exists() or old_content["config"] != described["config"]:
+        write_json(config_file, old_content | {"config": described["config"]})
+
+
+def _comparable_settings(config: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a configuration as JSON has it, each hyperparameter by itself, paths as seen from the output."""
+    settings = {name: config.get(name) for name in (f.name for f in fields(TrainConfig)) if name != "output"}
+    if config.get("output") and settings["begin"]:
+        settings["begin"] = os.path.relpath(settings["begin"], config["output"])
+    hyperparameters = settings.pop("hyperparameters") or {}
+    return settings | {f"hyperparameters.{name}": value for name, value in hyperparameters.items()}
+
+
+def contrib_packages(config: TrainConfig) -> tuple[str, ...]:
+    """sb3-contrib, where the algorithm is of it."""
+    return ("sb3_contrib",) if config.algo in ("tqc", "recurrent_ppo") else ()
+
+
+def read_config(folder: Path) -> TrainConfig:
+    """The configuration that a run folder was made from; what only a script had in it is left out."""
+    try:
+        config_file = whole_file(folder / CONFIG, "resume must be a run folder, with a config.json", 2**20)
+        found = json.loads(config_file.read_text(encoding="utf-8"))["config"]
+        settings = {f.name: found[f.name] for f in fields(TrainConfig)}
+        settings |= {
+            name: None if settings[name] is None else Path(settings[name]) for name in ("output", "settings", "begin")
+        }
+        settings["hyperparameters"] = parse_hyperparameters(ALGORITHMS[settings["algo"]], settings["hyperparameters"])
+        return TrainConfig(**settings)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{CONFIG} must be that of a run, but that of {folder} is not: {error!r}") from error

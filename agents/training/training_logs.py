@@ -1,0 +1,149 @@
+"""What follows a training from within Stable-Baselines3: its loop's callback, and its log."""
+
+from __future__ import annotations
+
+import csv
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
+
+from estimator.files import writing
+
+_STEPS_COLUMN = "time/total_timesteps"
+
+
+class TrainingCallback(BaseCallback):
+    """Reports every roll-out, and every update that follows one.
+
+    Args:
+        on_rollout: called with the samples so far and the mean return of the last episodes, before the update.
+        on_update: called after the update.
+        on_step: called with the samples so far, after every step of the environments.
+        entropy_bonus: of the algorithm at the start, where it is to fall linearly to 0; 0 leaves it as it is.
+    """
+
+    def __init__(
+        self,
+        on_rollout: Callable[[int, float], None],
+        on_update: Callable[[], None],
+        on_step: Callable[[int], None],
+        entropy_bonus: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self._entropy_bonus = entropy_bonus
+        self._on_rollout_callback, self._on_update_callback, self._on_step_callback = on_rollout, on_update, on_step
+        self._has_rollout = False
+
+    def _on_step(self) -> bool:
+        self._on_step_callback(self.num_timesteps)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        episodes: Any = self.model.ep_info_buffer or []
+        self._on_rollout_callback(
+            self.num_timesteps, float(np.mean([episode["r"] for episode in episodes])) if episodes else float("nan")
+        )
+        self._has_rollout = True
+        if self._entropy_bonus:
+            model: Any = self.model
+            model.ent_coef = self._entropy_bonus * model._current_progress_remaining
+
+    def _on_rollout_start(self) -> None:
+        if self._has_rollout:
+            self._on_update_callback()
+
+    def _on_training_end(self) -> None:
+        self._on_update_callback()
+
+
+class WallTimeLogger(Logger):
+    """Stable-Baselines3's log, with seconds of the clock that nobody sets, in place of its own.
+
+    Args:
+        folder: of the files.
+        formats: that write them.
+        first_step: samples that the training goes on from.
+    """
+
+    def __init__(self, folder: Path, formats: list[Any], first_step: int) -> None:
+        super().__init__(str(folder), formats)
+        self._start_time, self._steps = time.perf_counter(), first_step
+
+    def dump(self, step: int = 0) -> None:
+        """Write what was recorded."""
+        if "time/time_elapsed" in self.name_to_value:
+            seconds = max(time.perf_counter() - self._start_time, 1e-9)
+            self.name_to_value["time/time_elapsed"] = int(seconds)
+            self.name_to_value["time/fps"] = int((step - self._steps) / seconds)
+        super().dump(step)
+
+
+class TensorBoardLog(TensorBoardOutputFormat):
+    """TensorBoard's log; an error names its folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        with writing(folder):
+            super().__init__(str(folder))
+
+    def write(self, *row: Any) -> None:
+        """Write a row."""
+        with writing(self._folder):
+            super().write(*row)
+
+    def close(self) -> None:
+        """Write what is left."""
+        with writing(self._folder):
+            super().close()
+
+
+class ResumedCSVLog(CSVOutputFormat):
+    """A log that goes on after its rows up to ``first_step``; what is there already is never lost, as it replaces the file.
+
+    Args:
+        path: of the CSV file; it need not exist.
+        first_step: samples that the training goes on from.
+
+    Raises:
+        OSError: naming the file, where it cannot be written, as `write` and `close`.
+    """
+
+    def __init__(self, path: Path, first_step: int) -> None:
+        self._path = path
+        old_lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        kept = old_lines[:1] + [
+            line for line in old_lines[1:] if _is_complete_row_until(old_lines[0], line, first_step)
+        ]
+        replacement = path.with_name(f".{path.name}")
+        try:
+            with writing(path):
+                super().__init__(str(replacement))
+                if len(kept) > 1:
+                    self.keys = kept[0].split(",")
+                    self.file.write("".join(f"{line}\n" for line in kept))
+                    self.file.flush()
+                os.replace(replacement, path)
+        finally:
+            replacement.unlink(missing_ok=True)
+
+    def write(self, *row: Any) -> None:
+        """Write a row."""
+        with writing(self._path):
+            super().write(*row)
+
+    def close(self) -> None:
+        """Close the file."""
+        with writing(self._path):
+            super().close()
+
+
+def _is_complete_row_until(header: str, line: str, steps: int) -> bool:
+    """Whether a row is whole, and of a sample up to ``first_step``."""
+    (row,) = csv.DictReader([header, line])
+    return None not in row.values() and None not in row and int(row[_STEPS_COLUMN] or steps + 1) <= steps
