@@ -39,13 +39,13 @@ class Silverbox(Config):
 
 def main(config: Config) -> None:
     """Repeat the experiment, run the protocol, or compare its settings."""
-    from agents.studies.kouw2020 import reproduce
-    from agents.studies.silverbox_results import run_protocol, select
+    from research.studies.kouw2020 import reproduce
+    from research.studies.silverbox_results import compare_on_validation, run_protocol
 
     if not isinstance(config, Silverbox):
         reproduce(config.data, config.json, config.figures)
     elif config.select:
-        select(config.data)
+        compare_on_validation(config.data)
     else:
         run_protocol(config.data, config.json, config.figures)
 

@@ -22,7 +22,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from agents.interruption import Interrupted, raise_on_sigterm
-from agents.loading import spec_of
+from agents.user_code import env_spec_of
 
 
 def _parse_json_options(arguments: list[str]) -> dict[str, Any]:
@@ -143,7 +143,7 @@ def check_track_id(env_id: str) -> None:
     if not isinstance(env_id, str):
         raise ValueError(f"env must be the id of a track such as duffing_env/Short-v0, but is {shown(env_id)}")
     try:
-        vector_env_class: Any = spec_of(env_id).vector_entry_point
+        vector_env_class: Any = env_spec_of(env_id).vector_entry_point
         vector_env_class = load_env_creator(vector_env_class) if isinstance(vector_env_class, str) else vector_env_class
     except (ImportError, AttributeError) as error:
         raise ValueError(

@@ -169,7 +169,7 @@ def _policy_loop(size: int) -> Callable[[int], float]:
     import torch
     from stable_baselines3 import PPO
 
-    from agents.vec_env import DuffingVecEnv
+    from agents.sb3_vec_env import DuffingVecEnv
 
     torch.set_num_threads(POLICY_THREADS)
     envs = DuffingVecEnv(TRACK, size, seed=1)

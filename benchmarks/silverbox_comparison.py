@@ -15,20 +15,6 @@ import numpy as np
 
 from agents.cli import run_script
 from agents.console_output import format_table, print_texts_and_tables, replace_non_finite
-from agents.studies.silverbox_protocol import (
-    GIVEN,
-    LENGTHS,
-    SETTINGS,
-    TESTS,
-    TRAINING_SAMPLES,
-    Outcome,
-    Sections,
-    coverage_of,
-    rmse,
-    samples_until_close,
-    simulation_error,
-)
-from agents.studies.silverbox_results import run_protocol, submission
 from benchmarks.peer_process import NotAvailable, Peers
 from benchmarks.section_tables import ratio
 from benchmarks.timed_rounds import Result, Row, measure, timed
@@ -37,6 +23,20 @@ from estimator import OnlineEstimator
 from estimator.belief import Belief
 from estimator.models.difference import PRESETS
 from estimator.parameters import FloatArray
+from research.studies.silverbox_protocol import (
+    N_GIVEN_OUTPUTS,
+    SETTINGS,
+    TESTS,
+    TRAINING_LENGTHS,
+    TRAINING_SAMPLES,
+    ProtocolOutcome,
+    Sections,
+    coverage_of,
+    rmse,
+    samples_until_close,
+    simulation_error,
+)
+from research.studies.silverbox_results import run_protocol, submission_line
 
 TIMED = 4096
 """First samples of the training section, which all online rows are timed on."""
@@ -105,7 +105,7 @@ class Contender:
         }
 
 
-def compare(sections: Sections, outcomes: Mapping[str, Outcome], wanted: bool = True) -> dict[str, Any]:
+def compare(sections: Sections, outcomes: Mapping[str, ProtocolOutcome], wanted: bool = True) -> dict[str, Any]:
     """Runs the peers, prints them beside ours, and returns what was measured, fit for JSON.
 
     Args:
@@ -133,19 +133,19 @@ def compare(sections: Sections, outcomes: Mapping[str, Outcome], wanted: bool = 
     return cast("dict[str, Any]", replace_non_finite(compared))
 
 
-def given(sections: Sections, outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
+def given(sections: Sections, outcomes: Mapping[str, ProtocolOutcome]) -> dict[str, Any]:
     """What `benchmarks.silverbox_peer_filters` reads: samples, models, priors, noises, and the tests' first outputs."""
     training, test = sections.training, sections.multisine
     arrays: dict[str, Any] = {
         "u": np.concatenate([training.u, test.u]),
         "y": np.concatenate([training.y, test.y]),
         "timed": TIMED,
-        "lengths": np.array(LENGTHS),
+        "lengths": np.array(TRAINING_LENGTHS),
         "tests": np.array(TESTS),
     }
     for name in TESTS:
         section: Regime = getattr(sections, name)
-        arrays |= {f"{name}_u": section.u, f"{name}_given": section.y[:GIVEN]}
+        arrays |= {f"{name}_u": section.u, f"{name}_given": section.y[:N_GIVEN_OUTPUTS]}
     for name, ours in MODELS.items():
         prior = prior_of(name)
         learned = outcomes[ours].beliefs[TRAINING_SAMPLES]
@@ -173,7 +173,7 @@ def terms_of(name: str) -> FloatArray:
 
 
 def run(
-    peers: Peers, sections: Sections, outcomes: Mapping[str, Outcome], on_row: Callable[[str], None]
+    peers: Peers, sections: Sections, outcomes: Mapping[str, ProtocolOutcome], on_row: Callable[[str], None]
 ) -> dict[str, Contender]:
     """All rows: ours, then the peers that share the model; fastcan last."""
     training = sections.training
@@ -218,12 +218,12 @@ def _passes(ours: str, u: FloatArray, y: FloatArray) -> Callable[[int], float]:
 
 
 def judge(
-    name: str, answer: Mapping[str, Any], time: Result, sections: Sections, outcomes: Mapping[str, Outcome]
+    name: str, answer: Mapping[str, Any], time: Result, sections: Sections, outcomes: Mapping[str, ProtocolOutcome]
 ) -> Contender:
     """Measures what an online peer answered."""
     noises = outcomes[MODELS[name]].beliefs[TRAINING_SAMPLES]
     learning = {}
-    for samples, mean in zip(LENGTHS, answer["means"], strict=True):
+    for samples, mean in zip(TRAINING_LENGTHS, answer["means"], strict=True):
         estimator = estimator_at(name, np.array(mean), 1 / noises.gamma_mean, 1 / noises.xi_mean)
         learning[samples] = float("nan") if estimator is None else rmse(simulation_error(estimator, sections.arrow))
     errors = dict.fromkeys(TESTS, float("nan"))
@@ -302,7 +302,7 @@ def report(
 
 
 def _line(contender: Contender) -> str:
-    return submission(1e3 * contender.errors[test] for test in TESTS)
+    return submission_line(1e3 * contender.errors[test] for test in TESTS)
 
 
 def as_table(contenders: Mapping[str, Contender]) -> Any:

@@ -16,7 +16,7 @@ from typing import Any
 
 from agents.evaluation.comparison_tables import summarise_metrics
 from agents.evaluation.policy_evaluation import evaluate_policies
-from agents.policies.learned import CARD
+from agents.policies.networks.trained_policy import CARD_FILE
 from agents.training import PPOSettings, TrainConfig
 from benchmarks.peer_process import ROOT
 from benchmarks.section_tables import Claim, Section, ratio
@@ -87,7 +87,7 @@ def _loop(make: Callable[[], Any], threads: int) -> Callable[[int], tuple[float,
 
 
 def _our_model() -> Any:
-    from agents.vec_env import DuffingVecEnv
+    from agents.sb3_vec_env import DuffingVecEnv
 
     return PPOSettings().make(DuffingVecEnv(TRACK, PPOSettings().num_envs, seed=0), seed=0)
 
@@ -116,7 +116,7 @@ def _time_to_useful(seed: int, bar: float, reached: list[dict[str, float]]) -> f
             if float(interval["low"]) > bar:
                 low, high = float(interval["low"]), float(interval["high"])
                 reached.append({"samples": float(checkpoint.name), "low": low, "high": high})
-                return (checkpoint / CARD).stat().st_mtime - started
+                return (checkpoint / CARD_FILE).stat().st_mtime - started
     raise RuntimeError(f"seed {seed} is not useful after {ENOUGH:,} samples or {PATIENCE:.0f} s")
 
 
@@ -135,7 +135,7 @@ def _train_a_while(output: Path, seed: int, cache: Path) -> list[Path]:
         found: list[Path] = []
         while process.poll() is None and time.monotonic() < deadline and (not found or int(found[-1].name) < ENOUGH):
             time.sleep(0.2)
-            found = sorted(card.parent for card in output.glob(f"checkpoints/*/{CARD}"))
+            found = sorted(card.parent for card in output.glob(f"checkpoints/*/{CARD_FILE}"))
         if process.poll() is None:
             process.terminate()
         elif process.returncode:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from agents.console_output import format_table, print_texts_and_tables, write_json
-from agents.evaluation.batch import make
+from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy
 from benchmarks.interval_coverage import NO_LIMIT, QUANTILE
 from benchmarks.rigs.judge import calibrated
@@ -70,7 +70,7 @@ class Cell:
 
 def inputs_of(policy: str, track: str, systems: int, seed: int) -> FloatArray:
     """(samples, systems, 1) actions of a policy on the track as it is, but for the noises' true values."""
-    envs = make(track, systems, {"noise_range": 1.0, "horizon": SAMPLES})
+    envs = make_track_batch(track, systems, {"noise_range": 1.0, "horizon": SAMPLES})
     player = make_policy(policy, envs, seed=seed)
     observations, _ = envs.reset(seed=seed)
     state, begins, actions = None, np.ones(systems, dtype=np.bool_), []
@@ -87,7 +87,7 @@ def identified(track: str, center: tuple[float, float], actions: FloatArray, see
     systems = actions.shape[1]
     guesses = dict(zip(("process_noise_guess", "measurement_noise_guess"), np.multiply(center, NOISE), strict=True))
     options = {"process_noise": NOISE, "measurement_noise": NOISE, "noise_range": 1.0, "max_output": NO_LIMIT}
-    envs = make(track, systems, {"horizon": SAMPLES, **options, **guesses, **told})
+    envs = make_track_batch(track, systems, {"horizon": SAMPLES, **options, **guesses, **told})
     envs.reset(seed=seed)
     for action in actions:
         envs.step(action)
@@ -145,7 +145,7 @@ def main(config: Config) -> None:
                 identified(track, center, actions, config.seed, told)
                 for center in shown(centers, description=f"{track} {policy}")
             ]
-            names = list(make(track, 1).experiment.model.coefficients)
+            names = list(make_track_batch(track, 1).experiment.model.coefficients)
             titles = ["prior of σ_w", "of σ_v", *names, "all", "lost, nats"]
             print_texts_and_tables(
                 f"\n{track}, {policy}, {told}", format_table(titles, rows(cells, known), markdown=True)

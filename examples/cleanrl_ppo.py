@@ -25,7 +25,7 @@ from torch.distributions import Normal
 from agents import save_policy
 from agents.cli import full_track_id, run_script
 from agents.console_output import package_versions
-from agents.policies.saving import check_policy_folder
+from agents.policies.networks.policy_saving import check_policy_folder
 
 
 @dataclass(frozen=True)

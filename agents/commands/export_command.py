@@ -41,7 +41,7 @@ class ExportCommand:
 
         from agents.cli import check_not_overwritten
         from agents.console_output import print_wrapped
-        from agents.policies.export import export_signal
+        from agents.policies.signal_export import export_signal
         from estimator.parameters import SAMPLING_STEP
 
         check_not_overwritten("output", self.output, self.force)
@@ -57,8 +57,8 @@ class ExportCommand:
     def _export_network(self) -> None:
         from agents.console_output import print_wrapped
         from agents.policies import TRAINED, trained_policies
-        from agents.policies.learned import load_policy
-        from agents.policies.onnx_export import export_network
+        from agents.policies.networks.onnx_export import export_network
+        from agents.policies.networks.trained_policy import load_policy
 
         policy = load_policy(TRAINED / self.name if self.name in trained_policies() else self.name)
         export_network(policy, self.output)

@@ -16,9 +16,9 @@ from agents.evaluation.comparison_tables import (
     write_evaluations,
 )
 from agents.evaluation.policy_evaluation import Evaluation, evaluate_policies
-from agents.loading import spec_of
 from agents.policies import TRAINED, trained_policies
-from agents.policies.learned import load_policy
+from agents.policies.networks.trained_policy import load_policy
+from agents.user_code import env_spec_of
 from duffing_env.plants.silverbox_record import record_available
 from estimator.extras import how_to_get, is_missing, need
 from estimator.progress import progress
@@ -34,7 +34,7 @@ def default_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
 
     A record can be asked for its own input only; and all but the signals look at the posterior.
     """
-    track_options = spec_of(env_id).kwargs
+    track_options = env_spec_of(env_id).kwargs
     if track_options.get("regime") is not None:
         return (f"silverbox-{options.get('regime', 'multisine')}",)
     if {**track_options, **options}.get("observation", "posterior") != "posterior":

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from agents.planner.plants import plant_of
+from agents.evaluation.plant_model import plant_model_of
 from duffing_env.plants.silverbox_record import load_record, regime_input
 from duffing_env.storage.kernel_spec import parameter_names
 from estimator.free_run import free_run
@@ -85,7 +85,7 @@ def fisher_information_gain(
     (T, n, sensors) that were seen, or along the response without noise; Λ0 is the inverse covariance of the prior of
     plants so drawn.
     """
-    plant = plant_of(experiment, truth)
+    plant = plant_model_of(experiment, truth)
     F = fisher_information(
         plant.model, plant.coefficients_of(truth), inputs.T, plant.process_noise, plant.sensor_noises,
         interpolation=plant.interpolation, y=None if outputs is None else np.swapaxes(outputs, 0, 1),
@@ -101,10 +101,10 @@ def d_efficiency_metrics(evaluation: Any, env_id: str, options: dict[str, Any]) 
 
     The latter, ``certified``, is at least so much of what is possible. Without an oracle there is neither.
     """
-    from agents.evaluation.oracle import Oracle, Systems
+    from agents.evaluation.oracle import Oracle, TrackSystems
 
     try:
-        oracle = Oracle.of(Systems.of(env_id, evaluation.inputs.shape[1], options))
+        oracle = Oracle.of(TrackSystems.of(env_id, evaluation.inputs.shape[1], options))
     except FileNotFoundError:
         return {}
     n = len(oracle.values)

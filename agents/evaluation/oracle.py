@@ -1,6 +1,6 @@
 """The systems of a track that input is designed for, and their oracle: D-optimal inputs at the true parameters, stored.
 
-`agents.evaluation.oracle_search` finds them. The worth of inputs has many summits, and the best one found is only a
+`research.oracles.oracle_search` finds them. The worth of inputs has many summits, and the best one found is only a
 lower bound of the highest. So whoever finds a better input puts it in its place.
 """
 
@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.evaluation.batch import TESTED, make
-from agents.planner.ascent import Limits, climber
-from agents.planner.design import Known
-from agents.planner.plants import Plant, plant_of
+from agents.evaluation.plant_model import PlantModel, plant_model_of
+from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
+from agents.planning.d_optimality import NominalSystem
+from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from duffing_env.experiment_config import SimulatedExperiment
 from estimator.engine.feeding import input_degree
 from estimator.files import write_atomically
@@ -27,14 +27,14 @@ from estimator.information import fisher_information, variances
 from estimator.models.difference import difference
 from estimator.parameters import FloatArray
 
-FOLDER = Path(__file__).parents[1] / "oracles"
+ORACLE_FOLDER = Path(__file__).parents[1] / "oracles"
 
 #: Inputs are stored as whole numbers, of which this one stands for the largest.
-LEVELS = 32767
+QUANTISATION_LEVELS = 32767
 
 
 @dataclass(frozen=True)
-class Systems:
+class TrackSystems:
     """The first systems of a track, by row.
 
     Attributes:
@@ -50,32 +50,34 @@ class Systems:
     variances: FloatArray
 
     @classmethod
-    def of(cls, env_id: str, count: int, options: dict[str, Any] | None = None) -> Systems:
+    def of(cls, env_id: str, n_systems: int, options: dict[str, Any] | None = None) -> TrackSystems:
         """The first systems of a track, as they are evaluated with seed 0: of the branch ``test``, if not told another.
 
         Raises:
             ValueError: where its plant is not simulated, or changes.
         """
-        envs = make(env_id, count, TESTED | (options or {}))
+        envs = make_track_batch(env_id, n_systems, TEST_OPTIONS | (options or {}))
         envs.reset(seed=0)
-        e = envs.experiment
-        if not isinstance(e, SimulatedExperiment) or e.jump or e.max_slew is not None:
-            raise ValueError(f"env must simulate a plant without jump and slew limit, but is {e}; choose another track")
-        plant = plant_of(e, envs.truth)
+        experiment = envs.experiment
+        if not isinstance(experiment, SimulatedExperiment) or experiment.jump or experiment.max_slew is not None:
+            raise ValueError(
+                f"env must simulate a plant without jump and slew limit, but is {experiment}; choose another track"
+            )
+        plant = plant_model_of(experiment, envs.truth)
         precision = np.linalg.inv(plant.prior.coefficients_cov).astype(np.float64)
-        strengths = variances(plant.model, plant.process_noise, plant.sensor_noises)
-        strengths = np.broadcast_to(strengths, (count, strengths.shape[-1])).copy()
-        return cls(e, plant.coefficients_of(envs.truth), precision, strengths)
+        noise_variances = variances(plant.model, plant.process_noise, plant.sensor_noises)
+        noise_variances = np.broadcast_to(noise_variances, (n_systems, noise_variances.shape[-1])).copy()
+        return cls(experiment, plant.coefficients_of(envs.truth), precision, noise_variances)
 
-    def rows(self, first: int, stop: int) -> Systems:
+    def rows(self, first: int, stop: int) -> TrackSystems:
         """Some of them."""
         chosen = slice(first, stop)
         return replace(self, theta=self.theta[chosen], variances=self.variances[chosen])
 
     @property
-    def plant(self) -> Plant:
+    def plant(self) -> PlantModel:
         """What they obey."""
-        return plant_of(self.experiment)
+        return plant_model_of(self.experiment)
 
     @property
     def samples(self) -> int:
@@ -83,11 +85,11 @@ class Systems:
         return self.experiment.samples
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> DesignLimits:
         """What inputs must keep, over an episode."""
-        e = self.experiment
-        energy = np.inf if e.max_rms is None else e.max_rms**2 * e.samples
-        return Limits(e.max_output, e.max_output, e.max_input, energy)
+        experiment = self.experiment
+        energy = np.inf if experiment.max_rms is None else experiment.max_rms**2 * experiment.samples
+        return DesignLimits(experiment.max_output, experiment.max_output, experiment.max_input, energy)
 
     @property
     def degree(self) -> int:
@@ -100,28 +102,31 @@ class Systems:
 
         The paper's equation goes without saying, as it does in what was stored first.
         """
-        e, plant = self.experiment, self.plant
-        names = ("max_input", "max_output", "samples", "process_noise", "measurement_noise", "spread")
-        told = {name: getattr(e, name) for name in names}
-        told |= {"plant_spread": e.spread if e.plant_spread is None else e.plant_spread, "max_rms": e.max_rms}
-        told["branch"] = e.branch
-        if e.noise_range != 1:
-            told["noise_range"] = e.noise_range
+        experiment, plant = self.experiment, self.plant
+        option_names = ("max_input", "max_output", "samples", "process_noise", "measurement_noise", "spread")
+        described = {name: getattr(experiment, name) for name in option_names}
+        described |= {
+            "plant_spread": experiment.spread if experiment.plant_spread is None else experiment.plant_spread,
+            "max_rms": experiment.max_rms,
+        }
+        described["branch"] = experiment.branch
+        if experiment.noise_range != 1:
+            described["noise_range"] = experiment.noise_range
         if plant.model == difference():
-            return told
-        return told | {"model": plant.model.digest, "interpolation": plant.interpolation}
+            return described
+        return described | {"model": plant.model.digest, "interpolation": plant.interpolation}
 
     @property
     def path(self) -> Path:
         """The file in the package that holds their oracle."""
         digest = hashlib.sha256(json.dumps(self.description).encode()).hexdigest()[:12]
-        return FOLDER / f"{self.samples}-samples-{digest}.npz"
+        return ORACLE_FOLDER / f"{self.samples}-samples-{digest}.npz"
 
-    def known(self, row: int) -> Known:
+    def nominal_system(self, row: int) -> NominalSystem:
         """What the worth of an input to one system is taken at."""
-        return Known(self.theta[row].copy(), self.precision, tuple(self.variances[row]))
+        return NominalSystem(self.theta[row].copy(), self.precision, tuple(self.variances[row]))
 
-    def worth(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def criterion_and_peak(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Worth ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
 
         Each (n,). Inputs that are not finite, as after the end of an episode, tell nothing from there on.
@@ -130,11 +135,11 @@ class Systems:
         if u.ndim != 2 or len(u) > len(self.theta):
             raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.theta)}, but have {u.shape}")
         values, peaks = np.empty((2, len(u)))
-        appraise = climber(self.plant.model, self.degree).appraise
+        evaluate_batch = compile_projected_gradient(self.plant.model, self.degree).evaluate_batch
         for row in range(len(u)):
             one = slice(row, row + 1)
             noises = tuple(self.variances[row])
-            appraise(self.theta[one], self.precision, noises, self.limits.output, u[one], values[one], peaks[one])
+            evaluate_batch(self.theta[one], self.precision, noises, self.limits.output, u[one], values[one], peaks[one])
         return values, peaks
 
     def information(self, inputs: npt.ArrayLike, outputs: npt.ArrayLike | None = None) -> FloatArray:
@@ -157,17 +162,17 @@ class Oracle:
         systems: that they are for.
         inputs: (n, samples) [V].
         values: (n,) their worth [nats].
-        bounds: (n,) what no admissible input is worth more than [nats] (`agents.evaluation.certificate`); NaN where
+        bounds: (n,) what no admissible input is worth more than [nats] (`research.oracles.certificate`); NaN where
             nobody has found one.
     """
 
-    systems: Systems
+    systems: TrackSystems
     inputs: FloatArray
     values: FloatArray
     bounds: FloatArray
 
     @classmethod
-    def of(cls, systems: Systems) -> Oracle:
+    def of(cls, systems: TrackSystems) -> Oracle:
         """The stored oracle, of as many of the systems as it has.
 
         Raises:
@@ -176,7 +181,7 @@ class Oracle:
         """
         path = systems.path
         if not path.is_file():
-            command = "python -m agents.evaluation.oracle_search --env ..."
+            command = "python -m research.oracles.oracle_search --env ..."
             raise FileNotFoundError(f"no oracle is stored for {systems.description}; run {command}")
         with np.load(path, allow_pickle=False) as stored:
             scaled, theta, bounds = stored["inputs"], stored["theta"], stored["bounds"]
@@ -184,12 +189,12 @@ class Oracle:
         n = min(len(theta), len(systems.theta))
         if task != json.dumps(systems.description) or not np.allclose(theta[:n], systems.theta[:n], rtol=1e-9, atol=0):
             raise ValueError(f"oracle must be for the systems at hand, but {path.name} is not; make it anew")
-        chosen = systems.rows(0, n)
-        inputs = systems.limits.amplitude * (scaled[:n] / LEVELS)
-        return cls(chosen, inputs, chosen.worth(inputs)[0], bounds[:n])
+        systems_with_oracle = systems.rows(0, n)
+        inputs = systems.limits.amplitude * (scaled[:n] / QUANTISATION_LEVELS)
+        return cls(systems_with_oracle, inputs, systems_with_oracle.criterion_and_peak(inputs)[0], bounds[:n])
 
     @staticmethod
-    def stored(systems: Systems) -> int:
+    def count_stored(systems: TrackSystems) -> int:
         """The number of systems that an oracle is stored of."""
         if not systems.path.is_file():
             return 0
@@ -205,7 +210,7 @@ class Oracle:
         content = BytesIO()
         np.savez_compressed(
             content,
-            inputs=_as_integers(self.inputs / self.systems.limits.amplitude),
+            inputs=_to_int16(self.inputs / self.systems.limits.amplitude),
             theta=self.systems.theta,
             values=self.values,
             bounds=self.bounds,
@@ -237,17 +242,17 @@ class Oracle:
             raise ValueError(f"inputs must have shape (n, samples) with n <= {len(self.values)}, but have {u.shape}")
         information = self.systems.information(u, outputs)
         values = 0.5 * np.linalg.slogdet(self.systems.precision + information)[1]
-        best, least = (
+        to_stored, to_bound = (
             np.exp(2 * (values - top[: len(u)]) / information.shape[-1]) for top in (self.values, self.bounds)
         )
-        return best, least
+        return to_stored, to_bound
 
 
-def as_stored(scaled: FloatArray) -> FloatArray:
+def quantise(scaled: FloatArray) -> FloatArray:
     """Inputs in parts of the largest as they come back from the store, never larger than they were."""
-    return _as_integers(scaled) / LEVELS
+    return _to_int16(scaled) / QUANTISATION_LEVELS
 
 
-def _as_integers(scaled: FloatArray) -> npt.NDArray[np.int16]:
+def _to_int16(scaled: FloatArray) -> npt.NDArray[np.int16]:
     # A little more, so that what was stored stays so.
-    return np.trunc(scaled * (LEVELS * (1 + 1e-9))).astype(np.int16)
+    return np.trunc(scaled * (QUANTISATION_LEVELS * (1 + 1e-9))).astype(np.int16)

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation import metrics
-from agents.evaluation.batch import TESTED, make
+from agents.evaluation.plant_model import plant_model_of
 from agents.evaluation.policy_groups import (
     check_policies_can_play,
     check_predict_signature,
     policy_group,
     policy_title,
 )
-from agents.loading import of_ones_own
-from agents.planner.plants import plant_of
+from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies import make_policy
+from agents.user_code import attribute_user_errors
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.plants.silverbox_record import record_available
 from duffing_env.storage.kernel_spec import observation_bounds, parameter_names
@@ -129,7 +129,7 @@ def evaluate_policies(
         raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
     whole("systems", systems, _MAX_SYSTEMS, 2)  # intervals need more than one
     whole("seed", seed, MOST_SEED, 0)
-    options = TESTED | (options or {})
+    options = TEST_OPTIONS | (options or {})
     groups = [policy_group(name) for name in policies]
     titles = [policy_title(members[0]) if title is None else title for title, members in groups]
     if len(set(titles)) < len(titles):
@@ -227,12 +227,12 @@ def run_episodes(
 
     ``on_progress`` is told the share of the samples that were played.
     """
-    envs = make(env_id, systems, options)
+    envs = make_track_batch(env_id, systems, options)
     policy = make_policy(name, envs, seed=seed)
     check_predict_signature(policy, name)
     hold = envs.experiment.hold
     if hold > 1:  # applied sample by sample instead, which is the same, so that every sample is seen
-        envs = make(env_id, systems, {**options, "hold": 1})
+        envs = make_track_batch(env_id, systems, {**options, "hold": 1})
     sensors, last_input = envs.experiment.model.n_outputs, _last_input_index(envs.experiment)
     last_outputs = slice(last_input + 1, last_input + 1 + sensors)
     first_parameter = parameter_names(envs.experiment.truth_model)[0]
@@ -251,7 +251,7 @@ def run_episodes(
         try:
             if t % hold == 0:
                 started = time.process_time()
-                with of_ones_own(name, "policy"):
+                with attribute_user_errors(name, "policy"):
                     actions, state = policy.predict(observations, state, episode_start, deterministic=True)
                 decision_times.append(time.process_time() - started)
                 episode_start = np.zeros(systems, dtype=np.bool_)
@@ -332,7 +332,7 @@ def _estimate_with_other_estimators(
     input goes linearly from one action to the next, takes as an environment does the input at the sample before.
     """
     u, y = evaluation.inputs.T, np.swapaxes(evaluation.outputs, 0, 1)
-    plant, interpolation, own_prior, process_noise, sensor_noises = plant_of(experiment, truth)
+    plant, interpolation, own_prior, process_noise, sensor_noises = plant_model_of(experiment, truth)
     rig = Rig(experiment.step, interpolation=interpolation, delay=0 if interpolation == "linear" else -1)
     estimators: dict[str, tuple[Belief, FloatArray]] = {}
     if plant == difference():

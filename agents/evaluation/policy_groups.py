@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.batch import make
-from agents.loading import of_ones_own
+from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy
-from agents.policies.learned import CARD
+from agents.policies.networks.trained_policy import CARD_FILE
+from agents.user_code import attribute_user_errors
 
 
 def policy_title(policy: Any) -> str:
@@ -29,7 +29,7 @@ def policy_group(policy: Any) -> tuple[str | None, list[Any]]:
     title, equals, pattern = policy.partition("=")
     if not equals or Path(policy).exists():
         return None, [policy]
-    folders = sorted(path for path in glob.glob(pattern) if (Path(path) / CARD).is_file())
+    folders = sorted(path for path in glob.glob(pattern) if (Path(path) / CARD_FILE).is_file())
     if not title or len(folders) < 2:
         raise ValueError(
             f"policies must name a group as TITLE=PATTERN, whose pattern two policy folders or more match, but "
@@ -40,11 +40,11 @@ def policy_group(policy: Any) -> tuple[str | None, list[Any]]:
 
 def check_policies_can_play(policies: Sequence[Any], env_id: str, options: dict[str, Any], seed: int) -> None:
     """Refuse policies that cannot be made for an environment, before the first of them plays: that takes a while."""
-    envs = make(env_id, 2, options)
+    envs = make_track_batch(env_id, 2, options)
     for policy in policies:
         if isinstance(policy, str):
             try:
-                with of_ones_own(policy, "policy"):
+                with attribute_user_errors(policy, "policy"):
                     made = make_policy(policy, envs, seed=seed)
                 check_predict_signature(made, policy)
             except ValueError as error:

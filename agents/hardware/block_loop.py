@@ -16,10 +16,10 @@ from agents.hardware.env_view import EnvView
 from agents.hardware.recording import Recording
 from agents.hardware.run_estimator import RunEstimator
 from agents.hardware.safety_session import SafetyStop, Session
-from agents.planner.blocks import best_block, drafts, systems_of
-from agents.planner.futures import Futures
-from agents.planner.policy import Planner
+from agents.planning.open_loop.chance_constrained_block import initial_guesses, optimise_block, sampled_systems
+from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.policies import Policy
+from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
 from estimator.parameters import FloatArray
 
@@ -30,7 +30,7 @@ ScaledBlock = tuple[FloatArray, float, float]
 class BlockDesigner(Protocol):
     """What chooses blocks."""
 
-    def block(self, samples: int, futures: Futures, bound: float) -> ScaledBlock:
+    def block(self, samples: int, futures: MonteCarloSystems, bound: float) -> ScaledBlock:
         """Inputs on the belief as it is observed, of which fewer futures than the bound leave the limit."""
         ...
 
@@ -42,7 +42,7 @@ class SignalBlockDesigner:
         self._policy, self._env_view = policy, env_view
         self._state: Any = None
 
-    def block(self, samples: int, futures: Futures, bound: float) -> ScaledBlock:
+    def block(self, samples: int, futures: MonteCarloSystems, bound: float) -> ScaledBlock:
         """The next samples of the signal."""
         u, empty_observation = np.empty(samples), np.zeros(1)
         for k in range(samples):
@@ -53,17 +53,17 @@ class SignalBlockDesigner:
 
 
 class PlannedBlockDesigner:
-    """Blocks that are planned for systems that are drawn from the belief (`agents.planner.blocks`)."""
+    """Blocks that are planned for systems that are drawn from the belief (`agents.planning.open_loop.chance_constrained_block`)."""
 
-    def __init__(self, planner: Planner, env_view: EnvView) -> None:
+    def __init__(self, planner: EfePlanner, env_view: EnvView) -> None:
         self._planner, self._env_view, self._rng = planner, env_view, np.random.default_rng(planner.seed)
 
-    def block(self, samples: int, futures: Futures, bound: float) -> ScaledBlock:
+    def block(self, samples: int, futures: MonteCarloSystems, bound: float) -> ScaledBlock:
         """The best block; it is planned as if it were the last."""
         planner, belief = self._planner, self._env_view.belief
-        systems = systems_of(planner.view, belief, futures, samples)
-        starting_inputs = drafts(planner, belief.record, samples, int(self._rng.integers(2**63)))
-        return best_block(planner.view, systems, futures, starting_inputs, planner.terms.amplitude, bound)
+        systems = sampled_systems(planner.model_view, belief, futures, samples)
+        starting_inputs = initial_guesses(planner, belief.record, samples, int(self._rng.integers(2**63)))
+        return optimise_block(planner.model_view, systems, futures, starting_inputs, planner.objective.amplitude, bound)
 
 
 def block_designer(policy: Policy, env_view: EnvView) -> BlockDesigner:
@@ -74,7 +74,7 @@ def block_designer(policy: Policy, env_view: EnvView) -> BlockDesigner:
     """
     if isinstance(policy, SignalPolicy):
         return SignalBlockDesigner(policy, env_view)
-    if isinstance(policy, Planner):
+    if isinstance(policy, EfePlanner):
         return PlannedBlockDesigner(policy, env_view)
     raise ValueError(
         f"policy must be a signal or the planner efe to be played in blocks, but is a {type(policy).__name__}, which "
@@ -94,7 +94,7 @@ def design_safe_block(
         Tripped: if the belief says that even without input the output leaves its range with more than the bound.
     """
     estimator, env_view.belief = run_estimator.online, run_estimator.belief
-    futures = Futures(
+    futures = MonteCarloSystems(
         estimator.model, run_estimator.draw_systems(rng), env_view.experiment.max_output, rng, run_estimator.delay
     )
     u, scale, probability = designer.block(samples, futures, bound)

@@ -21,10 +21,10 @@ from agents.hardware.run_settings import RunSettings
 from agents.hardware.safety_session import SafetyStop, Session, check_safety_settings
 from agents.hardware.sample_loop import InputFunction, SampleLoop, inputs_from_policy, inputs_from_signal
 from agents.interruption import Interrupted
-from agents.loading import of_ones_own
-from agents.planner.futures import Futures
+from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.policies import make_policy
 from agents.policies.signals import SignalPolicy
+from agents.user_code import attribute_user_errors
 from estimator.belief import Belief
 from estimator.files import write_atomically
 from estimator.identification.beliefs import disturbance
@@ -130,7 +130,7 @@ def run_experiment(
     run_estimator, watchdog_timeout = RunEstimator(rig, prior), settings.watchdog_timeout(rig.step)
     check_safety_settings(rig, plant, watchdog_timeout)
     env_view = EnvView(rig, run_estimator.belief, settings.samples)
-    with of_ones_own(settings.policy, "policy"):
+    with attribute_user_errors(settings.policy, "policy"):
         policy = make_policy(settings.policy, env_view, seed=settings.seed)  # type: ignore[arg-type]
         designer = block_designer(policy, env_view) if settings.block or isinstance(policy, SignalPolicy) else None
         next_input: InputFunction | None = None if designer else inputs_from_policy(policy, env_view, run_estimator)
@@ -223,12 +223,12 @@ def _compile_ahead(
         # A missing output is the longer way.
         policy.predict(env_view.observation(0.0, np.nan, 0), None, deterministic=True)
         return
-    futures = Futures(run_estimator.online.model, run_estimator.draw_systems(rng), 1.0, rng)
+    futures = MonteCarloSystems(run_estimator.online.model, run_estimator.draw_systems(rng), 1.0, rng)
     if settings.block:
         run_estimator.compile_block_update()
     if settings.block and not isinstance(policy, SignalPolicy):
         designer.block(settings.block, futures, settings.bound)
-    futures.probability(np.zeros(1))
+    futures.violation_probability(np.zeros(1))
 
 
 def _write_result_files(result: RunResult, run_estimator: RunEstimator) -> None:

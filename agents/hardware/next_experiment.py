@@ -12,14 +12,20 @@ from scipy.special import ndtri
 
 from agents.hardware.block_loop import ScaledBlock, SignalBlockDesigner
 from agents.hardware.env_view import EnvView
-from agents.loading import of_ones_own
-from agents.planner.blocks import MOST_PLANNED, best_block, drafts, expected, systems_of
-from agents.planner.futures import Futures, drawn_at_rest, draws_for, rests
-from agents.planner.mean_design import Systems
-from agents.planner.motion import View, frequency
-from agents.planner.policy import Planner
+from agents.planning.model_probe import ModelView, believed_resonance
+from agents.planning.open_loop.chance_constrained_block import (
+    MAX_PLANNED_DRAWS,
+    expected_information,
+    initial_guesses,
+    optimise_block,
+    sampled_systems,
+)
+from agents.planning.open_loop.expected_d_optimality import SampledSystems
+from agents.planning.open_loop.posterior_samples import MonteCarloSystems, draw_at_rest, equilibria, required_draws
 from agents.policies import make_policy
+from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
+from agents.user_code import attribute_user_errors
 from estimator.belief import Belief, covariance_places
 from estimator.checks import MOST_SEED, SMALLEST, number, whole
 from estimator.files import write_atomically
@@ -63,7 +69,7 @@ class ExperimentDesign:
         expected_stds: parameter to the standard deviation that is to be expected after it: the median over the belief.
         information_gain: nats that the coefficients are expected to gain.
         share: of what the policy chose that is safe.
-        exit_probability: at most that of leaving the range, under the belief (`agents.planner.futures.Futures.chance`).
+        exit_probability: at most that of leaving the range, under the belief (`agents.planning.open_loop.posterior_samples.MonteCarloSystems.chance`).
         samples_per_period: samples in a period of small motions, as they are believed.
     """
 
@@ -105,7 +111,7 @@ def design_experiment(
 ) -> ExperimentDesign:
     """Design the next experiment: a signal for an oscillator at rest.
 
-    ``efe`` climbs what is learned of systems drawn from the belief, on average (`agents.planner.blocks`). A policy that
+    ``efe`` climbs what is learned of systems drawn from the belief, on average (`agents.planning.open_loop.chance_constrained_block`). A policy that
     answers to outputs is played on some of them, and the signal that tells most on average is taken. A signal is taken
     as it is. What would leave the range with more than the bound is made smaller.
 
@@ -140,16 +146,18 @@ def design_experiment(
     belief = rig_prior(rig) if prior is None else prior
     env_view = EnvView(rig, belief, int(samples))
     rng = np.random.default_rng(seed)
-    view, limit = View.of(env_view.experiment), float(env_view.experiment.max_output)
-    posterior_draws = drawn_at_rest(belief, rng, draws_for(bound, MOST_PLANNED))
-    futures = Futures(view.model, posterior_draws, limit, rng, max(0, rig.whole_delay), view.degree)
-    systems = systems_of(view, belief, futures, int(samples))
-    with of_ones_own(policy, "policy"):
+    view, limit = ModelView.of(env_view.experiment), float(env_view.experiment.max_output)
+    posterior_draws = draw_at_rest(belief, rng, required_draws(bound, MAX_PLANNED_DRAWS))
+    futures = MonteCarloSystems(view.model, posterior_draws, limit, rng, max(0, rig.whole_delay), view.degree)
+    systems = sampled_systems(view, belief, futures, int(samples))
+    with attribute_user_errors(policy, "policy"):
         policy_object = make_policy(policy, env_view, seed=seed)  # type: ignore[arg-type]
-    if isinstance(policy_object, Planner):
+    if isinstance(policy_object, EfePlanner):
         n_noise_starts = min(max(_NOISE_START_SAMPLES // int(samples), _MIN_NOISE_STARTS), _MAX_NOISE_STARTS)
-        starting_inputs = drafts(policy_object, _belief_record_at_rest(belief), int(samples), seed, n_noise_starts)
-        u, scale, probability = best_block(
+        starting_inputs = initial_guesses(
+            policy_object, _belief_record_at_rest(belief), int(samples), seed, n_noise_starts
+        )
+        u, scale, probability = optimise_block(
             view, systems, futures, starting_inputs, env_view.max_input, bound, tell=on_progress
         )
     elif isinstance(policy_object, SignalPolicy):
@@ -161,9 +169,9 @@ def design_experiment(
             )
             for k in range(_N_ROLLOUTS)
         ]
-        information = [expected(view, systems, limit, u)[0] for u, *_ in rollouts]
+        information = [expected_information(view, systems, limit, u)[0] for u, *_ in rollouts]
         u, scale, probability = rollouts[int(np.argmax(information))]
-    samples_per_period = 1 / frequency(belief)
+    samples_per_period = 1 / believed_resonance(belief)
     if scale == 0.0 and probability >= bound:
         raise ValueError(
             undersampling_message(rig.step, samples_per_period) if samples_per_period < SLOWEST else
@@ -171,7 +179,7 @@ def design_experiment(
             f"{probability:.2g}, and at most {bound:.2g} is allowed; give a narrower guess or a wider range"
         )  # fmt: skip
     u = np.clip(u, -env_view.max_input, env_view.max_input)
-    log_det_gain, covs = expected(view, systems, limit, u)
+    log_det_gain, covs = expected_information(view, systems, limit, u)
     if not (np.isfinite(log_det_gain) and np.isfinite(covs).all()):
         raise ValueError(
             undersampling_message(rig.step, samples_per_period) if samples_per_period < SLOWEST else
@@ -205,7 +213,7 @@ def undersampling_message(step: float, samples_per_period: float) -> str:
     )
 
 
-def _expected_stds(belief: Belief, systems: Systems, covs: FloatArray) -> dict[str, float]:
+def _expected_stds(belief: Belief, systems: SampledSystems, covs: FloatArray) -> dict[str, float]:
     """Parameter to the median over systems of its standard deviation with these covariances."""
     parameter_covs = [
         propagate(belief.model, c, cov, belief.scales)[1] for c, cov in zip(systems.coefficients, covs, strict=True)
@@ -218,7 +226,7 @@ def _belief_record_at_rest(belief: Belief) -> FloatArray:
     """A belief's record, with the state at rest."""
     n, places, record = belief.model.n_states, covariance_places(belief.model), belief.record.copy()
     record[:n] = 0.0
-    record[0] = rests(belief.model, belief.coefficients_mean)[0]
+    record[0] = equilibria(belief.model, belief.coefficients_mean)[0]
     record[places[:n]] = 0.0
     record[np.diag(places)[:n]] = _REST_STD**2
     return record
@@ -227,7 +235,7 @@ def _belief_record_at_rest(belief: Belief) -> FloatArray:
 class _SampledPlant:
     """A drawn system as the plant of ``Rig-v0``, in the rig's units."""
 
-    def __init__(self, env_view: EnvView, futures: Futures, system: int) -> None:
+    def __init__(self, env_view: EnvView, futures: MonteCarloSystems, system: int) -> None:
         self._scales, self._model = env_view.experiment.scales, futures.model
         self._system = futures.coefficients[system], futures.states[system]
         self._noises = tuple(noise[system] for noise in futures.disturbances(env_view.horizon))
@@ -246,7 +254,13 @@ class _SampledPlant:
 
 
 def _roll_out_policy(
-    policy_name: str, env_view: EnvView, futures: Futures, system: int, bound: float, seed: int, on_progress: Tell
+    policy_name: str,
+    env_view: EnvView,
+    futures: MonteCarloSystems,
+    system: int,
+    bound: float,
+    seed: int,
+    on_progress: Tell,
 ) -> ScaledBlock:
     """What a policy answers to a drawn system, as large as it is safe on all."""
     import gymnasium as gym
@@ -263,7 +277,7 @@ def _roll_out_policy(
     u, state, episode_start = np.zeros(env_view.horizon), None, np.ones(1, dtype=bool)
     for t in range(env_view.horizon):
         on_progress(t / env_view.horizon)
-        with of_ones_own(policy_name, "policy"):
+        with attribute_user_errors(policy_name, "policy"):
             action, state = policy.predict(observation, state, episode_start, deterministic=True)
         episode_start = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, _ = env.step(action)

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy.typing as npt
 
-from agents.loading import load_object
+from agents.user_code import load_object
 from estimator.parameters import FloatArray
 from estimator.rig import Rig
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.planner.futures import Drawn, drawn_from
-from agents.planner.motion import frequency, survey
+from agents.planning.model_probe import believed_resonance, local_dynamics
+from agents.planning.open_loop.posterior_samples import SystemDraws, draw_from_estimator
 from estimator.arrays import copy as copy_numbers
 from estimator.belief import Belief, covariance_places
 from estimator.engine.motion import motion
@@ -101,7 +101,7 @@ class RunEstimator:
         prior = rig_prior(rig) if prior is None else begun_again(prior)
         self._n_pauses = 0
         self._start_components: list[tuple[float, FloatArray, FloatArray]] = []
-        self._systems_after_pause: Drawn | None = None
+        self._systems_after_pause: SystemDraws | None = None
         self._rig, self._prior = rig, prior
         self._blocks: list[tuple[FloatArray, FloatArray]] = []
         self.online = OnlineEstimator(
@@ -167,12 +167,12 @@ class RunEstimator:
         """Compile what `update_block` calls."""
         refit(self._rig, [(np.zeros(8), np.zeros(8))] * 2, self._prior, self.belief)
 
-    def draw_systems(self, rng: np.random.Generator) -> Drawn:
+    def draw_systems(self, rng: np.random.Generator) -> SystemDraws:
         """States and coefficients (draws, d) and noises (draws, 2) of systems that are believed in now.
 
         After a pause they are those that rang: a Gaussian of their states would put many out of the range.
         """
-        return self._systems_after_pause or drawn_from(self.online, rng)
+        return self._systems_after_pause or draw_from_estimator(self.online, rng)
 
     def predict_ahead(self, u: float) -> Belief:
         """When the next input begins to act, if the one in force is u; nothing changes."""
@@ -192,18 +192,18 @@ class RunEstimator:
         """
         rng = np.random.default_rng(self._n_pauses)
         self._n_pauses += 1
-        systems, noises = drawn_from(self.online, rng)
+        systems, noises = draw_from_estimator(self.online, rng)
         systems = np.ascontiguousarray(systems)
         n, max_pause = (
             self.online.model.n_states,
-            int(np.clip(_MAX_PAUSE_PERIODS / frequency(self.belief), 8, _MAX_PAUSE_SAMPLES)),
+            int(np.clip(_MAX_PAUSE_PERIODS / believed_resonance(self.belief), 8, _MAX_PAUSE_SAMPLES)),
         )
         # Each rings by itself: of two wells, a linear forecast would not know that they hold.
         _compile_free_response(self.online.model)(
             systems, u / self.online.scales.input, rng.integers(max_pause, size=len(systems))
         )
         states = systems[:, :n]
-        outputs = survey(self.online.model, systems[:, n:], states).shown
+        outputs = local_dynamics(self.online.model, systems[:, n:], states).outputs_shown
         kept = states[(np.abs(outputs) < _DIVERGED_OUTPUT) & np.isfinite(states).all(axis=1)]
         if len(kept) < len(states) / 2:
             raise ValueError(

@@ -45,12 +45,12 @@ class RunSettings:
             self._check()
 
     def _check(self) -> None:
-        from agents.asked import MOST_SAMPLES
+        from agents.predict_checks import MAX_SAMPLES
         from estimator.checks import MOST_SEED, SMALLEST, flag, number, shown, whole
 
         ranges = {
-            "samples": (1, MOST_SAMPLES), "listen": (1, MOST_SAMPLES), "stale": (0, MOST_SAMPLES),
-            "block": (8, MOST_SAMPLES), "seed": (0, MOST_SEED),
+            "samples": (1, MAX_SAMPLES), "listen": (1, MAX_SAMPLES), "stale": (0, MAX_SAMPLES),
+            "block": (8, MAX_SAMPLES), "seed": (0, MOST_SEED),
         }  # fmt: skip
         for name, (least, most) in ranges.items():
             if name != "block" or self.block is not None:

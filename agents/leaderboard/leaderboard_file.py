@@ -11,7 +11,7 @@ from typing import Any
 
 from agents.console_output import check_output_file, check_output_folder, replace_non_finite
 from agents.evaluation.comparison_tables import METRIC_COLUMNS, MetricColumn, center_value
-from agents.evaluation.oracle import FOLDER
+from agents.evaluation.oracle import ORACLE_FOLDER
 from agents.leaderboard.protocol import PROTOCOL_TRACKS, PROTOCOL_VERSION, SCORE_COLUMN, file_digest
 from estimator.checks import printable
 from estimator.files import append_atomically, whole_file, write_atomically
@@ -93,7 +93,7 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
 
 def stored_oracle_digests() -> set[str]:
     """Digests of the oracles of this version."""
-    return {file_digest(path) for path in FOLDER.glob("*.npz")}
+    return {file_digest(path) for path in ORACLE_FOLDER.glob("*.npz")}
 
 
 def leaderboard_rows(entries: Sequence[dict[str, Any]]) -> dict[str, list[list[str]]]:

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 
 from agents.console_output import package_versions
-from agents.evaluation.batch import TESTED
 from agents.evaluation.comparison_tables import IQM, METRIC_COLUMNS, MetricColumn, center_and_interval
 from agents.evaluation.metrics import fisher_information_gain
-from agents.evaluation.oracle import Oracle, Systems
+from agents.evaluation.oracle import Oracle, TrackSystems
 from agents.evaluation.policy_evaluation import Evaluation, run_episodes
 from agents.evaluation.policy_groups import policy_group
-from agents.loading import load_object
+from agents.evaluation.track_batch import TEST_OPTIONS
 from agents.policies import TRAINED, trained_policies
-from agents.policies.learned import CARD, MOST_STEPS, WEIGHTS, steps_of
+from agents.policies.networks.trained_policy import CARD_FILE, MAX_STEPS, WEIGHTS_FILE, training_steps_of
+from agents.user_code import load_object
 from estimator.checks import whole
 from estimator.parameters import FloatArray
 from estimator.progress import Tell, untold
@@ -100,7 +100,7 @@ def measure_policy(
         raise ValueError(f"protocol must be one of {', '.join(PROTOCOL_TRACKS)}, but is {track}; others have no oracle")
     if not entry_name.strip():
         raise ValueError("submit must be a name, but is empty; it is what the board shows")
-    whole("samples", 0 if training_samples is None else training_samples, MOST_STEPS, 0)
+    whole("samples", 0 if training_samples is None else training_samples, MAX_STEPS, 0)
     _, members = policy_group(policy)
     training_samples = max((_training_samples(member) or training_samples or 0 for member in members), default=0)
     budget = _budget_name(training_samples)
@@ -115,14 +115,14 @@ def measure_policy(
             for k, member in enumerate(members)
         ]
 
-    evaluations = evaluate_members(track, TESTED, 0, f"{entry_name} on {track}")
-    oracle = Oracle.of(Systems.of(track, N_SYSTEMS))
+    evaluations = evaluate_members(track, TEST_OPTIONS, 0, f"{entry_name} on {track}")
+    oracle = Oracle.of(TrackSystems.of(track, N_SYSTEMS))
     score = np.array([_efficiency_scores(evaluation, oracle) for evaluation in evaluations])
     shifted: dict[str, Any] = {}
     for k, (shift, (env_id, options)) in enumerate(shifts.items(), start=1):
         try:
             shifted_evaluations = evaluate_members(
-                env_id, TESTED | options, k * len(members), f"{entry_name}, shifted: {shift}"
+                env_id, TEST_OPTIONS | options, k * len(members), f"{entry_name}, shifted: {shift}"
             )
         except ValueError as error:
             shifted[shift] = {"refused": str(error)}
@@ -184,7 +184,7 @@ def _budget_name(samples: int) -> str:
 def _policy_folder(policy: str) -> Path | None:
     """The folder of a trained policy."""
     folder = TRAINED / policy if policy in trained_policies() else Path(policy)
-    return folder if (folder / CARD).is_file() else None
+    return folder if (folder / CARD_FILE).is_file() else None
 
 
 def _training_samples(policy: str) -> int | None:
@@ -192,14 +192,14 @@ def _training_samples(policy: str) -> int | None:
     folder = _policy_folder(policy)
     if folder is None:
         return None
-    return steps_of(folder)
+    return training_steps_of(folder)
 
 
 def policy_fingerprint(policy: str) -> str:
     """What tells a policy from another of its name: of its weights, or its source; one of ours has the version."""
     folder = _policy_folder(policy)
     if folder is not None:
-        return file_digest(folder / WEIGHTS)
+        return file_digest(folder / WEIGHTS_FILE)
     if ":" in policy:
         policy_object = load_object(policy, "policy")
         try:

@@ -14,14 +14,14 @@ from gymnasium import Env
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
-from agents.loading import load_object
-from agents.planner.block_policy import BlockPlanner
-from agents.planner.policy import Planner
+from agents.policies.block_planner import BlockPlanner
+from agents.policies.custom_policies import custom_policy, unwrap_vec_env
+from agents.policies.efe_planner import EfePlanner
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
-from agents.policies.own import own_policy, within
-from agents.policies.shield import Shield
+from agents.policies.shield_baseline import ShieldBaseline
 from agents.policies.signals import make_signal
+from agents.user_code import load_object
 from estimator.checks import MOST_SEED, hint, shown, whole
 
 
@@ -53,9 +53,9 @@ class Policy(Protocol):
 POLICIES: dict[str, Callable[..., Policy]] = {
     **{name: partial(make_signal, name) for name in EXCITATIONS},
     **FEEDBACK,
-    "efe": Planner,
-    "efe-myopic": partial(Planner, horizon=1),
-    "shield": Shield,
+    "efe": EfePlanner,
+    "efe-myopic": partial(EfePlanner, horizon=1),
+    "shield": ShieldBaseline,
     **{f"efe-block-{n}": partial(BlockPlanner, block=n) for n in (16, 64, 256)},
 }
 
@@ -69,7 +69,7 @@ def trained_policies() -> list[str]:
     return sorted(card.parent.relative_to(TRAINED).as_posix() for card in TRAINED.glob("*/*/policy.json"))
 
 
-def exists(name: str) -> bool:
+def path_exists(name: str) -> bool:
     """Whether there is a file or folder of this name; none has one that no file can have."""
     try:
         return Path(name).exists()
@@ -105,29 +105,29 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
     whole("seed", seed, MOST_SEED, 0)
     name = str(name) if isinstance(name, Path) else name
     if not isinstance(name, str):
-        return own_policy(name, env, seed, options)
-    own = ":" in name and name not in POLICIES and not exists(name)
-    env = env if own else within(env, name in EXCITATIONS)
+        return custom_policy(name, env, seed, options)
+    is_custom = ":" in name and name not in POLICIES and not path_exists(name)
+    env = env if is_custom else unwrap_vec_env(env, name in EXCITATIONS)
     if name in POLICIES:
         make = POLICIES[name]
-        known = [o for o in inspect.signature(make).parameters if o not in ("regime", "env", "seed")]
+        known_names = [o for o in inspect.signature(make).parameters if o not in ("regime", "env", "seed")]
         for option, value in options.items():
-            if option not in known:
-                raise ValueError(f"{option}={value!r} is no option of policy {name!r}, which has {known}")
+            if option not in known_names:
+                raise ValueError(f"{option}={value!r} is no option of policy {name!r}, which has {known_names}")
         return make(env if env is None else env.unwrapped, seed, **options)
-    if own:
-        return own_policy(load_object(name, "policy"), env, seed, options)
+    if is_custom:
+        return custom_policy(load_object(name, "policy"), env, seed, options)
     if options:
         raise ValueError(f"options must be none for a trained policy, but are {options}; leave them out")
-    if name in trained_policies() or exists(name):
-        from agents.policies.learned import load_policy
+    if name in trained_policies() or path_exists(name):
+        from agents.policies.networks.trained_policy import load_policy
 
         policy = load_policy(TRAINED / name if name in trained_policies() else name, seed)
         if env is not None:
-            policy.move_to(env.unwrapped)
+            policy.adapt_to(env.unwrapped)
         return policy
-    known = [*POLICIES, *trained_policies()]
+    known_names = [*POLICIES, *trained_policies()]
     raise ValueError(
         f"policy must be one that is known, the path of a trained one, or module:name of your own, but is {shown(name)}"
-        f"{hint(name, known)}; known are {', '.join(known)}"
+        f"{hint(name, known_names)}; known are {', '.join(known_names)}"
     )

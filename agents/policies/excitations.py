@@ -1,6 +1,6 @@
 """Excitations by name: classical test signals, drawn by a generator, in volts.
 
-`EXCITATIONS` makes a `Draw` from an amplitude limit, which can be copied and pickled. Every draw is new: what is not
+`EXCITATIONS` makes a `SignalDraw` from an amplitude limit, which can be copied and pickled. Every draw is new: what is not
 random about a signal (its band, its levels) is fixed, and its phase, order or start is drawn. The sampling rate is
 610.35 Hz (δ = 1.6384 ms); an input is held for a sample. `agents.policies.signals.SignalPolicy` plays them, within a
 track's limits. docs/policies.md has a table of them, with their frequency content.
@@ -20,7 +20,7 @@ from estimator.models.difference import difference
 from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.physical import coefficients_of
 
-Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
+SignalDraw = Callable[[np.random.Generator, int], NDArray[np.float64]]
 
 BAND = (10.0, 150.0)
 """Of multisines and chirps [Hz].
@@ -29,11 +29,11 @@ The linear resonances of oscillators within ±30 % of the twin lie between 49 an
 with its stiffness, at it with its damping, above it with its mass: a band with room on both sides tells them apart.
 """
 
-LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+PRBS_LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Of ``multilevel-prbs``, in parts of the limit; the small ones show the linear term, the large ones the cubic one."""
 
 
-def draw_regime(name: str) -> Draw:
+def draw_regime(name: str) -> SignalDraw:
     """A stretch of a regime of the Silverbox record, or of its synthesised stand-in.
 
     The stretch is contiguous and starts anywhere it fits, gaps and quiet beginning included. One
@@ -48,16 +48,16 @@ def _regime(rng: np.random.Generator, samples: int, name: str) -> NDArray[np.flo
     return np.resize(regime[start : start + samples], samples)
 
 
-def draw_recorded(u: NDArray[np.float64]) -> Draw:
+def draw_recorded(recorded_input: NDArray[np.float64]) -> SignalDraw:
     """A given input in volts, shape `(samples,)`, from its first sample; repeated if too short."""
-    return partial(_recorded, u=u)
+    return partial(_recorded, u=recorded_input)
 
 
 def _recorded(rng: np.random.Generator, samples: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.resize(u, samples)
 
 
-def draw_uniform(max_input: float) -> Draw:
+def draw_uniform(max_input: float) -> SignalDraw:
     """Independent samples, uniform in ±`max_input` volts."""
     return partial(_uniform, max_input=max_input)
 
@@ -66,7 +66,7 @@ def _uniform(rng: np.random.Generator, samples: int, max_input: float) -> NDArra
     return rng.uniform(-max_input, max_input, samples)
 
 
-def draw_gaussian(max_input: float) -> Draw:
+def draw_gaussian(max_input: float) -> SignalDraw:
     """Independent normal samples of standard deviation `max_input` / 3, clipped at ±`max_input` (1 in 370 is)."""
     return partial(_gaussian, max_input=max_input)
 
@@ -75,7 +75,7 @@ def _gaussian(rng: np.random.Generator, samples: int, max_input: float) -> NDArr
     return np.clip(rng.normal(0.0, max_input / 3.0, samples), -max_input, max_input)
 
 
-def draw_prbs(max_input: float, hold: int = 1) -> Draw:
+def draw_prbs(max_input: float, hold: int = 1) -> SignalDraw:
     """A random binary signal: +`max_input` or -`max_input` volts with even odds; see `draw_levels`.
 
     A coin rather than a shift register: of a maximum length sequence every draw would be the same one, shifted.
@@ -83,7 +83,7 @@ def draw_prbs(max_input: float, hold: int = 1) -> Draw:
     return draw_levels(max_input, hold, levels=(-1.0, 1.0))
 
 
-def draw_levels(max_input: float, hold: int, levels: tuple[float, ...] = LEVELS) -> Draw:
+def draw_levels(max_input: float, hold: int, levels: tuple[float, ...] = PRBS_LEVELS) -> SignalDraw:
     """A random signal of a few levels, in parts of `max_input` volts, with even odds, each held for so many samples.
 
     Raises:
@@ -100,7 +100,7 @@ def _levels(
     return max_input * np.repeat(values, hold)[:samples]
 
 
-def draw_multisine(max_input: float) -> Draw:
+def draw_multisine(max_input: float) -> SignalDraw:
     """Σ_k cos(2π k t / (samples δ) + φ_k) over all k in `BAND`, φ_k uniform on [0, 2π), its peak at `max_input`.
 
     A draw is one period, so that its power lies on the lines exactly. Its crest factor is about 3.
@@ -110,10 +110,10 @@ def draw_multisine(max_input: float) -> Draw:
 
 def _multisine(rng: np.random.Generator, samples: int, max_input: float) -> NDArray[np.float64]:
     lines = band_lines(samples)
-    return _tones(lines, rng.uniform(0.0, 2.0 * np.pi, lines.size), samples, max_input)
+    return _multitone(lines, rng.uniform(0.0, 2.0 * np.pi, lines.size), samples, max_input)
 
 
-def draw_schroeder(max_input: float) -> Draw:
+def draw_schroeder(max_input: float) -> SignalDraw:
     """The multisine with the phases of Schroeder (1970), from a random place of its period.
 
     The n-th of N lines of equal power has φ_n = -π n (n - 1) / N, which makes the sum a sweep through the band, with
@@ -124,8 +124,8 @@ def draw_schroeder(max_input: float) -> Draw:
 
 def _schroeder(rng: np.random.Generator, samples: int, max_input: float) -> NDArray[np.float64]:
     lines = band_lines(samples)
-    n = np.arange(1, lines.size + 1)
-    period = _tones(lines, -np.pi * n * (n - 1) / lines.size, samples, max_input)
+    line = np.arange(1, lines.size + 1)
+    period = _multitone(lines, -np.pi * line * (line - 1) / lines.size, samples, max_input)
     return np.roll(period, rng.integers(samples))
 
 
@@ -145,7 +145,7 @@ def band_lines(samples: int) -> NDArray[np.int64]:
     return lines
 
 
-def _tones(lines: NDArray[np.int64], phases: FloatArray, samples: int, peak: float) -> NDArray[np.float64]:
+def _multitone(lines: NDArray[np.int64], phases: FloatArray, samples: int, peak: float) -> NDArray[np.float64]:
     """Equal cosines at these harmonics, with these phases, scaled to this peak."""
     spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
     spectrum[lines] = np.exp(1j * phases)
@@ -153,7 +153,7 @@ def _tones(lines: NDArray[np.int64], phases: FloatArray, samples: int, peak: flo
     return volts * (peak / np.abs(volts).max())
 
 
-def draw_chirp(max_input: float, method: str) -> Draw:
+def draw_chirp(max_input: float, method: str) -> SignalDraw:
     """A sine of amplitude `max_input` that rises through `BAND` once in a draw, its first phase random.
 
     It rises because a hardening oscillator follows a rising frequency to larger displacements than a falling one.
@@ -171,15 +171,15 @@ def _chirp(rng: np.random.Generator, samples: int, max_input: float, method: str
     return max_input * chirp(time, low, samples * SAMPLING_STEP, high, method=method, phi=phase)
 
 
-def draw_square(max_input: float) -> Draw:
-    """A square wave of ±`max_input` at the twin's linear `resonance`, its first phase random.
+def draw_square(max_input: float) -> SignalDraw:
+    """A square wave of ±`max_input` at the twin's linear `linear_resonance`, its first phase random.
 
     The resonance rises with the amplitude A, about as sqrt((a + ¾ b A²) / m): an oscillator that is driven at the
     linear one falls out of step as it grows, and beats. To stay in step, the frequency must follow what the
     oscillator does: see ``square-believed`` and ``velocity-sign`` in `agents.policies.feedback`.
     """
     theta1, _, theta3, _ = coefficients_of(difference(), SILVERBOX_TWIN)
-    step = float(2.0 * np.pi * SAMPLING_STEP * resonance(theta1, theta3))
+    step = float(2.0 * np.pi * SAMPLING_STEP * linear_resonance(theta1, theta3))
     return partial(_square, max_input=max_input, step=step)
 
 
@@ -189,7 +189,7 @@ def _square(rng: np.random.Generator, samples: int, max_input: float, step: floa
     return max_input * square(rng.uniform(0.0, 2.0 * np.pi) + step * np.arange(samples))
 
 
-def resonance(theta1: FloatArray | np.float64, theta3: FloatArray | np.float64) -> FloatArray:
+def linear_resonance(theta1: FloatArray | np.float64, theta3: FloatArray | np.float64) -> FloatArray:
     """Frequency at which the linear part of Eq. (2) rings [Hz], within `BAND`.
 
     The poles are those of z² - θ1 z - θ3, of the angle arccos(θ1 / (2 sqrt(-θ3))). It is 68.1 Hz for the twin;
@@ -201,7 +201,7 @@ def resonance(theta1: FloatArray | np.float64, theta3: FloatArray | np.float64) 
     return np.clip(angle / (2.0 * np.pi * SAMPLING_STEP), *BAND)
 
 
-EXCITATIONS: dict[str, Callable[[float], Draw]] = {
+EXCITATIONS: dict[str, Callable[[float], SignalDraw]] = {
     "silverbox-multisine": lambda max_input: draw_regime("multisine"),
     "silverbox-arrow": lambda max_input: draw_regime("arrow"),
     "uniform": draw_uniform,

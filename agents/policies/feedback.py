@@ -1,10 +1,10 @@
 """Classical policies with feedback: they read the believed resonance, or the believed velocity, off the observation.
 
-Velocity and resonance are those of any model (`agents.planner.motion`): of Eq. (2) x_t - x_{t-1} and the angle of the
+Velocity and resonance are those of any model (`agents.planning.model_probe`): of Eq. (2) x_t - x_{t-1} and the angle of the
 poles, of Eq. (1) x' and the square root of the stiffness over the mass, but for the damping.
 
 Both give ±amplitude: the amplitude limit, or the budget's RMS where that is smaller. Both brake, giving the input
-against the velocity, while the amplitude that the oscillation is believed to have is beyond `TURN` of the displacement
+against the velocity, while the amplitude that the oscillation is believed to have is beyond `BRAKE_FRACTION` of the displacement
 that ends the episode. Where the limits allow for an amplitude so large, they spend the rest of the episode about it,
 pumping and braking by turns, which puts most of the power above the resonance. Both are deterministic: the seed has no
 effect. Where an action is held for several samples, both choose it by what is believed at the first.
@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.asked import check_rows, check_state, starts
-from agents.planner.motion import places, resonances, survey
+from agents.planning.model_probe import local_dynamics, observation_layout, resonance_frequencies
 from agents.policies.excitations import BAND
-from agents.policies.signals import Limits, limits_of
+from agents.policies.signals import InputLimits, input_limits_of
+from agents.predict_checks import check_batch_size, check_state, episode_starts
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from estimator.checks import numbers
 from estimator.parameters import SAMPLING_STEP
 
-TURN = 0.7
+BRAKE_FRACTION = 0.7
 """Amplitude beyond which the policies brake, in parts of the displacement that ends the episode.
 
 An input of 0.15 V held for a sample changes an amplitude by about 0.09 V, for the lightest oscillators by 0.14 V, so
@@ -36,10 +36,10 @@ the largest displacement was 0.78 of the limit on Amplitude-v0, 0.93 on Output-v
 """
 
 #: Cycles per sample between which a resonance is looked for.
-_BAND = (BAND[0] * SAMPLING_STEP, BAND[1] * SAMPLING_STEP)
+_RESONANCE_BAND = (BAND[0] * SAMPLING_STEP, BAND[1] * SAMPLING_STEP)
 
 #: The signs `(n,)` of inputs that need not brake, of velocities and phases of a wave of the believed resonance.
-Signs = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+SignLaw = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
 class FeedbackPolicy:
@@ -49,34 +49,36 @@ class FeedbackPolicy:
         limits: What the input keeps to.
     """
 
-    def __init__(self, signs: Signs, limits: Limits, experiment: Experiment) -> None:
+    def __init__(self, sign_law: SignLaw, limits: InputLimits, experiment: Experiment) -> None:
         """Takes from the experiment what an observed mean, in the prior's standard deviations, stands for."""
-        self._signs, self.limits = signs, limits
+        self._sign_law, self.limits = sign_law, limits
         self._model, self._step = experiment.model, experiment.step
-        self._places = places(experiment.model)
+        self._layout = observation_layout(experiment.model)
         self._limit = float(experiment.max_output)
         self._centers = experiment.prior_belief.coefficients_mean
         self._stds = np.sqrt(np.diag(experiment.prior_belief.coefficients_cov))
 
     def frequency(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
         """The linear resonance that is believed, shape `(n,)` [Hz], of observations `(n, features)`."""
-        return self._look(observations)[2] / self._step
+        return self._read_motion(observations)[2] / self._step
 
     def amplitude(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
         """The amplitude that is believed, shape `(n,)`, in parts of the displacement limit; see `_amplitude`."""
-        return self._amplitude(*self._look(observations))
+        return self._amplitude(*self._read_motion(observations))
 
-    def _look(self, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _read_motion(
+        self, rows: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """What the sensor shows and its velocity, in parts of the limit, and the resonance in cycles per sample."""
-        at, k, n = self._places, self._model.n_coefficients, self._model.n_states
-        means = self._centers + self._stds * rows[:, at.mean : at.mean + k]
-        states = self._limit * rows[:, at.state : at.state + n]
-        found = survey(self._model, means, states)
-        cycles = np.clip(resonances(self._model, found.slopes), *_BAND)
-        return found.shown / self._limit, found.velocities / self._limit, cycles
+        layout, k, n = self._layout, self._model.n_coefficients, self._model.n_states
+        means = self._centers + self._stds * rows[:, layout.mean : layout.mean + k]
+        states = self._limit * rows[:, layout.state : layout.state + n]
+        dynamics = local_dynamics(self._model, means, states)
+        cycles = np.clip(resonance_frequencies(self._model, dynamics.jacobians), *_RESONANCE_BAND)
+        return dynamics.outputs_shown / self._limit, dynamics.velocities / self._limit, cycles
 
     def _amplitude(
-        self, shown: NDArray[np.float64], velocities: NDArray[np.float64], cycles: NDArray[np.float64]
+        self, outputs: NDArray[np.float64], velocities: NDArray[np.float64], cycles: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """The amplitude of a free oscillation at the believed resonance, φ rad per sample.
 
@@ -86,9 +88,11 @@ class FeedbackPolicy:
         """
         angles = 2.0 * np.pi * cycles
         if self._model.is_continuous:
-            return np.hypot(shown, velocities / angles)
-        before = shown - velocities
-        return np.sqrt(shown**2 + before**2 - 2.0 * shown * before * np.cos(angles)) / np.sin(angles)
+            return np.hypot(outputs, velocities / angles)
+        previous_outputs = outputs - velocities
+        return np.sqrt(outputs**2 + previous_outputs**2 - 2.0 * outputs * previous_outputs * np.cos(angles)) / np.sin(
+            angles
+        )
 
     def predict(
         self,
@@ -109,19 +113,21 @@ class FeedbackPolicy:
         if state is not None:
             check_state(state, 1)
         phase = np.zeros(len(rows)) if state is None else state
-        check_rows("state", len(phase), len(rows))
-        phase = np.where(starts(episode_start, len(rows)), 0.0, phase)
-        seen = self._look(rows)
-        signs = np.where(self._amplitude(*seen) > TURN, -np.sign(seen[1]), self._signs(seen[1], phase))
+        check_batch_size("state", len(phase), len(rows))
+        phase = np.where(episode_starts(episode_start, len(rows)), 0.0, phase)
+        motion = self._read_motion(rows)
+        signs = np.where(
+            self._amplitude(*motion) > BRAKE_FRACTION, -np.sign(motion[1]), self._sign_law(motion[1], phase)
+        )
         # An input of one magnitude has that magnitude as its RMS.
-        size = self.limits.fit(np.array([self.limits.max_input])).item()
+        size = self.limits.to_actions(np.array([self.limits.max_input])).item()
         actions = (size * signs).astype(np.float32).reshape(*np.shape(observation)[:-1], 1)
-        return actions, (phase + self.limits.hold * seen[2]) % 1.0
+        return actions, (phase + self.limits.hold * motion[2]) % 1.0
 
     def _rows(self, observation: ArrayLike) -> NDArray[np.float64]:
         """The observations as a batch `(n, features)`."""
         observed = numbers("observation", observation)
-        size = self._places.size
+        size = self._layout.size
         if observed.ndim not in (1, 2) or observed.shape[-1] != size:
             raise ValueError(
                 f"observation must have the shape ({size},) or (environments, {size}), as those of duffing_env have, "
@@ -147,14 +153,14 @@ def square_believed(velocities: NDArray[np.float64], phases: NDArray[np.float64]
     return np.where(phases < 0.5, 1.0, -1.0)
 
 
-def make_feedback(signs: Signs, env: Any, seed: int) -> FeedbackPolicy:
+def make_feedback(sign_law: SignLaw, env: Any, seed: int) -> FeedbackPolicy:
     """A policy with feedback for an unwrapped environment (or None: the defaults); the seed has no effect.
 
     Raises:
         ValueError: `env` is not one of duffing_env.
     """
-    limits, _ = limits_of(env)
-    return FeedbackPolicy(signs, limits, SimulatedExperiment() if env is None else env.experiment)
+    limits, _ = input_limits_of(env)
+    return FeedbackPolicy(sign_law, limits, SimulatedExperiment() if env is None else env.experiment)
 
 
 FEEDBACK: dict[str, Callable[[Any, int], FeedbackPolicy]] = {

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.asked import MOST_SAMPLES, check_rows, check_state, starts
-from agents.planner.motion import frequency
-from agents.policies.excitations import EXCITATIONS, Draw, draw_recorded
+from agents.planning.model_probe import believed_resonance
+from agents.policies.excitations import EXCITATIONS, SignalDraw, draw_recorded
+from agents.predict_checks import MAX_SAMPLES, check_batch_size, check_state, episode_starts
 from estimator.belief import Belief
 from estimator.checks import MOST_SEED, SMALLEST, is_finite, numbers, shown, whole
 from estimator.parameters import SAMPLING_STEP
@@ -23,16 +23,16 @@ from estimator.parameters import SAMPLING_STEP
 SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 DEFAULT_MAX_INPUT = 0.15  # V; the largest input of the Silverbox record is 0.149 V
-_RESONANCE = 68.1 * SAMPLING_STEP  # cycles per sample; the Silverbox's, for which bands and holds are made
-_MOST_DRAWN = 2**16  # of an environment's; longer episodes are continued by the next draw
+_SILVERBOX_RESONANCE = 68.1 * SAMPLING_STEP  # cycles per sample; the Silverbox's, for which bands and holds are made
+_MAX_DRAW_SAMPLES = 2**16  # of an environment's; longer episodes are continued by the next draw
 DEFAULT_SAMPLES = 1024  # for environments whose episodes have no fixed length
 
 # Float32 rounding of the actions must not bring a signal of exactly the budget above it.
-_WITHIN = 1.0 - 1e-6
+_RMS_SAFETY_FACTOR = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
-class Limits:
+class InputLimits:
     """What an input must keep to.
 
     Attributes:
@@ -56,7 +56,7 @@ class Limits:
                 )
         whole("hold", self.hold, 10**9)
 
-    def fit(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_actions(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
         """Turns an input into actions within the limits. This is the one place where signals are scaled.
 
         The input is clipped at `max_input`. Where its root mean square is then above `max_rms`, it is scaled down
@@ -67,15 +67,15 @@ class Limits:
         every `hold` samples, held. Frequencies stay what they are in Hz; those above half of the actions' rate fold.
 
         Args:
-            volts: The input of an episode, or of a part that repeats, shape `(samples,)`.
+            volts: The input of an episode, or of a part that repeats, shape `(n_samples,)`.
 
         Returns:
-            Actions in [-1, 1], shape `(ceil(samples / hold),)`.
+            Actions in [-1, 1], shape `(ceil(n_samples / hold),)`.
         """
         held = np.repeat(volts[:: self.hold], self.hold)[: len(volts)]
         actions = np.clip(held / self.max_input, -1.0, 1.0)
         if self.max_rms is not None:
-            allowed = _WITHIN * self.max_rms / self.max_input
+            allowed = _RMS_SAFETY_FACTOR * self.max_rms / self.max_input
             rms = np.sqrt(np.mean(actions**2))
             if rms > allowed:
                 actions *= allowed / rms
@@ -97,13 +97,13 @@ class SignalPolicy:
         seed: The seed that `reset` starts from.
 
     Raises:
-        ValueError: `max_input` or `max_rms` is not positive and finite, or `samples` or `seed` is not a whole number.
+        ValueError: `max_input` or `max_rms` is not positive and finite, or `n_samples` or `seed` is not a whole number.
     """
 
     def __init__(
         self,
         name: str,
-        draw: Draw,
+        draw: SignalDraw,
         *,
         max_input: float,
         max_rms: float | None = None,
@@ -111,10 +111,10 @@ class SignalPolicy:
         hold: int = 1,
         seed: int = 0,
     ) -> None:
-        whole("samples", samples, MOST_SAMPLES)
+        whole("samples", samples, MAX_SAMPLES)
         whole("seed", seed, MOST_SEED, 0)
         self.name = name
-        self.limits = Limits(max_input, max_rms, hold)
+        self.limits = InputLimits(max_input, max_rms, hold)
         self.samples = samples
         self.actions = -(-samples // hold)
         self.seed = seed
@@ -163,15 +163,15 @@ class SignalPolicy:
         else:
             check_state(state, 2)
             position, signals = state
-            check_rows("state", len(position), rows)
-        due = (position == self.actions) | starts(episode_start, rows)
+            check_batch_size("state", len(position), rows)
+        due = (position == self.actions) | episode_starts(episode_start, rows)
         if due.any():
             position = np.where(due, 0, position)
             signals = signals.copy()
             missing = rows - len(self._generators)
             self._generators += map(np.random.default_rng, self._seeds.spawn(max(0, missing)))
             for row in np.flatnonzero(due).tolist():
-                signals[row] = self.limits.fit(self._draw(self._generators[row], self.samples))
+                signals[row] = self.limits.to_actions(self._draw(self._generators[row], self.samples))
         actions = signals[np.arange(rows), position][:, np.newaxis]
         return actions.reshape(*observed[:-1], 1), (position + 1, signals)
 
@@ -188,13 +188,13 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     Raises:
         ValueError: `env` is not one of duffing_env.
     """
-    limits, samples = limits_of(env)
+    limits, samples = input_limits_of(env)
     draw = EXCITATIONS[name](limits.max_input)
     experiment: Any = getattr(env, "experiment", None)
     if getattr(experiment, "rig", None) is not None:
-        hold = holds(experiment.prior_belief, samples)
-        usual = EXCITATIONS[name](DEFAULT_MAX_INPUT)
-        draw = partial(_slower, draw=usual, hold=hold, worth=limits.max_input / DEFAULT_MAX_INPUT)
+        hold = hold_for_resonance(experiment.prior_belief, samples)
+        silverbox_draw = EXCITATIONS[name](DEFAULT_MAX_INPUT)
+        draw = partial(_stretched_draw, draw=silverbox_draw, hold=hold, worth=limits.max_input / DEFAULT_MAX_INPUT)
     recorded = getattr(env, "recorded_input", None)
     if recorded is not None and name.startswith("silverbox-"):
         draw, samples = draw_recorded(recorded), len(recorded)
@@ -203,31 +203,33 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     )
 
 
-def holds(prior: Belief, samples: int) -> int:
+def hold_for_resonance(prior: Belief, n_samples: int) -> int:
     """Samples to hold each value of an excitation for, at least 1, so that it excites what is believed."""
-    return int(np.clip(round(_RESONANCE / frequency(prior)), 1, max(1, samples // 8)))
+    return int(np.clip(round(_SILVERBOX_RESONANCE / believed_resonance(prior)), 1, max(1, n_samples // 8)))
 
 
-def _slower(rng: np.random.Generator, samples: int, draw: Draw, hold: int, worth: float) -> NDArray[np.float64]:
+def _stretched_draw(
+    rng: np.random.Generator, samples: int, draw: SignalDraw, hold: int, amplitude_ratio: float
+) -> NDArray[np.float64]:
     """A draw that is slower, and in another unit."""
     # Below 5 samples a multisine has no line in its band.
-    values: NDArray[np.float64] = np.repeat(worth * draw(rng, max(5, -(-samples // hold))), hold)[:samples]
+    values: NDArray[np.float64] = np.repeat(amplitude_ratio * draw(rng, max(5, -(-samples // hold))), hold)[:samples]
     return values
 
 
-def limits_of(env: Any) -> tuple[Limits, int]:
+def input_limits_of(env: Any) -> tuple[InputLimits, int]:
     """The limits of the input, and the length of an episode, of an unwrapped environment (or None).
 
     Raises:
         ValueError: `env` is not one of duffing_env.
     """
     if env is None:
-        return Limits(), DEFAULT_SAMPLES
+        return InputLimits(), DEFAULT_SAMPLES
     if not hasattr(env, "max_input"):
         raise ValueError(
             f"env must be an environment of duffing_env, which has max_input, but its unwrapped type is "
             f"{type(env).__name__}; pass what gym.make, gym.make_vec or DuffingVecEnv made of its id"
         )
     experiment = getattr(env, "experiment", None)
-    limits = Limits(env.max_input, getattr(experiment, "max_rms", None), getattr(experiment, "hold", 1))
-    return limits, min(getattr(env, "horizon", None) or DEFAULT_SAMPLES, _MOST_DRAWN)
+    limits = InputLimits(env.max_input, getattr(experiment, "max_rms", None), getattr(experiment, "hold", 1))
+    return limits, min(getattr(env, "horizon", None) or DEFAULT_SAMPLES, _MAX_DRAW_SAMPLES)

@@ -18,20 +18,20 @@ import numpy as np
 
 from agents.cli import check_track_id, full_track_id, iterate_with_progress, run_script
 from agents.console_output import print_texts_and_tables
-from agents.evaluation.batch import make
 from agents.evaluation.comparison import default_policies
-from agents.loading import of_ones_own
+from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy, trained_policies
+from agents.user_code import attribute_user_errors
 from estimator.checks import one_of, whole
 from estimator.extras import need
 
 #: Grade to the policy that plays it; the expert is the one that ships for the track.
 POLICIES = {"random": "uniform", "medium": "velocity-sign", "planner": "efe"}
 
-_ROWS = 256
+_MAX_BATCH = 256
 
 #: Episodes, which are in memory together.
-_MOST = 100_000
+_MAX_EPISODES = 100_000
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Config:
         object.__setattr__(self, "env", full_track_id(self.env))
         check_track_id(self.env)
         one_of("grade", self.grade, (*POLICIES, "expert"))
-        whole("episodes", self.episodes, _MOST)
+        whole("episodes", self.episodes, _MAX_EPISODES)
         whole("seed", self.seed, 2**32 - 1, 0)
 
     @property
@@ -70,17 +70,17 @@ class Config:
         return f"duffing/{self.env.split('/')[-1].lower()}/{self.grade}-v0"
 
 
-def collect(config: Config) -> list[dict[str, Any]]:
+def collect_episodes(config: Config) -> list[dict[str, Any]]:
     """Episodes as Minari's buffers hold them: an observation more than actions, rewards and ends."""
     name = config.policy
-    envs = make(config.env, min(_ROWS, config.episodes))
-    with of_ones_own(name, "policy"):
+    envs = make_track_batch(config.env, min(_MAX_BATCH, config.episodes))
+    with attribute_user_errors(name, "policy"):
         policy = make_policy(name, envs, seed=config.seed)
     episodes: list[dict[str, Any]] = []
     seeds = np.random.SeedSequence(config.seed).generate_state(-(-config.episodes // envs.num_envs))
     batches = [(f"batch {number} of {len(seeds)}", int(seed)) for number, seed in enumerate(seeds, start=1)]
     for seed in iterate_with_progress(batches):
-        with of_ones_own(name, "policy"):
+        with attribute_user_errors(name, "policy"):
             episodes += _play(envs, policy, seed)
     envs.close()
     return episodes[: config.episodes]
@@ -89,21 +89,21 @@ def collect(config: Config) -> list[dict[str, Any]]:
 def _play(envs: Any, policy: Any, seed: int) -> list[dict[str, Any]]:
     """One episode in every row, which all begin together."""
     n, state, start = envs.num_envs, None, np.ones(envs.num_envs, dtype=np.bool_)
-    seen, _ = envs.reset(seed=seed)
-    observations, steps = [seen], []
+    observation, _ = envs.reset(seed=seed)
+    observations, steps = [observation], []
     length = np.zeros(n, dtype=np.intp)
     while not length.all():
-        actions, state = policy.predict(seen, state, start, deterministic=True)
-        seen, rewards, terminated, truncated, _ = envs.step(actions)
-        observations.append(seen)
+        actions, state = policy.predict(observation, state, start, deterministic=True)
+        observation, rewards, terminated, truncated, _ = envs.step(actions)
+        observations.append(observation)
         steps.append((actions, rewards, terminated, truncated))
         start = terminated | truncated
         length[start & (length == 0)] = len(steps)  # a row that has ended plays on; what it plays is left out
     actions, rewards, terminated, truncated = (np.array(part) for part in zip(*steps, strict=True))
-    told = np.array(observations)
+    observed = np.array(observations)
     return [
         {
-            "observations": told[: end + 1, row],
+            "observations": observed[: end + 1, row],
             "actions": actions[:end, row],
             "rewards": rewards[:end, row],
             "terminations": terminated[:end, row],
@@ -128,7 +128,7 @@ def main(config: Config) -> None:
     place = get_dataset_path(config.name)
     if place.exists():
         raise ValueError(f"{config.name} must be a new dataset, but is in {place}; delete that folder to make it anew")
-    buffers = [EpisodeBuffer(id=number, **episode) for number, episode in enumerate(collect(config))]
+    buffers = [EpisodeBuffer(id=number, **episode) for number, episode in enumerate(collect_episodes(config))]
     with warnings.catch_warnings():
         # There is no author to write to, no page of its own, and no other environment to evaluate on.
         warnings.filterwarnings("ignore", ".* is set to None", UserWarning)

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.learned import WEIGHTS
-from agents.policies.saving import write_policy
+from agents.policies.networks.policy_saving import write_policy
+from agents.policies.networks.trained_policy import WEIGHTS_FILE
 from estimator.files import whole_file, write_atomically, writing
 
 if TYPE_CHECKING:
@@ -119,10 +119,10 @@ def load_initial_network(policy_folder: Path, model: BaseAlgorithm) -> None:
     from safetensors.numpy import load_file
 
     try:
-        tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(policy_folder / WEIGHTS).items()}
+        tensors = {name: torch.from_numpy(t.copy()) for name, t in load_file(policy_folder / WEIGHTS_FILE).items()}
     except OSError as error:
         raise ValueError(
-            f"begin must be the folder of a policy, but {policy_folder} has no {WEIGHTS}; name one"
+            f"begin must be the folder of a policy, but {policy_folder} has no {WEIGHTS_FILE}; name one"
         ) from error
     for name in ("setting", *_NORMALIZER_TENSORS):
         tensors.pop(name, None)
@@ -144,7 +144,7 @@ def _copy_normalizer(policy_folder: Path, model: BaseAlgorithm) -> None:
     from safetensors.numpy import load_file
 
     envs: Any = model.get_env()
-    tensors = load_file(policy_folder / WEIGHTS)
+    tensors = load_file(policy_folder / WEIGHTS_FILE)
     if hasattr(envs, "normalizer") and _NORMALIZER_TENSORS[0] in tensors:
         envs.normalizer.mean, envs.normalizer.std = (tensors[name].copy() for name in _NORMALIZER_TENSORS)
 

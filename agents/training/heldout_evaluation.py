@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.evaluation.policy_evaluation import run_episodes
-from agents.policies.learned import CARD
-from agents.policies.saving import write_policy
+from agents.policies.networks.policy_saving import write_policy
+from agents.policies.networks.trained_policy import CARD_FILE
 from estimator.files import write_atomically
 
 if TYPE_CHECKING:
@@ -53,10 +53,10 @@ class HeldOutEvaluator:
                 if int(row["steps"]) <= first_step:
                     self._rows.append({name: int(v) if name == "steps" else float(v) for name, v in row.items()})
         self._best = float("-inf")
-        if (folder / BEST_POLICY_FOLDER / CARD).exists():
-            self._best = json.loads((folder / BEST_POLICY_FOLDER / CARD).read_text(encoding="utf-8"))["evaluation"][
-                HELDOUT_SCORE
-            ]
+        if (folder / BEST_POLICY_FOLDER / CARD_FILE).exists():
+            self._best = json.loads((folder / BEST_POLICY_FOLDER / CARD_FILE).read_text(encoding="utf-8"))[
+                "evaluation"
+            ][HELDOUT_SCORE]
 
     @property
     def has_begun(self) -> bool:

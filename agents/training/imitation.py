@@ -93,8 +93,8 @@ def discounted_returns(
 def _network_actions(envs: FeatureVecEnv, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """What the network would have to choose for these actions: upright, as its action space has it."""
     features = envs.current_features
-    max_actions = np.maximum(features.pushes, 1e-6)
-    mirrored = np.clip(actions[:, 0] * features.signs / max_actions, -1.0, 1.0)
+    max_actions = np.maximum(features.action_scales, 1e-6)
+    mirrored = np.clip(actions[:, 0] * features.mirror_signs / max_actions, -1.0, 1.0)
     if not isinstance(envs.action_space, gym.spaces.Discrete):
         return mirrored[:, None].astype(np.float32)
     return np.rint((mirrored + 1.0) / 2.0 * (int(envs.action_space.n) - 1)).astype(np.int64)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from agents.policies.learned import CONFIG
+from agents.policies.networks.trained_policy import CONFIG_FILE
 from agents.training.hyperparameters import track_name
 from agents.training.ray_tasks import run_on_ray
 from agents.training.training_config import TrainConfig, claim_run_folder, read_config
@@ -36,7 +36,7 @@ def train_seeds(config: TrainConfig, seeds: int, *, on_ray: bool = False) -> Ite
     runs = [folder / str(seed) for seed in range(config.seed, config.seed + seeds)]
     begin = None if config.begin is None else config.begin.resolve()
     for run in runs:
-        claim_run_folder(run / CONFIG, replace(config, seed=int(run.name), output=run, begin=begin))
+        claim_run_folder(run / CONFIG_FILE, replace(config, seed=int(run.name), output=run, begin=begin))
     if on_ray:
         yield from (run for run, _ in run_on_ray(_train_or_resume_folder, runs))
         return

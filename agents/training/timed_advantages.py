@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from agents.policies.features import NAMES
+from agents.policies.networks.rollout_features import FEATURE_NAMES
 
-_TIME_LEFT_INDEX = NAMES.index("time_left")
+_TIME_LEFT_INDEX = FEATURE_NAMES.index("time_left")
 
 #: Stretches of time that advantages are normalised in; standard deviations that are kept at most.
 _N_TIME_BINS, _MAX_ADVANTAGE = 16, 4.0

@@ -11,11 +11,11 @@ from typing import Any, Literal
 
 from agents.cli import RIG_TRACK, JsonOptions, check_track_id, full_track_id, options_with_rig
 from agents.console_output import package_versions, write_json
-from agents.loading import check_options, spec_of
-from agents.policies.learned import CONFIG
+from agents.policies.networks.trained_policy import CONFIG_FILE
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, hyperparameters_to_dict
 from agents.training.environments.oscillator_family import FAMILY
 from agents.training.hyperparameters import parse_hyperparameters, read_hyperparameters
+from agents.user_code import check_env_options, env_spec_of
 from estimator.checks import is_finite, mapping, one_of, shown, whole
 from estimator.extras import need
 from estimator.files import whole_file
@@ -83,7 +83,7 @@ class TrainConfig(TrainingSubject):
         if not isinstance(self.env, str):
             check_track_id(self.env)
         mapping("options", self.options)
-        check_options(self.options)
+        check_env_options(self.options)
         # A run has its rig in itself, and not the name of a file that may change.
         object.__setattr__(self, "options", options_with_rig(self.options, self.rig))
         object.__setattr__(self, "rig", None)
@@ -108,7 +108,7 @@ class TrainConfig(TrainingSubject):
         elif self.options or self.eval_every or self.algo != "ppo":
             raise ValueError(
                 f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare with "
-                "python -m agents.studies.family"
+                "python -m research.studies.unseen_oscillators"
             )
         if self.hyperparameters is None:
             object.__setattr__(self, "hyperparameters", read_hyperparameters(self.algo, self.env, self.settings))
@@ -138,7 +138,7 @@ class TrainConfig(TrainingSubject):
 
 def _check_observation(config: TrainConfig) -> None:
     """Refuse an observation that has no features."""
-    observation = {**spec_of(config.env).kwargs, **config.options}.get("observation", "posterior")
+    observation = {**env_spec_of(config.env).kwargs, **config.options}.get("observation", "posterior")
     if observation != "posterior":
         raise ValueError(
             f"observation must be 'posterior' with features, but is {shown(observation)}; "
@@ -230,7 +230,7 @@ def contrib_packages(config: TrainConfig) -> tuple[str, ...]:
 def read_config(folder: Path) -> TrainConfig:
     """The configuration that a run folder was made from; what only a script had in it is left out."""
     try:
-        config_file = whole_file(folder / CONFIG, "resume must be a run folder, with a config.json", 2**20)
+        config_file = whole_file(folder / CONFIG_FILE, "resume must be a run folder, with a config.json", 2**20)
         found = json.loads(config_file.read_text(encoding="utf-8"))["config"]
         settings = {f.name: found[f.name] for f in fields(TrainConfig)}
         settings |= {
@@ -239,4 +239,4 @@ def read_config(folder: Path) -> TrainConfig:
         settings["hyperparameters"] = parse_hyperparameters(ALGORITHMS[settings["algo"]], settings["hyperparameters"])
         return TrainConfig(**settings)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{CONFIG} must be that of a run, but that of {folder} is not: {error!r}") from error
+        raise ValueError(f"{CONFIG_FILE} must be that of a run, but that of {folder} is not: {error!r}") from error

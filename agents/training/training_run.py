@@ -18,8 +18,8 @@ import numpy as np
 
 from agents.console_output import check_output_folder, write_json
 from agents.interruption import InterruptHandler, add_resume_hint
-from agents.policies.learned import CARD, CONFIG, steps_of
-from agents.policies.saving import write_policy
+from agents.policies.networks.policy_saving import write_policy
+from agents.policies.networks.trained_policy import CARD_FILE, CONFIG_FILE, training_steps_of
 from agents.training.checkpoints import (
     TrainingProgress,
     delete_training_states,
@@ -124,10 +124,12 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
         ValueError: where it is no run folder, the run is finished, or another process trains in it.
         OSError: where nothing can be written there.
     """
-    if not (folder / CONFIG).is_file():
-        raise ValueError(f"resume must be a run folder, which holds {CONFIG}, but {folder} is not one; name a run's")
+    if not (folder / CONFIG_FILE).is_file():
+        raise ValueError(
+            f"resume must be a run folder, which holds {CONFIG_FILE}, but {folder} is not one; name a run's"
+        )
     with held("resume", folder), add_resume_hint(lambda message: message or _resume_hint(folder)):
-        if (folder / CARD).exists():
+        if (folder / CARD_FILE).exists():
             command = shlex.join(["duffing-env", "train", "--begin", str(folder)])
             raise ValueError(
                 f"resume must be a run that was stopped, but {folder} is finished; for more samples begin another run "
@@ -140,9 +142,9 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
 def train_or_resume(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found: None) -> None:
     """Train into ``config.output``, or go on with what is there; of a finished run there is nothing to do."""
     assert config.output is not None
-    if not (config.output / CONFIG).exists():
+    if not (config.output / CONFIG_FILE).exists():
         train(config, on_evaluation)
-    elif not (config.output / CARD).exists():
+    elif not (config.output / CARD_FILE).exists():
         resume(config.output, on_evaluation)
 
 
@@ -151,7 +153,7 @@ def _resume_hint(folder: Path) -> str:
     command = shlex.join(["duffing-env", "train", "--resume", str(folder)])
     if latest_checkpoint(folder) is not None:
         return f"go on with: {command}"
-    return "nothing was kept" + (f"; begin again with: {command}" if (folder / CONFIG).exists() else "")
+    return "nothing was kept" + (f"; begin again with: {command}" if (folder / CONFIG_FILE).exists() else "")
 
 
 class _TrainingLoop:
@@ -185,12 +187,12 @@ class _TrainingLoop:
         self._evaluator = HeldOutEvaluator(folder, config, first_step)
         self._on_evaluation = on_evaluation
         self._tensorboard: Any = None
-        config_file = folder / CONFIG
+        config_file = folder / CONFIG_FILE
         self._description = (
             json.loads(config_file.read_text(encoding="utf-8")) if config_file.exists() else describe_run(config)
         )
         if not config_file.exists() and config.begin is not None:
-            self._description[STEPS_BEFORE_KEY] = steps_of(config.begin)
+            self._description[STEPS_BEFORE_KEY] = training_steps_of(config.begin)
 
     def run(self) -> TrainingRun:
         from stable_baselines3.common.logger import KVWriter
@@ -198,8 +200,8 @@ class _TrainingLoop:
         from agents.evaluation.figures import plot_learning_curve, save_png
         from agents.training.training_logs import ResumedCSVLog, TensorBoardLog, WallTimeLogger
 
-        if not (self._folder / CONFIG).exists():
-            write_json(self._folder / CONFIG, self._description)
+        if not (self._folder / CONFIG_FILE).exists():
+            write_json(self._folder / CONFIG_FILE, self._description)
         logs: list[KVWriter] = [ResumedCSVLog(self._folder / "progress.csv", self._progress.steps)]
         if self._config.tensorboard:
             self._tensorboard = TensorBoardLog(self._folder)
@@ -301,7 +303,7 @@ class _TrainingLoop:
 
 def _make_training_envs(config: TrainConfig, seed: int) -> Any:
     """The environments of a run, seen as its hyperparameters say; features are normalised by the run's own seed."""
-    from agents.vec_env import DuffingVecEnv
+    from agents.sb3_vec_env import DuffingVecEnv
 
     hyperparameters = config.hyperparameters
     if not hyperparameters.features:
@@ -317,10 +319,10 @@ def _make_training_envs(config: TrainConfig, seed: int) -> Any:
 
 def _make_feature_envs(config: TrainConfig, num_envs: int, seed: int) -> tuple[Any, int]:
     """Environments that show features, and the samples of an episode."""
-    from agents.evaluation.batch import make
+    from agents.evaluation.track_batch import make_track_batch
+    from agents.sb3_vec_env import DuffingVecEnv
     from agents.training.environments.feature_vec_env import FeatureVecEnv
     from agents.training.environments.mixed_vec_env import MixedVecEnv, draw_track_options
-    from agents.vec_env import DuffingVecEnv
 
     options, raw_observation = {"reward": config.reward, **config.options}, config.hyperparameters.own
     levels = getattr(config.hyperparameters, "levels", 0)
@@ -331,7 +333,9 @@ def _make_feature_envs(config: TrainConfig, num_envs: int, seed: int) -> tuple[A
         ), oscillator_family.TYPICAL_SAMPLES
     if config.vary:
         for name, bound in ((name, end) for name, bounds in config.vary.items() for end in bounds):
-            checked_envs = make(config.env, 1, options | {name: bound})  # which refuses what the option may not be
+            checked_envs = make_track_batch(
+                config.env, 1, options | {name: bound}
+            )  # which refuses what the option may not be
             checked_envs.close()
         draw = partial(draw_track_options, env_id=config.env, options=config.options, ranges=config.vary)
         return MixedVecEnv(num_envs, seed, draw, raw_observation=raw_observation, **mixed_options), checked_envs.horizon
@@ -376,7 +380,7 @@ def _create_run_folder(config: TrainConfig) -> Iterator[Path]:
 def _check_run_folder(config: TrainConfig) -> None:
     """Refuse a named folder that is neither new nor empty."""
     if config.output is not None:
-        for content, name in (("run", CONFIG), ("policy", CARD)):
+        for content, name in (("run", CONFIG_FILE), ("policy", CARD_FILE)):
             if (config.output / name).exists():
                 raise ValueError(
                     f"output must be a new folder, but {config.output} holds a {content}; remove it or name another"

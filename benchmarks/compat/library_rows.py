@@ -201,7 +201,7 @@ class StableBaselines3:
     package = "stable-baselines3"
 
     def _envs(self):
-        from agents.vec_env import DuffingVecEnv
+        from agents.sb3_vec_env import DuffingVecEnv
 
         return DuffingVecEnv(ID, ROWS, seed=0)
 
@@ -221,7 +221,7 @@ class StableBaselines3:
         """Ours, made and wrapped by the user."""
         from gymnasium.wrappers.vector import TransformReward
 
-        from agents.vec_env import DuffingVecEnv
+        from agents.sb3_vec_env import DuffingVecEnv
 
         envs = DuffingVecEnv(TransformReward(made(), lambda reward: 0.1 * reward))
         envs.reset()

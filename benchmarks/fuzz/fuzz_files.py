@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from agents.commands.rig_file_builder import text_of
 from agents.leaderboard import leaderboard_file
-from agents.policies.learned import CARD, WEIGHTS, load_policy
+from agents.policies.networks.trained_policy import CARD_FILE, WEIGHTS_FILE, load_policy
 from agents.training.checkpoints import STATE_FILE, TrainingProgress, load_progress
 from agents.training.hyperparameters import HYPERPARAMETER_FOLDER, read_hyperparameters
 from agents.training.training_config import TrainConfig, describe_run, read_config
@@ -63,7 +63,7 @@ def calls() -> st.SearchStrategy[Call]:
 
     place = Path(tempfile.mkdtemp(prefix="fuzz-"))
     shipped = Path(str(__import__("agents").__file__)).parent / "policies" / "trained" / "ppo" / "short"
-    card, tensors = json.loads((shipped / CARD).read_text()), load_file(shipped / WEIGHTS)
+    card, tensors = json.loads((shipped / CARD_FILE).read_text()), load_file(shipped / WEIGHTS_FILE)
     kinds = ("paper", "look-ahead", "ensemble", "rig")
     estimators = {}
     for name in kinds:
@@ -130,8 +130,8 @@ def calls() -> st.SearchStrategy[Call]:
                 described = draw(
                     changed({name: card[name] for name in ("format", "network", "features") if name in card})
                 )
-            (folder / WEIGHTS).write_bytes(draw(damaged(save(weights))) if way == 2 else save(weights))
-            (folder / CARD).write_bytes(
+            (folder / WEIGHTS_FILE).write_bytes(draw(damaged(save(weights))) if way == 2 else save(weights))
+            (folder / CARD_FILE).write_bytes(
                 draw(damaged(json.dumps(card).encode())) if way == 3 else json.dumps(described).encode()
             )
             return Call("load_policy", lambda: _act(folder), names, sound=str)

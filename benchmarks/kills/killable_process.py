@@ -12,7 +12,7 @@ from agents.cli import run_script
 #: The processes are forked from one that imported these.
 PRELOADED = (
     "torch", "stable_baselines3", "optuna", "matplotlib.figure", "duffing_env", "agents.commands.train_command",
-    "agents.evaluation.comparison", "agents.studies.ship", "agents.hardware.experiment_run", "estimator.identification",
+    "agents.evaluation.comparison", "research.studies.ship_policy", "agents.hardware.experiment_run", "estimator.identification",
 )  # fmt: skip
 
 
@@ -34,11 +34,11 @@ def _command(folder: Path, words: list[str]) -> None:
     sys.argv = ["duffing-env", *words]
     if words[0] == "ship":
         from agents import policies
-        from agents.studies import ship
+        from research.studies import ship_policy
 
         policies.TRAINED = folder  # not into the package
         sys.argv = words
-        return run_script(ship.ship, ship.Config)
+        return run_script(ship_policy.ship_median, ship_policy.Config)
     from agents.commands import main as command
 
     command()

@@ -8,7 +8,7 @@ from typing import Any
 
 from agents.hardware.simulated_plant import SimulatedPlant
 from agents.leaderboard.leaderboard_file import SHIPPED_LEADERBOARD
-from agents.policies.learned import CARD, WEIGHTS
+from agents.policies.networks.trained_policy import CARD_FILE, WEIGHTS_FILE
 from agents.training.checkpoints import STATE_FILE
 from estimator import Rig
 from estimator.extras import how_to_get, is_missing
@@ -84,13 +84,13 @@ class Train(Case):
     def again(self, folder: Path) -> list[str]:
         """``--resume``, where there is a run."""
         run = folder / "run"
-        if (run / CARD).exists() or not (run / "config.json").exists():
-            return ["rig", "list"] if (run / CARD).exists() else self.start(folder)
+        if (run / CARD_FILE).exists() or not (run / "config.json").exists():
+            return ["rig", "list"] if (run / CARD_FILE).exists() else self.start(folder)
         return ["train", "--resume", "run", "--systems", "0"]
 
     def measured(self, folder: Path) -> list[Any]:
         """The policies of the checkpoints."""
-        return [(path.parent.name, path.read_bytes()) for path in folder.glob(f"run/checkpoints/*/{WEIGHTS}")]
+        return [(path.parent.name, path.read_bytes()) for path in folder.glob(f"run/checkpoints/*/{WEIGHTS_FILE}")]
 
     def lost(self, folder: Path) -> float:
         """Samples in the log beyond the latest checkpoint."""
@@ -99,7 +99,7 @@ class Train(Case):
     def lost_by(self, run: Path) -> float:
         """By one run."""
         log = run / "progress.csv"
-        if (run / CARD).exists() or not log.exists():
+        if (run / CARD_FILE).exists() or not log.exists():
             return 0.0
         steps = [int(row["time/total_timesteps"]) for row in csv.DictReader(log.read_text().splitlines())]
         kept = [int(state.parent.name) for state in run.glob(f"checkpoints/*/{STATE_FILE}")]
@@ -107,7 +107,7 @@ class Train(Case):
 
     def result(self, folder: Path) -> Any:
         """The weights."""
-        return (folder / "run" / WEIGHTS).read_bytes()
+        return (folder / "run" / WEIGHTS_FILE).read_bytes()
 
 
 class Tune(Case):
@@ -191,14 +191,14 @@ class Submit(Case):
 class Ship(Case):
     """Two seeds, over a policy that ships already."""
 
-    name, unit = "agents.studies.ship", "files of before"
+    name, unit = "research.studies.ship_policy", "files of before"
 
     def prepare(self, folder: Path) -> None:
         """Two run folders of policies that nobody trained."""
         from stable_baselines3 import PPO
 
-        from agents.policies.saving import save_policy
-        from agents.vec_env import DuffingVecEnv
+        from agents.policies.networks.policy_saving import save_policy
+        from agents.sb3_vec_env import DuffingVecEnv
 
         super().prepare(folder)
         envs = DuffingVecEnv(TRACK, 2)
@@ -217,7 +217,7 @@ class Ship(Case):
     def result(self, folder: Path) -> Any:
         """Weights and card."""
         shipped = folder / "ppo" / "mine"
-        return (shipped / WEIGHTS).read_bytes(), json.loads((shipped / CARD).read_text())
+        return (shipped / WEIGHTS_FILE).read_bytes(), json.loads((shipped / CARD_FILE).read_text())
 
 
 class Counted(SimulatedPlant):
@@ -289,7 +289,7 @@ class Ray(Train):
 
     def measured(self, folder: Path) -> list[Any]:
         """The policies of the checkpoints."""
-        found = folder.glob(f"run/*/checkpoints/*/{WEIGHTS}")
+        found = folder.glob(f"run/*/checkpoints/*/{WEIGHTS_FILE}")
         return [(path.parts[-4], path.parent.name, path.read_bytes()) for path in found]
 
     def lost(self, folder: Path) -> float:
@@ -298,7 +298,7 @@ class Ray(Train):
 
     def result(self, folder: Path) -> Any:
         """The weights of both."""
-        return [(folder / "run" / seed / WEIGHTS).read_bytes() for seed in "01"]
+        return [(folder / "run" / seed / WEIGHTS_FILE).read_bytes() for seed in "01"]
 
 
 def _untimed(content: Any) -> Any:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from agents import console_output
-from agents.studies.family import PLANNER, play
 from agents.training.environments.oscillator_family import FamilyMember
 from estimator.rig import Channel, Rig
+from research.studies.unseen_oscillators import PLANNER, play_episode
 
 RIGS = {
     "softening": Rig(
@@ -54,7 +54,7 @@ def run(names: Sequence[str], policies: Sequence[str], seeds: int) -> dict[str, 
     for name in names:
         member = FamilyMember(name, 0.0, 0.0, 0.0, {"rig": RIGS[name], "horizon": 256})
         for policy in (PLANNER, *policies):
-            episodes = [play(member, policy, seed)[0] for seed in range(seeds)]
+            episodes = [play_episode(member, policy, seed)[0] for seed in range(seeds)]
             gained.setdefault(name, {})[policy] = episodes
     return gained
 

@@ -55,7 +55,7 @@ REFERENCE = {
         "agents.training.RecurrentPPOSettings",
         "agents.training.environments.feature_vec_env.FeatureVecEnv",
         "agents.evaluation.policy_evaluation",
-        "agents.vec_env",
+        "agents.sb3_vec_env",
     ],
 }
 
@@ -174,7 +174,7 @@ def _policies() -> str:
                 f"::: agents.policies.{name}\n"
                 for name in (
                     *("make_policy", "Policy", "signals.SignalPolicy"),
-                    *("learned.LearnedPolicy", "features", "features.FeatureMap"),
+                    *("learned.TrainedPolicy", "features", "features.FeatureEncoder"),
                 )
             ),
         ]

@@ -10,8 +10,8 @@ import pytest
 from agents.hardware.clock import JumpingClock, RealClock
 from agents.hardware.experiment_run import RunSettings, run_experiment
 from agents.hardware.simulated_plant import SimulatedPlant
+from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import ALGORITHMS, TrainConfig, train
-from agents.vec_env import DuffingVecEnv
 from estimator import Channel, Rig
 
 RIG = Rig(

@@ -10,9 +10,16 @@ from tables import table
 
 from agents import make_policy
 from agents.commands import main
-from agents.evaluation.batch import make
-from agents.policies.features import BOUND, FeatureMap
-from agents.policies.learned import CARD, FORMAT, WEIGHTS, LearnedPolicy, Network, load_policy
+from agents.evaluation.track_batch import make_track_batch
+from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncoder
+from agents.policies.networks.trained_policy import (
+    CARD_FILE,
+    CARD_FORMAT,
+    WEIGHTS_FILE,
+    NetworkCard,
+    TrainedPolicy,
+    load_policy,
+)
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 ACTORS = {
@@ -24,7 +31,7 @@ ACTORS = {
 }
 
 
-def written(found, hidden=(16, 8), normalised=BOUND, spread="log_std", everywhere=False, seed=0, **network):
+def written(found, hidden=(16, 8), normalised=MAX_FEATURE, spread="log_std", everywhere=False, seed=0, **network):
     """Network, tensors and card of a policy with features and random weights, so large that tanh and clipping matter.
 
     ``everywhere``: it is for all oscillators.
@@ -43,7 +50,7 @@ def written(found, hidden=(16, 8), normalised=BOUND, spread="log_std", everywher
     if spread and not network.get("levels"):
         tensors["log_std"] = np.array([-1.0], np.float32)
     spread = "log_std" if "log_std" in tensors else None
-    described = Network(names, spread=spread, features=True, normalised=normalised, **network)
+    described = NetworkCard(names, spread=spread, features=True, normalised=normalised, **network)
     return described, tensors, {"features": {"own": False} if everywhere else found.describe()}
 
 
@@ -51,8 +58,8 @@ def folder_of(folder, policy):
     """The folder of a policy that was `written`."""
     network, tensors, card = policy
     folder.mkdir(exist_ok=True)
-    save_file(tensors, folder / WEIGHTS)
-    (folder / CARD).write_text(json.dumps({"format": FORMAT, "network": vars(network), **card}))
+    save_file(tensors, folder / WEIGHTS_FILE)
+    (folder / CARD_FILE).write_text(json.dumps({"format": CARD_FORMAT, "network": vars(network), **card}))
     return folder
 
 
@@ -63,7 +70,7 @@ def scattered(found, rows=300):
 
 def played(env_id, policy, rows=9, samples=60, **options):
     """What some environments show while a policy plays, and what it does."""
-    envs = make(env_id, rows, options)
+    envs = make_track_batch(env_id, rows, options)
     player = make_policy(str(policy), envs)
     shown, _ = envs.reset(seed=1)
     seen, done = [], []
@@ -78,17 +85,17 @@ def played(env_id, policy, rows=9, samples=60, **options):
 @pytest.fixture
 def folder(tmp_path):
     """Of a policy for Power-v0."""
-    return folder_of(tmp_path / "policy", written(FeatureMap.of(make(POWER, 1))))
+    return folder_of(tmp_path / "policy", written(FeatureEncoder.of(make_track_batch(POWER, 1))))
 
 
 @pytest.mark.parametrize("own", [True, False], ids=["own", "features alone"])
 @pytest.mark.parametrize("name", ACTORS)
 def test_what_is_compiled_decides_as_the_network(name, own):
-    found = FeatureMap.of(make(AMPLITUDE, 1), own=own)
-    policy, seen = LearnedPolicy(*written(found, **ACTORS[name])), scattered(found)
+    found = FeatureEncoder.of(make_track_batch(AMPLITUDE, 1), with_observation=own)
+    policy, seen = TrainedPolicy(*written(found, **ACTORS[name])), scattered(found)
     shown = found(seen)
-    choices, _ = policy._choose(shown.values, None, None, True)
-    expected, (decided, _) = shown.act(choices[:, 0]), policy.predict(seen, deterministic=True)
+    choices, _ = policy._network_output(shown.values, None, None, True)
+    expected, (decided, _) = shown.to_actions(choices[:, 0]), policy.predict(seen, deterministic=True)
     assert (decided.shape, decided.dtype) == ((len(seen), 1), np.float32)
     if policy.network.levels:
         np.testing.assert_array_equal(decided, expected)
@@ -100,9 +107,9 @@ def test_what_is_compiled_decides_as_the_network(name, own):
 
 @pytest.mark.parametrize("name", ACTORS)
 def test_a_decision_is_the_same_alone_in_a_batch_and_in_a_batch_of_another_size(tmp_path, name):
-    policy = written(FeatureMap.of(make(AMPLITUDE, 1)), **ACTORS[name])
+    policy = written(FeatureEncoder.of(make_track_batch(AMPLITUDE, 1)), **ACTORS[name])
     seen, decided = played(AMPLITUDE, folder_of(tmp_path / "policy", policy))
-    alone = LearnedPolicy(*policy)
+    alone = TrainedPolicy(*policy)
 
     def decide(rows):
         return alone.predict(rows, deterministic=True)[0]
@@ -122,10 +129,10 @@ def test_of_recorded_observations_it_decides_the_same_without_an_environment(fol
 
 @table("actor", [{}, {"levels": 3}])
 def test_what_is_sampled_is_seeded_and_within_the_span(actor):
-    found = FeatureMap.of(make(AMPLITUDE, 1))
-    policy, again = (LearnedPolicy(*written(found, **actor), seed=3) for _ in range(2))
+    found = FeatureEncoder.of(make_track_batch(AMPLITUDE, 1))
+    policy, again = (TrainedPolicy(*written(found, **actor), seed=3) for _ in range(2))
     seen = scattered(found)
-    low, high = (found(seen).act(np.full(len(seen), end)) for end in (-1.0, 1.0))
+    low, high = (found(seen).to_actions(np.full(len(seen), end)) for end in (-1.0, 1.0))
     sampled, _ = policy.predict(seen)
     np.testing.assert_array_equal(again.predict(seen)[0], sampled)
     assert not np.array_equal(policy.predict(seen)[0], sampled)
@@ -135,8 +142,8 @@ def test_what_is_sampled_is_seeded_and_within_the_span(actor):
 
 @table("value", [np.nan, np.inf, -np.inf])
 def test_an_observation_that_is_not_finite_is_refused(value):
-    found = FeatureMap.of(make(AMPLITUDE, 1))
-    policy = LearnedPolicy(*written(found))
+    found = FeatureEncoder.of(make_track_batch(AMPLITUDE, 1))
+    policy = TrainedPolicy(*written(found))
     seen = np.zeros((5, found.observation_size), np.float32)
     seen[3, -1] = value
     for deterministic in (True, False):
@@ -150,12 +157,12 @@ def test_an_observation_that_is_not_finite_is_refused(value):
 def test_in_another_environment_it_takes_the_prior_and_the_limits_there(folder):
     options = {"max_rms": 0.05, "spread": 0.2, "horizon": 64}
     seen, decided = played(POWER, folder, samples=64, **options)
-    there = FeatureMap.of(make(POWER, 1, options))
+    there = FeatureEncoder.of(make_track_batch(POWER, 1, options))
     policy = load_policy(folder)
     assert not np.array_equal(policy.predict(seen, deterministic=True)[0], decided)
-    policy.move_to(make(POWER, 2, options))
+    policy.adapt_to(make_track_batch(POWER, 2, options))
     np.testing.assert_array_equal(policy.predict(seen, deterministic=True)[0], decided)
-    np.testing.assert_array_equal(policy._map.to_tensor(), there.to_tensor())
+    np.testing.assert_array_equal(policy._encoder.to_tensor(), there.to_tensor())
 
 
 def test_a_policy_that_sees_its_observation_refuses_another_model(folder):
@@ -168,7 +175,7 @@ def test_a_policy_that_sees_its_observation_refuses_another_model(folder):
 
 
 def test_a_policy_for_all_oscillators_plays_each_but_not_without_one(tmp_path):
-    found = FeatureMap.of(make(AMPLITUDE, 1), own=False)
+    found = FeatureEncoder.of(make_track_batch(AMPLITUDE, 1), with_observation=False)
     place = folder_of(tmp_path / "policy", written(found, everywhere=True))
     for env_id, size in ((POWER, 22), ("duffing_env/Amplitude-v1", 22), ("duffing_env/Pendulum-v0", 19)):
         seen, decided = played(env_id, place, rows=3, samples=5)
@@ -190,18 +197,18 @@ def test_a_policy_for_all_oscillators_plays_each_but_not_without_one(tmp_path):
     ],
 )
 def test_damaged_tensors_are_refused(tmp_path, name, change, message):
-    place = folder_of(tmp_path / "policy", written(FeatureMap.of(make(POWER, 1))))
-    tensors = load_file(place / WEIGHTS)
-    save_file(tensors | {name: change(tensors[name])}, place / WEIGHTS)
+    place = folder_of(tmp_path / "policy", written(FeatureEncoder.of(make_track_batch(POWER, 1))))
+    tensors = load_file(place / WEIGHTS_FILE)
+    save_file(tensors | {name: change(tensors[name])}, place / WEIGHTS_FILE)
     with pytest.raises(ValueError, match=rf"policy must be what its card says, but .*{message}"):
         load_policy(place)
 
 
 @table("wrong", ["3", "[1]", '{"own": true}', '{"own": true, "model": {"name": "x"}, "degree": 0, "lag": 0}'])
 def test_a_damaged_description_is_refused(tmp_path, wrong):
-    place = folder_of(tmp_path / "policy", written(FeatureMap.of(make(POWER, 1))))
-    card = json.loads((place / CARD).read_text()) | {"features": json.loads(wrong)}
-    (place / CARD).write_text(json.dumps(card))
+    place = folder_of(tmp_path / "policy", written(FeatureEncoder.of(make_track_batch(POWER, 1))))
+    card = json.loads((place / CARD_FILE).read_text()) | {"features": json.loads(wrong)}
+    (place / CARD_FILE).write_text(json.dumps(card))
     with pytest.raises(ValueError, match="policy must be what its card says"):
         load_policy(place)
 
@@ -211,14 +218,14 @@ def test_the_network_as_onnx_chooses_the_same(tmp_path, name):
     onnx = pytest.importorskip("onnx", reason="onnx is not installed; it is the extra onnx")
     from onnx.reference import ReferenceEvaluator
 
-    found = FeatureMap.of(make(AMPLITUDE, 1))
+    found = FeatureEncoder.of(make_track_batch(AMPLITUDE, 1))
     place = folder_of(tmp_path / "policy", written(found, **ACTORS[name]))
     main(["export", str(place), "--output", str(tmp_path / "network.onnx")])
     policy, seen = load_policy(place), found(scattered(found, 200)).values
     graph = onnx.load(tmp_path / "network.onnx")
     onnx.checker.check_model(graph, full_check=True)
     (chosen,) = ReferenceEvaluator(graph).run(["action"], {"observation": seen})
-    expected, _ = policy._choose(seen, None, None, True)
+    expected, _ = policy._network_output(seen, None, None, True)
     np.testing.assert_allclose(chosen, expected, atol=1e-5)
     assert chosen.shape == (200, 1)
     assert len(np.unique(chosen)) > 1

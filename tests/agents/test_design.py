@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tables import table
 
-from agents.planner.ascent import Limits, climber
-from agents.planner.design import Known, designer, half_log_det, invert
+from agents.planning.d_optimality import NominalSystem, compile_d_optimality, half_log_det, invert_from_cholesky
+from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from estimator import SILVERBOX_TWIN, silverbox_prior
 from estimator.engine.gradient import pieces
 from estimator.information import fisher_information
@@ -22,20 +22,22 @@ Q, R, LIMIT, AMPLITUDE = 5e-4, 3e-4, 0.3, 0.1
 PAPER = difference()
 THETA = coefficients_of(PAPER, {name: getattr(SILVERBOX_TWIN, name) for name in "mcab"})
 PRECISION = np.linalg.inv(silverbox_prior(PAPER).coefficients_cov)
-TWIN = Known(THETA, PRECISION, (Q**2, R**2))
+TWIN = NominalSystem(THETA, PRECISION, (Q**2, R**2))
 
 
 def evaluated(u, start=None, penalty=0.0, climbs=False, limit=LIMIT, known=TWIN, found=None):
     """Worth and peak, or worth, peak and gradient."""
-    found = found or designer(PAPER)
-    start, memory = np.zeros(found.start_size) if start is None else start, found.memory(len(u))
+    found = found or compile_d_optimality(PAPER)
+    start, memory = np.zeros(found.start_size) if start is None else start, found.workspace(len(u))
     told = (known, limit, penalty, start, u, memory)
-    return (*found.climb(*told), memory.gradient) if climbs else found.worth(*told)
+    return (*found.criterion_and_gradient(*told), memory.gradient) if climbs else found.criterion(*told)
 
 
 def improved(inputs, energy=np.inf):
     inputs, values = inputs.copy(), np.empty(len(inputs))
-    climber(PAPER).improve(TWIN, Limits(LIMIT, LIMIT, AMPLITUDE, energy), 0.3, 100, inputs, values)
+    compile_projected_gradient(PAPER).ascend_batch(
+        TWIN, DesignLimits(LIMIT, LIMIT, AMPLITUDE, energy), 0.3, 100, inputs, values
+    )
     return inputs, values
 
 
@@ -44,7 +46,7 @@ def case_of(name):
     model, interpolation, c, size = CASES[name]
     c = np.array(c, dtype=np.float64)
     precision = np.diag(1 / (0.1 * np.maximum(np.abs(c), 0.01)) ** 2)
-    return model, interpolation, size, Known(c, precision, (4e-6, *[1e-6] * model.n_outputs))
+    return model, interpolation, size, NominalSystem(c, precision, (4e-6, *[1e-6] * model.n_outputs))
 
 
 @pytest.mark.parametrize(
@@ -53,7 +55,9 @@ def case_of(name):
 def test_the_worth_is_half_the_log_determinant_of_the_precision(name):
     model, interpolation, size, known = case_of(name)
     u = size * np.random.default_rng(0).choice([-0.5, 0.5], 60)
-    value, _ = evaluated(u, limit=np.inf, known=known, found=designer(model, int(interpolation == "linear")))
+    value, _ = evaluated(
+        u, limit=np.inf, known=known, found=compile_d_optimality(model, int(interpolation == "linear"))
+    )
     told = fisher_information(model, known.coefficients, u, 2e-3, 1e-3, interpolation=interpolation)
     assert value == pytest.approx(0.5 * np.linalg.slogdet(known.precision + told)[1], rel=1e-12)
 
@@ -65,7 +69,7 @@ def test_factor_and_inverse(size):
     A = A @ A.T + np.eye(size)
     L, inverse = A.copy(), np.empty((size, size))
     assert half_log_det(L) == pytest.approx(0.5 * np.linalg.slogdet(A)[1], rel=1e-12)
-    invert(L, inverse)
+    invert_from_cholesky(L, inverse)
     np.testing.assert_allclose(inverse @ A, np.eye(size), atol=1e-12)
     assert half_log_det(-np.eye(size)) == -np.inf
 
@@ -74,7 +78,7 @@ def test_factor_and_inverse(size):
 @table("moving", [False, True])
 def test_the_gradient_is_that_of_differences(name, moving):
     model, interpolation, size, known = case_of(name)
-    found = designer(model, int(interpolation == "linear"))
+    found = compile_d_optimality(model, int(interpolation == "linear"))
     rng = np.random.default_rng(2)
     u, n = size * rng.uniform(-1, 1, 40), model.n_states
     start = np.zeros(found.start_size)

@@ -15,14 +15,14 @@ import agents.evaluation.comparison
 import agents.evaluation.metrics
 import agents.evaluation.policy_evaluation
 from agents import make_policy
-from agents.evaluation.batch import TESTED, make
 from agents.evaluation.comparison import compare_policies, default_policies
-from agents.evaluation.oracle import Systems
+from agents.evaluation.oracle import TrackSystems
 from agents.evaluation.policy_evaluation import evaluate_policies
+from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.leaderboard import leaderboard_file
-from agents.policies.learned import WEIGHTS, load_policy
-from agents.policies.saving import save_policy
-from agents.vec_env import DuffingVecEnv
+from agents.policies.networks.policy_saving import save_policy
+from agents.policies.networks.trained_policy import WEIGHTS_FILE, load_policy
+from agents.sb3_vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
 from duffing_env.plants.silverbox_record import Regime
 from estimator import SAMPLING_STEP, OnlineEstimator, Rig, difference, silverbox_prior
@@ -118,7 +118,11 @@ def act(name, options):
 
 def act_as_network(name, options):
     """As `act`: a product of matrices rounds by its size, so that the actions are those of the batch, and checked."""
-    policy, weights, envs = load_policy(name), load_file(Path(name) / WEIGHTS), make(TRACK, SYSTEMS, TESTED | options)
+    policy, weights, envs = (
+        load_policy(name),
+        load_file(Path(name) / WEIGHTS_FILE),
+        make_track_batch(TRACK, SYSTEMS, TEST_OPTIONS | options),
+    )
     observations, played = envs.reset(seed=SEED)[0], []
     for _ in range(HORIZON):
         played.append(policy.predict(observations, deterministic=True)[0])
@@ -440,10 +444,10 @@ def test_with_noises_that_are_drawn_all_is_measured_with_the_true_ones(without_r
         evaluation.metrics["information_gain"].mean(), abs=0.4
     )
     assert 0.7 < evaluation.estimator_metrics["auditor"]["nees"].mean() < 1.3
-    systems = Systems.of(CONTINUOUS, 2)
+    systems = TrackSystems.of(CONTINUOUS, 2)
     assert len(np.unique(systems.variances)) == 4
     u = 0.03 * np.ones((2, systems.samples))
-    values, _ = systems.worth(u)
+    values, _ = systems.criterion_and_peak(u)
     expected = np.linalg.slogdet(systems.precision + systems.information(u))[1] / 2
     np.testing.assert_allclose(values, expected, rtol=1e-6)
 

@@ -9,10 +9,10 @@ from tables import table
 
 from agents import make_policy
 from agents.commands import main
-from agents.policies.excitations import EXCITATIONS, LEVELS, resonance
-from agents.policies.export import draw_signal, export_signal
-from agents.policies.feedback import FEEDBACK, TURN
-from agents.policies.signals import Limits, SignalPolicy
+from agents.policies.excitations import EXCITATIONS, PRBS_LEVELS, linear_resonance
+from agents.policies.feedback import BRAKE_FRACTION, FEEDBACK
+from agents.policies.signal_export import draw_signal, export_signal
+from agents.policies.signals import InputLimits, SignalPolicy
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.models.difference import difference
@@ -102,7 +102,7 @@ def test_gaussian_is_a_third_of_the_limit():
 def test_levels_are_five_and_even():
     u = draws("multilevel-prbs")
     values, counts = np.unique(u[:, ::4], return_counts=True)
-    np.testing.assert_allclose(values, 0.15 * np.array(LEVELS))
+    np.testing.assert_allclose(values, 0.15 * np.array(PRBS_LEVELS))
     np.testing.assert_allclose(counts / counts.sum(), 0.2, atol=0.02)
     np.testing.assert_array_equal(u[:, ::4], u[:, 3::4])
 
@@ -128,9 +128,9 @@ def test_resonance_is_where_a_free_oscillation_crosses_zero():
         crossings = np.flatnonzero(np.diff(np.signbit(x[1:])))
         halves = crossings.size - 1
         measured = halves / (2 * SAMPLING_STEP * (crossings[-1] - crossings[0]))
-        found = resonance(theta1, theta3)
+        found = linear_resonance(theta1, theta3)
         assert found == pytest.approx(measured, rel=2 / (crossings[-1] - crossings[0]))
-    assert resonance(np.float64(1.0), np.float64(0.1)) == 10.0  # describes no oscillator
+    assert linear_resonance(np.float64(1.0), np.float64(0.1)) == 10.0  # describes no oscillator
 
 
 @table("name", EXCITATIONS)
@@ -144,14 +144,14 @@ def test_a_budget_scales_the_whole_signal_down_to_it(name):
 
 
 def test_limits_leave_what_fits_and_silence_alone():
-    limits = Limits(0.1, 0.05)
-    np.testing.assert_array_equal(limits.fit(np.zeros(5)), 0.0)
-    np.testing.assert_allclose(limits.fit(np.array([0.04, -0.04])), [0.4, -0.4])
+    limits = InputLimits(0.1, 0.05)
+    np.testing.assert_array_equal(limits.to_actions(np.zeros(5)), 0.0)
+    np.testing.assert_allclose(limits.to_actions(np.array([0.04, -0.04])), [0.4, -0.4])
     np.testing.assert_allclose(
-        limits.fit(np.array([0.3, 0.0, 0.0, 0.0])), [1.0, 0.0, 0.0, 0.0], rtol=2e-6
+        limits.to_actions(np.array([0.3, 0.0, 0.0, 0.0])), [1.0, 0.0, 0.0, 0.0], rtol=2e-6
     )  # clipped first
     with pytest.raises(ValueError, match=r"max_rms must be positive and finite, in volts, .* but it is 0"):
-        Limits(0.1, 0.0)
+        InputLimits(0.1, 0.0)
     with pytest.raises(ValueError, match=r"max_input must be positive .* it is nan"):
         SignalPolicy("prbs", EXCITATIONS["prbs"](1.0), max_input=np.nan)
 
@@ -199,7 +199,7 @@ def test_velocity_sign_pumps_with_the_velocity_and_brakes_beyond_the_amplitude()
     assert policy.predict(observation())[0] == 1.0
     assert policy.predict(observation(state_x1=0.1, state_x2=0.05))[0] == 1.0
     assert policy.predict(observation(state_x1=0.1, state_x2=0.15))[0] == -1.0
-    turning = observation(state_x1=TURN + 0.05, state_x2=TURN)
+    turning = observation(state_x1=BRAKE_FRACTION + 0.05, state_x2=BRAKE_FRACTION)
     assert policy.predict(turning)[0] == -1.0
     swinging = observation(state_x1=0.0, state_x2=-0.6)  # through the middle, too fast
     assert policy.predict(swinging)[0] == -1.0

@@ -7,15 +7,15 @@ import pytest
 from tables import table
 
 from agents import make_policy
-from agents.evaluation.batch import make
-from agents.policies.features import BOUND, FeatureMap
-from agents.policies.learned import load_policy
-from agents.policies.saving import save_policy
+from agents.evaluation.track_batch import make_track_batch
+from agents.policies.networks.policy_saving import save_policy
+from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncoder
+from agents.policies.networks.trained_policy import load_policy
+from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import ALGORITHMS, PPOSettings, TrainConfig, train
 from agents.training.environments.feature_vec_env import REWARD_SCALE, FeatureNormalizer, FeatureVecEnv
 from agents.training.imitation import imitate_policy
 from agents.training.training_logs import TrainingCallback
-from agents.vec_env import DuffingVecEnv
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 #: Too narrow for the shield to keep all within.
@@ -38,14 +38,14 @@ def seen_through(rows=6, seed=2, env_id=AMPLITUDE, fitted=False, levels=0, in_na
 def test_rewards_differ_from_the_environments_by_a_potential():
     """Over an episode they add up to the plain return less what was to come at its start, whatever is done."""
     plain, envs = DuffingVecEnv(AMPLITUDE, 6, seed=2, **NARROW), seen_through(**NARROW)
-    found, rng = FeatureMap.of(plain.envs), np.random.default_rng(0)
+    found, rng = FeatureEncoder.of(plain.envs), np.random.default_rng(0)
     envs.reset()
     plain.reset()
-    start = envs.current_features.to_come.copy()
+    start = envs.current_features.remaining_information.copy()
     returns, running, early = np.zeros(6), np.ones(6, dtype=bool), 0
     for _ in range(24):
         choices = rng.uniform(-1, 1, (6, 1)).astype(np.float32)
-        actions = envs.current_features.act(choices[:, 0])
+        actions = envs.current_features.to_actions(choices[:, 0])
         shown, rewards, dones, infos = envs.step(choices)
         observations, _, plain_dones, plain_infos = plain.step(actions)
         np.testing.assert_array_equal(dones, plain_dones)
@@ -76,7 +76,7 @@ def test_rewards_without_a_potential_stay_as_they_are(env_id, in_nats, options):
     envs.reset()
     plain.reset()
     for _ in range(5):
-        actions = envs.current_features.act([1.0, 0.0, -1.0])
+        actions = envs.current_features.to_actions([1.0, 0.0, -1.0])
         _, rewards, _, _ = envs.step(np.array([[1.0], [0.0], [-1.0]], dtype=np.float32))
         np.testing.assert_allclose(rewards, REWARD_SCALE * plain.step(actions)[1], rtol=1e-6, atol=1e-9)
 
@@ -93,10 +93,10 @@ def test_what_is_seen_is_normalised_over_random_choices():
     for _ in range(20):
         normalised.append(first.step(rng.uniform(-1, 1, (32, 1)).astype(np.float32))[0])
         expected = (first.current_features.values - first.normalizer.mean) / first.normalizer.std
-        np.testing.assert_array_equal(normalised[-1], np.clip(expected, -BOUND, BOUND))
+        np.testing.assert_array_equal(normalised[-1], np.clip(expected, -MAX_FEATURE, MAX_FEATURE))
     least = first.normalizer.std.min()  # of what is constant
     assert least == np.float32(0.05)
-    kept = np.abs(expected).max(axis=0) < BOUND
+    kept = np.abs(expected).max(axis=0) < MAX_FEATURE
     found, varied = np.concatenate(normalised)[:, kept], first.normalizer.std[kept] > least
     np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=1e-2)
     np.testing.assert_allclose(found.std(axis=0)[varied], 1.0, atol=1e-2)
@@ -135,13 +135,15 @@ def test_a_policy_acts_the_same_from_its_file(tmp_path, algo, settings):
     envs = seen_through(env_id=POWER, fitted=True, levels=settings.get("levels", 0), own=asked.own)
     model = asked.make(envs, seed=0)
     save_policy(tmp_path, model)
-    policy, other = load_policy(tmp_path), make_policy(str(tmp_path), make(POWER, 6))
+    policy, other = load_policy(tmp_path), make_policy(str(tmp_path), make_track_batch(POWER, 6))
     assert policy.network.features
     assert policy.card["features"] == json.loads(json.dumps(envs.features))
     shown, state, own_state, starts = envs.reset(), None, None, np.ones(6, dtype=bool)
     for _ in range(30):
         choices, state = model.predict(shown, state, starts, deterministic=True)
-        expected = envs.current_features.act(np.linspace(-1, 1, 3)[choices] if choices.ndim == 1 else choices[:, 0])
+        expected = envs.current_features.to_actions(
+            np.linspace(-1, 1, 3)[choices] if choices.ndim == 1 else choices[:, 0]
+        )
         before = own_state
         actions, own_state = policy.predict(envs.raw_observations, before, starts, deterministic=True)
         np.testing.assert_allclose(actions, expected, atol=1e-5)
@@ -169,24 +171,24 @@ def test_a_network_learns_what_another_policy_decides(levels):
     """In the other's own episodes it agrees seldom before, and mostly after."""
     asked = PPOSettings(num_envs=32, n_steps=16, batch_size=64, hidden=(64,), levels=levels)
     envs = seen_through(rows=32, fitted=True, levels=levels)
-    model, found, told = asked.make(envs, seed=1), FeatureMap.of(envs.venv.envs), []
+    model, found, told = asked.make(envs, seed=1), FeatureEncoder.of(envs.venv.envs), []
 
     def choose(shown):
         features = found(shown)
         choices, _ = model.predict(envs.normalizer(features.values), deterministic=True)
-        return features.act(np.linspace(-1, 1, levels)[choices] if levels else choices[:, 0])
+        return features.to_actions(np.linspace(-1, 1, levels)[choices] if levels else choices[:, 0])
 
-    before = agreement(choose, make(AMPLITUDE, 32))
+    before = agreement(choose, make_track_batch(AMPLITUDE, 32))
     imitate_policy(model, envs, "velocity-sign", 8192, 0, told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0
-    assert before < 0.5 < 0.8 < agreement(choose, make(AMPLITUDE, 32))
+    assert before < 0.5 < 0.8 < agreement(choose, make_track_batch(AMPLITUDE, 32))
 
 
 def test_a_run_begins_with_what_was_imitated(tmp_path):
     """So a run that learns next to nothing by reward decides as its teacher; the same again by the same seed."""
     settings = PPOSettings(num_envs=32, n_steps=16, batch_size=64, hidden=(64,), levels=3, learning_rate=1e-9)
-    envs, agreed, weights = make(AMPLITUDE, 32), [], []
+    envs, agreed, weights = make_track_batch(AMPLITUDE, 32), [], []
     for name, teacher in (("plain", None), ("one", "velocity-sign"), ("again", "velocity-sign")):
         run = tmp_path / name
         train(TrainConfig(seed=1, steps=512, imitate=teacher, imitations=8192, output=run, hyperparameters=settings))

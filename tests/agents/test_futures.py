@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from agents.planner import block_policy, blocks
-from agents.planner.block_policy import BlockPlanner, counted
-from agents.planner.futures import drawn_from_records, force_of_noise
-from agents.policies import make_policy
+from agents.planning.open_loop import chance_constrained_block
+from agents.planning.open_loop.posterior_samples import draw_from_records, noise_as_input
+from agents.policies import block_planner, make_policy
+from agents.policies.block_planner import BlockPlanner, countable_probability
 from estimator import Belief
 from estimator.models.difference import difference
 from estimator.models.duffing import duffing
@@ -20,7 +20,7 @@ def test_every_sensor_has_its_own_noise():
     stds = np.array([1e-3, 2e-2, 3e-1])
     gamma, *xi = [(shape, shape * std**2) for std in stds]
     record = Belief.of(PENDULUM, np.ones(5), 0.01 * np.eye(5), gamma, xi).record
-    systems, noises = drawn_from_records(PENDULUM, record[None], np.ones(1), np.random.default_rng(0), 200)
+    systems, noises = draw_from_records(PENDULUM, record[None], np.ones(1), np.random.default_rng(0), 200)
     assert systems.shape == (200, 5)
     np.testing.assert_allclose(noises, np.tile(stds, (200, 1)), rtol=0.01)
 
@@ -28,7 +28,7 @@ def test_every_sensor_has_its_own_noise():
 def test_a_spread_widens_deviations_and_noises():
     record = Belief.of(PENDULUM, np.arange(1.0, 6.0), 0.01 * np.eye(5), (2.0, 3.0), [(4.0, 5.0)] * 2).record
     one, wide = (
-        drawn_from_records(PENDULUM, record[None], np.ones(1), np.random.default_rng(0), 50, spread)
+        draw_from_records(PENDULUM, record[None], np.ones(1), np.random.default_rng(0), 50, spread)
         for spread in (1.0, 1.25)
     )
     np.testing.assert_allclose(wide[0] - np.arange(1.0, 6.0), 1.25 * (one[0] - np.arange(1.0, 6.0)), atol=1e-12)
@@ -43,7 +43,7 @@ def test_a_spread_widens_deviations_and_noises():
 def test_process_noise_is_a_force(model, name, unit):
     coefficients = np.random.default_rng(0).uniform(0.5, 2.0, (3, model.n_coefficients))
     gain = coefficients[:, list(model.coefficients).index(name)]
-    np.testing.assert_allclose(force_of_noise(model)(*coefficients.T), unit / gain)
+    np.testing.assert_allclose(noise_as_input(model)(*coefficients.T), unit / gain)
 
 
 def test_noise_that_is_no_force_is_refused():
@@ -80,8 +80,8 @@ def test_a_block_is_planned_for_a_model_of_two_sensors(monkeypatch):
         asked.append((systems, futures, candidates, amplitude, bound, played))
         return candidates[0], 1.0, 0.0
 
-    monkeypatch.setattr(block_policy, "drafts", lambda planner, record, samples, seed: np.full((1, samples), 0.3))
-    monkeypatch.setattr(block_policy, "best_block", best_block)
+    monkeypatch.setattr(block_planner, "drafts", lambda planner, record, samples, seed: np.full((1, samples), 0.3))
+    monkeypatch.setattr(block_planner, "optimise_block", best_block)
     policy, plan, state = BlockPlanner(env, block=8), [], None
     for _ in range(9):
         action, state = policy.predict(observation, state)
@@ -90,19 +90,22 @@ def test_a_block_is_planned_for_a_model_of_two_sensors(monkeypatch):
     assert len(asked) == 2  # the second block begins with its ninth input
     np.testing.assert_allclose(plan, 0.3 / env.max_input, rtol=1e-6)
     systems, futures, candidates, amplitude, bound, played = asked[0]
-    assert (systems.noises.shape, systems.starts.shape[0]) == ((blocks.SYSTEMS, 3), blocks.SYSTEMS)
-    np.testing.assert_array_equal(systems.noises, futures.noises[: blocks.SYSTEMS] ** 2)
+    assert (systems.noises.shape, systems.path_starts.shape[0]) == (
+        (chance_constrained_block.N_SYSTEMS, 3),
+        chance_constrained_block.N_SYSTEMS,
+    )
+    np.testing.assert_array_equal(systems.noises, futures.noises[: chance_constrained_block.N_SYSTEMS] ** 2)
     assert amplitude == env.max_input
     assert 8 < played < candidates.shape[1]
     assert bound >= 5e-4
     u = candidates[0]
     process, sensor = futures.disturbances(len(u))
-    shown = futures.shown(u, slice(0, 3))
+    shown = futures.simulate_outputs(u, slice(0, 3))
     for i in range(3):
         expected = runge_kutta_of_the_pendulum(futures.coefficients[i], futures.states[i], u + process[i])
         np.testing.assert_allclose(shown[i], expected + sensor[i], atol=1e-9)
-    leaving = futures.leaving(u, len(futures.states))
-    is_out = (np.abs(futures.shown(u, slice(None))) > futures.limit).any(axis=1)
+    leaving = futures.violating_draws(u, len(futures.states))
+    is_out = (np.abs(futures.simulate_outputs(u, slice(None))) > futures.limit).any(axis=1)
     np.testing.assert_array_equal(leaving, np.flatnonzero(is_out))
 
 
@@ -112,13 +115,13 @@ def test_a_block_is_planned_for_a_model_of_two_sensors(monkeypatch):
 def test_blocks_share_the_risk_of_an_episode(block, parts):
     env = gym.make("duffing_env/Amplitude-v1").unwrapped
     policy = BlockPlanner(env, block=block)
-    shares = [policy.bound(left) / 2.5e-4 for left in range(256, 0, -block)]
+    shares = [policy.risk_of_block(left) / 2.5e-4 for left in range(256, 0, -block)]
     assert shares == pytest.approx(parts)
     assert sum(shares) == pytest.approx(1.0)
 
 
 def test_rare_events_are_counted_with_larger_deviations():
     for probability in (1e-2, 5e-4, 1e-4, 1e-5):
-        bound, spread = counted(probability)
+        bound, spread = countable_probability(probability)
         assert bound == max(probability, 5e-4)
         assert norm.sf(spread * norm.isf(bound)) == pytest.approx(probability)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tables import table
 
-from agents.evaluation.batch import TESTED, make
 from agents.evaluation.policy_evaluation import evaluate_policies
+from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies import make_policy
 from estimator import SAMPLING_STEP
 
@@ -43,7 +43,7 @@ def test_a_signal_keeps_to_its_budget_as_it_is_held():
     held = play(make_policy("schroeder", stand_in(HOLD, max_rms=0.03)), 3, 13)
     volts = 0.15 * np.repeat(held, HOLD, axis=0)[:50]
     np.testing.assert_allclose(np.sqrt((volts**2).mean(axis=0)), 0.03, rtol=2e-6)
-    envs = make("duffing_env/Power-v0", 3, {"hold": HOLD})
+    envs = make_track_batch("duffing_env/Power-v0", 3, {"hold": HOLD})
     policy, state = make_policy("uniform", envs), None
     observations, _ = envs.reset(seed=0)
     for _ in range(64):
@@ -56,7 +56,7 @@ def test_a_signal_keeps_to_its_budget_as_it_is_held():
 def test_a_square_wave_goes_on_by_as_many_samples_as_it_was_held():
     phases = []
     for hold in (1, HOLD):
-        envs = make(TRACK, 2, {"hold": hold})
+        envs = make_track_batch(TRACK, 2, {"hold": hold})
         observations, _ = envs.reset(seed=0)
         policy = make_policy("square-believed", envs)
         _, phase = policy.predict(observations)
@@ -77,7 +77,7 @@ def test_every_sample_is_evaluated(monkeypatch):
     monkeypatch.setattr("agents.evaluation.policy_evaluation.record_available", lambda: False)
     options = {"hold": HOLD, "horizon": 50, "max_output": 0.3}
     (evaluation,) = evaluate_policies(["uniform"], systems=6, seed=5, options=options)
-    envs = make(TRACK, 6, options | TESTED)
+    envs = make_track_batch(TRACK, 6, options | TEST_OPTIONS)
     policy, state = make_policy("uniform", envs, seed=5), None
     observations, _ = envs.reset(seed=5)
     gains, running, samples = np.zeros(6), np.ones(6, dtype=bool), np.zeros(6)

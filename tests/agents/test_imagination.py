@@ -7,9 +7,9 @@ import pytest
 from reference.plants import DRAG
 from tables import table
 
-from agents.planner.design import Known, designer
-from agents.planner.imagination import Terms, mind
-from agents.planner.pursuit import pursuit
+from agents.planning.belief_rollout import PlanObjective, compile_belief_rollout
+from agents.planning.d_optimality import NominalSystem, compile_d_optimality
+from agents.planning.energy_limited_plan import compile_energy_limited_plan
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from estimator.belief import Belief
@@ -140,16 +140,16 @@ def expected(case, belief, u, last, walk):
 
 def terms(model, **others):
     values = {"amplitude": 0.15, "slew": np.inf, "limit": 10.0, "margin": 2.0, "walk": np.zeros(model.n_coefficients)}
-    return Terms(**{**values, "scales": np.ones(model.n_states), **others})
+    return PlanObjective(**{**values, "scales": np.ones(model.n_states), **others})
 
 
 def block_after(model, degree, belief, u, told, last=0.0):
     """The block of a mind after inputs u (T, LANES), and the mind."""
-    found = mind(model, degree)
+    found = compile_belief_rollout(model, degree)
     W = np.zeros(found.size)
-    found.fill(W, belief.record.copy(), np.array([last, 0.0]))
+    found.load_belief(W, belief.record.copy(), np.array([last, 0.0]))
     for inputs in u:
-        W[found.u : found.u + LANES] = inputs
+        W[found.input_row : found.input_row + LANES] = inputs
         found.advance(W, belief.record.copy(), told)
     return W.reshape(-1, LANES), found
 
@@ -166,7 +166,7 @@ def test_imagination_is_the_plain_recursion(case, walks):
     W, found = block_after(model, degree, belief, u, terms(model, walk=walk), last=0.1)
     factor = np.tril(rng.normal(0.0, 30.0, (k, k)))
     place = imagination(model, degree).layout
-    found.appraise(W.reshape(-1), factor, 0.5)
+    found.evaluate(W.reshape(-1), factor, 0.5)
     for j in range(0, LANES, 11):
         mean, cov, surprise = expected(case, belief, u[:, j], 0.1, walk)
         if not walks and model.n_outputs == 1:
@@ -188,7 +188,9 @@ def test_imagination_is_the_plain_recursion(case, walks):
 def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limit(case, limit, firm):
     model, degree, *_ = CASES[case]
     belief = random_belief(model, np.random.default_rng(1))
-    told = terms(model, limit=limit, price=3.0, goal=0.1, goal_weight=4.0, shaken=5.0, firm=firm)
+    told = terms(
+        model, limit=limit, input_weight=3.0, goal=0.1, goal_weight=4.0, accumulated_noise=5.0, hard_margin=firm
+    )
     W, _ = block_after(model, degree, belief, np.full((1, LANES), 0.1), told)
     place = imagination(model, degree).layout
     shown, variance = W[place["SHOWN"], 0], W[place["SPREAD"], 0]
@@ -208,7 +210,7 @@ def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limi
 def test_what_the_output_before_tells_is_made_up_for_by_what_brakes_harder(reach):
     model = duffing()
     belief = random_belief(model, np.random.default_rng(1))
-    told = terms(model, limit=1.0, margin=3.0, reach=reach)
+    told = terms(model, limit=1.0, margin=3.0, recoverable_step=reach)
     u = np.stack([np.full(LANES, 0.1), np.linspace(-0.15, 0.15, LANES)])
     W, _ = block_after(model, 0, belief, u, told)
     place = imagination(model, 0).layout
@@ -226,14 +228,14 @@ def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
     # Kalman's separation of state and parameters: -½ log det C_H of the joint recursion is ½ log det(Λ + F).
     model = difference()
     belief = random_belief(model, np.random.default_rng(2))
-    found = designer(model)
+    found = compile_d_optimality(model)
     precision, start = np.empty((4, 4)), np.zeros(found.start_size)
-    pursuit(model).begin(belief.record.copy(), precision, start)
-    known = Known(belief.coefficients_mean, precision, (0.01**2, 0.02**2))
+    compile_energy_limited_plan(model).begin(belief.record.copy(), precision, start)
+    known = NominalSystem(belief.coefficients_mean, precision, (0.01**2, 0.02**2))
     u = np.random.default_rng(3).normal(0.0, 0.05, 8)
-    value, _ = found.worth(known, 1e3, 0.0, start, u, found.memory(8))
+    value, _ = found.criterion(known, 1e3, 0.0, start, u, found.workspace(8))
     W, found = block_after(model, 0, belief, np.repeat(u[:, None], LANES, axis=1), terms(model, limit=1e3))
-    found.appraise(W.reshape(-1), np.zeros((4, 4)), 1.0)
+    found.evaluate(W.reshape(-1), np.zeros((4, 4)), 1.0)
     assert value == pytest.approx(W[imagination(model).layout["SCORE"], 0], abs=1e-6)
 
 
@@ -244,7 +246,7 @@ def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
     u[:, 5] = 50.0  # far beyond where the difference equation is stable
     W, found = block_after(model, 0, belief, u, terms(model))
     place = imagination(model, 0).layout
-    found.appraise(W.reshape(-1), np.zeros((4, 4)), 1.0)
+    found.evaluate(W.reshape(-1), np.zeros((4, 4)), 1.0)
     assert W[place["SCORE"], 5] == LOST
     others = np.delete(W[place["SCORE"]], 5)
     np.testing.assert_array_equal(others, others[0])
@@ -273,12 +275,12 @@ def test_few_steps_are_enough_to_plan_with():
     belief, fine = ContinuousExperiment().prior_belief, replace(duffing(), substeps=16)
     u = np.random.default_rng(2).choice([-0.15, 0.15], (24, LANES))
     W, found = block_after(duffing(), 0, belief, u, terms(duffing()))
-    found.appraise(W.reshape(-1), np.zeros((4, 4)), 1.0)
-    exact, precision = designer(fine), np.empty((4, 4))
+    found.evaluate(W.reshape(-1), np.zeros((4, 4)), 1.0)
+    exact, precision = compile_d_optimality(fine), np.empty((4, 4))
     start, (shape, rate, xi_shape, xi_rate) = np.zeros(exact.start_size), belief.record[-4:]
-    pursuit(fine).begin(belief.record.copy(), precision, start)
-    known = Known(belief.coefficients_mean, precision, (rate / shape, xi_rate / xi_shape))
-    nats = [exact.worth(known, 1e3, 0.0, start, u[:, j].copy(), exact.memory(24))[0] for j in range(LANES)]
+    compile_energy_limited_plan(fine).begin(belief.record.copy(), precision, start)
+    known = NominalSystem(belief.coefficients_mean, precision, (rate / shape, xi_rate / xi_shape))
+    nats = [exact.criterion(known, 1e3, 0.0, start, u[:, j].copy(), exact.workspace(24))[0] for j in range(LANES)]
     errors = W[imagination(duffing(), 0).layout["SCORE"]] - nats
     assert 0 < np.abs(errors).max() < 0.06
     assert errors.std() < 0.02
@@ -291,12 +293,12 @@ def test_older_inputs_move_on():
     belief = weak_prior(model, mean, 1e-4 * np.eye(model.n_coefficients))
     u = rng.normal(0.0, 0.1, (5, LANES))
     for lag in (0, 1):
-        found = mind(model, 0, lag)
+        found = compile_belief_rollout(model, 0, lag)
         W = np.zeros(found.size)
-        found.fill(W, belief.record.copy(), np.array([0.3, -0.2]))
+        found.load_belief(W, belief.record.copy(), np.array([0.3, -0.2]))
         x, before = [0.0, 0.0], [0.3, -0.2]
         for inputs in u:
-            W[found.u : found.u + LANES] = inputs
+            W[found.input_row : found.input_row + LANES] = inputs
             found.advance(W, belief.record.copy(), terms(model))
             taps = [inputs[0], *before] if lag == 0 else [*before, before[1]]
             phi = [x[0], x[0] ** 3, x[1], *taps, 1.0]
@@ -307,7 +309,7 @@ def test_older_inputs_move_on():
 def test_one_state_is_enough():
     belief = weak_prior(DECAY, [0.5], [[0.01]])
     W, found = block_after(DECAY, 0, belief, np.full((3, LANES), 0.1), terms(DECAY))
-    found.appraise(W.reshape(-1), np.zeros((1, 1)), 1.0)
+    found.evaluate(W.reshape(-1), np.zeros((1, 1)), 1.0)
     assert W[imagination(DECAY, 0).layout["SCORE"], 0] > -0.5 * np.log(0.01)
 
 

@@ -17,10 +17,10 @@ from tables import table
 import agents
 from agents import make_policy
 from agents.evaluation.policy_evaluation import evaluate_policies
-from agents.policies.learned import CARD, WEIGHTS, load_policy
-from agents.policies.saving import save_policy
+from agents.policies.networks.policy_saving import save_policy
+from agents.policies.networks.trained_policy import CARD_FILE, WEIGHTS_FILE, load_policy
+from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import ALGORITHMS
-from agents.vec_env import DuffingVecEnv
 
 FEATURES = 22
 
@@ -54,10 +54,10 @@ def rounding_of(folder, observations, state=None):
 
     The observations and the memory are the same for both.
     """
-    network = json.loads((folder / CARD).read_text())["network"]
+    network = json.loads((folder / CARD_FILE).read_text())["network"]
     if state is not None:
         state = tuple(Rounded.exact(values[0]) for values in state)
-    actions, state = play(load_file(folder / WEIGHTS), network, observations, state)
+    actions, state = play(load_file(folder / WEIGHTS_FILE), network, observations, state)
     assert np.median(actions) < 0.01  # or the comparison would say little of actions in [-1, 1]
     return actions, None if state is None else np.array([[2 * values.error] for values in state])
 
@@ -173,16 +173,16 @@ def test_td3_does_not_sample(tmp_path):
 @table("algo", ["sac", "td3", "tqc"])
 def test_critics_do_not_travel(tmp_path, algo):
     folder, _ = saved(tmp_path, algo=algo)
-    assert all(name.startswith("actor.") for name in load_file(folder / WEIGHTS))
+    assert all(name.startswith("actor.") for name in load_file(folder / WEIGHTS_FILE))
 
 
 def test_every_weight_is_saved_as_it_is(tmp_path):
     folder, model = saved(tmp_path)
-    tensors, expected = load_file(folder / WEIGHTS), model.policy.state_dict()
+    tensors, expected = load_file(folder / WEIGHTS_FILE), model.policy.state_dict()
     assert tensors.keys() == expected.keys()
     for name, tensor in tensors.items():
         np.testing.assert_array_equal(tensor, expected[name].numpy())
-    assert sorted(path.name for path in folder.iterdir()) == [CARD, WEIGHTS]
+    assert sorted(path.name for path in folder.iterdir()) == [CARD_FILE, WEIGHTS_FILE]
 
 
 def test_saving_again_replaces_the_policy(tmp_path):
@@ -194,7 +194,7 @@ def test_saving_again_replaces_the_policy(tmp_path):
 def test_the_card_tells_what_it_was_told(tmp_path):
     folder, _ = saved(tmp_path, card={"algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}})
     card = load_policy(folder).card
-    assert json.loads((folder / CARD).read_text()) == card
+    assert json.loads((folder / CARD_FILE).read_text()) == card
     assert card.pop("network")["activation"] == "tanh"
     told = {"format": 4, "observation": "posterior", "algorithm": "ppo", "steps": 7}
     assert card == {**told, "config": {"reward": "log_posterior"}}
@@ -239,13 +239,15 @@ def test_a_wrong_observation_is_refused(tmp_path, shape):
         load_policy(folder).predict(np.zeros(shape))
 
 
-@table("missing", [WEIGHTS, CARD, None])
+@table("missing", [WEIGHTS_FILE, CARD_FILE, None])
 def test_a_folder_without_the_files_is_refused(tmp_path, missing):
     folder = tmp_path / "run"
     if missing:
         saved(folder)
         (folder / missing).unlink()
-    with pytest.raises(ValueError, match=f"must hold {WEIGHTS} and {CARD}, but .*run does not; pass a run folder"):
+    with pytest.raises(
+        ValueError, match=f"must hold {WEIGHTS_FILE} and {CARD_FILE}, but .*run does not; pass a run folder"
+    ):
         load_policy(folder)
 
 
@@ -269,9 +271,9 @@ def test_pickles_and_archives_are_refused_unopened(tmp_path):
     for path in (folder, folder / "policy.zip", folder / "policy.pkl"):
         with pytest.raises(ValueError, match="must hold"):
             make_policy(str(path))
-    (folder / CARD).write_text('{"format": 4}')
+    (folder / CARD_FILE).write_text('{"format": 4}')
     for content in (pickle.dumps(Trap(sprung)), (folder / "policy.zip").read_bytes()):
-        (folder / WEIGHTS).write_bytes(content)
+        (folder / WEIGHTS_FILE).write_bytes(content)
         with pytest.raises(ValueError, match=r"must hold sound files, but .*run does not"):
             load_policy(folder)
     assert not sprung.exists()
@@ -303,14 +305,14 @@ def test_pickles_and_archives_are_refused_unopened(tmp_path):
 )
 def test_an_unknown_card_is_refused(tmp_path, card, message):
     folder, _ = saved(tmp_path)
-    (folder / CARD).write_text(card)
+    (folder / CARD_FILE).write_text(card)
     with pytest.raises(ValueError, match=message):
         load_policy(folder)
 
 
 def test_cut_off_weights_are_refused(tmp_path):
     folder, _ = saved(tmp_path)
-    (folder / WEIGHTS).write_bytes((folder / WEIGHTS).read_bytes()[:-10])
+    (folder / WEIGHTS_FILE).write_bytes((folder / WEIGHTS_FILE).read_bytes()[:-10])
     with pytest.raises(ValueError, match="must hold sound files"):
         load_policy(folder)
 
@@ -333,8 +335,8 @@ CHANGED = {
 def test_tensors_that_cannot_act_are_refused(tmp_path, change):
     folder, _ = saved(tmp_path)
     name, changed = CHANGED[change]
-    tensors = load_file(folder / WEIGHTS)
-    save_file({**tensors, name: np.ascontiguousarray(changed(tensors[name]))}, folder / WEIGHTS)
+    tensors = load_file(folder / WEIGHTS_FILE)
+    save_file({**tensors, name: np.ascontiguousarray(changed(tensors[name]))}, folder / WEIGHTS_FILE)
     with pytest.raises(ValueError, match=rf"must be what its card says, but .*{name} must be finite float32 of shape"):
         load_policy(folder)
 
@@ -342,8 +344,8 @@ def test_tensors_that_cannot_act_are_refused(tmp_path, change):
 @table("name", ["weight_ih_l0", "weight_hh_l0", "bias_ih_l0"])
 def test_a_memory_of_wrong_shape_is_refused(tmp_path, name):
     folder, _ = saved(tmp_path, algo="recurrent_ppo")
-    tensors = load_file(folder / WEIGHTS)
-    save_file({**tensors, f"lstm_actor.{name}": tensors[f"lstm_actor.{name}"][:-1].copy()}, folder / WEIGHTS)
+    tensors = load_file(folder / WEIGHTS_FILE)
+    save_file({**tensors, f"lstm_actor.{name}": tensors[f"lstm_actor.{name}"][:-1].copy()}, folder / WEIGHTS_FILE)
     with pytest.raises(ValueError, match=r"lstm_actor.* must be finite float32 of shape"):
         load_policy(folder)
 
@@ -358,7 +360,7 @@ def test_an_observation_that_is_not_finite_is_refused(tmp_path):
 
 def test_weights_of_something_else_are_refused(tmp_path):
     folder, _ = saved(tmp_path)
-    save_file({"weights": np.zeros(3)}, folder / WEIGHTS)
+    save_file({"weights": np.zeros(3)}, folder / WEIGHTS_FILE)
     with pytest.raises(ValueError, match=r"must be what its card says, but .*KeyError\('.*weight'\); copy it anew"):
         load_policy(folder)
 

@@ -7,10 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agents.evaluation.batch import make
-from agents.planner.candidates import CHOICES, uniform
-from agents.planner.imagination import LOST, terms_of
-from agents.planner.mapped import _HALVINGS, _HOPELESS, Task, enough_for, mapped
+from agents.evaluation.track_batch import make_track_batch
+from agents.planning.belief_rollout import LOST, objective_at
+from agents.planning.candidate_inputs import INPUT_FRACTIONS, next_uniform
+from agents.planning.grid_beam_search import (
+    _N_BISECTIONS,
+    _PRUNE_GAP,
+    SearchProblem,
+    compile_grid_beam_search,
+    score_threshold,
+)
 from agents.policies import make_policy
 from estimator.belief import covariance_places
 from estimator.lanes import LANES
@@ -19,53 +25,55 @@ from estimator.lanes import LANES
 @settings(deadline=None)
 @given(arrays(float, st.integers(1, 200), elements=st.floats(-1.0, 1.0)), st.integers(1, 64))
 def test_no_more_ways_are_followed_than_there_is_place_for(scores, most):
-    enough = enough_for(scores, most)
-    assert scores.max() - _HOPELESS <= enough <= scores.max()
+    enough = score_threshold(scores, most)
+    assert scores.max() - _PRUNE_GAP <= enough <= scores.max()
     followed = np.sum(scores >= enough)
     assert followed <= most or enough == scores.max()
     # A bit lower there would be too many, unless all that are not hopeless have a place.
-    lower = np.sum(scores >= enough - 1.01 * _HOPELESS * 0.5**_HALVINGS)
-    assert lower > most or np.sum(scores >= scores.max() - _HOPELESS) <= most
+    lower = np.sum(scores >= enough - 1.01 * _PRUNE_GAP * 0.5**_N_BISECTIONS)
+    assert lower > most or np.sum(scores >= scores.max() - _PRUNE_GAP) <= most
 
 
 def test_ways_that_are_lost_are_followed_when_there_are_no_others():
-    assert enough_for(np.full(5, LOST), 3) == LOST
+    assert score_threshold(np.full(5, LOST), 3) == LOST
 
 
 def test_the_best_of_many_are_followed():
     scores = np.random.default_rng(0).permutation(np.arange(400) * 1e-3)
-    np.testing.assert_array_equal(np.sort(scores[scores >= enough_for(scores, 96)])[-90:], np.arange(310, 400) * 1e-3)
+    np.testing.assert_array_equal(
+        np.sort(scores[scores >= score_threshold(scores, 96)])[-90:], np.arange(310, 400) * 1e-3
+    )
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_best_way_is_that_of_plain_numpy(seed):
-    envs = make("duffing_env/Output-v0", 1, {})
+    envs = make_track_batch("duffing_env/Output-v0", 1, {})
     actions = np.random.default_rng(seed).choice([-0.4, 0.4], (24, 1, 1)).astype(np.float32)
     envs.reset(seed=seed)
     for action in actions:
         envs.step(action)
     planner = make_policy("efe", envs)
-    terms, belief = terms_of(planner.terms, 60), envs.belief(0)
+    terms, belief = objective_at(planner.objective, 60), envs.belief(0)
     rate = 1e-3 * np.linalg.inv(belief.coefficients_cov)
     lasts = terms.amplitude * actions[:-3:-1, 0, 0].astype(float)
     sizes = 30, 3, 5, LANES, LANES // 4
-    task = Task(belief.record, 60, 14, 1, terms, lasts, np.linalg.cholesky(rate), *sizes, np.nan, 1.0)
+    task = SearchProblem(belief.record, 60, 14, 1, terms, lasts, np.linalg.cholesky(rate), *sizes, np.nan, 1.0)
     stream = np.random.SFC64(seed).state["state"]["state"]
     found = np.zeros(14)
-    best_way(planner.view)(task, found, stream.copy())
+    best_way(planner.model_view)(task, found, stream.copy())
     np.testing.assert_allclose(found, reference(belief, task, stream.copy()), atol=1e-15)
 
 
 def best_way(view):
     """The search through the map, for callers in Python."""
-    memory, find = mapped(*view)
-    return numba.njit(lambda task, found, words: find(memory(task.steps, task.ways), task, found, words))
+    memory, find = compile_grid_beam_search(*view)
+    return numba.njit(lambda task, found, words: find(memory(task.n_moves, task.beam_width), task, found, words))
 
 
 def reference(belief, task, words):
     """The best way through the map of the state of Eq. (2), from matrices and way by way."""
-    terms, L = task.terms, task.terms.limit
-    theta, offsets = belief.coefficients_mean, (uniform(words), uniform(words))
+    terms, L = task.objective, task.objective.limit
+    theta, offsets = belief.coefficients_mean, (next_uniform(words), next_uniform(words))
     q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
 
     def sample(z, P, u, gain, variance):
@@ -75,11 +83,11 @@ def reference(belief, task, words):
         S[1] = [1, 0, 0, 0, 0, 0]
         P = S @ P @ S.T
         P[0, 0] += q
-        shaken = max((S @ gain)[0] ** 2 * variance, terms.shaken * q)
+        shaken = max((S @ gain)[0] ** 2 * variance, terms.accumulated_noise * q)
         variance = P[0, 0] + r
         gain, deviation = P[:, 0] / variance, np.sqrt(variance + shaken)
         # What braking harder than planned makes up for.
-        spared = terms.reach * (terms.amplitude + u if moved[0] > 0 else terms.amplitude - u)
+        spared = terms.recoverable_step * (terms.amplitude + u if moved[0] > 0 else terms.amplitude - u)
         margin = max(terms.margin * np.sqrt(variance), terms.margin * deviation - spared)
         near = max(0.0, abs(moved[0]) + min(margin, 0.5 * L) - L) / deviation
         cost = 1e4 / L * max(0.0, abs(moved[0]) - L) + 0.05 * near**4
@@ -91,8 +99,14 @@ def reference(belief, task, words):
 
     P = belief.record[covariance_places(belief.model)]
     followed = [(belief.state_mean, P, np.zeros(6), 0.0, 0.0, [])]
-    for h in range(task.steps):
-        tried = CHOICES if h < task.finest else CHOICES[:5] if h < task.fine else CHOICES[:2]
+    for h in range(task.n_moves):
+        tried = (
+            INPUT_FRACTIONS
+            if h < task.n_moves_all_inputs
+            else INPUT_FRACTIONS[:5]
+            if h < task.n_moves_some_inputs
+            else INPUT_FRACTIONS[:2]
+        )
         entered = {}
         # In the order of the blocks, of which the first that leads into a cell and the first of equal ways count.
         for block in range(0, len(followed), LANES):
@@ -100,13 +114,13 @@ def reference(belief, task, words):
                 for z, C, gain, variance, cost, inputs in followed[block : block + LANES]:
                     u = part * terms.amplitude
                     to, D, told, spread, price = sample(z, C, u, gain, variance)
-                    to_come = max(0, task.left - h - 1) * task.M @ task.M.T
+                    to_come = max(0, task.samples_left - h - 1) * task.information_factor @ task.information_factor.T
                     known = 0.5 * np.linalg.slogdet(np.linalg.inv(D[2:, 2:]) + to_come)[1]
                     score = known - cost - price
                     if score > entered.get(cell(to), (-np.inf,))[0]:
                         entered[cell(to)] = score, (to, D, told, spread, cost + price, [*inputs, u])
-        most = task.ways if h < task.fine else task.fewer
-        enough = enough_for(np.array([score for score, _ in entered.values()]), most)
+        most = task.beam_width if h < task.n_moves_some_inputs else task.far_beam_width
+        enough = score_threshold(np.array([score for score, _ in entered.values()]), most)
         kept = [found for found in entered.values() if found[0] >= enough][:most]
         followed = [way for _, way in kept]
     return followed[int(np.argmax([score for score, _ in kept]))][-1]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.planner.design import LOST, Known, designer
-from agents.planner.mean_design import Systems, mean_designer
+from agents.planning.d_optimality import DIVERGED_RATIO, NominalSystem, compile_d_optimality
+from agents.planning.open_loop.expected_d_optimality import SampledSystems, compile_expected_d_optimality
 from estimator.engine.feeding import older_inputs
 from estimator.lanes import LANES
 
@@ -23,7 +23,7 @@ def drawn(name, systems):
     degree, n, rng = int(interpolation == "linear"), model.n_states, np.random.default_rng(6)
     c = np.array(c, dtype=np.float64)
     coefficients = c * rng.uniform(0.9, 1.1, (systems, len(c)))
-    starts = np.zeros((systems, designer(model, degree).start_size))
+    starts = np.zeros((systems, compile_d_optimality(model, degree).start_size))
     starts[:, :n] = 0.05 * size * rng.standard_normal((systems, n))
     starts[:, n : n + n * (n + 1) // 2] = 1e-6 * np.eye(n)[np.triu_indices(n)]
     older = older_inputs(model, degree)
@@ -31,15 +31,22 @@ def drawn(name, systems):
     noises = 1e-6 * rng.uniform(1.0, 4.0, (systems, 1 + model.n_outputs))
     shakes = 0.1 * size * rng.standard_normal((systems, SAMPLES))
     precision = np.diag(1 / (0.1 * np.maximum(np.abs(c), 0.01)) ** 2)
-    return model, degree, Systems(coefficients, starts, noises, shakes, precision), size * rng.uniform(-1, 1, SAMPLES)
+    return (
+        model,
+        degree,
+        SampledSystems(coefficients, starts, noises, shakes, precision),
+        size * rng.uniform(-1, 1, SAMPLES),
+    )
 
 
 def one_by_one(model, degree, systems, limit, penalty, u):
     """The mean worth, its gradient, and the peaks (S,)."""
-    found, values, gradients, peaks = designer(model, degree), [], [], []
-    memory = found.memory(len(u))
+    found, values, gradients, peaks = compile_d_optimality(model, degree), [], [], []
+    memory = found.workspace(len(u))
     for c, start, noises, shakes in zip(*systems[:4], strict=True):
-        value, peak = found.climb(Known(c, systems.precision, tuple(noises)), limit, penalty, start, u + shakes, memory)
+        value, peak = found.criterion_and_gradient(
+            NominalSystem(c, systems.precision, tuple(noises)), limit, penalty, start, u + shakes, memory
+        )
         values.append(value)
         peaks.append(peak)
         gradients.append(memory.gradient.copy())
@@ -52,12 +59,12 @@ def one_by_one(model, degree, systems, limit, penalty, u):
 def test_the_mean_worth_and_its_gradient_are_those_of_each_system(name):
     model, degree, systems, u = drawn(name, LANES + 5)
     *_, peaks = one_by_one(model, degree, systems, np.inf, 0.0, u)
-    limit = float(np.median(peaks)) / LOST  # half of the systems are lost
+    limit = float(np.median(peaks)) / DIVERGED_RATIO  # half of the systems are lost
     expected, slopes, peaks = one_by_one(model, degree, systems, limit, PENALTY, u)
-    assert 0 < np.count_nonzero(peaks >= LOST * limit) < len(peaks)
-    found = mean_designer(model, degree)
-    memory = found.memory(SAMPLES)
-    assert found.climb(systems, limit, PENALTY, u, memory) == pytest.approx(expected, rel=1e-11)
+    assert 0 < np.count_nonzero(peaks >= DIVERGED_RATIO * limit) < len(peaks)
+    found = compile_expected_d_optimality(model, degree)
+    memory = found.workspace(SAMPLES)
+    assert found.criterion_and_gradient(systems, limit, PENALTY, u, memory) == pytest.approx(expected, rel=1e-11)
     np.testing.assert_allclose(memory.gradient, slopes, rtol=0, atol=1e-9 * np.abs(slopes).max())
 
 
@@ -65,9 +72,9 @@ def test_a_system_that_runs_away_counts_what_it_told_until_then():
     model, degree, systems, u = drawn("paper", 3)
     systems.coefficients[1] *= 1e3  # its outputs overflow
     expected, slopes, peaks = one_by_one(model, degree, systems, 1.0, 0.0, u)
-    assert peaks[1] > LOST
-    found = mean_designer(model, degree)
-    memory = found.memory(SAMPLES)
-    assert found.climb(systems, 1.0, 0.0, u, memory) == pytest.approx(expected, rel=1e-11)
+    assert peaks[1] > DIVERGED_RATIO
+    found = compile_expected_d_optimality(model, degree)
+    memory = found.workspace(SAMPLES)
+    assert found.criterion_and_gradient(systems, 1.0, 0.0, u, memory) == pytest.approx(expected, rel=1e-11)
     assert np.isfinite(memory.gradient).all()
     np.testing.assert_allclose(memory.gradient, slopes, rtol=0, atol=1e-9 * np.abs(slopes).max())

@@ -56,7 +56,7 @@ def test_an_episode_adds_up_to_what_it_gained(track):
         LANES, 5, partial(draw_track_options, env_id=track, options={}, ranges=LENGTHS), raw_observation=True
     )
     envs.reset()
-    to_come = (track != TRACK) * envs._groups[0].current_features.to_come
+    to_come = (track != TRACK) * envs._groups[0].current_features.remaining_information
     total = np.zeros(LANES)
     for _ in range(envs._groups[0].envs.horizon):
         _, rewards, dones, infos = envs.step(np.zeros((LANES, 1)))

@@ -15,10 +15,10 @@ from tables import table
 from agents import make_policy, save_policy
 from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.leaderboard.protocol import policy_fingerprint
-from agents.policies.learned import load_policy
+from agents.policies.networks.trained_policy import load_policy
+from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import TrainConfig, train
 from agents.training.algorithms import PPOSettings
-from agents.vec_env import DuffingVecEnv
 
 FEATURES = 22
 SHORT = {"env_id": "duffing_env/Short-v0", "systems": 4, "options": {"horizon": 6}}

@@ -16,13 +16,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tables import table
 
 import duffing_env
-from agents.planner import block_policy, blocks
-from agents.planner.block_policy import BlockPlanner
-from agents.planner.imagination import Terms
-from agents.planner.motion import View, reach_of, swing_of
-from agents.planner.policy import Planner
-from agents.planner.search import search
-from agents.policies import make_policy
+from agents.planning.belief_rollout import PlanObjective
+from agents.planning.model_probe import ModelView, probe_time_scales, recoverable_step
+from agents.planning.open_loop import chance_constrained_block
+from agents.planning.receding_horizon import compile_receding_horizon
+from agents.policies import block_planner, make_policy
+from agents.policies.block_planner import BlockPlanner
+from agents.policies.efe_planner import EfePlanner
 from duffing_env.experiment_config import SimulatedExperiment
 from estimator import Channel, Rig
 from estimator.belief import Belief, covariance_places
@@ -152,7 +152,7 @@ def test_rows_do_not_depend_on_the_batch(track):
 
 def test_the_next_best_plan_is_another_one_and_is_followed_where_it_is_the_best():
     n, envs = 64, make("Amplitude", 64)
-    planner = Planner(envs)
+    planner = EfePlanner(envs)
     observations, _ = envs.reset(seed=0)
     state, start = None, np.ones(n, dtype=bool)
     for _ in range(30):
@@ -252,7 +252,7 @@ def test_a_planner_needs_an_environment_of_its_own():
     with pytest.raises(ValueError, match="env must be an environment of duffing_env"):
         make_policy("efe")
     with pytest.raises(ValueError, match="env must be an environment of duffing_env"):
-        Planner(SimpleNamespace(max_input=0.1))
+        EfePlanner(SimpleNamespace(max_input=0.1))
     policy = make_policy("efe", gym.make("duffing_env/Amplitude-v0"))
     with pytest.raises(ValueError, match="planner's own 1 environments"):
         policy.predict(np.zeros((3, 22)))
@@ -311,51 +311,59 @@ def test_it_plays_a_plant_of_ones_own():
 
 def test_the_map_measures_every_state_by_its_size_at_the_limit():
     paper = SimulatedExperiment().prior_belief.coefficients_mean
-    np.testing.assert_array_equal(swing_of(View(difference()), paper, 0.15, 0.6).scales, [0.6, 0.6])
+    np.testing.assert_array_equal(probe_time_scales(ModelView(difference()), paper, 0.15, 0.6).scales, [0.6, 0.6])
     # A linear oscillator of 2π / 40 rad per sample: its velocity has that much of the displacement's amplitude.
     omega = 2 * np.pi / 40
-    found = swing_of(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 0.6).scales
+    found = probe_time_scales(ModelView(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 0.6).scales
     np.testing.assert_allclose(found, [0.6, 0.6 * omega], rtol=0.15)
     # Also where no input comes near the limit.
     np.testing.assert_allclose(
-        swing_of(View(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 1e3).scales[1], 1e3 * omega, rtol=0.15
+        probe_time_scales(ModelView(duffing()), [omega**2, 0.0, 0.02, 0.01], 1.0, 1e3).scales[1], 1e3 * omega, rtol=0.15
     )
-    seen = swing_of(View(WIENER_HAMMERSTEIN), [0.4, 0.1, 0.0, 0.5], 0.15, 0.6).scales
+    seen = probe_time_scales(ModelView(WIENER_HAMMERSTEIN), [0.4, 0.1, 0.0, 0.5], 0.15, 0.6).scales
     assert seen[2] == 0.6
     assert np.all(seen[:2] > 0.1)
     decay = Model("decay", {"x": "V"}, {"rate": "1"}, noise=("1",), outputs={"y": "x"}, rates=("u - rate*x",))
-    assert swing_of(View(decay), [0.3], 1.0, 2.0).scales == [2.0]
+    assert probe_time_scales(ModelView(decay), [0.3], 1.0, 2.0).scales == [2.0]
 
 
 def test_plans_count_on_what_an_input_moves_within_its_sample():
     # From rest a held force moves a linear oscillator to its static deflection, less the cosine.
     omega, gain = 2 * np.pi / 9, 0.5
-    held = swing_of(View(duffing()), [omega**2, 0.0, 0.0, gain], 0.15, 0.6)
-    np.testing.assert_allclose(held.moved, gain * (1 - np.cos(omega)) / omega**2, rtol=1e-3)
-    assert swing_of(View(difference()), [1.5, -0.2, -0.9, 0.4], 0.15, 0.6).moved == pytest.approx(0.4)
+    held = probe_time_scales(ModelView(duffing()), [omega**2, 0.0, 0.0, gain], 0.15, 0.6)
+    np.testing.assert_allclose(held.step_response, gain * (1 - np.cos(omega)) / omega**2, rtol=1e-3)
+    assert probe_time_scales(ModelView(difference()), [1.5, -0.2, -0.9, 0.4], 0.15, 0.6).step_response == pytest.approx(
+        0.4
+    )
 
     free = SimpleNamespace(kernel_params=SimpleNamespace(max_slew=np.inf, budget=np.inf), model=duffing())
-    assert reach_of(free, View(duffing()), held) == 0.75 * held.moved
+    assert recoverable_step(free, ModelView(duffing()), held) == 0.75 * held.step_response
     # An input that goes linearly from the last one acts in full a sample later; rigs keep the whole margin.
     slow = SimpleNamespace(kernel_params=SimpleNamespace(max_slew=0.1, budget=np.inf), model=duffing())
     weak = SimpleNamespace(kernel_params=SimpleNamespace(max_slew=np.inf, budget=1.0), model=duffing())
     rig = SimpleNamespace(kernel_params=free.kernel_params, model=duffing(), rig=Rig(SAMPLING_STEP))
-    assert reach_of(free, View(duffing(), 1), held) == reach_of(free, View(difference(), 0, 1), held) == 0.0
-    assert reach_of(free, View(duffing()), held._replace(pace=2)) == 0.0
-    assert [reach_of(one, View(duffing()), held) for one in (slow, weak, rig)] == [0.0, 0.0, 0.0]
+    assert (
+        recoverable_step(free, ModelView(duffing(), 1), held)
+        == recoverable_step(free, ModelView(difference(), 0, 1), held)
+        == 0.0
+    )
+    assert recoverable_step(free, ModelView(duffing()), held._replace(hold_samples=2)) == 0.0
+    assert [recoverable_step(one, ModelView(duffing()), held) for one in (slow, weak, rig)] == [0.0, 0.0, 0.0]
 
 
 def test_other_sensors_see_the_same_swing():
     omega = 2 * np.pi / 40
     means = [omega**2, 0.0, 0.02, 0.002]
     swings = [
-        swing_of(View(duffing(sensor=sensor)), means, 1.0, 0.6 * omega**order)
+        probe_time_scales(ModelView(duffing(sensor=sensor)), means, 1.0, 0.6 * omega**order)
         for order, sensor in enumerate(("displacement", "velocity", "acceleration"))
     ]
-    assert {swing.pace for swing in swings} == {round(40 / 9)}
+    assert {swing.hold_samples for swing in swings} == {round(40 / 9)}
     for order, swing in enumerate(swings):
         np.testing.assert_allclose(swing.scales, [0.6, 0.6 * omega], rtol=0.15)
-        np.testing.assert_allclose(swing.shaken, swings[0].shaken * omega ** (2 * order), rtol=0.4)
+        np.testing.assert_allclose(
+            swing.accumulated_noise, swings[0].accumulated_noise * omega ** (2 * order), rtol=0.4
+        )
 
 
 @pytest.mark.slow  # seconds of compilation
@@ -376,7 +384,7 @@ def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track):
     """As the module says: exceeded with probability ``risk`` by outputs that all are at the margin."""
     env, freedom = gym.make(f"duffing_env/{track}"), 4 + (2 + np.arange(48) / 16) ** 2
     for risk in (0.05, 0.5):
-        margin = make_policy("efe", env, risk=risk).terms.margin
+        margin = make_policy("efe", env, risk=risk).objective.margin
         np.testing.assert_allclose(margin, t(freedom).isf(risk / 48), rtol=1e-12)
 
 
@@ -397,14 +405,14 @@ def test_on_a_rig_moves_of_several_samples_become_shorter_towards_the_end():
         begun = left == 0
         actions, state = policy.predict(observations, state)
         if begun.all():
-            moves.append(state.held + 1)
-        left = state.held
+            moves.append(state.remaining_holds + 1)
+        left = state.remaining_holds
         observations, rewards, terminated, *_ = envs.step(actions)
         assert not terminated.any()
         gains += rewards
     lengths = np.array(moves)
     assert (lengths == lengths[:, :1]).all(), "all plan at the same samples"
-    assert lengths[0, 0] == policy.terms.pace == 3
+    assert lengths[0, 0] == policy.objective.hold_samples == 3
     assert (np.diff(lengths[:, 0]) <= 0).all()
     assert set(lengths[:, 0].tolist()) == {1, 3}
     assert lengths[:, 0].sum() == envs.horizon
@@ -445,7 +453,7 @@ def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
     horizon = 4
     # What is known after one move, two and four counts; a plan to the end is worth what is known there.
     weights = np.array([1.0, 1.0, 0.0, 1.0]) if left > horizon else np.array([0.0, 0.0, 0.0, 1.0])
-    terms = Terms(0.15, np.inf, 10.0, np.full(left, 2.0), walk=np.zeros(4), scales=np.ones(2))
+    terms = PlanObjective(0.15, np.inf, 10.0, np.full(left, 2.0), walk=np.zeros(4), scales=np.ones(2))
     for seed in range(4):
         rng = np.random.default_rng(seed)
         belief = random_belief(rng)
@@ -453,7 +461,9 @@ def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
         plans, others = np.zeros((2, 1, horizon))
         rates, words = rate[None].copy(), rng.integers(1, 2**63, (1, 4), dtype=np.uint64)
         arguments = belief.record[None].copy(), np.array([left]), horizon, 60, terms, np.zeros((1, 2))
-        search(difference()).plan(*arguments, plans, others, rates, words, np.empty(1), np.empty(1, dtype=np.int64))
+        compile_receding_horizon(difference()).plan(
+            *arguments, plans, others, rates, words, np.empty(1), np.empty(1, dtype=np.int64)
+        )
 
         def worth(inputs, belief=belief, rate=rate):
             to_come = (left - 1 - np.arange(horizon))[:, None, None] * rate
@@ -494,7 +504,7 @@ def test_what_moves_teach_counts_the_less_the_later():
             return 0.5 * np.linalg.slogdet(precisions(belief, plan)[1:])[1]
 
         tried = np.array(
-            [known(plan) for plan in itertools.product(policy.terms.amplitude * np.array([-1, 1]), repeat=8)]
+            [known(plan) for plan in itertools.product(policy.objective.amplitude * np.array([-1, 1]), repeat=8)]
         )
         worths = tried @ -np.diff(weights)
         little = 5e-3 * np.ptp(worths)
@@ -528,15 +538,17 @@ def test_a_safe_block_is_tried_nearer_to_the_limit(monkeypatch):
     told = {}
 
     def best_block(view, systems, futures, candidates, amplitude, bound, played):
-        found = blocks.best_block(view, systems, futures, candidates, amplitude, bound, played)
-        told[blocks._HALVINGS] = blocks.expected(view, systems, futures.limit, found[0])[0]
+        found = chance_constrained_block.optimise_block(view, systems, futures, candidates, amplitude, bound, played)
+        told[chance_constrained_block._N_BISECTIONS] = chance_constrained_block.expected_information(
+            view, systems, futures.limit, found[0]
+        )[0]
         assert found[1] == 1.0
         assert found[2] < bound
         return found
 
-    monkeypatch.setattr(block_policy, "best_block", best_block)
-    for halvings in (0, blocks._HALVINGS):
-        monkeypatch.setattr(blocks, "_HALVINGS", halvings)
+    monkeypatch.setattr(block_planner, "optimise_block", best_block)
+    for halvings in (0, chance_constrained_block._N_BISECTIONS):
+        monkeypatch.setattr(chance_constrained_block, "_HALVINGS", halvings)
         BlockPlanner(env, block=24, risk=0.1).predict(observation)
     never, often = told.values()
     assert often > never + 0.02

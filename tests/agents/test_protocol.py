@@ -10,7 +10,7 @@ import pytest
 from tables import table
 
 from agents.commands import main
-from agents.evaluation.oracle import Oracle, Systems
+from agents.evaluation.oracle import Oracle, TrackSystems
 from agents.leaderboard import leaderboard_file, protocol
 from agents.policies import POLICIES
 
@@ -66,7 +66,7 @@ def test_what_the_protocol_fixes_may_be_said(command, entry, monkeypatch):
 
 
 def test_the_score_is_against_the_bound_where_there_is_one(entry):
-    oracle = Oracle.of(Systems.of(SHORT, 8))
+    oracle = Oracle.of(TrackSystems.of(SHORT, 8))
     evaluation = protocol._evaluate_on_track("uniform", SHORT, {"branch": "test"}, lambda share, at="": None)
     rows = np.swapaxes(evaluation.outputs, 0, 1)[:8]
     best, least = oracle.efficiency(evaluation.inputs.T[:8], rows)

@@ -19,7 +19,8 @@ from safetensors.numpy import load_file, save_file
 import agents
 from agents import make_policy
 from agents.interruption import Interrupted
-from agents.policies.features import NAMES
+from agents.policies.networks.rollout_features import FEATURE_NAMES
+from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import ALGORITHMS, TrainConfig, resume, train
 from agents.training.checkpoints import (
     STATE_FILE,
@@ -30,7 +31,6 @@ from agents.training.checkpoints import (
     restore_training_state,
     save_checkpoint,
 )
-from agents.vec_env import DuffingVecEnv
 
 ENV = "duffing_env/Short-v0"
 OFF_POLICY = {
@@ -242,7 +242,11 @@ def test_only_the_latest_checkpoint_holds_the_state(tmp_path):
     assert set(found) == {"000000512"}
     assert latest_checkpoint(folder) == folder / "checkpoints" / "000000512"
     buffer = load_file(latest_checkpoint(folder) / TENSORS_FILE)
-    assert buffer["buffer/observations"].shape == (50, 8, len(NAMES) + 22)  # of 64 samples of each, the buffer holds 50
+    assert buffer["buffer/observations"].shape == (
+        50,
+        8,
+        len(FEATURE_NAMES) + 22,
+    )  # of 64 samples of each, the buffer holds 50
     earlier = make_policy(str(folder / "checkpoints" / "000000256"))
     assert earlier.card["steps"] == 256
 

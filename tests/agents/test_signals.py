@@ -327,9 +327,9 @@ def test_unknown_name_is_refused_with_the_names_and_the_nearest():
 
 
 def test_a_path_loads_the_trained_policy(tmp_path, monkeypatch):
-    learned = ModuleType("agents.policies.learned")
+    learned = ModuleType("agents.policies.networks.trained_policy")
     learned.load_policy = lambda path, seed: ("loaded", Path(path), seed)
-    monkeypatch.setitem(sys.modules, "agents.policies.learned", learned)
+    monkeypatch.setitem(sys.modules, "agents.policies.networks.trained_policy", learned)
     assert make_policy(str(tmp_path), seed=3) == ("loaded", tmp_path, 3)
 
 

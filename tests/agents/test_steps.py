@@ -3,7 +3,7 @@
 import numpy as np
 from tables import table
 
-from agents.planner.steps import nudge, rivals_for, step
+from agents.planning.newton_steps import empty_candidate_batch, fill_finite_differences, fill_newton_candidates
 
 AMPLITUDE, STEPS, CHANGED = 0.15, 16, 20
 
@@ -12,14 +12,14 @@ def made(rng, horizon, teaching, near_at, sensitivities, weights):
     """Rivals whose nudged plans are worth what a linear teaching and the margin's cost say, and the plan."""
     plan = rng.choice([-1.0, 1.0, 0.3], horizon) * AMPLITUDE
     plan[0] = 0.3 * AMPLITUDE  # one at least is free
-    rivals = rivals_for(horizon)
-    last = nudge(rivals, plan, horizon, AMPLITUDE)
+    rivals = empty_candidate_batch(horizon)
+    last = fill_finite_differences(rivals, plan, horizon, AMPLITUDE)
     assert last == min(horizon, CHANGED) + 1
     moved = rivals.candidates[:last] - plan
-    rivals.near[:, :last] = near_at[:, None] + sensitivities @ moved.T
+    rivals.margin_excess[:, :last] = near_at[:, None] + sensitivities @ moved.T
     rivals.weights[:] = weights
-    cost = 0.05 * weights @ np.maximum(rivals.near[:, :last], 0.0) ** 4
-    rivals.worths[:last] = moved @ teaching - cost
+    cost = 0.05 * weights @ np.maximum(rivals.margin_excess[:, :last], 0.0) ** 4
+    rivals.scores[:last] = moved @ teaching - cost
     return rivals, plan
 
 
@@ -61,7 +61,7 @@ def case(seed, horizon, near_at):
 def test_steps_are_those_of_newton(seed, horizon):
     near = np.random.default_rng(seed + 10).uniform(-3.0, 2.0, min(horizon, 12))
     rivals, plan, told = case(seed, horizon, near)
-    assert step(rivals, horizon, AMPLITUDE) == STEPS
+    assert fill_newton_candidates(rivals, horizon, AMPLITUDE) == STEPS
     n = min(horizon, CHANGED)
     # Differences are of a thousandth of the amplitude, over which the cost's slope changes a bit.
     got, want = rivals.candidates[:STEPS, :n] - plan[:n], reference(plan, *told)
@@ -72,7 +72,7 @@ def test_steps_are_those_of_newton(seed, horizon):
 
 def test_without_a_margin_a_step_is_as_long_as_its_price_allows():
     rivals, plan, (teaching, *_) = case(3, 20, [])
-    assert step(rivals, 20, AMPLITUDE) == STEPS
+    assert fill_newton_candidates(rivals, 20, AMPLITUDE) == STEPS
     largest = np.abs(teaching[~((np.abs(plan) >= AMPLITUDE) & (plan * teaching > 0))]).max()
     for s in range(STEPS):
         price = largest / (2.0 * AMPLITUDE) * 1.6 ** (STEPS - 1 - s)
@@ -81,16 +81,16 @@ def test_without_a_margin_a_step_is_as_long_as_its_price_allows():
 
 
 def test_a_plan_that_nothing_can_improve_is_left():
-    rivals = rivals_for(5)
-    first = nudge(rivals, np.full(5, AMPLITUDE), 5, AMPLITUDE)
-    rivals.near[:], rivals.weights[:] = -50.0, 1.0
-    rivals.worths[:first] = rivals.candidates[:first].sum(axis=1)  # all would have to be larger
-    assert step(rivals, 5, AMPLITUDE) == 0
+    rivals = empty_candidate_batch(5)
+    first = fill_finite_differences(rivals, np.full(5, AMPLITUDE), 5, AMPLITUDE)
+    rivals.margin_excess[:], rivals.weights[:] = -50.0, 1.0
+    rivals.scores[:first] = rivals.candidates[:first].sum(axis=1)  # all would have to be larger
+    assert fill_newton_candidates(rivals, 5, AMPLITUDE) == 0
 
 
 def test_numbers_that_are_not_finite_give_no_steps():
-    rivals = rivals_for(5)
-    nudge(rivals, np.zeros(5), 5, AMPLITUDE)
-    rivals.near[:], rivals.weights[:], rivals.worths[:] = -50.0, 1.0, np.inf
-    rivals.worths[0] = 0.0
-    assert step(rivals, 5, AMPLITUDE) == 0
+    rivals = empty_candidate_batch(5)
+    fill_finite_differences(rivals, np.zeros(5), 5, AMPLITUDE)
+    rivals.margin_excess[:], rivals.weights[:], rivals.scores[:] = -50.0, 1.0, np.inf
+    rivals.scores[0] = 0.0
+    assert fill_newton_candidates(rivals, 5, AMPLITUDE) == 0

@@ -15,14 +15,14 @@ import torch
 from safetensors.numpy import load_file
 from tables import table
 
-import agents.vec_env
+import agents.sb3_vec_env
 from agents import make_policy
 from agents.commands.train_command import TrainCommand
 from agents.console_output import write_json
-from agents.evaluation.batch import TESTED, make
 from agents.evaluation.comparison_tables import summarise_metrics
 from agents.evaluation.policy_evaluation import evaluate_policies
-from agents.policies.features import NAMES
+from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
+from agents.policies.networks.rollout_features import FEATURE_NAMES
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.hyperparameters import parse_hyperparameters
 from agents.training.training_config import describe_run
@@ -141,12 +141,12 @@ def test_the_curve_and_the_log_tell_the_same(runs):
 def test_reward_and_options_reach_the_environment(tmp_path, monkeypatch):
     made = []
 
-    class Spy(agents.vec_env.DuffingVecEnv):
+    class Spy(agents.sb3_vec_env.DuffingVecEnv):
         def __init__(self, *arguments, **options):
             super().__init__(*arguments, **options)
             made.append(self)
 
-    monkeypatch.setattr(agents.vec_env, "DuffingVecEnv", Spy)
+    monkeypatch.setattr(agents.sb3_vec_env, "DuffingVecEnv", Spy)
     run = tiny(tmp_path / "run", reward="parameter_error", options={"horizon": 8, "max_output": 3.0, "spread": 0.1})
     envs, examples = made  # these show how the features vary
     assert examples.envs.experiment.horizon == 8
@@ -160,7 +160,7 @@ def test_reward_and_options_reach_the_environment(tmp_path, monkeypatch):
 
 def test_no_training_meets_a_system_that_policies_are_compared_on():
     def begun(options):
-        envs = make("duffing_env/Short-v0", 256, options)
+        envs = make_track_batch("duffing_env/Short-v0", 256, options)
         envs.reset(seed=0)
         return envs.truth.m
 
@@ -174,7 +174,7 @@ def test_no_training_meets_a_system_that_policies_are_compared_on():
             envs.step(np.ones((64, 1), dtype=np.float32))
             met |= {*envs.envs.truth.m.tolist()}
         assert len(met) > 4 * 64
-        assert not met & {*begun(TESTED).tolist()}
+        assert not met & {*begun(TEST_OPTIONS).tolist()}
 
 
 def test_a_training_can_begin_with_the_network_of_a_policy(runs, tmp_path):
@@ -201,7 +201,7 @@ def test_hyperparameters_reach_the_algorithm(tmp_path):
     ppo = replace(TINY, n_steps=32, n_epochs=3, log_std_init=-1.25, hidden=(5, 7), learning_rate=1e-9)
     run = tiny(tmp_path / "run", steps=512, hyperparameters=ppo)
     weights = load_file(run.folder / "policy.safetensors")
-    assert weights["mlp_extractor.policy_net.0.weight"].shape == (5, len(NAMES) + 22)
+    assert weights["mlp_extractor.policy_net.0.weight"].shape == (5, len(FEATURE_NAMES) + 22)
     assert weights["mlp_extractor.policy_net.2.weight"].shape == (7, 5)
     assert weights["action_net.weight"].shape == (1, 7)
     np.testing.assert_allclose(weights["log_std"], -1.25, atol=1e-5)

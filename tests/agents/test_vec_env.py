@@ -10,7 +10,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import make_policy
-from agents.vec_env import DuffingVecEnv
+from agents.sb3_vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
 from estimator import Parameters
 

@@ -22,14 +22,14 @@ from agents.hardware.clock import JumpingClock
 from agents.hardware.experiment_run import RunSettings, run_experiment
 from agents.hardware.simulated_plant import SimulatedPlant
 from agents.leaderboard import leaderboard_file, protocol
-from agents.policies.saving import save_policy
-from agents.studies import ship
+from agents.policies.networks.policy_saving import save_policy
+from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import TrainConfig, resume, train
 from agents.training.algorithms import ALGORITHMS
 from agents.training.checkpoints import latest_checkpoint
-from agents.vec_env import DuffingVecEnv
 from estimator import Rig
 from estimator.identification.tables import read_table
+from research.studies import ship_policy
 
 resource = pytest.importorskip("resource", reason="this system has no limits of the size of files")
 
@@ -171,7 +171,7 @@ def command(words, monkeypatch, folder):
     try:
         if name == "ship":
             monkeypatch.setattr(sys, "argv", ["ship.py", *rest])
-            run_script(ship.ship, ship.Config)
+            run_script(ship_policy.ship_median, ship_policy.Config)
         else:
             main()
     except SystemExit as stop:

@@ -1,4 +1,4 @@
-"""What `agents.policies.features` makes of an observation of Eq. (2), with matrices, one observation after the other.
+"""What `agents.policies.networks.rollout_features` makes of an observation of Eq. (2), with matrices, one observation after the other.
 
 The motion is x⁺ = θ·φ with φ = (x, x³, x₋, u); the sensor shows x.
 """
@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from agents.policies.features import BOUND, Setting
+from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureSettings
 from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.models.difference import difference
 
@@ -60,7 +60,7 @@ def shield(up, none, down):
     return min(left), max(right)
 
 
-def features(observation, s: Setting):
+def features(observation, s: FeatureSettings):
     """Values without the observation itself, sign, span, push and what is to come."""
     o = dict(zip(ENTRIES, np.float64(observation), strict=True))
     theta, C = coefficients_of(o, s)
@@ -74,13 +74,15 @@ def features(observation, s: Setting):
         reserve = np.sqrt(o["budget_left"] * s.energy / s.max_input**2)
         thrift = min(1.0, reserve / np.sqrt(left))
         height = np.abs(roll(theta, x, before, lambda t, velocity: 0.0, limit)[0]).max() / limit
-        push = min(1.0, max(thrift, s.growth * height / s.moved))
+        push = min(1.0, max(thrift, s.amplitude_growth * height / s.step_response))
     process, sensor = s.process * np.exp(-o["log_gamma"]), s.sensor * np.exp(-o["log_xi_y"])
     variance = process + sensor
     J = share / variance * s.rate
     W = np.linalg.inv(np.linalg.inv(C) + J)
     to_come = 0.5 * np.linalg.slogdet(np.eye(4) + C @ J)[1]
-    noise = variance * np.array([1.0, 2.0, 2.0, 2.0, 2.0]) + s.shaken * process * np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    noise = variance * np.array([1.0, 2.0, 2.0, 2.0, 2.0]) + s.accumulated_noise * process * np.array(
+        [0.0, 1.0, 1.0, 1.0, 1.0]
+    )
 
     free, found = None, {name: [] for name in ("next", "rest", "peak", "reach", "taught", "braked")}
     for first in (1.0, 0.0, -1.0):
@@ -113,4 +115,4 @@ def features(observation, s: Setting):
     values += [sign * o["last_input"], sign * o["last_y"], x / limit, (x - before) / limit]
     values += [0.5 * np.log(variance / limit**2) + 7, low, high, *np.concatenate(list(found.values())), *free]
     values += [to_come / 4, np.log(np.trace(W @ s.rate) / (2 * variance) * s.samples + 1e-6)]
-    return np.clip(values, -BOUND, BOUND), sign, (low, high), push, to_come
+    return np.clip(values, -MAX_FEATURE, MAX_FEATURE), sign, (low, high), push, to_come

@@ -5,12 +5,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from agents.evaluation.certificate import Certificate
-from agents.evaluation.mixture import Multipliers, mix
-from agents.evaluation.oracle import Oracle, Systems
-from agents.evaluation.state_grid import StateGrid
+from agents.evaluation.oracle import Oracle, TrackSystems
 from estimator.free_run import free_run
 from estimator.models.difference import difference
+from research.oracles.certificate import Certificate
+from research.oracles.input_mixture import BoundMultipliers, improve_mixture
+from research.oracles.state_grid import StateGrid
 
 SHORT = "duffing_env/Short-v0"
 
@@ -90,7 +90,7 @@ def highest(values, held, limited):
 
 
 def test_no_matrix_is_below_the_information():
-    systems = Systems.of(SHORT, 1)
+    systems = TrackSystems.of(SHORT, 1)
     certificate = Certificate(systems, 0)
     rng = np.random.default_rng(0)
     u = rng.uniform(-0.15, 0.15, 48)
@@ -105,34 +105,34 @@ def test_no_matrix_is_below_the_information():
 
 def test_it_is_above_every_input_of_a_tiny_problem():
     horizon = 6
-    systems = Systems.of(SHORT, 1, {"horizon": horizon})
+    systems = TrackSystems.of(SHORT, 1, {"horizon": horizon})
     inputs = 0.15 * np.array(list(product([-1.0, 0.0, 1.0], repeat=horizon)))
     rng = np.random.default_rng(0)
     inputs = np.concatenate([inputs, rng.uniform(-0.15, 0.15, (1024, horizon))])
-    worths, peaks = np.array([[part[0] for part in systems.worth(u[None])] for u in inputs]).T
+    worths, peaks = np.array([[part[0] for part in systems.criterion_and_peak(u[None])] for u in inputs]).T
     allowed = np.where(peaks <= 0.6, worths, -np.inf)
-    bound = Certificate(systems, 0).find(inputs[[allowed.argmax()]], rounds=32)
+    bound = Certificate(systems, 0).find_bound(inputs[[allowed.argmax()]], rounds=32)
     assert allowed.max() < bound < allowed.max() + 2.5
 
 
 def test_it_is_above_the_oracle_and_not_far():
-    oracle = Oracle.of(Systems.of(SHORT, 1))
+    oracle = Oracle.of(TrackSystems.of(SHORT, 1))
     certificate = Certificate(oracle.systems, 0)
-    bound = certificate.find(oracle.inputs, rounds=8)
+    bound = certificate.find_bound(oracle.inputs, rounds=8)
     assert oracle.values[0] < bound < oracle.values[0] + 0.5
     finer = StateGrid(certificate.theta, 0.6, 0.15, 97, 9, 9)
     G = np.linalg.inv(np.eye(4) + oracle.systems.information(oracle.inputs)[0])
     _, N, M = certificate.moments(oracle.inputs[0])
-    multipliers = Multipliers(G, np.linalg.solve(M, N))
+    multipliers = BoundMultipliers(G, np.linalg.solve(M, N))
     here, there = (certificate.bound(multipliers, grid)[0] for grid in (certificate.grid, finer))
     assert abs(here - there) < 0.2 * (there - oracle.values[0])
 
 
 @pytest.mark.slow  # some programmes of 256 samples
 def test_a_path_keeps_its_displacements_where_rounding_leads_its_inputs_elsewhere():
-    systems = Systems.of("duffing_env/Amplitude-v0", 4)
+    systems = TrackSystems.of("duffing_env/Amplitude-v0", 4)
     oracle, certificate = Oracle.of(systems), Certificate(systems, 3)
-    multipliers = mix([certificate.moments(oracle.inputs[3])], np.ones(1))[2]
+    multipliers = improve_mixture([certificate.moments(oracle.inputs[3])], np.ones(1))[2]
     _, V = certificate.bound(multipliers, certificate.grid, 257)
     u, x = certificate.path(multipliers, V)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -140,7 +140,7 @@ def test_a_path_keeps_its_displacements_where_rounding_leads_its_inputs_elsewher
     now, last = np.append(0.0, x[:-1]), np.append([0.0, 0.0], x[:-2])
     moved = np.stack([now, now**3, last, u], axis=1) @ certificate.theta
     np.testing.assert_allclose(x, np.clip(moved, -0.6, 0.6), atol=1e-9)
-    assert np.exp((oracle.values[3] - certificate.find(oracle.inputs[3:4], rounds=8)) / 2) > 0.85
+    assert np.exp((oracle.values[3] - certificate.find_bound(oracle.inputs[3:4], rounds=8)) / 2) > 0.85
 
 
 @pytest.mark.parametrize(
@@ -148,33 +148,33 @@ def test_a_path_keeps_its_displacements_where_rounding_leads_its_inputs_elsewher
     [("Amplitude", 24, 0.88), ("Short", 24, 0.88), ("Output", 24, 0.85), ("Power", 24, 0.9)],
 )
 def test_stored_bounds_are_above_the_oracles(track, count, share):
-    oracle = Oracle.of(Systems.of(f"duffing_env/{track}-v0", count))
+    oracle = Oracle.of(TrackSystems.of(f"duffing_env/{track}-v0", count))
     assert np.all(oracle.bounds > oracle.values)
     assert np.exp((oracle.values - oracle.bounds) / 2).mean() > share
 
 
 def test_it_is_above_every_input_of_a_tiny_problem_with_little_energy():
     horizon = 16
-    systems = Systems.of("duffing_env/Power-v0", 1, {"horizon": horizon, "max_rms": 0.05})
+    systems = TrackSystems.of("duffing_env/Power-v0", 1, {"horizon": horizon, "max_rms": 0.05})
     inputs = np.random.default_rng(0).normal(size=(4096, horizon)) * np.random.default_rng(1).random((4096, 1))
     inputs *= np.sqrt(systems.limits.energy) / np.linalg.norm(inputs, axis=1, keepdims=True)
     inputs = inputs.clip(-0.15, 0.15)
-    worths = np.array([systems.worth(u[None])[0][0] for u in inputs])
-    bound = Certificate(systems, 0).find(inputs[[worths.argmax()]], rounds=32)
+    worths = np.array([systems.criterion_and_peak(u[None])[0][0] for u in inputs])
+    bound = Certificate(systems, 0).find_bound(inputs[[worths.argmax()]], rounds=32)
     assert worths.max() < bound < worths.max() + 2.5
 
 
 @pytest.mark.slow  # some programmes with energy left as a state
 def test_it_is_above_the_oracle_where_energy_is_limited_and_not_far():
-    oracle = Oracle.of(Systems.of("duffing_env/Power-v0", 1))
+    oracle = Oracle.of(TrackSystems.of("duffing_env/Power-v0", 1))
     certificate = Certificate(oracle.systems, 0)
-    bound = certificate.find(oracle.inputs)
+    bound = certificate.find_bound(oracle.inputs)
     assert 0.9 < np.exp((oracle.values[0] - bound) / 2) < 1.0
-    multipliers = mix([certificate.moments(oracle.inputs[0])], np.ones(1))[2]
+    multipliers = improve_mixture([certificate.moments(oracle.inputs[0])], np.ones(1))[2]
     u, _ = certificate.path(multipliers, certificate.bound(multipliers, certificate.grid, 257)[1])
-    (before,) = certificate.told(multipliers, u[None], free_run(difference(), certificate.theta, u)[None])
-    climbed, x = certificate.climb(multipliers, u)
-    (after,) = certificate.told(multipliers, climbed[None], x[None])
+    (before,) = certificate.attained_sum(multipliers, u[None], free_run(difference(), certificate.theta, u)[None])
+    climbed, x = certificate.ascend(multipliers, u)
+    (after,) = certificate.attained_sum(multipliers, climbed[None], x[None])
     assert after > before
     np.testing.assert_allclose(x, free_run(difference(), certificate.theta, climbed))
     assert climbed @ climbed <= oracle.systems.limits.energy * (1 + 1e-12)
@@ -184,4 +184,4 @@ def test_it_is_above_the_oracle_where_energy_is_limited_and_not_far():
 
 def test_other_equations_have_none_yet():
     with pytest.raises(ValueError, match=r"must obey Eq. \(2\)"):
-        Certificate(Systems.of("duffing_env/Power-v1", 1), 0)
+        Certificate(TrackSystems.of("duffing_env/Power-v1", 1), 0)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.evaluation.batch import make
+from agents.evaluation.track_batch import make_track_batch
 from agents.studies import datasets
-from agents.studies.datasets import Config, collect, main
+from agents.studies.datasets import Config, collect_episodes, main
 
 ROOT = Path(__file__).parents[2]
 SHORT = "duffing_env/Short-v0"
@@ -16,7 +16,7 @@ SHORT = "duffing_env/Short-v0"
 
 @pytest.mark.parametrize("grade", ["random", "medium"])
 def test_episodes_are_whole(grade):
-    episodes = collect(Config(grade, SHORT, episodes=300))
+    episodes = collect_episodes(Config(grade, SHORT, episodes=300))
     assert len(episodes) == 300
     for episode in episodes:
         length = len(episode["actions"])
@@ -31,8 +31,8 @@ def test_episodes_are_whole(grade):
 
 def test_actions_give_what_is_told_again():
     """What is written is one history: the same seed and actions give the same observations and rewards."""
-    (episode, *_) = collect(Config("medium", SHORT, episodes=4))
-    envs = make(SHORT, 4)
+    (episode, *_) = collect_episodes(Config("medium", SHORT, episodes=4))
+    envs = make_track_batch(SHORT, 4)
     envs.reset(seed=int(np.random.SeedSequence(0).generate_state(1)[0]))
     for t, action in enumerate(episode["actions"]):
         observations, rewards, *_ = envs.step(np.tile(action, (4, 1)))
@@ -42,7 +42,7 @@ def test_actions_give_what_is_told_again():
 
 def test_a_track_without_an_expert_has_none():
     with pytest.raises(ValueError, match="grade must not be expert on duffing_env/WienerHammerstein-v0"):
-        collect(Config("expert", "duffing_env/WienerHammerstein-v0", episodes=1))
+        collect_episodes(Config("expert", "duffing_env/WienerHammerstein-v0", episodes=1))
 
 
 def test_a_track_is_known_by_its_name():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from agents.planner.ascent import Limits
-from agents.planner.programme import Programme
+from agents.planning.projected_gradient import DesignLimits
+from research.oracles.linear_programme import LinearProgramme
 
 pytest.importorskip("highspy", reason="pip install 'duffing-env[oracle]'")
 SAMPLES, STATES, RADIUS = 12, 2, 0.05
@@ -27,7 +27,7 @@ def reference(u, gradient, shown_now, slopes, limits, shown):
         outputs.append(after[shown])
     G = np.array(outputs)
     rows = np.concatenate([G, -G])
-    room = np.concatenate([limits.aim - shown_now, limits.aim + shown_now])
+    room = np.concatenate([limits.soft_limit - shown_now, limits.soft_limit + shown_now])
     if np.isfinite(limits.energy):
         rows, room = np.vstack([rows, 2 * u]), np.append(room, limits.energy - u @ u)
     low = np.maximum(-RADIUS, -limits.amplitude - u)
@@ -39,16 +39,16 @@ def reference(u, gradient, shown_now, slopes, limits, shown):
 @pytest.mark.parametrize("shown", [0, STATES])  # a state, or another output
 def test_the_change_is_the_best_one_each_time(energy, shown):
     rng = np.random.default_rng(0)
-    limits = Limits(0.52, 0.51, 0.1, energy)
-    programme, held = Programme(SAMPLES, STATES, shown, limits), 0
+    limits = DesignLimits(0.52, 0.51, 0.1, energy)
+    programme, held = LinearProgramme(SAMPLES, STATES, shown, limits), 0
     for _ in range(5):
         given = line(rng)
-        delta, states = programme.best(*given, RADIUS)
+        delta, states = programme.best_change(*given, RADIUS)
         wanted, G = reference(*given, limits, shown)
         assert given[1] @ delta == pytest.approx(-wanted.fun, rel=1e-6)
         assert np.abs(delta).max() <= RADIUS + 1e-9
-        assert np.abs(given[2] + G @ delta).max() <= limits.aim + 1e-7
-        held += np.isclose(np.abs(given[2] + G @ delta), limits.aim).sum()
+        assert np.abs(given[2] + G @ delta).max() <= limits.soft_limit + 1e-7
+        held += np.isclose(np.abs(given[2] + G @ delta), limits.soft_limit).sum()
         if shown == 0:
             np.testing.assert_allclose(states[1:, 0], (G @ delta)[:-1], atol=1e-9)
     assert held  # the limit is felt
@@ -56,11 +56,11 @@ def test_the_change_is_the_best_one_each_time(energy, shown):
 
 def test_what_no_small_change_leads_within_the_limits_has_no_solution_and_the_next_has():
     rng = np.random.default_rng(1)
-    limits = Limits(0.52, 0.51, 0.1, np.inf)
-    programme = Programme(SAMPLES, STATES, 0, limits)
+    limits = DesignLimits(0.52, 0.51, 0.1, np.inf)
+    programme = LinearProgramme(SAMPLES, STATES, 0, limits)
     u, gradient, shown, slopes = line(rng)
-    assert programme.best(u, gradient, shown + 5.0, slopes, RADIUS) is None
-    delta, _ = programme.best(u, gradient, shown, slopes, RADIUS)
+    assert programme.best_change(u, gradient, shown + 5.0, slopes, RADIUS) is None
+    delta, _ = programme.best_change(u, gradient, shown, slopes, RADIUS)
     wanted, _ = reference(u, gradient, shown, slopes, limits, 0)
     assert gradient @ delta == pytest.approx(-wanted.fun, rel=1e-6)
 
@@ -68,4 +68,4 @@ def test_what_no_small_change_leads_within_the_limits_has_no_solution_and_the_ne
 def test_without_highspy_it_says_which_extra_brings_it(monkeypatch):
     monkeypatch.setattr("estimator.extras.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"^highspy is not installed; get it with: .*duffing-env\[oracle\]'$"):
-        Programme(SAMPLES, STATES, 0, Limits(0.52, 0.51, 0.1, np.inf))
+        LinearProgramme(SAMPLES, STATES, 0, DesignLimits(0.52, 0.51, 0.1, np.inf))

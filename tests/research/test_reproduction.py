@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.studies import kouw2020 as module
-from agents.studies.kouw2020 import PUBLISHED, SETTINGS, prediction_mse, reproduce, simulation_mse
 from duffing_env.plants.silverbox_record import CSV_NAME
 from estimator.offline import PEMNARX
+from research.studies import kouw2020 as module
+from research.studies.kouw2020 import PUBLISHED, SETTINGS, prediction_mse, reproduce, simulation_mse
 
 ROOT = Path(__file__).parents[2]
 MANUAL = ROOT / "docs" / "reproduction.md"
@@ -105,8 +105,10 @@ def test_the_manual_shows_what_is_printed(outcome, capsys):
 
 def test_drawn_series_is_every_80th_sample(record):
     y = record.arrow.y
-    run = module.Run(prediction=y + 0.1, simulation=y - 0.2, prediction_mse=0.01, simulation_mse=0.04, seconds=0.0)
-    figure = module.draw({"FEM-NLARX": run}, record.arrow, "simulation")
+    run = module.ValidationRun(
+        prediction=y + 0.1, simulation=y - 0.2, prediction_mse=0.01, simulation_mse=0.04, seconds=0.0
+    )
+    figure = module.draw_errors({"FEM-NLARX": run}, record.arrow, "simulation")
     upper, lower = figure.axes
     output, error = upper.lines
     np.testing.assert_array_equal(output.get_xdata(), np.arange(0, 40_100, 80))

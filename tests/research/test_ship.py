@@ -8,14 +8,14 @@ import pytest
 from stable_baselines3 import PPO
 
 from agents import make_policy, policies
-from agents.evaluation.oracle import Systems
+from agents.evaluation.oracle import TrackSystems
 from agents.evaluation.policy_evaluation import evaluate_policies
-from agents.policies.learned import CARD, load_policy
-from agents.policies.saving import save_policy
-from agents.studies.family import play, unseen
-from agents.studies.ship import Config, card_of, median_index, ship
+from agents.policies.networks.policy_saving import save_policy
+from agents.policies.networks.trained_policy import CARD_FILE, load_policy
+from agents.sb3_vec_env import DuffingVecEnv
 from agents.training.environments.oscillator_family import FAMILY
-from agents.vec_env import DuffingVecEnv
+from research.studies.ship_policy import Config, card_of, median_index, ship_median
+from research.studies.unseen_oscillators import draw_unseen_rigs, play_episode
 
 SHORT = "duffing_env/Short-v0"
 
@@ -48,7 +48,7 @@ def changed(run, folder, **config):
 
 
 def test_the_median_seed_ships_with_the_scores_of_all(runs, shelf, capsys):
-    folder = ship(Config("ppo/short", runs, systems=8))
+    folder = ship_median(Config("ppo/short", runs, systems=8))
     assert folder == shelf / "ppo" / "short"
     assert sorted(path.name for path in folder.iterdir()) == ["policy.json", "policy.safetensors"]
     card = json.loads((folder / "policy.json").read_text())
@@ -57,7 +57,7 @@ def test_the_median_seed_ships_with_the_scores_of_all(runs, shelf, capsys):
     scores = card["scores"]
     each = evaluate_policies([str(run) for run in runs], SHORT, systems=8)
     by = card["shipped"]["median_by"]
-    assert by == ("efficiency" if Systems.of(SHORT, 1).path.exists() else "information_gain")
+    assert by == ("efficiency" if TrackSystems.of(SHORT, 1).path.exists() else "information_gain")
     for name in {by, "information_gain"}:
         assert scores[name]["seeds"] == pytest.approx([float(e.metrics[name].mean()) for e in each])
         assert scores[name]["median_of_seeds"] == pytest.approx(sorted(scores[name]["seeds"])[1])
@@ -72,7 +72,7 @@ def test_the_median_seed_ships_with_the_scores_of_all(runs, shelf, capsys):
 
 
 def test_a_single_seed_ships_as_one(runs, shelf):
-    card = json.loads((ship(Config("ppo/short", runs[1:2], systems=8)) / "policy.json").read_text())
+    card = json.loads((ship_median(Config("ppo/short", runs[1:2], systems=8)) / "policy.json").read_text())
     assert (card["seeds"], card["shipped"]["seed"]) == ([1], 1)
     assert "seeds" not in card["scores"]["information_gain"]
 
@@ -80,12 +80,12 @@ def test_a_single_seed_ships_as_one(runs, shelf):
 def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
     other = changed(runs[1], tmp_path / "other", reward="fisher")
     with pytest.raises(ValueError, match=r"one recipe, but .*other has another reward"):
-        ship(Config("ppo/short", (runs[0], other)))
+        ship_median(Config("ppo/short", (runs[0], other)))
     twice = changed(runs[1], tmp_path / "twice", seed=0)
     with pytest.raises(ValueError, match=r"a seed each, but have \[0, 0\]"):
-        ship(Config("ppo/short", (runs[0], twice)))
+        ship_median(Config("ppo/short", (runs[0], twice)))
     with pytest.raises(ValueError, match="finished run folders"):
-        ship(Config("ppo/short", (runs[0], tmp_path)))
+        ship_median(Config("ppo/short", (runs[0], tmp_path)))
     with pytest.raises(ValueError, match="runs must be run folders, but there are none"):
         Config("ppo/short", ())
     with pytest.raises(ValueError, match="ALGORITHM/TRACK"):
@@ -95,11 +95,11 @@ def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
 
 def test_runs_ship_under_their_own_name(runs, shelf):
     with pytest.raises(ValueError, match="name must begin with the runs' algorithm, ppo, but is 'sac/short'"):
-        ship(Config("sac/short", runs))
+        ship_median(Config("sac/short", runs))
     (shelf / "ppo" / "amplitude").mkdir(parents=True)
-    (shelf / "ppo" / "amplitude" / CARD).write_text('{"track": "duffing_env/Amplitude-v0"}')
+    (shelf / "ppo" / "amplitude" / CARD_FILE).write_text('{"track": "duffing_env/Amplitude-v0"}')
     with pytest.raises(ValueError, match=f"name must be one for {SHORT}, but 'ppo/amplitude' is of duffing_env/Amp"):
-        ship(Config("ppo/amplitude", runs))
+        ship_median(Config("ppo/amplitude", runs))
 
 
 def test_the_median_of_an_even_number_is_the_lower_one():
@@ -108,12 +108,12 @@ def test_the_median_of_an_even_number_is_the_lower_one():
 
 
 def test_no_card_that_ships_tells_of_a_machine(tmp_path, runs):
-    for card in policies.TRAINED.glob(f"*/*/{CARD}"):
+    for card in policies.TRAINED.glob(f"*/*/{CARD_FILE}"):
         assert '"/' not in card.read_text(), card
     run = shutil.copytree(runs[0], tmp_path / "mine")
-    card = json.loads((run / CARD).read_text())
+    card = json.loads((run / CARD_FILE).read_text())
     card["config"]["output"], card["command"] = str(run), ["train.py", "--output", str(run), "--seed", "1"]
-    (run / CARD).write_text(json.dumps(card))
+    (run / CARD_FILE).write_text(json.dumps(card))
     found = card_of(run)
     assert found["config"]["output"] == "mine"
     assert found["command"] == ["train.py", "--output", "mine", "--seed", "1"]
@@ -123,7 +123,7 @@ def test_no_card_that_ships_tells_of_a_machine(tmp_path, runs):
 def test_a_policy_that_ships_does_what_its_card_says(name):
     card = make_policy(name).card
     if card["config"]["env"] == FAMILY:
-        gains = np.array([play(member, name, i)[0] for i, member in enumerate(unseen(8))])
+        gains = np.array([play_episode(member, name, i)[0] for i, member in enumerate(draw_unseen_rigs(8))])
         expected = card["scores"]["information_gain"]["mean"]
         assert abs(gains.mean() - expected) < 4 * gains.std() / np.sqrt(8)
         return

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.studies import silverbox_protocol as module
-from agents.studies import silverbox_results as reporting
-from agents.studies.silverbox_protocol import GIVEN, SETTINGS, TESTS, Outcome
 from duffing_env.plants.silverbox_record import Regime, SilverboxRecord, synthesise_multisine
+from research.studies import silverbox_protocol as module
+from research.studies import silverbox_results as reporting
+from research.studies.silverbox_protocol import N_GIVEN_OUTPUTS, SETTINGS, TESTS, ProtocolOutcome
 
 ROOT = Path(__file__).parents[2]
 MANUAL = ROOT / "docs" / "silverbox.md"
@@ -25,7 +25,7 @@ MANUAL = ROOT / "docs" / "silverbox.md"
 
 def test_sections_are_those_of_the_benchmark():
     samples = np.arange(131_072.0)
-    sections = module.cut(SilverboxRecord(samples, -samples))
+    sections = module.split_record(SilverboxRecord(samples, -samples))
     # nonlinear_benchmarks: u[40650:127400] of which the first 75 % train, u[100:40575], and of that 32,000.
     whole = samples[40_650:127_400]
     expected = {
@@ -57,7 +57,7 @@ def outcome(**changes):
         "beliefs": {},
         "arrow_error": np.zeros(3),
     }
-    return Outcome(**{**values, **changes})
+    return ProtocolOutcome(**{**values, **changes})
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_samples_until_the_error_stays_close(errors, samples):
 
 
 def test_the_submission_line():
-    assert reporting.submission([0.25149, 0.3, 1.0]) == "[0.251; 0.300; 1.000]"
+    assert reporting.submission_line([0.25149, 0.3, 1.0]) == "[0.251; 0.300; 1.000]"
 
 
 # --- The rules, on a simulated oscillator --------------------------------------------------------------------------
@@ -109,10 +109,10 @@ def test_a_simulation_knows_no_more_than_the_first_outputs(simulated):
     estimator, _, _ = module.identify(SETTINGS["ODE spline"], training, 2500)
     error = module.simulation_error(estimator, test)
     unknown = test.y.copy()
-    unknown[GIVEN:] = 7.0
+    unknown[N_GIVEN_OUTPUTS:] = 7.0
     other = module.simulation_error(estimator, Regime("test", test.u, unknown))
     np.testing.assert_allclose(error + test.y, other + unknown, rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(error[:GIVEN], 0.0)
+    np.testing.assert_array_equal(error[:N_GIVEN_OUTPUTS], 0.0)
     assert 2.5e-4 < module.rmse(error) < 1e-3
 
 
@@ -152,7 +152,7 @@ def test_selection_uses_the_training_section_only(record, monkeypatch, capsys):
     )
     monkeypatch.setattr(reporting, "PROCESS_NOISES", (1e-4,))
     monkeypatch.setattr(reporting, "SUBSTEPS", (2,))
-    scores = reporting.select()
+    scores = reporting.compare_on_validation()
     assert {model: list(row) for model, row in scores.items()} == {"ODE linear": ["default", "100 µV", "2 steps"]}
     (default, covers), (noisy, too_wide), (coarse, _) = scores["ODE linear"].values()
     assert default < 0.36e-3 < noisy
@@ -164,7 +164,7 @@ def test_selection_uses_the_training_section_only(record, monkeypatch, capsys):
 
 # --- On the record -------------------------------------------------------------------------------------------------
 
-FEW = ("paper as published", "paper structured", "NLARX offset", *reporting.SUBMITTED)
+FEW = ("paper as published", "paper structured", "NLARX offset", *reporting.SUBMITTED_SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -251,8 +251,8 @@ def test_the_manual_shows_what_is_printed(results):
         row = next(line for line in manual.splitlines() if line.startswith(f"{name}  "))
         assert row.removeprefix(name).split()[:3] == [f"{error:.3f}" for error in triple(results[0], name)]
     printed = [str(part) for part in results[2]]
-    for name in reporting.SUBMITTED:
-        line = f"  {name:24} {reporting.submission(triple(results[0], name))}"
+    for name in reporting.SUBMITTED_SETTINGS:
+        line = f"  {name:24} {reporting.submission_line(triple(results[0], name))}"
         assert line in printed
         assert line in manual
 

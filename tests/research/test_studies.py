@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from agents.evaluation.batch import TESTED
 from agents.evaluation.metrics import fisher_information_gain
 from agents.evaluation.policy_evaluation import run_episodes
+from agents.evaluation.track_batch import TEST_OPTIONS
 from agents.policies import make_policy
-from agents.studies import baselines, pendulum, robustness
+from research.studies import changed_options, iosmc_pendulum, sb3_baselines
 
 
 def test_the_pendulum_is_the_published_one_and_its_posterior_exact():
-    played, beliefs, truth, experiment = run_episodes("uniform", pendulum.TRACK, 64, 0, TESTED)
+    played, beliefs, truth, experiment = run_episodes("uniform", iosmc_pendulum.TRACK, 64, 0, TEST_OPTIONS)
     u, (ahead, w) = played.inputs.T, np.moveaxis(played.outputs, 2, 0).swapaxes(1, 2)
     h, start = 0.05, np.zeros((64, 1))
     q, velocity = (np.concatenate([start, seen], axis=1) for seen in (ahead - w, w / h))
@@ -40,35 +40,35 @@ def test_the_pendulum_is_the_published_one_and_its_posterior_exact():
 
 @pytest.mark.parametrize("policy", ["uniform", "prbs"])
 def test_signals_gain_what_is_published(policy):
-    mean, std = pendulum.PUBLISHED[policy]
-    found = pendulum.gains(policy, 256)[0][pendulum.SAMPLE - 1]
+    mean, std = iosmc_pendulum.PUBLISHED[policy]
+    found = iosmc_pendulum.information_gains(policy, 256)[0][iosmc_pendulum.PUBLISHED_SAMPLE - 1]
     assert abs(found.mean() - mean) < 4 * std * np.sqrt(1 / 256 + 1 / 1024) + 0.005
     assert found.std() == pytest.approx(std, rel=0.2)
 
 
 def test_policies_are_judged_beside_the_planner():
     track, options = "duffing_env/Amplitude-v0", {"horizon": 24, "max_input": 0.05}
-    planned, signal, again = robustness.judge(track, options, ("prbs", "efe"), 4)
+    planned, signal, again = changed_options.compare_with_planner(track, options, ("prbs", "efe"), 4)
     assert (planned["efficiency"] == 1.0).all()
     np.testing.assert_array_equal(again["efficiency"], planned["efficiency"])
     expected = np.exp((signal["fisher_gain"] - planned["fisher_gain"]) / 2)
     np.testing.assert_allclose(signal["efficiency"], expected)
     assert signal["efficiency"].mean() < 1.0
-    assert robustness.own("Power", 0) == "ppo/power"
-    assert robustness.own("Power", 1) == "ppo/power-v1"
+    assert changed_options.shipped_policy_name("Power", 0) == "ppo/power"
+    assert changed_options.shipped_policy_name("Power", 1) == "ppo/power-v1"
 
 
 @pytest.mark.parametrize("cases", [(9,), (0,), ()])
 def test_cases_that_are_none_are_refused(cases):
     with pytest.raises(ValueError, match=r"cases must be of \[1, 2, 3, 4\], but are \["):
-        robustness.Config(cases=cases)
+        changed_options.Config(cases=cases)
     with pytest.raises(ValueError, match=r"versions must be of \[0, 1\], but are \[2\]"):
-        robustness.Config(versions=(2,))
+        changed_options.Config(versions=(2,))
 
 
 def test_an_algorithm_as_it_comes_is_trained_and_saved(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    baselines.main(baselines.Config("ppo", steps=100))
+    sb3_baselines.main(sb3_baselines.Config("ppo", steps=100))
     policy = make_policy("runs/sb3-ppo-short-v0-0")
     assert policy.card["steps"] == 2048  # a roll-out of PPO as it comes
     assert policy.predict(np.zeros((50, 22)), deterministic=True)[0].shape == (50, 1)

@@ -1,4 +1,4 @@
-"""Environments as a network with features sees them: `agents.policies.features` in place of observations."""
+"""Environments as a network with features sees them: `agents.policies.networks.rollout_features` in place of observations."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from agents.policies.features import BOUND, FeatureMap, Features
-from agents.vec_env import DuffingVecEnv
+from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncoder, ShieldedFeatures
+from agents.sb3_vec_env import DuffingVecEnv
 
 #: Rewards are scaled to returns of about 1, where a critic begins.
 REWARD_SCALE = 5.0
@@ -34,7 +34,7 @@ class FeatureNormalizer:
 
     def __call__(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Normalised features, at most `BOUND` in size."""
-        return np.clip((values - self.mean) / self.std, -np.float32(BOUND), np.float32(BOUND))
+        return np.clip((values - self.mean) / self.std, -np.float32(MAX_FEATURE), np.float32(MAX_FEATURE))
 
     def to_tensors(self) -> dict[str, npt.NDArray[Any]]:
         """By the names that a policy's file has them under."""
@@ -81,12 +81,12 @@ class FeatureVecEnv(VecEnvWrapper):
     def __init__(
         self, venv: DuffingVecEnv, *, raw_observation: bool = True, levels: int = 0, reward_in_nats: bool = True
     ) -> None:
-        self._feature_map = FeatureMap.of(venv.envs.unwrapped, own=raw_observation)
+        self._feature_map = FeatureEncoder.of(venv.envs.unwrapped, with_observation=raw_observation)
         self.features = self._feature_map.describe()
         self.normalizer = FeatureNormalizer(self._feature_map.size)
         self._shaping_weight = np.float32(reward_in_nats and has_shaping_potential(venv.envs.unwrapped))
         self._discrete_actions = np.linspace(-1.0, 1.0, levels) if levels else None
-        space = gym.spaces.Box(-BOUND, BOUND, (self._feature_map.size,), np.float32)
+        space = gym.spaces.Box(-MAX_FEATURE, MAX_FEATURE, (self._feature_map.size,), np.float32)
         super().__init__(venv, space, gym.spaces.Discrete(levels) if levels else venv.action_space)
 
     @property
@@ -95,7 +95,7 @@ class FeatureVecEnv(VecEnvWrapper):
         return {"setting": self._feature_map.to_tensor(), **self.normalizer.to_tensors()}
 
     @property
-    def current_features(self) -> Features:
+    def current_features(self) -> ShieldedFeatures:
         """What the environments show now, not normalised."""
         return self._current_features
 
@@ -110,11 +110,11 @@ class FeatureVecEnv(VecEnvWrapper):
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Take what the network chose."""
         choices = actions[:, 0] if self._discrete_actions is None else self._discrete_actions[actions]
-        self.venv.step_async(self._current_features.act(choices))
+        self.venv.step_async(self._current_features.to_actions(choices))
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows."""
-        potential_before = self._current_features.to_come
+        potential_before = self._current_features.remaining_information
         observations, rewards, dones, infos = self.venv.step_wait()
         ended = np.flatnonzero(dones)
         if len(ended):
@@ -122,7 +122,7 @@ class FeatureVecEnv(VecEnvWrapper):
             for row, values in zip(ended, self.normalizer(last), strict=True):
                 infos[row] |= {"terminal_observation": values, "TimeLimit.truncated": False}
         normalised = self._to_features(observations)
-        potential = np.where(dones, np.float32(0), self._current_features.to_come)
+        potential = np.where(dones, np.float32(0), self._current_features.remaining_information)
         return (
             normalised,
             np.float32(REWARD_SCALE) * (rewards + self._shaping_weight * (potential - potential_before)),

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from agents.evaluation.batch import make
-from agents.policies.features import BOUND, FeatureMap, Features
+from agents.evaluation.track_batch import make_track_batch
+from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncoder, ShieldedFeatures
+from agents.sb3_vec_env import BatchVecEnv, info_of_row, infos_by_row
 from agents.training.environments.feature_vec_env import REWARD_SCALE, FeatureNormalizer, has_shaping_potential
-from agents.vec_env import BatchVecEnv, rows_of, told_of
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.checks import shown
 from estimator.lanes import LANES
@@ -50,17 +50,17 @@ class _RowGroup:
         self, rng: np.random.Generator, draw: DrawOptions, options: dict[str, Any], raw_observation: bool
     ) -> None:
         env_id, drawn = draw(rng)
-        self.envs: DuffingVectorEnv = make(env_id, LANES, drawn | options)
-        self.feature_map = FeatureMap.of(self.envs, own=raw_observation)
+        self.envs: DuffingVectorEnv = make_track_batch(env_id, LANES, drawn | options)
+        self.feature_map = FeatureEncoder.of(self.envs, with_observation=raw_observation)
         observations, self.infos = self.envs.reset(seed=int(rng.integers(2**31)))
-        self.current_features: Features = self.feature_map(observations)
+        self.current_features: ShieldedFeatures = self.feature_map(observations)
         self.samples_left = self.envs.horizon
         self.weight = np.float32(has_shaping_potential(self.envs))
 
     def row_infos(self, **extra: Any) -> list[dict[str, Any]]:
         """The infos of its rows at the last reset or step."""
         single = self.envs.single_env_class
-        return rows_of(self.infos, (*single._info_gains, *single._info_flags), LANES, **extra)
+        return infos_by_row(self.infos, (*single._info_gains, *single._info_flags), LANES, **extra)
 
 
 class MixedVecEnv(BatchVecEnv):
@@ -104,7 +104,7 @@ class MixedVecEnv(BatchVecEnv):
         self.features = first.describe() if raw_observation else {"own": False}
         self.normalizer = FeatureNormalizer(first.size)
         space = gym.spaces.Discrete(levels) if levels else gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-        seen = gym.spaces.Box(-BOUND, BOUND, (first.size,), np.float32)
+        seen = gym.spaces.Box(-MAX_FEATURE, MAX_FEATURE, (first.size,), np.float32)
         super().__init__(num_envs, seen, space)
         self._choices = np.zeros(num_envs)
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64)
@@ -142,21 +142,21 @@ class MixedVecEnv(BatchVecEnv):
         rows: list[dict[str, Any]] = []
         for g, group in enumerate(self._groups):
             group_rows = slice(g * LANES, (g + 1) * LANES)
-            potential_before = group.current_features.to_come
-            actions = group.current_features.act(self._choices[group_rows])
+            potential_before = group.current_features.remaining_information
+            actions = group.current_features.to_actions(self._choices[group_rows])
             observations, group_rewards, terminated, truncated, group.infos = group.envs.step(actions)
             ended = terminated | truncated
             rows += group.row_infos(**{"TimeLimit.truncated": False})
             group.current_features = group.feature_map(observations)
             group.samples_left -= 1
-            potential = np.where(ended, np.float32(0), group.current_features.to_come)
+            potential = np.where(ended, np.float32(0), group.current_features.remaining_information)
             rewards[group_rows] = REWARD_SCALE * (group_rewards + group.weight * (potential - potential_before))
             self._returns[group_rows] += group_rewards
             self._lengths[group_rows] += 1
             dones[group_rows] = ended | (group.samples_left == 0)
             for row in np.flatnonzero(dones[group_rows]).tolist():
                 env_row = g * LANES + row
-                rows[env_row] |= (told_of(group.infos["final_info"], row) if ended[row] else {}) | {
+                rows[env_row] |= (info_of_row(group.infos["final_info"], row) if ended[row] else {}) | {
                     "terminal_observation": self.normalizer(group.current_features.values[row]),
                     "TimeLimit.truncated": bool(not ended[row]),
                     "episode": {

@@ -17,7 +17,7 @@ from agents.hardware.next_experiment import design_experiment
 from agents.hardware.run_settings import RunSettings
 from agents.hardware.simulated_plant import SimulatedPlant
 from agents.hardware.simulated_plant import plant as simulated
-from agents.planner.futures import rests
+from agents.planning.open_loop.posterior_samples import equilibria
 from estimator import OnlineEstimator, identify, load_estimator, save_estimator
 from estimator.identification.beliefs import disturbance
 from estimator.identification.tables import read_table
@@ -80,7 +80,7 @@ def test_an_oscillator_rests_where_its_forces_are_in_balance():
     names = list(model.coefficients)
 
     def at(**values):
-        return sorted(rests(model, np.array([values.get(name, 0.0) for name in names])))
+        return sorted(equilibria(model, np.array([values.get(name, 0.0) for name in names])))
 
     assert at(stiffness=0.1, cubic=1.0) == [0.0]
     np.testing.assert_allclose(at(stiffness=-0.1, cubic=0.4, force=-0.02, output_offset=0.2), [-0.3, 0.7])

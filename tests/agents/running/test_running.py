@@ -25,8 +25,8 @@ from agents.hardware.plant_interface import load_plant
 from agents.hardware.run_estimator import RunEstimator
 from agents.hardware.safety_session import SafetyStop, Session
 from agents.hardware.simulated_plant import SimulatedPlant
-from agents.planner.futures import Futures
-from agents.policies.signals import holds
+from agents.planning.open_loop.posterior_samples import MonteCarloSystems
+from agents.policies.signals import hold_for_resonance
 from estimator import Channel, OnlineEstimator, Rig, identify
 from estimator.free_run import free_run
 from estimator.identification.beliefs import refit
@@ -307,7 +307,7 @@ def test_where_a_fit_of_all_blocks_begins_does_not_matter():
 
 def test_signals_are_as_slow_as_the_rig():
     follower = RunEstimator(RIG)
-    hold = holds(follower.belief, 256)
+    hold = hold_for_resonance(follower.belief, 256)
     assert hold in (2, 3), "1.9 Hz at 50 Hz are 27 samples a period; the Silverbox has 9"
     policy = make_policy("prbs", EnvView(RIG, follower.belief, 256), seed=0)
     actions, state = [], None
@@ -339,9 +339,9 @@ def listened(rig, truth, seed):
 def test_the_probability_of_leaving_grows_with_the_input():
     follower, _ = listened(RIG, TRUTH, 0)
     rng = np.random.default_rng(0)
-    futures = Futures(follower.online.model, follower.draw_systems(rng), 1.0, rng)
+    futures = MonteCarloSystems(follower.online.model, follower.draw_systems(rng), 1.0, rng)
     u = np.repeat([1.0, -1.0], 16)
-    found = [futures.probability(share * u) for share in (0.0, 1.0, 5.0, 30.0)]
+    found = [futures.violation_probability(share * u) for share in (0.0, 1.0, 5.0, 30.0)]
     assert found[0] < 0.01
     assert found == sorted(found)
     assert found[-1] > 0.9
@@ -353,23 +353,25 @@ def test_the_probability_of_leaving_grows_with_the_input():
 def test_the_draws_that_leave_are_those_whose_outputs_do():
     follower, _ = listened(RIG, TRUTH, 0)
     rng = np.random.default_rng(0)
-    futures = Futures(follower.online.model, follower.draw_systems(rng), 1.0, rng)
+    futures = MonteCarloSystems(follower.online.model, follower.draw_systems(rng), 1.0, rng)
     u = 3.0 * np.repeat([1.0, -1.0], 16)
     process, sensor = futures.disturbances(len(u))
     draws = zip(futures.coefficients, process, futures.states, strict=True)
     outputs = np.array([free_run(futures.model, c, u + w, x) for c, w, x in draws])
     leaving = np.flatnonzero(~(np.abs(outputs + sensor) <= 1.0).all(axis=1)).tolist()  # NaN has run away
     assert 20 < len(leaving) < 280
-    assert futures.leaving(u, 1000) == leaving
-    assert futures.leaving(u, 7) == leaving[:7]
+    assert futures.violating_draws(u, 1000) == leaving
+    assert futures.violating_draws(u, 7) == leaving[:7]
     most = binomtest(len(leaving), len(outputs), alternative="less").proportion_ci(0.95).high
-    assert futures.probability(u) == futures.chance(len(leaving)) == pytest.approx(most, rel=1e-9)
-    assert futures.leaving(u, 1000, planned=leaving[:9]) == leaving[9:]
-    assert futures.chance(0, planned=200) == pytest.approx(1 - 0.05 ** (1 / (len(outputs) - 200)), rel=1e-9)
+    assert futures.violation_probability(u) == futures.probability_bound(len(leaving)) == pytest.approx(most, rel=1e-9)
+    assert futures.violating_draws(u, 1000, planned=leaving[:9]) == leaving[9:]
+    assert futures.probability_bound(0, n_planned=200) == pytest.approx(
+        1 - 0.05 ** (1 / (len(outputs) - 200)), rel=1e-9
+    )
     for bound in (0.003, 0.01, 0.0125, 0.05, 0.5):
-        enough = futures.enough(bound)
-        assert futures.chance(enough) >= bound > futures.chance(enough - 1) or enough == 1
-        assert (futures.probability(u, bound) < bound) == (futures.chance(len(leaving)) < bound)
+        enough = futures.min_violations_for(bound)
+        assert futures.probability_bound(enough) >= bound > futures.probability_bound(enough - 1) or enough == 1
+        assert (futures.violation_probability(u, bound) < bound) == (futures.probability_bound(len(leaving)) < bound)
 
 
 def test_a_belief_that_cannot_be_safe_is_not_played(tmp_path):
@@ -396,7 +398,7 @@ def test_blocks_leave_the_range_as_rarely_as_asked(policy):
         truth["m"] = float(np.exp(np.log(low * high) / 2 + np.log(high / low) / 2 / HALF_WIDTH * rng.standard_normal()))
         follower, plant = listened(rig, truth, k)
         observed = EnvView(rig, follower.belief, 64)
-        futures = Futures(follower.online.model, follower.draw_systems(rng), 1.0, rng)
+        futures = MonteCarloSystems(follower.online.model, follower.draw_systems(rng), 1.0, rng)
         u, _, probability = block_designer(make_policy(policy, observed, seed=k), observed).block(64, futures, 0.05)
         _, y = plant.play(40.0 * u)
         left += bool((np.abs(y) > 0.08).any())

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.studies.silverbox_protocol import LENGTHS, SETTINGS, TESTS, TRAINING_SAMPLES, Outcome, Sections, evaluate
 from benchmarks import peer_process, silverbox_comparison, silverbox_peer_filters
 from benchmarks.peer_process import NotAvailable, Peers
 from benchmarks.silverbox_comparison import MODELS, OFFLINE, PEERS, Contender
@@ -15,6 +14,15 @@ from benchmarks.timed_rounds import Result
 from duffing_env.plants.silverbox_record import Regime
 from estimator import OnlineEstimator
 from estimator.belief import Belief
+from research.studies.silverbox_protocol import (
+    SETTINGS,
+    TESTS,
+    TRAINING_LENGTHS,
+    TRAINING_SAMPLES,
+    ProtocolOutcome,
+    Sections,
+    evaluate,
+)
 
 
 def time(*values: float) -> Result:
@@ -59,15 +67,15 @@ class Learned:
 
 
 @pytest.fixture(scope="module")
-def outcomes() -> dict[str, Outcome]:
+def outcomes() -> dict[str, ProtocolOutcome]:
     errors = dict.fromkeys(TESTS, 4e-4)
     beliefs = {TRAINING_SAMPLES: Learned()}
-    outcome = Outcome(errors, 1e-4, 0.9, 1e-6, 0.0, {50: 4e-4}, beliefs, np.zeros(3))  # type: ignore[arg-type]
+    outcome = ProtocolOutcome(errors, 1e-4, 0.9, 1e-6, 0.0, {50: 4e-4}, beliefs, np.zeros(3))  # type: ignore[arg-type]
     return {ours: outcome for ours in MODELS.values()}
 
 
 @pytest.fixture(scope="module")
-def given(sections: Sections, outcomes: dict[str, Outcome]) -> dict[str, np.ndarray]:
+def given(sections: Sections, outcomes: dict[str, ProtocolOutcome]) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in silverbox_comparison.given(sections, outcomes).items()}
 
 
@@ -120,9 +128,9 @@ def test_a_peer_that_answers_our_means_gets_our_errors(
 ) -> None:
     ours = MODELS[name]
     lengths = (500, 3000)
-    monkeypatch.setattr("agents.studies.silverbox_protocol.LENGTHS", lengths)
-    monkeypatch.setattr("agents.studies.silverbox_protocol.TRAINING_SAMPLES", 3000)
-    monkeypatch.setattr("agents.studies.silverbox_protocol.TIMINGS", 1)
+    monkeypatch.setattr("research.studies.silverbox_protocol.TRAINING_LENGTHS", lengths)
+    monkeypatch.setattr("research.studies.silverbox_protocol.TRAINING_SAMPLES", 3000)
+    monkeypatch.setattr("research.studies.silverbox_protocol.N_TIMINGS", 1)
     monkeypatch.setattr(silverbox_comparison, "LENGTHS", lengths)
     monkeypatch.setattr(silverbox_comparison, "TRAINING_SAMPLES", 3000)
     outcome = evaluate(SETTINGS[ours], sections)
@@ -144,8 +152,8 @@ def test_a_peer_that_answers_our_means_gets_our_errors(
         assert contender.learning[samples] == pytest.approx(outcome.learning[samples], rel=max(tolerance, 1e-3))
 
 
-def test_means_that_are_not_finite_have_no_errors(sections: Sections, outcomes: dict[str, Outcome]) -> None:
-    answer = {"means": [[np.nan] * 9] * len(LENGTHS), "forecasts": None}
+def test_means_that_are_not_finite_have_no_errors(sections: Sections, outcomes: dict[str, ProtocolOutcome]) -> None:
+    answer = {"means": [[np.nan] * 9] * len(TRAINING_LENGTHS), "forecasts": None}
     contender = silverbox_comparison.judge("three-tap", answer, time(1.0), sections, outcomes)
     assert all(np.isnan(error) for error in [*contender.errors.values(), contender.coverage])
     assert contender.to_dict()["samples_until_1_mV"] is None
@@ -187,7 +195,10 @@ def test_speed_counts_at_equal_or_better_errors() -> None:
 
 
 def test_missing_peers_are_rows_that_say_so(
-    sections: Sections, outcomes: dict[str, Outcome], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    sections: Sections,
+    outcomes: dict[str, ProtocolOutcome],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
 ) -> None:
     monkeypatch.setattr(peer_process, "ensure_environment", lambda: Path(sys.executable))
     monkeypatch.setattr(silverbox_comparison, "REPETITIONS", 1)
@@ -206,7 +217,9 @@ def test_missing_peers_are_rows_that_say_so(
     assert "not available: dynamax EKF, ODE linear" in printed
 
 
-def test_without_peers_the_table_says_so(sections: Sections, outcomes: dict[str, Outcome], tmp_path: Path) -> None:
+def test_without_peers_the_table_says_so(
+    sections: Sections, outcomes: dict[str, ProtocolOutcome], tmp_path: Path
+) -> None:
     with Peers(tmp_path / "given.npz", wanted=False) as peers:
         assert silverbox_comparison._offline(peers, sections).reason == "--no-peers"
         with pytest.raises(NotAvailable, match="--no-peers"):

@@ -1,0 +1,294 @@
+"""The best ways through the map of a model's state, compiled: a plan, built move by move.
+
+As by dynamic programming, of all ways that lead into the same cell of the plane of the first two states only the best
+is followed; and of these, so many of the best. So a long plan is found in the time of a short one. A way goes on with
+the highest input, the lowest, none, and half of either, since near its limit a signal may be led too far by a whole
+push and not far enough by none. In its first moves, which will be played, quarters are tried, too. Far ahead, where the
+plan will be made anew, only the highest and the lowest are, and fewer ways are followed.
+A way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of the
+last plans. Without the latter a way would be praised for what every way teaches sooner or later.
+
+The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
+line. Each state is measured by its size when the first sensor is at its limit (`agents.planning.model_probe.TimeScales`). Other
+states, and older inputs, are followed with their way, and do not tell ways apart.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.planning.belief_rollout import compile_belief_rollout
+from agents.planning.candidate_inputs import INPUT_FRACTIONS, allowed_input, next_uniform
+from estimator.arrays import aligned, copy, highest
+from estimator.engine.imagination import imagination
+from estimator.lanes import LANES, jit, lanewise, part
+from estimator.models.model import Model
+from estimator.straight import straight
+
+#: Where not all inputs are tried, so many are, and far ahead so many.
+_N_INPUTS_NEAR, _N_INPUTS_FAR = 5, 2
+
+#: Sizes that are tried of a first input whose direction is given and that is held for one sample, in parts of the
+#: largest.
+_FIRST_INPUT_SIZES = (1.0, 0.75, 0.5, 0.25)
+
+#: A way this much [nats] worse than the best of its length is followed no further.
+_PRUNE_GAP = 0.5
+
+#: Halvings of that in which a score is searched that no more than so many ways reach.
+_N_BISECTIONS = 12
+
+
+class GridBeamSearch(NamedTuple):
+    """Compiled functions of one model.
+
+    Attributes:
+        workspace: ``workspace(horizon, beam_width)``: a `BeamWorkspace` for plans of so many moves and so many ways, which are a multiple
+            of `LANES`.
+        find_best_plan: ``find_best_plan(workspace, task, found, rng_state)``: the best way, a plan ``found`` (horizon,). The map is laid anew at
+            random every time.
+    """
+
+    workspace: Any
+    find_best_plan: Any
+
+
+class BeamWorkspace(NamedTuple):
+    """What is written on.
+
+    Attributes:
+        beam_width: blocks of the ways that are followed.
+        continuations: blocks of their continuations.
+        parents: (horizon, ways) of which way each continues.
+        inputs: (horizon, ways) with which input.
+        scores: (len(`CHOICES`) ways,) of the best continuations into the cells that any leads into.
+        best_continuations: (len(`CHOICES`) ways,) which these are.
+        visited_cells: (len(`CHOICES`) ways,) which cells.
+        source_offsets: (ways,) where the continuations begin that become ways.
+    """
+
+    beam_width: Any
+    continuations: Any
+    parents: Any
+    inputs: Any
+    scores: Any
+    best_continuations: Any
+    visited_cells: Any
+    source_offsets: Any
+
+
+class SearchProblem(NamedTuple):
+    """What is searched for, of one environment.
+
+    Attributes:
+        record: the belief.
+        samples_left: samples left in the episode.
+        n_moves: moves of the plan.
+        hold_samples: samples of a move.
+        objective: `agents.planning.belief_rollout.PlanObjective`.
+        previous_inputs: (2,) the inputs that were applied last, newest first.
+        information_factor: (K, K) factor of the information per sample that is to come.
+        cells: of the map along each axis.
+        n_moves_all_inputs: moves for which all inputs are tried.
+        n_moves_some_inputs: moves up to which whole and half ones are; then the highest and the lowest alone.
+        beam_width: that are followed, at most.
+        far_beam_width: of these, beyond ``n_moves_some_inputs`` moves.
+        first_direction: where the first input goes: 1.0 up, -1.0 down, 0.0 there is none, NaN anywhere.
+        mirror_sign: -1.0 turns the map over.
+    """
+
+    record: Any
+    samples_left: int
+    n_moves: int
+    hold_samples: int
+    objective: Any
+    previous_inputs: Any
+    information_factor: Any
+    cells: int
+    n_moves_all_inputs: int
+    n_moves_some_inputs: int
+    beam_width: int
+    far_beam_width: int
+    first_direction: float
+    mirror_sign: float
+
+
+@cache
+def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> GridBeamSearch:
+    """The ways through the map of a model; arguments as `estimator.engine.imagination.imagination`."""
+    rollout = compile_belief_rollout(model, degree, lag)
+    size, n_carried, U, SCORE = rollout.size, rollout.kept, rollout.input_row, rollout.score_row
+    load_belief, advance, evaluate = rollout.load_belief, rollout.advance, rollout.evaluate
+    states = {"FIRST": 0, "SECOND": 1, "CELL": imagination(model, degree, lag).layout["CELL"]}
+    CELL = states["CELL"] * LANES
+    in_line = lanewise(states, "CELL", uniform="sign right cells scale")(_cell_on_line)
+    in_plane = lanewise(states, "CELL", uniform="sign right up cells scale other")(_cell_in_plane)
+    is_plane = model.n_states > 1
+    compile_inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
+
+    @compile_inner
+    def workspace(horizon, beams):
+        blocks = beams // LANES
+        beam_blocks, continuations = aligned(blocks, size), aligned(len(INPUT_FRACTIONS) * blocks, size)
+        parents, inputs = np.empty((horizon, beams), np.int64), np.empty((horizon, beams))
+        most = len(INPUT_FRACTIONS) * beams
+        scores, best_continuations, visited_cells = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
+        return BeamWorkspace(
+            beam_blocks,
+            continuations,
+            parents,
+            inputs,
+            scores,
+            best_continuations,
+            visited_cells,
+            np.empty(beams, np.int64),
+        )
+
+    @compile_inner
+    def select_beams(memory, h, most, found):
+        """Make the best of the continuations the new ways, and note where they come from; gives their number.
+
+        Into ``found`` cells leads any; the scores become those of the ways.
+        """
+        beams, continuations, parents, inputs, scores, best_continuations, _, source_offsets = memory
+        threshold = score_threshold(scores[:found], most)
+        count = 0
+        for i in range(found):
+            if scores[i] >= threshold and count < most:
+                b, j = best_continuations[i] // LANES, best_continuations[i] % LANES
+                parents[h, count] = b // len(INPUT_FRACTIONS) * LANES + j
+                inputs[h, count] = continuations[b, U + j]
+                scores[count], source_offsets[count] = scores[i], b * size + j
+                count += 1
+        # Lanes beyond the last way do the same work as the others, so that none of them runs wild.
+        for lane in range(count, -(-count // LANES) * LANES):
+            source_offsets[lane] = source_offsets[lane // LANES * LANES]
+        flat_values = continuations.reshape(-1)
+        for block in range(-(-count // LANES)):
+            for row in range(0, n_carried, LANES):
+                for lane in range(LANES):
+                    beams[block, row + lane] = flat_values[source_offsets[block * LANES + lane] + row]
+        return count
+
+    @compile_inner
+    def find_best_plan(memory, problem, found, rng_state):
+        """Build a plan by the best ways into the cells of the map, which is laid anew at random every time."""
+        beams, continuations, parents, inputs, scores, best_continuations, visited_cells, _ = memory
+        record, objective, information_factor, hold_samples = (
+            problem.record,
+            problem.objective,
+            problem.information_factor,
+            problem.hold_samples,
+        )  # once: each time they would be counted
+        cell_entries = np.full(problem.cells * problem.cells if is_plane else problem.cells, -1)
+        offset_x, offset_y = next_uniform(rng_state), next_uniform(rng_state)
+        load_belief(beams[0], record, problem.previous_inputs)
+        count = 1
+        for h in range(problem.n_moves):
+            n_reached = 0
+            has_direction = h == 0 and problem.first_direction == problem.first_direction
+            n_inputs = (
+                len(INPUT_FRACTIONS)
+                if h < problem.n_moves_all_inputs
+                else _N_INPUTS_NEAR
+                if h < problem.n_moves_some_inputs
+                else _N_INPUTS_FAR
+            )
+            if has_direction:
+                n_inputs = len(_FIRST_INPUT_SIZES) if problem.first_direction != 0.0 and hold_samples == 1 else 1
+            for i in range(n_inputs * (-(-count // LANES))):
+                block, choice = i // n_inputs, i % n_inputs
+                b = block * len(INPUT_FRACTIONS) + choice
+                W = continuations[b]
+                copy(W, 0, beams[block], n_carried)
+                for j in range(LANES):
+                    W[U + j] = (
+                        first_input(choice, problem) if has_direction else allowed_input(choice, W[U + j], objective)
+                    )
+                for _ in range(hold_samples):
+                    advance(W, record, objective)
+                evaluate(W, information_factor, np.sqrt(max(0, problem.samples_left - (h + 1) * hold_samples)))
+                if is_plane:
+                    in_plane(
+                        W,
+                        problem.mirror_sign,
+                        offset_x,
+                        offset_y,
+                        problem.cells,
+                        objective.scales[0],
+                        objective.scales[1],
+                    )
+                else:
+                    in_line(W, problem.mirror_sign, offset_x, problem.cells, objective.scales[0])
+                for j in range(min(LANES, count - block * LANES)):
+                    cell = np.int64(W[CELL + j])
+                    if cell_entries[cell] < 0:
+                        cell_entries[cell] = n_reached
+                        visited_cells[n_reached], scores[n_reached] = cell, -np.inf
+                        n_reached += 1
+                    at = cell_entries[cell]
+                    if W[SCORE + j] > scores[at]:
+                        scores[at], best_continuations[at] = W[SCORE + j], b * LANES + j
+            for i in range(n_reached):
+                cell_entries[visited_cells[i]] = -1
+            count = select_beams(
+                memory, h, problem.beam_width if h < problem.n_moves_some_inputs else problem.far_beam_width, n_reached
+            )
+        beam = highest(scores, count)
+        for h in range(problem.n_moves - 1, -1, -1):
+            found[h] = inputs[h, beam]
+            beam = parents[h, beam]
+
+    return GridBeamSearch(workspace, find_best_plan)
+
+
+@jit
+def first_input(size_index, problem):
+    """One of the first inputs in the direction that is given."""
+    return problem.first_direction * _FIRST_INPUT_SIZES[size_index] * problem.objective.amplitude
+
+
+@jit
+def score_threshold(scores, max_count):
+    """A score that no more than ``max_count`` of them reach, but where more are the highest, and none that is hopeless."""
+    high = scores[highest(scores, len(scores))]
+    low = high - _PRUNE_GAP
+    if _count_reaching(scores, low) <= max_count:
+        return low
+    for _ in range(_N_BISECTIONS):
+        middle = 0.5 * (low + high)
+        if _count_reaching(scores, middle) > max_count:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@jit
+def _count_reaching(scores, threshold):
+    """How many scores are as high or higher."""
+    count = 0
+    for i in range(len(scores)):
+        count += scores[i] >= threshold
+    return count
+
+
+@straight
+def _axis_cell(x, scale, cells, offset):
+    """The cell along one axis; the first for a state that is not a number."""
+    position = (x / scale + 1.0) * 0.5 * (cells - 1) + offset
+    return math.floor(min(position, cells - 1.0)) if position > 0.0 else 0.0
+
+
+def _cell_on_line(FIRST, sign, right, cells, scale):
+    """The cell of a state of one number."""
+    return _axis_cell(sign * FIRST, scale, cells, right)
+
+
+def _cell_in_plane(FIRST, SECOND, sign, right, up, cells, scale, other):
+    """The cell of a state, of which the first two numbers count."""
+    return _axis_cell(sign * FIRST, scale, cells, right) * cells + _axis_cell(sign * SECOND, other, cells, up)

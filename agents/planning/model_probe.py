@@ -1,0 +1,363 @@
+"""What policies read off an observation, of any model: coefficients and states, resonance, velocity, sizes of states.
+
+Time is counted in samples: a frequency is in cycles per sample, a velocity in what the first sensor changes by in one.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from duffing_env.storage.kernel_spec import observation_bounds
+from estimator.arrays import copy, fill
+from estimator.belief import Belief
+from estimator.engine.motion import motion
+from estimator.lanes import kernel
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+
+
+class ModelView(NamedTuple):
+    """How a policy takes the model of an experiment.
+
+    Attributes:
+        model: that is believed.
+        degree: of the input over a sample of a differential equation.
+        lag: 1 where a difference equation takes every input a sample later.
+    """
+
+    model: Model
+    degree: int = 0
+    lag: int = 0
+
+    @classmethod
+    def of(cls, experiment: Any) -> ModelView:
+        """That of an experiment of duffing_env.
+
+        On a plant whose input goes linearly from one action to the next, a difference equation takes the input at the
+        begin of a sample, as the environment feeds it (`duffing_env.kernel_stages.env_codegen`).
+        """
+        model = experiment.model
+        if model.is_continuous:
+            return cls(model, experiment.degree)
+        return cls(model, 0, int(experiment.truth_model.is_continuous and experiment.degree == 1))
+
+    @property
+    def kind(self) -> str:
+        """What tells the functions compiled for it from those for others (`estimator.lanes.part`)."""
+        return f"{self.model.name}_{self.model.digest}_{self.degree}_{self.lag}"
+
+
+class ObservationLayout(NamedTuple):
+    """Where the entries of an observation begin.
+
+    Attributes:
+        mean: of the coefficients' means.
+        log_std: of the logarithms of their standard deviations.
+        correlation: of their correlations.
+        noise: of the logarithms of the precisions: process noise, then each sensor's.
+        state: of the states.
+        last_input: of the last input.
+        last_output: of the last outputs.
+        time_left: of the time left.
+        budget_left: of the energy left.
+        size: entries.
+    """
+
+    mean: int
+    log_std: int
+    correlation: int
+    noise: int
+    state: int
+    last_input: int
+    last_output: int
+    time_left: int
+    budget_left: int
+    size: int
+
+
+@cache
+def observation_layout(model: Model) -> ObservationLayout:
+    """Where the entries of a model's observation begin."""
+    at = {name: i for i, name in enumerate(observation_bounds(model))}
+    k, state, sensor = model.n_coefficients, next(iter(model.states)), next(iter(model.outputs))
+    return ObservationLayout(
+        0, k, 2 * k, at["log_gamma"], at[f"state_{state}"], at["last_input"], at[f"last_{sensor}"], at["time_left"],
+        at["budget_left"], len(at),
+    )  # fmt: skip
+
+
+class LocalDynamics(NamedTuple):
+    """What n systems do by themselves, at given states.
+
+    Attributes:
+        outputs_shown: (n,) what the first sensor shows.
+        velocities: (n,) its velocity.
+        input_gains: (n,) the gain (`estimator.engine.motion`).
+        jacobians: (n, states, states) of the linear part.
+        regressors: (n, K) derivatives of a sample's moves by the coefficients, under an input that is on.
+    """
+
+    outputs_shown: FloatArray
+    velocities: FloatArray
+    input_gains: FloatArray
+    jacobians: FloatArray
+    regressors: FloatArray
+
+
+@cache
+def _compile_local_dynamics(model: Model) -> Any:
+    """``local_dynamics(means, states, inputs, free_response)`` fills in a `LocalDynamics`."""
+    free_response = motion(model)
+    at, sense, linearise, regress = (
+        free_response.layout,
+        free_response.sense,
+        free_response.linearise,
+        free_response.regress,
+    )
+    n, k, size, u = model.n_states, model.n_coefficients, len(at), at["INPUT"]
+    now, velocity, gain = at["NOW"], at["VELOCITY"], at["GAIN"]
+    state, coefficient = next(iter(model.states)), next(iter(model.coefficients))
+    linear, first = at[f"A_{state}_{state}"], at[f"E_{coefficient}"]
+
+    @kernel(kind=f"{model.name}_{model.digest}")
+    def survey(means, states, inputs, found):
+        W = np.zeros(size)
+        for i in range(len(means)):
+            copy(W, 0, states[i], n)
+            copy(W, n, means[i], k)
+            W[u] = inputs
+            sense(W)
+            linearise(W)
+            regress(W)
+            found.outputs_shown[i], found.velocities[i], found.input_gains[i] = W[now], W[velocity], W[gain]
+            for a in range(n):
+                for b in range(n):
+                    found.jacobians[i, a, b] = W[linear + a * n + b]
+            copy(found.regressors[i], 0, W[first:], k)
+
+    return survey
+
+
+def local_dynamics(model: Model, means: npt.ArrayLike, states: npt.ArrayLike, u: float = 0.0) -> LocalDynamics:
+    """What systems do, at states and under an input.
+
+    Args:
+        model: of all.
+        means: (n, K) their coefficients.
+        states: (n, states) where they are.
+        u: the input.
+    """
+    coefficient_rows = np.ascontiguousarray(np.atleast_2d(means), dtype=np.float64)
+    state_rows = np.ascontiguousarray(np.atleast_2d(states), dtype=np.float64)
+    count, n, k = len(coefficient_rows), model.n_states, model.n_coefficients
+    shown, velocities, gains = np.empty((3, count))
+    found = LocalDynamics(shown, velocities, gains, np.empty((count, n, n)), np.empty((count, k)))
+    _compile_local_dynamics(model)(coefficient_rows, state_rows, float(u), found)
+    return found
+
+
+def resonance_frequencies(model: Model, jacobians: FloatArray) -> FloatArray:
+    """(n,) the frequencies in cycles per sample at which linear parts ring: the highest, or 0 where one does not."""
+    poles = np.linalg.eigvals(jacobians)
+    angles = np.abs(poles.imag if model.is_continuous else np.where(poles.imag != 0, np.angle(poles), 0.0))
+    highest: FloatArray = angles.max(axis=-1) / (2.0 * np.pi)
+    return highest
+
+
+def believed_resonance(belief: Belief) -> float:
+    """Cycles per sample at which a believed system rings in small motions: of two wells, at the bottom of one."""
+    means = belief.coefficients_mean
+    found = local_dynamics(belief.model, means, np.zeros(belief.model.n_states))
+    cycles = float(resonance_frequencies(belief.model, found.jacobians)[0])
+    if cycles <= 0.0:
+        stiffness = dict(zip(belief.names, means, strict=True)).get("stiffness", 0.0)
+        cycles = np.sqrt(2.0 * abs(stiffness)) / (2.0 * np.pi)
+    return max(cycles, 1e-9)
+
+
+def sampled_peak_fraction(belief: Belief, amplitude: float) -> float:
+    """The part of a peak that samples see at least, of a believed oscillator that swings by a displacement."""
+    means = dict(zip(belief.names, belief.coefficients_mean, strict=True))
+    square = means.get("stiffness", 0.0) + 0.75 * means.get("cubic", 0.0) * amplitude**2
+    # Half a sample from the peak; and no worse than at six samples a period.
+    return float(np.cos(min(np.sqrt(max(square, 0.0)) / 2, np.pi / 6)))
+
+
+def is_on_rig(experiment: Any) -> bool:
+    """Whether an experiment of duffing_env is one on a rig, where leaving the limit may cost more than information."""
+    return getattr(experiment, "rig", None) is not None
+
+
+def planning_limit(experiment: Any, state_scales: FloatArray) -> float:
+    """The limit that plans keep in an experiment: on a rig less than its own, by what a swing hides between samples.
+
+    Args:
+        experiment: of duffing_env.
+        state_scales: (states,) when the first sensor is at its limit.
+    """
+    limit = float(experiment.kernel_params.max_output)
+    return (
+        limit * sampled_peak_fraction(experiment.prior_belief, float(state_scales[0]))
+        if is_on_rig(experiment)
+        else limit
+    )
+
+
+#: Samples of the motion by which a system is measured, and where it turns, in parts of the limit.
+_N_PROBE_SAMPLES, _TURN_FRACTION = 128, 0.95
+
+#: The part of what a believed system's input moves that plans count on.
+_RELIABLE_STEP_FRACTION = 0.75
+
+#: Moves of the input in a period of the motion: fewer cannot follow it, more take time and look less far.
+MOVES_PER_PERIOD = 9
+
+
+class TimeScales(NamedTuple):
+    """How a system swings when it is pumped up along its velocity, and turned before the limit.
+
+    Attributes:
+        scales: (states,) sizes of the states when the first sensor is at its limit. The sensor's own state, and one
+            that keeps its last value, have the limit itself. Others, such as a velocity, have the limit times the ratio
+            of their peak to the sensor's. So they have no unit of their own to go wrong by, and are right where the
+            limit is out of reach, too.
+        hold_samples: samples that a planned input is held for, so that a plan of some moves looks some periods ahead also
+            where there are many samples in a period.
+        accumulated_noise: variance by which process noise moves the first sensor in a quarter of a period, in parts of what it
+            does to the displacement in a sample, less that sample's own. Nothing done within this time takes it back.
+        mean_information: (K, K) the mean of φ φᵀ over the samples, with φ the derivatives by the coefficients of what the first
+            sensor shows a sample later.
+        rise_time: samples until it comes near the limit; inf where it does not within `_N_PROBE_SAMPLES`.
+        step_response: by how much an input of 1 over a sample from rest moves what the first sensor shows after it.
+    """
+
+    scales: FloatArray
+    hold_samples: int
+    accumulated_noise: float
+    mean_information: FloatArray
+    rise_time: float
+    step_response: float
+
+
+@cache
+def _compile_pumped_swing(view: ModelView) -> Any:
+    """``time_scales(means, max_input, limit, peaks, mean_information)`` fills `TimeScales.mean_information`, and what the others are made of.
+
+    These are the peaks of states and sensor, samples in a period, or 0, samples until the limit is near, or 0, and how
+    far the largest input moves what the first sensor shows after a sample from rest.
+    """
+    free_response = motion(*view)
+    at, sense, glance, step = free_response.layout, free_response.sense, free_response.glance, free_response.step
+    n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
+    u, shown, velocity = at["INPUT"], at["SHOWN"], at["VELOCITY"]
+    phi = at[f"PHI_{next(iter(view.model.coefficients))}"]
+    # What pumps is a push along the motion itself: along what an accelerometer sees rise, it would brake.
+    rate, states = (view.model.rates or ("",))[0], list(view.model.states)
+    velocity = at[rate] if rate in states else velocity
+
+    @kernel(kind=view.kind)
+    def swing(means, max_input, limit, peaks, mean_information):
+        W = np.zeros(size)
+        copy(W, n, means, k)
+        fill(peaks, 0.0)
+        for a in range(k):
+            fill(mean_information[a], 0.0)
+        glance(W)
+        output_at_rest = W[shown]
+        W[u] = max_input
+        glance(W)
+        peaks[n + 3] = W[shown] - output_at_rest
+        n_turns, first, last, direction = 0, 0, 0, 0.0
+        for t in range(_N_PROBE_SAMPLES):
+            sense(W)
+            now = 1.0 if W[velocity] >= 0.0 else -1.0
+            W[u] = max_input * now
+            if t > 0 and now != direction:
+                first = t if n_turns == 0 else first
+                last = t
+                n_turns += 1
+            direction = now
+            glance(W)
+            if abs(W[shown]) > _TURN_FRACTION * limit:
+                W[u] = -W[u]
+                peaks[n + 2] = t + 1.0 if peaks[n + 2] == 0.0 else peaks[n + 2]
+            step(W)
+            if not abs(W[shown]) < 2.0 * limit:
+                break
+            for i in range(n):
+                peaks[i] = max(peaks[i], abs(W[i]))
+            peaks[n] = max(peaks[n], abs(W[shown]))
+            for a in range(k):
+                for b in range(k):
+                    mean_information[a, b] += W[phi + a] * W[phi + b] / _N_PROBE_SAMPLES
+        if n_turns > 1:
+            peaks[n + 1] = 2.0 * (last - first) / (n_turns - 1)
+
+    return swing
+
+
+def probe_time_scales(view: ModelView, prior_means: npt.ArrayLike, max_input: float, limit: float) -> TimeScales:
+    """How the prior's means swing.
+
+    Args:
+        view: of the model.
+        prior_means: (K,) of the coefficients.
+        max_input: amplitude limit.
+        limit: of the first sensor.
+    """
+    model = view.model
+    peaks, mean_information = np.empty(model.n_states + 4), np.empty((model.n_coefficients, model.n_coefficients))
+    _compile_pumped_swing(view)(
+        np.asarray(prior_means, dtype=np.float64), float(max_input), float(limit), peaks, mean_information
+    )
+    sizes, (peak, period, rise_time, step_response) = peaks[:-4], peaks[-4:]
+    sensor = next(iter(model.outputs.values()))
+    moves = zip(model.states, model.moves, strict=True)
+    has_sensor_scale = np.array([x == sensor or (not model.is_continuous and move == sensor) for x, move in moves])
+    has_sensor_scale |= (sizes <= 0) | (peak <= 0)
+    scales = limit * np.divide(sizes, peak, out=np.ones(model.n_states), where=~has_sensor_scale)
+    # Kicks of the velocity, of variance 3 a sample, after a quarter period 2π/4ω: 3 (t/2ω²), of the displacement.
+    accumulated_noise = max(0.0, 3.0 * period**3 / (32.0 * np.pi**2) - 1.0) * float(limit / scales[0]) ** 2
+    hold_samples = max(1, round(period / MOVES_PER_PERIOD))
+    return TimeScales(
+        scales,
+        hold_samples,
+        float(accumulated_noise),
+        mean_information,
+        float(rise_time) or np.inf,
+        float(step_response) / max_input,
+    )
+
+
+def kept_accumulated_noise(experiment: Any, time_scales: TimeScales) -> float:
+    """`TimeScales.accumulated_noise`, where plans keep that from the limit besides what the last output may tell; else 0.
+
+    On a rig they do. With several sensors, too: the others tell of a kick before the first one shows it.
+    """
+    return time_scales.accumulated_noise if is_on_rig(experiment) or experiment.model.n_outputs > 1 else 0.0
+
+
+def recoverable_step(experiment: Any, view: ModelView, time_scales: TimeScales) -> float:
+    """What of `TimeScales.step_response` plans count on to make up for what the output before tells (`Terms.recoverable_step`); 0 for none.
+
+    None where an input acts in full only a sample later, is held or changed slowly, or has little energy, where another
+    sensor tells of a kick before the first one shows it, and on a rig, where leaving the limit may cost more than
+    information.
+    """
+    setup = experiment.kernel_params
+    acts_slowly = (
+        view.degree
+        or view.lag
+        or time_scales.hold_samples > 1
+        or np.isfinite(setup.max_slew)
+        or np.isfinite(setup.budget)
+    )
+    return (
+        0.0
+        if acts_slowly or is_on_rig(experiment) or experiment.model.n_outputs > 1
+        else _RELIABLE_STEP_FRACTION * time_scales.step_response
+    )

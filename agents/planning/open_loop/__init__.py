@@ -1,0 +1,1 @@
+"""Blocks of inputs that are fixed before their outputs are seen."""

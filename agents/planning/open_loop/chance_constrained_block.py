@@ -1,0 +1,271 @@
+"""Whole blocks of inputs, chosen on a belief before any of their outputs is seen.
+
+A block is planned for systems that are drawn from the belief, not for its means: it climbs the mean of what they tell,
+
+    J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / aim - 1)²],
+
+by the gradient (`agents.planning.d_optimality`), each system k with coefficients, state and process noise of its own. Several
+hundred further draws tell whether a block is safe: whether so few of them leave the limit that the probability is below
+a bound, with a confidence of 95 % (`agents.planning.open_loop.posterior_samples`). Until then, some of those that leave join the systems
+that are planned for, and no longer count; and the *aim* falls, each time by more. Once the block is safe, aims
+between the last two are tried. There are many summits. So several candidates climb, among them the planner's own plan
+for the belief's means; the best of what is safe is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from agents.planning.d_optimality import NominalSystem, compile_d_optimality
+from agents.planning.model_probe import ModelView
+from agents.planning.open_loop.expected_d_optimality import SampledSystems, compile_expected_d_optimality
+from agents.planning.open_loop.posterior_samples import MonteCarloSystems
+from agents.planning.projected_gradient import DesignLimits, project_input
+from agents.planning.receding_horizon import compile_receding_horizon
+from agents.policies.efe_planner import EfePlanner
+from estimator.arrays import copy
+from estimator.belief import Belief
+from estimator.engine.motion import coarsened
+from estimator.lanes import kernel
+from estimator.models.model import Model
+from estimator.parameters import FloatArray
+from estimator.progress import Tell, untold
+
+#: Systems that a block is planned for.
+N_SYSTEMS = 32
+
+#: Steps of the gradient for a candidate, besides one for each sample and up to so many in all; and after every change
+#: of the aim.
+_N_STEPS, _MAX_STEPS, _N_STEPS_AFTER_TIGHTENING = 600, 1024, 200
+
+#: The first step (`agents.planning.projected_gradient`), the part of a step that goes into the next, and the last step in parts of
+#: the first.
+_STEP_FRACTION, _MOMENTUM, _FINAL_STEP_FRACTION = 0.05, 0.8, 0.05
+
+#: The aim in parts of the limit, and how often it falls: by this part of it at first, then by more and more, up to the
+#: last number. Each time so many systems that leave the limit are added to those that are planned for.
+_SOFT_LIMIT_FRACTION, _MAX_TIGHTENINGS, _N_SYSTEMS_ADDED = 0.998, 16, 8
+_FIRST_TIGHTENING, _TIGHTENING_GROWTH, _MAX_TIGHTENING = 0.005, 1.5, 0.05
+
+#: Of a candidate's time, about so much is left after it was climbed first, and of that after every change of the aim.
+_REMAINING_TIME_FRACTION = 0.6
+
+#: How often the last fall is halved, once a block is safe: it was too far by half of it on average.
+_N_BISECTIONS = 2
+
+#: Draws that a block is planned for, at most.
+MAX_PLANNED_DRAWS = N_SYSTEMS + _MAX_TIGHTENINGS * _N_SYSTEMS_ADDED
+
+#: Penalty [nats] of what goes beyond the aim: one system of all must not leave it far for what the others tell.
+_EXCESS_PENALTY = 3e4
+
+#: The second candidate in parts of the first, and the standard deviation of candidates of noise in parts of the limit.
+_WEAKER_PLAN_FRACTION, _NOISE_STD_FRACTION = 0.6, 0.3
+
+
+def sampled_systems(
+    view: ModelView, belief: Belief, monte_carlo: MonteCarloSystems, n_samples: int, previous_input: float = 0.0
+) -> SampledSystems:
+    """The first of drawn systems, before a block of so many samples; ``previous_input`` is the input before it.
+
+    What is not known of a state is what the belief does not know of it.
+    """
+    d_optimality, n = compile_d_optimality(view.model, view.degree), view.model.n_states
+    precision = np.asarray(np.linalg.inv(belief.coefficients_cov), dtype=np.float64)
+    Z = belief.cov[:n, n:] @ precision
+    V = belief.state_cov - Z @ belief.cov[n:, :n]
+    starts = np.zeros((N_SYSTEMS, d_optimality.start_size))
+    starts[:, :n] = monte_carlo.states[:N_SYSTEMS]
+    starts[:, n : d_optimality.n_path] = np.concatenate([V[np.triu_indices(n)], Z.ravel()])
+    starts[:, d_optimality.n_path : d_optimality.n_path + 1] = previous_input
+    input_disturbances = np.ascontiguousarray(monte_carlo.disturbances(n_samples)[0][:N_SYSTEMS])
+    coefficients = np.ascontiguousarray(monte_carlo.coefficients[:N_SYSTEMS])
+    return SampledSystems(coefficients, starts, monte_carlo.noises[:N_SYSTEMS] ** 2, input_disturbances, precision)
+
+
+def _extend_systems(systems: SampledSystems, monte_carlo: MonteCarloSystems, added_draws: list[int]) -> SampledSystems:
+    """The systems, and more of the draws."""
+    starts = np.repeat(systems.path_starts[:1], len(added_draws), axis=0)
+    starts[:, : monte_carlo.model.n_states] = monte_carlo.states[added_draws]
+    return SampledSystems(
+        np.concatenate([systems.coefficients, monte_carlo.coefficients[added_draws]]),
+        np.concatenate([systems.path_starts, starts]),
+        np.concatenate([systems.noises, monte_carlo.noises[added_draws] ** 2]),
+        np.concatenate(
+            [systems.input_disturbances, monte_carlo.disturbances(systems.input_disturbances.shape[1])[0][added_draws]]
+        ),
+        systems.precision,
+    )
+
+
+@cache
+def _compile_momentum_ascent(model: Model, degree: int) -> Any:
+    """``ascend(systems, limits, iterations, u)``: climb from u (T,); the best met overwrites it. Gives its J."""
+    workspace_for, criterion_and_gradient = compile_expected_d_optimality(model, degree)
+
+    @kernel(kind=f"{model.name}_{model.digest}_{degree}")
+    def ascend(systems, limits, iterations, u):
+        T, workspace = len(u), workspace_for(len(u))
+        gradient, best, momentum = workspace.gradient, np.empty(T), np.zeros(T)
+        copy(best, 0, u, T)
+        best_value = -np.inf
+        radius = min(np.sqrt(limits.energy), limits.amplitude * np.sqrt(T))
+        for i in range(iterations + 1):
+            value = criterion_and_gradient(systems, limits.soft_limit, _EXCESS_PENALTY, u, workspace)
+            if value > best_value:
+                best_value = value
+                copy(best, 0, u, T)
+            squared_norm = 0.0
+            for t in range(T):
+                if abs(u[t]) >= limits.amplitude and u[t] * gradient[t] > 0.0:
+                    gradient[t] = 0.0  # the limit holds it where it is
+                squared_norm += gradient[t] * gradient[t]
+            if i == iterations or not squared_norm > 0.0:
+                break
+            step_length = (
+                _STEP_FRACTION * (1.0 - (1.0 - _FINAL_STEP_FRACTION) * i / iterations) * radius / np.sqrt(squared_norm)
+            )
+            for t in range(T):
+                momentum[t] = _MOMENTUM * momentum[t] + step_length * gradient[t]
+                u[t] += momentum[t]
+            project_input(u, limits.amplitude, limits.energy)
+        copy(u, 0, best, T)
+        return best_value
+
+    return ascend
+
+
+def optimise_block(
+    view: ModelView, systems: SampledSystems, monte_carlo: MonteCarloSystems, candidates: FloatArray, amplitude: float, max_probability: float,
+    n_safe_samples: int | None = None, tell: Tell = untold,
+) -> tuple[FloatArray, float, float]:  # fmt: skip
+    """The best input that is safe enough: what tells most on average, of the summits that candidates lead to.
+
+    Args:
+        view: of the model.
+        systems: that it is planned for.
+        monte_carlo: that tell how safe it is.
+        candidates: (n, T) to begin from.
+        amplitude: limit of the input.
+        max_probability: of the probability.
+        n_safe_samples: samples that are asked to be safe; all where None.
+        tell: is told the share that is done.
+
+    Returns:
+        Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and
+        `Futures.probability_bound` of leaving the limit.
+    """
+    monte_carlo.disturbances(candidates.shape[1])  # drawn before the threads share them
+    progress, lock = np.zeros(len(candidates)), Lock()
+
+    def climb(k: int) -> tuple[FloatArray, float, float]:
+        def advance(fraction: float) -> None:
+            with lock:
+                progress[k] = fraction
+                tell(float(progress.mean()))
+
+        found = _climb_candidate(
+            view, systems, monte_carlo, amplitude, max_probability, n_safe_samples, candidates[k], advance
+        )
+        advance(1.0)
+        return found
+
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(climb, range(len(candidates))))
+    information = [expected_information(view, systems, monte_carlo.limit, u)[0] for u, *_ in found]
+    return found[int(np.argmax(information))]
+
+
+def _climb_candidate(
+    view: ModelView, systems: SampledSystems, monte_carlo: MonteCarloSystems, amplitude: float, max_probability: float, n_safe_samples: int | None, u: FloatArray,
+    tell: Tell,
+) -> tuple[FloatArray, float, float]:  # fmt: skip
+    """As `optimise_block`, from one candidate (T,)."""
+    ascend = _compile_momentum_ascent(
+        coarsened(view.model), view.degree
+    )  # how safe a block is, is judged with all steps
+    planned = set(range(N_SYSTEMS))
+
+    def ascended(u: FloatArray, aim: float, iterations: int) -> FloatArray:
+        u = u.copy()
+        ascend(systems, DesignLimits(monte_carlo.limit, aim, amplitude, np.inf), iterations, u)
+        return u
+
+    def safety_of(u: FloatArray) -> tuple[list[int], float]:
+        max_count = monte_carlo.min_violations_for(max_probability, len(planned))
+        leaving = monte_carlo.violating_draws(u[:n_safe_samples], max(_N_SYSTEMS_ADDED, max_count), planned)
+        return leaving, monte_carlo.probability_bound(len(leaving), len(planned))
+
+    unsafe_limit = soft_limit = _SOFT_LIMIT_FRACTION * monte_carlo.limit
+    u = ascended(u, soft_limit, min(_MAX_STEPS, _N_STEPS + len(u)))
+    for k in range(_MAX_TIGHTENINGS):
+        tell(1 - _REMAINING_TIME_FRACTION ** (k + 1))
+        leaving, probability = safety_of(u)
+        if probability < max_probability:
+            for _ in range(_N_BISECTIONS if k else 0):
+                middle = (soft_limit + unsafe_limit) / 2
+                tried = ascended(u, middle, _N_STEPS_AFTER_TIGHTENING)
+                chance = safety_of(tried)[1]
+                if chance < max_probability:
+                    u, probability, soft_limit = tried, chance, middle
+                else:
+                    unsafe_limit = middle
+            return u, 1.0, probability
+        planned.update(leaving[:_N_SYSTEMS_ADDED])
+        systems = _extend_systems(systems, monte_carlo, leaving[:_N_SYSTEMS_ADDED])
+        unsafe_limit, soft_limit = (
+            soft_limit,
+            soft_limit * (1 - min(_FIRST_TIGHTENING * _TIGHTENING_GROWTH**k, _MAX_TIGHTENING)),
+        )
+        u = ascended(u, soft_limit, _N_STEPS_AFTER_TIGHTENING)
+    share, probability = monte_carlo.share(u[:n_safe_samples], max_probability)
+    return share * u, share, probability
+
+
+def initial_guesses(
+    planner: EfePlanner, record: FloatArray, n_samples: int, seed: int, n_noise_guesses: int = 2
+) -> FloatArray:
+    """(2 + noises, samples) to begin from: the planner's plan, were the belief's means true, a weaker one, and noise.
+
+    The plan's margin is the least of an episode's, and no output is answered: the limits that a block must keep are
+    `optimise_block`'s.
+    """
+    plan = np.zeros(n_samples)
+    objective = planner.objective._replace(margin=float(np.min(planner.objective.margin)), recoverable_step=0.0)
+    rng_state = np.random.SFC64(seed).state["state"]["state"]
+    horizon = min(planner.horizon, n_samples)
+    compile_receding_horizon(*planner.model_view).plan_known_system(
+        record.copy(), 0, horizon, planner.rounds, objective, plan, rng_state
+    )
+    moves = np.random.default_rng(seed).standard_normal(
+        (n_noise_guesses, math.ceil(n_samples / objective.hold_samples))
+    )
+    noise = _NOISE_STD_FRACTION * objective.amplitude * np.repeat(moves, objective.hold_samples, axis=1)[:, :n_samples]
+    return np.clip(np.stack([plan, _WEAKER_PLAN_FRACTION * plan, *noise]), -objective.amplitude, objective.amplitude)
+
+
+def expected_information(
+    view: ModelView, systems: SampledSystems, limit: float, u: FloatArray
+) -> tuple[float, FloatArray]:
+    """What inputs (T,) are expected to tell: the mean of ½ log det(Λ + F) [nats], and (S, K, K) covariances after them.
+
+    Args:
+        view: of the model.
+        systems: that are believed in.
+        limit: of the first sensor's signal; what comes after it was left far does not count.
+        u: the inputs.
+    """
+    d_optimality = compile_d_optimality(view.model, view.degree)
+    workspace, values, covs = d_optimality.workspace(len(u)), [], []
+    for c, start, noises, disturbance in zip(*systems[:4], strict=True):
+        nominal = NominalSystem(c, systems.precision, tuple(noises.tolist()))
+        values.append(d_optimality.criterion(nominal, limit, 0.0, start, u + disturbance[: len(u)], workspace)[0])
+        factor = np.linalg.inv(np.tril(workspace.F))
+        covs.append(factor.T @ factor)
+    return float(np.mean(values)), np.array(covs)

@@ -1,0 +1,141 @@
+"""Climbing the worth of an input under the limits of an experiment, compiled for any model.
+
+The method is a projected gradient with steps of given length: u ← P(u + α R g / |g|), with P the projection on the
+limits and R the radius of what they allow. For long steps it is the generalised power method, which under a limit of
+energy is at a summit within some ten steps: information is about quadratic in the input, as a Rayleigh quotient is.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.planning.d_optimality import NominalSystem, compile_d_optimality
+from estimator.arrays import copy
+from estimator.lanes import jit, kernel, part
+from estimator.models.model import Model
+
+#: The gradient aims at this much of the displacement limit, so that what it ends with is within the limit itself.
+_SOFT_LIMIT_FRACTION = 0.9995
+
+#: Penalty [nats] of displacements beyond that, see `agents.planning.d_optimality`.
+EXCESS_PENALTY = 3e3
+
+#: The last step in parts of the first.
+_FINAL_STEP_FRACTION = 0.05
+
+
+class DesignLimits(NamedTuple):
+    """What inputs must keep, and what climbing aims at.
+
+    Attributes:
+        output: limit of the first sensor's signal without noise, in its unit; inf where there is none.
+        soft_limit: signals beyond this one are penalised.
+        amplitude: limit of the input.
+        energy: limit of Σ u², inf where there is none.
+    """
+
+    output: float
+    soft_limit: float
+    amplitude: float
+    energy: float
+
+
+class ProjectedGradient(NamedTuple):
+    """Compiled functions of one model and interpolation of the input.
+
+    Attributes:
+        ascend_batch: ``ascend_batch(nominal, limits, rate, iterations, inputs, values)``: improve several inputs (starts, T) of one
+            system from rest, each on its own; overwritten by the best found that keeps all limits. ``values`` (starts,)
+            receives their worth [nats], -inf where nothing found keeps them. ``limits.aim`` is not used.
+        ascend: ``ascend(nominal, limits, rate, iterations, start, u, best, workspace)``: climb from u (T,); the best input
+            met overwrites it, that is the most worth, less the penalty, of those within ``limits.output``. Gives that
+            worth [nats]. ``best`` (T,) is written on.
+        evaluate_batch: ``evaluate_batch(coefficients, precision, noises, limit, inputs, values, peaks)``: worth [nats] and peak of
+            an input (n, T) for each system (n, K), without a penalty. An input ends before its first value that is not
+            finite.
+
+        ``rate`` is the first step α; the steps fall linearly to a twentieth. ``iterations`` are those of the gradient.
+    """
+
+    ascend_batch: Any
+    ascend: Any
+    evaluate_batch: Any
+
+
+@cache
+def compile_projected_gradient(model: Model, degree: int = 0) -> ProjectedGradient:
+    """What climbs the worth of inputs to a model; arguments as `agents.planning.d_optimality.compile_d_optimality`."""
+    d_optimality = compile_d_optimality(model, degree)
+    criterion_and_gradient, criterion, workspace_for, start_size = (
+        d_optimality.criterion_and_gradient,
+        d_optimality.criterion,
+        d_optimality.workspace,
+        d_optimality.start_size,
+    )
+    compile_key = f"{model.name}_{model.digest}_{degree}"
+
+    @part(compile_key)
+    def ascend(nominal, limits, first_step, iterations, start, u, best, workspace):
+        copy(best, 0, u, len(u))
+        best_value = -np.inf
+        gradient = workspace.gradient
+        radius = min(np.sqrt(limits.energy), limits.amplitude * np.sqrt(len(u)))
+        for k in range(iterations + 1):
+            value, peak = criterion_and_gradient(nominal, limits.soft_limit, EXCESS_PENALTY, start, u, workspace)
+            if peak <= limits.output and value > best_value:
+                best_value = value
+                copy(best, 0, u, len(u))
+            squared_norm = 0.0
+            for t in range(len(u)):
+                squared_norm += gradient[t] * gradient[t]
+            if k == iterations or not squared_norm > 0.0:
+                break
+            step_length = (
+                first_step * (1.0 - (1.0 - _FINAL_STEP_FRACTION) * k / iterations) * radius / np.sqrt(squared_norm)
+            )
+            for t in range(len(u)):
+                u[t] += step_length * gradient[t]
+            project_input(u, limits.amplitude, limits.energy)
+        copy(u, 0, best, len(u))
+        return best_value
+
+    @kernel(kind=compile_key)
+    def ascend_batch(nominal, limits, first_step, iterations, inputs, values):
+        start, workspace, best = np.zeros(start_size), workspace_for(inputs.shape[1]), np.empty(inputs.shape[1])
+        soft_limits = DesignLimits(limits.output, _SOFT_LIMIT_FRACTION * limits.output, limits.amplitude, limits.energy)
+        for i in range(len(inputs)):
+            u = inputs[i]
+            project_input(u, limits.amplitude, limits.energy)
+            ascend(nominal, soft_limits, first_step, iterations, start, u, best, workspace)
+            values[i], peak = criterion(nominal, limits.output, 0.0, start, u, workspace)
+            if not peak <= limits.output:
+                values[i] = -np.inf
+
+    @kernel(kind=compile_key)
+    def evaluate_batch(coefficients, precision, noises, limit, inputs, values, peaks):
+        start, workspace = np.zeros(start_size), workspace_for(inputs.shape[1])
+        for i in range(len(inputs)):
+            n_played = 0
+            while n_played < inputs.shape[1] and np.isfinite(inputs[i, n_played]):
+                n_played += 1
+            nominal = NominalSystem(coefficients[i], precision, noises)
+            values[i], peaks[i] = criterion(nominal, limit, 0.0, start, inputs[i, :n_played], workspace)
+
+    return ProjectedGradient(ascend_batch, ascend, evaluate_batch)
+
+
+@jit
+def project_input(u, amplitude, energy):
+    """Clip the inputs (T,) to their amplitude, and shrink them to their energy."""
+    spent = 0.0
+    for t in range(len(u)):
+        u[t] = max(-amplitude, min(amplitude, u[t]))
+        spent += u[t] * u[t]
+    if spent > energy:
+        # A little less, because the square of what is rounded may be above again.
+        scale = (1.0 - 1e-12) * np.sqrt(energy / spent)
+        for t in range(len(u)):
+            u[t] *= scale

@@ -1,0 +1,154 @@
+"""The planner in blocks reads its environment's belief and model, and is no function of the observation.
+
+It decides on a whole block of inputs at once, and sees their outputs when all were played.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtri
+
+from agents.planning.model_probe import observation_layout
+from agents.planning.open_loop.chance_constrained_block import (
+    MAX_PLANNED_DRAWS,
+    initial_guesses,
+    optimise_block,
+    sampled_systems,
+)
+from agents.planning.open_loop.posterior_samples import (
+    MonteCarloSystems,
+    draw_from_records,
+    noise_as_input,
+    required_draws,
+)
+from agents.policies.efe_planner import EfePlanner
+from estimator.checks import whole
+from estimator.parameters import FloatArray
+
+#: Moves after a block that are planned with it, so that it ends where the next can go on.
+_LOOKAHEAD_MOVES = 9
+
+#: Of these, those that must be safe, too: what a block has begun the next one can stop only then.
+_SAFE_LOOKAHEAD_MOVES = 3
+
+#: Samples of a block, at most.
+_MAX_BLOCK = 4096
+
+#: The least probability that is counted in draws. A smaller one is that of draws with larger deviations.
+_MIN_COUNTED_PROBABILITY = 5e-4
+
+
+def countable_probability(probability: float) -> tuple[float, float]:
+    """A probability that can be counted in draws, and by how much these must deviate more than believed.
+
+    What is beyond so many standard deviations of a Gaussian is as probable in the belief as asked, if it has the
+    probability that is returned in these draws:
+
+    >>> countable_probability(0.01)
+    (0.01, 1.0)
+    >>> bound, spread = countable_probability(2e-5)
+    >>> bound, round(spread, 3)
+    (0.0005, 1.248)
+    """
+    if probability >= _MIN_COUNTED_PROBABILITY:
+        return probability, 1.0
+    return _MIN_COUNTED_PROBABILITY, float(ndtri(probability) / ndtri(_MIN_COUNTED_PROBABILITY))
+
+
+class BlockPlannerState(NamedTuple):
+    """What `BlockPlanner.predict` goes on from, of n environments.
+
+    Attributes:
+        plans: (n, block) the blocks.
+        n_played: (n,) samples of these that were played.
+        samples_left: (n,) samples that were left of the episodes; where more are left now, another one has begun.
+    """
+
+    plans: FloatArray
+    n_played: npt.NDArray[np.int64]
+    samples_left: npt.NDArray[np.int64]
+
+
+class BlockPlanner:
+    """Planning a block at a time on an environment's belief and model; it is no function of the observation.
+
+    It minimises expected free energy (`agents.planning.open_loop.chance_constrained_block`), in the environment that it was made for, as `Planner`.
+
+    Args:
+        env: as of `agents.policies.efe_planner.EfePlanner`.
+        seed: of the search, and of the systems that are drawn.
+        block: samples of a block.
+        risk: probability, as believed, that an episode leaves its range. Blocks share half of it equally. Of the other
+            half each takes half of what is left, for the first ones know least, and the last one all.
+
+    Raises:
+        ValueError: as `Planner`; for a design or a run, which plan blocks of ``efe``; for a block below 1 or above
+            4,096; where the input's energy is limited; or for a model whose process noise acts on another state than
+            its input does.
+    """
+
+    def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 2.5e-4) -> None:
+        self._planner = EfePlanner(env, seed, risk=risk)
+        whole("block", block, _MAX_BLOCK)
+        if not hasattr(env, "mixture"):
+            raise ValueError(
+                f"policy must be 'efe' here, but is 'efe-block-{block}': a design is one block anyway, and a run takes "
+                f"efe with --block {block}"
+            )
+        setup = env.experiment.kernel_params
+        if np.isfinite(setup.budget):
+            raise ValueError(f"env must have no limit of energy for blocks, but has max_rms={env.experiment.max_rms!r}")
+        noise_as_input(self._planner.model_view.model)  # refuses what cannot be simulated
+        self._env, self.block, self._risk = env, int(block), risk
+        self._limit = float(setup.max_output)
+
+    def predict(
+        self,
+        observation: npt.ArrayLike,
+        state: BlockPlannerState | None = None,
+        episode_start: npt.ArrayLike | None = None,
+        deterministic: bool = False,
+    ) -> tuple[npt.NDArray[np.float32], BlockPlannerState]:
+        """The next inputs of the blocks, which are planned where one is at its end; as `Planner.predict`."""
+        rows, episode_begins = self._planner.checked_rows(observation, state, BlockPlannerState, episode_start)
+        records, n, layout = self._env.records, len(rows), observation_layout(self._planner.model_view.model)
+        left = np.rint(rows[:, layout.time_left] * self._env.horizon).astype(np.int64)
+        if state is None:
+            state = BlockPlannerState(np.zeros((n, self.block)), np.zeros(n, dtype=np.int64), left)
+        plans, played = state.plans.copy(), state.n_played.copy()
+        # An episode that is over is shown once more where the next step only begins the next one: no block goes there.
+        due = episode_begins | (left >= state.samples_left) | (played >= self.block)
+        plans[due], played[due] = 0.0, 0
+        for i in np.flatnonzero(due & (left > 0)):
+            last = self._planner.objective.amplitude * rows[i, layout.last_input]
+            plans[i] = self._plan(records[i], int(left[i]), float(last), int(i))
+        actions = (plans[np.arange(n), played] / self._planner.objective.amplitude).astype(np.float32)
+        return actions.reshape(*np.shape(observation)[:-1], 1), BlockPlannerState(plans, played + 1, left)
+
+    def risk_of_block(self, samples_left: int) -> float:
+        """The part of the risk that the block takes which begins so many samples before the end."""
+        n_begun, blocks = (self._env.horizon - samples_left) // self.block, -(-self._env.horizon // self.block)
+        return self._risk * (0.5 / blocks + 0.5 ** (min(n_begun + 1, blocks - 1) + 1))
+
+    def _plan(self, record: FloatArray, samples_left: int, previous_input: float, i: int) -> FloatArray:
+        """A block (block,), zeros beyond the end of the episode."""
+        planner, samples = self._planner, min(self.block, samples_left)
+        view, objective = planner.model_view, planner.objective
+        n_planned = min(samples_left, samples + _LOOKAHEAD_MOVES * objective.hold_samples)
+        rng = np.random.default_rng([planner.seed, i, samples_left])
+        (belief,) = self._env.experiment.prior_belief.with_records(record[None])
+        max_probability, deviation_scale = countable_probability(self.risk_of_block(samples_left))
+        records, weights = self._env.mixture(i)
+        draws = draw_from_records(
+            view.model, records, weights, rng, required_draws(max_probability, MAX_PLANNED_DRAWS), deviation_scale
+        )
+        monte_carlo = MonteCarloSystems(view.model, draws, self._limit, rng, degree=view.degree)
+        systems = sampled_systems(view, belief, monte_carlo, n_planned, previous_input)
+        u, *_ = optimise_block(
+            view, systems, monte_carlo, initial_guesses(planner, record, n_planned, int(rng.integers(2**63))), objective.amplitude, max_probability,
+            min(n_planned, samples + _SAFE_LOOKAHEAD_MOVES * objective.hold_samples),
+        )  # fmt: skip
+        return np.concatenate([u[:samples], np.zeros(self.block - samples)])

@@ -1,0 +1,335 @@
+"""The expected free energy planner reads its environment's belief and model, and is no function of the observation.
+
+It imagines what candidate inputs would teach, and applies the best one's first. Of a sequence of inputs u over the next
+H samples the expected free energy is, in nats,
+
+    G(u) = -[½ log det C_0 - ½ log det (C_H(u)⁻¹ + J)⁻¹]              what it teaches (epistemic)
+           + Σ_h E[(x_h - goal)²] / (2 goal_std²)                       how far it is from a goal (pragmatic, optional)
+           + input_cost Σ_h u_h²                                        what it costs (optional)
+
+with C_0 the covariance of the coefficients now and C_H the one after the H outputs that are expected, by belief
+propagation: the joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample
+teaches is not counted again by the next. The teaching part then telescopes: a plan of the whole episode would be
+Bayesian D-optimal. J is the information that the rest of the episode after H will bring anyway, at the rate of the last
+plans; so a plan looks for what will be lacking at the end. Plans that do not reach the end of the episode are compared
+by a mean of G after each of their moves, in which what a move adds counts the less the later it is
+(`agents.planning.receding_horizon`). Where the coefficients walk (``drift``) J is 0, and the walk is imagined too.
+
+What the first sensor shows should stay within the limit by a margin of standard deviations of the output that is then
+predicted; plans that do not are the worse the further they go within it, as fast as the chance of an early end grows,
+and beyond the limit they are worth nothing. On a rig the margin is as firm as the limit. The margin is the quantile
+that Student's t exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin
+(`agents.planning.belief_rollout.margin_profile`); it narrows as the noises become known. Few are at it, so much less comes true.
+The standard deviation is what is expected two samples before: near its limit a plan may brake as hard as it can
+already, and cannot make up for what one more output tells. Where it could brake harder, most of what that would move
+the output is taken off the margin, down to the deviations that are expected one sample before (not on a rig). Where an
+input comes to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the
+sample between moves the next output about as much again, and no input makes up for it: the margin is then twice as
+wide.
+
+Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
+nothing helps: on a rig the limit is lower by what a swing at it can hide.
+
+The search (`agents.planning.receding_horizon`) builds a plan move by move, by the best ways through the plane of the
+model's first two states, and improves it, the last plan and the next best one then, by steps of the whole plan and by
+small changes. Horizon 1 is myopic.
+
+Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
+climbs by gradient (`agents.planning.energy_limited_plan`): then the question is when to spend, which no short horizon can answer.
+That search knows neither ``max_slew`` nor ``drift``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from agents.planning.belief_rollout import DEFAULT_RISK, PlanObjective, margin_profile
+from agents.planning.discount import discount_moves_for
+from agents.planning.energy_limited_plan import compile_energy_limited_plan
+from agents.planning.model_probe import (
+    ModelView,
+    is_on_rig,
+    kept_accumulated_noise,
+    observation_layout,
+    planning_limit,
+    probe_time_scales,
+    recoverable_step,
+)
+from agents.planning.receding_horizon import compile_receding_horizon
+from agents.predict_checks import check_batch_size, check_last_observation, episode_starts
+from estimator.checks import SMALLEST, number, numbers, shown, whole
+from estimator.engine.motion import coarsened
+from estimator.parameters import FloatArray
+
+
+class EfePlannerState(NamedTuple):
+    """What `EfePlanner.predict` goes on from, of n environments.
+
+    Attributes:
+        plans: (n, horizon) the last plans [V].
+        runner_ups: (n, horizon) the next best ones [V].
+        information_rates: (n, K, K) what plans taught per sample.
+        rng_states: (n, 4) the streams of random numbers.
+        last_inputs: (n,) the last inputs [V].
+        chosen_inputs: (n,) the inputs that were chosen last [V].
+        remaining_holds: (n,) samples that these are still to be held for.
+        holds: (n,) samples of a move of the plans.
+    """
+
+    plans: FloatArray
+    runner_ups: FloatArray
+    information_rates: FloatArray
+    rng_states: npt.NDArray[np.uint64]
+    last_inputs: FloatArray
+    chosen_inputs: FloatArray
+    remaining_holds: npt.NDArray[np.int64]
+    holds: npt.NDArray[np.int64]
+
+
+#: Moves to plan under an amplitude limit: some periods of the oscillator.
+_DEFAULT_HORIZON = 44
+
+#: Rounds of a decision, at most: three are usual.
+_DEFAULT_ROUNDS = 12
+
+#: Moves that a short episode is divided into: none is longer than these need to reach its end.
+_MIN_EPISODE_MOVES = 24
+
+#: Moves of a plan, at most.
+_MAX_MOVES = 100_000
+
+#: Cells of the map, times the third root of the moves that a swing takes to come near the limit, and their bounds: the
+#: less a move does beside the limit, the finer the map.
+_CELLS_PER_CUBE_ROOT, _MIN_CELLS, _MAX_CELLS = 13.5, 22, 38
+
+
+class EfePlanner:
+    """Expected free energy planning on an environment's belief and model; it is no function of the observation.
+
+    So it plays the environment that it was made for, and no other. `predict` must be called between that one's steps,
+    with what it showed last, which is checked; a wrapper that changes or delays observations is refused by that.
+
+    Environment i searches with a stream of random numbers of its own, the i-th child of the seed, so that its inputs
+    do not depend on the size of the batch.
+
+    Args:
+        env: the unwrapped environment, single or vector, whose beliefs it reads.
+        seed: of the search.
+        horizon: moves to plan for, each held for at most ``objective.hold_samples`` samples, but no longer than the episode needs;
+            by default 44, and the whole episode sample by sample where the energy is limited. No more than 24 of the
+            last 48 of an episode.
+        rounds: of steps and changed copies of each plan that climbs, at most, two blocks of `estimator.lanes.LANES`
+            each; one that brings less than 0.00005 nats is the last. Of no effect on a plan of the whole episode.
+        risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
+        goal: mean of the goal prior of what the first sensor shows, within its limit.
+        goal_std: its standard deviation; no goal where it is None.
+        input_cost: nats for the square of an input. Like the goal, it is in the belief's scale: in V on the tracks.
+
+    Attributes:
+        view: of the model that is planned on.
+        terms: what plans are judged by.
+
+    Raises:
+        ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
+            samples, a number is out of range, a goal has no ``goal_std``, a plan of the whole episode is asked to have
+            a goal or cost, or where the energy of a long episode is limited and no horizon is given.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        seed: int = 0,
+        *,
+        horizon: int | None = None,
+        rounds: int = _DEFAULT_ROUNDS,
+        risk: float = DEFAULT_RISK,
+        goal: float = 0.0,
+        goal_std: float | None = None,
+        input_cost: float = 0.0,
+    ) -> None:
+        if not hasattr(env, "records") or hasattr(env, "recorded_input"):
+            raise ValueError(
+                f"env must be an environment of duffing_env that simulates a plant, but is {type(env).__name__}; "
+                "the planner needs its beliefs: pass it to make_policy"
+            )
+        whole("horizon", _DEFAULT_HORIZON if horizon is None else horizon, _MAX_MOVES)
+        whole("rounds", rounds, 1000)
+        number("risk", risk, SMALLEST, 1 - SMALLEST)
+        number("input_cost", input_cost, 0)
+        experiment = env.experiment
+        if experiment.hold != 1:
+            raise ValueError(
+                f"env must take an action for every sample, as plans do, but its hold is {experiment.hold}; "
+                "make it with hold=1, or choose a signal or a feedback law"
+            )
+        if experiment.observation not in ("posterior", "privileged"):
+            raise ValueError(
+                f"env must show the posterior, in which the planner looks up the time left, but its observation is "
+                f"{shown(experiment.observation)}; make it with observation='posterior'"
+            )
+        setup, self.model_view = experiment.kernel_params, ModelView.of(experiment)
+        number("goal", goal, -float(setup.max_output), float(setup.max_output), "a goal lies within the limit")
+        if goal_std is not None:
+            number("goal_std", goal_std, remedy="None is no goal")
+        elif goal:
+            raise ValueError(f"goal_std must be given with a goal, but is None for goal={goal!r}; add goal_std=0.05")
+        plans_whole_episode = bool(np.isfinite(setup.budget)) and horizon is None
+        if plans_whole_episode and env.horizon > _MAX_MOVES:
+            raise ValueError(
+                f"horizon must be given in an episode of {env.horizon} samples whose energy is limited, but is None; a "
+                f"plan of all of it has at most {_MAX_MOVES}"
+            )
+        if plans_whole_episode and (goal_std is not None or input_cost):
+            raise ValueError(
+                "goal_std and input_cost must be left out where the energy is limited, but are "
+                f"{goal_std!r} and {input_cost!r}; pass a horizon to plan with them"
+            )
+        horizon = env.horizon if plans_whole_episode else min(horizon or _DEFAULT_HORIZON, env.horizon)
+        self._energy = setup.budget if plans_whole_episode else None
+        if plans_whole_episode:
+            self._plan_rest_of_episode = compile_energy_limited_plan(
+                coarsened(self.model_view.model), self.model_view.degree
+            ).plan_rest_of_episode
+        self._env = env
+        self.seed = seed
+        self.horizon, self.rounds = int(horizon), int(rounds)
+        means = experiment.prior_belief.coefficients_mean
+        time_scales = probe_time_scales(self.model_view, means, setup.max_input, setup.max_output)
+        self.objective = PlanObjective(
+            amplitude=setup.max_input,
+            slew=setup.max_slew,
+            limit=planning_limit(experiment, time_scales.scales),
+            margin=margin_profile(env.horizon, risk) * (1 + max(self.model_view.degree, self.model_view.lag)),
+            walk=setup.walk_variances.copy(),
+            scales=time_scales.scales,
+            hold_samples=min(time_scales.hold_samples, -(-env.horizon // min(horizon, _MIN_EPISODE_MOVES))),
+            accumulated_noise=kept_accumulated_noise(experiment, time_scales),
+            input_weight=float(input_cost),
+            goal=float(goal),
+            goal_weight=0.0 if goal_std is None else 0.5 / goal_std**2,
+            hard_margin=float(is_on_rig(experiment)),
+            discount_moves=discount_moves_for(time_scales),
+            recoverable_step=recoverable_step(experiment, self.model_view, time_scales),
+            cells=int(
+                np.clip(
+                    _CELLS_PER_CUBE_ROOT * np.cbrt(time_scales.rise_time / time_scales.hold_samples),
+                    _MIN_CELLS,
+                    _MAX_CELLS,
+                )
+            ),
+        )
+
+    def predict(
+        self,
+        observation: npt.ArrayLike,
+        state: EfePlannerState | None = None,
+        episode_start: npt.ArrayLike | None = None,
+        deterministic: bool = False,
+    ) -> tuple[npt.NDArray[np.float32], EfePlannerState]:
+        """Plan, and give the first input of each environment's plan, as `agents.policies.Policy`.
+
+        An episode begins with a new plan, and where the state is None all plans and streams are new. ``deterministic``
+        is without effect: the search is reproducible by its seed.
+
+        Raises:
+            ValueError: as `checked_rows`.
+        """
+        rows, episode_begins = self.checked_rows(observation, state, EfePlannerState, episode_start)
+        records, n = self._env.records, len(rows)
+        k, objective = self.model_view.model.n_coefficients, self.objective
+        if state is None:
+            streams = map(np.random.SFC64, np.random.SeedSequence(self.seed).spawn(n))
+            rng_states = np.array([stream.state["state"]["state"] for stream in streams])
+            plans, information_rates, remaining_holds = (
+                np.zeros((n, self.horizon)),
+                np.zeros((n, k, k)),
+                np.zeros(n, dtype=np.int64),
+            )
+            state = EfePlannerState(
+                plans,
+                plans,
+                information_rates,
+                rng_states,
+                np.zeros(n),
+                np.zeros(n),
+                remaining_holds,
+                np.ones_like(remaining_holds),
+            )
+        plans, runner_ups = state.plans.copy(), state.runner_ups.copy()
+        information_rates, rng_states = state.information_rates.copy(), state.rng_states.copy()
+        older_inputs, chosen = state.last_inputs.copy(), state.chosen_inputs.copy()
+        remaining_holds, holds = state.remaining_holds.copy(), state.holds.copy()
+        (
+            plans[episode_begins],
+            runner_ups[episode_begins],
+            information_rates[episode_begins],
+            older_inputs[episode_begins],
+            remaining_holds[episode_begins],
+        ) = 0.0, 0.0, 0.0, 0.0, 0
+        layout = observation_layout(self.model_view.model)
+        samples_left = np.rint(rows[:, layout.time_left] * self._env.horizon).astype(np.int64)
+        last_inputs = objective.amplitude * rows[:, layout.last_input]
+        due = np.flatnonzero(remaining_holds == 0)
+        inputs = np.empty(len(due))
+        searched = plans[due], runner_ups[due], information_rates[due], rng_states[due]
+        if self._energy is not None:
+            energies = rows[:, layout.budget_left] * self._energy
+            self._plan_rest_of_episode(
+                records, samples_left, energies, objective, last_inputs, searched[0], searched[3], inputs
+            )
+        else:
+            previous_inputs = np.stack([last_inputs, older_inputs], axis=1)[due]
+            holds_of_due = holds[due]
+            compile_receding_horizon(*self.model_view).plan(
+                records[due],
+                samples_left[due],
+                self.horizon,
+                self.rounds,
+                objective,
+                previous_inputs,
+                *searched,
+                inputs,
+                holds_of_due,
+            )
+            remaining_holds[due] = holds[due] = holds_of_due
+            remaining_holds -= 1
+        plans[due], runner_ups[due], information_rates[due], rng_states[due] = searched
+        chosen[due] = inputs
+        actions = (chosen / objective.amplitude).astype(np.float32)
+        state = EfePlannerState(
+            plans, runner_ups, information_rates, rng_states, last_inputs, chosen, remaining_holds, holds
+        )
+        return actions.reshape(*np.shape(observation)[:-1], 1), state
+
+    def checked_rows(
+        self,
+        observation: npt.ArrayLike,
+        state: Any,
+        state_type: type[tuple[Any, ...]],
+        episode_start: npt.ArrayLike | None,
+    ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """The observations (n, features) of all environments, and which of them begin an episode (n,).
+
+        Raises:
+            ValueError: for an observation that is not finite, or not what ``env`` showed last; or a state or
+                ``episode_start`` that does not go with it.
+        """
+        observed, n = numbers("observation", observation), len(self._env.records)
+        min_size = observation_layout(self.model_view.model).size
+        if observed.ndim not in (1, 2) or observed.shape[-1] < min_size or observed.size != n * observed.shape[-1]:
+            raise ValueError(
+                f"observation must be of the planner's own {n} environments, with {min_size} entries each, but has shape "
+                f"{observed.shape}"
+            )
+        if not np.isfinite(observed).all():
+            raise ValueError("observation must be finite, but is not; pass what the environment showed last")
+        if state is not None:
+            if not isinstance(state, state_type):
+                raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
+            check_batch_size("state", len(state[0]), n)
+        observed = observed.reshape(n, -1)
+        check_last_observation(self._env, observed)
+        return observed, episode_starts(episode_start, n)

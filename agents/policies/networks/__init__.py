@@ -1,0 +1,1 @@
+"""Trained networks: what they see, their shield, how they act and how they are saved."""

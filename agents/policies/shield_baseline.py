@@ -1,0 +1,50 @@
+"""`shield`: pushes along the velocity, bounded by the networks' shield. Nothing is learned."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from agents.policies.networks.rollout_features import FEATURE_NAMES, FeatureEncoder
+from agents.predict_checks import check_observation_finite, check_observation_size
+from estimator.checks import numbers
+
+_VELOCITY = FEATURE_NAMES.index("velocity")
+
+
+class ShieldBaseline:
+    """Push along the velocity of the first sensor, as hard as the shield allows (`agents.policies.networks.rollout_features`).
+
+    A trained network is compared with it: both have the same shield.
+
+    Args:
+        env: the unwrapped environment, single or vector, whose prior, limits and noises it is to know.
+        seed: without effect: nothing in it is random.
+
+    Raises:
+        ValueError: as `FeatureEncoder.of`.
+    """
+
+    def __init__(self, env: Any, seed: int = 0) -> None:
+        self._encoder = FeatureEncoder.of(env, with_observation=False)
+
+    def predict(
+        self,
+        observation: npt.ArrayLike,
+        state: Any = None,
+        episode_start: npt.ArrayLike | None = None,
+        deterministic: bool = False,
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """The action (n, 1) for observations (n, features), or (1,) for one observation; the state is handed on unused.
+
+        Raises:
+            ValueError: for observations of another shape, or that are not finite.
+        """
+        observations = numbers("observation", observation).astype(np.float32)
+        check_observation_size(observations, self._encoder.observation_size)
+        check_observation_finite(observations)
+        features = self._encoder(np.atleast_2d(observations))
+        pushes = np.where(features.values[:, _VELOCITY] >= 0.0, 1.0, -1.0)
+        return features.to_actions(pushes).reshape(*observations.shape[:-1], 1), state

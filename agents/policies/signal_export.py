@@ -1,0 +1,76 @@
+"""Excitations as CSV, for a real signal generator: ``duffing-env export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.policies.excitations import EXCITATIONS
+from agents.policies.feedback import FEEDBACK
+from agents.policies.signals import DEFAULT_MAX_INPUT, DEFAULT_SAMPLES, InputLimits
+from agents.predict_checks import MAX_SAMPLES
+from estimator.checks import MOST_SEED, hint, shown, whole
+from estimator.files import write_atomically
+from estimator.parameters import SAMPLING_STEP
+
+
+def draw_signal(
+    name: str,
+    *,
+    samples: int = DEFAULT_SAMPLES,
+    max_input: float = DEFAULT_MAX_INPUT,
+    max_rms: float | None = None,
+    seed: int = 0,
+) -> NDArray[np.float64]:
+    """Draws an excitation within its limits.
+
+    It is, up to the float32 rounding of actions, the first signal that `make_policy(name, env, seed=seed)` plays to
+    the first environment, where `env` has these limits and this horizon.
+
+    Args:
+        name: A name in `agents.policies.excitations.EXCITATIONS`.
+        samples: Its length, 1 to `MAX_SAMPLES`; multisines need 5.
+        max_input: The amplitude limit, in volts, positive.
+        max_rms: The largest root mean square, in volts, positive; None: no limit. See `Limits.fit`.
+        seed: The seed of the draw, 0 or more.
+
+    Returns:
+        The input in volts, shape `(samples,)`.
+
+    Raises:
+        ValueError: An argument is out of its range, or there is no excitation of this name.
+    """
+    if not isinstance(name, str) or name not in EXCITATIONS:
+        remedy = hint(name, EXCITATIONS)
+        if str(name) in FEEDBACK:
+            remedy = "; it answers to what an oscillator does, so it must be played: use agents.make_policy"
+        raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {shown(name)}{remedy}")
+    whole("samples", samples, MAX_SAMPLES)
+    whole("seed", seed, MOST_SEED, 0)
+    limits = InputLimits(max_input, max_rms)
+    generator = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
+    return max_input * limits.to_actions(EXCITATIONS[name](max_input)(generator, samples))
+
+
+def export_signal(name: str, path: str | Path, **limits: Any) -> NDArray[np.float64]:
+    """Writes an excitation as CSV, in one piece: columns ``t [s]`` and ``u [V]``, a row for each sample.
+
+    Numbers have all their digits, so that reading them gives the very signal.
+
+    The folder is made where it is missing; a file of this name is replaced.
+
+    Returns:
+        The input in volts, shape `(samples,)`.
+
+    Raises:
+        ValueError: As `draw_signal`, whose arguments the others are; nothing is written then.
+        OSError: The file cannot be written.
+    """
+    volts = draw_signal(name, **limits)
+    times = (SAMPLING_STEP * np.arange(len(volts))).tolist()
+    rows = [f"{time!r},{value!r}" for time, value in zip(times, volts.tolist(), strict=True)]
+    write_atomically(Path(path), "\n".join(["t [s],u [V]", *rows, ""]))
+    return volts

@@ -1,0 +1,1 @@
+"""The search for D-optimal inputs, and the bounds that certify them."""

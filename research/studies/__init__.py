@@ -1,0 +1,1 @@
+"""Studies: the paper's experiment, the Silverbox protocol, trainings that ship."""
